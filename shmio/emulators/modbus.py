@@ -98,6 +98,7 @@ class _TableImage:
                 self.places.append(_Place(register, parse(register), unit, orders))
             except ValueError as error:
                 raise ConfigError(f"layout: {register.path}: {error}") from None
+        self._spans = [(one.offset, one.offset + one.size) for one in layout.registers]
         self._codecs = [codec(register, layout.byte_order) for register in layout.registers]
 
     def fill(self, words: Words) -> None:
@@ -114,8 +115,7 @@ class _TableImage:
 
     def store(self, before: bytes, frame: bytearray, words: Words) -> None:
         """Put the values of an image that have changed into the device."""
-        spans = [(one.offset, one.offset + one.size) for one in self.layout.registers]
-        self._store(words, frame, [before[start:stop] != frame[start:stop] for start, stop in spans])
+        self._store(words, frame, [before[start:stop] != frame[start:stop] for start, stop in self._spans])
 
     def _store(self, words: Words, frame: bytearray, chosen: Sequence[bool], wanted: bool = True) -> None:
         for place, own, one in zip(self.places, self._codecs, chosen, strict=True):
@@ -152,6 +152,7 @@ class ModbusEmulator:
             image.fill(self._words)
         self._frame = bytearray(self._layout.size)
         self._lock = threading.Lock()
+        self._store = _Store(self._words, self._lock)
         self._loop = LoopThread("modbus-server")
         self._server: ModbusTcpServer | None = None
         self.cycle = Cycle(self._program.period_ms / 1000, self._step, f"program-{program_name}")
@@ -182,7 +183,7 @@ class ModbusEmulator:
         logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # it logs what clients do wrong
         nothing = SimDevice(0, simdata=[SimData(0, datatype=DataType.REGISTERS)])
         server: Any = ModbusTcpServer(nothing, address=(self.address.host, self.address.port))
-        server.context = _Store(self._words, self._lock)
+        server.context = self._store
         connected = server.callback_new_connection
 
         def connect() -> Any:
@@ -199,11 +200,14 @@ class ModbusEmulator:
     def _step(self, time_s: float) -> None:
         if isinstance(self._program, Idle):
             return
+        image = self._images[0]
         with self._lock:
-            self._images[0].load(self._frame, self._words)
+            if self._store.written:  # else the frame has the device's values already
+                self._store.written = False
+                image.load(self._frame, self._words)
             before = bytes(self._frame)
             self._program.step(time_s, self._frame)
-            self._images[0].store(before, self._frame, self._words)
+            image.store(before, self._frame, self._words)
 
 
 class _Store:
@@ -211,6 +215,8 @@ class _Store:
 
     def __init__(self, words: Mapping[tuple[int, Table], list[int]], lock: threading.Lock) -> None:
         self._words, self._lock = words, lock
+        self.written = True
+        """Whether the tables may differ from the image of the program: initially, and after a client has written."""
         self._units = {unit for unit, _ in words}
 
     def device_ids(self) -> list[int]:
@@ -235,6 +241,7 @@ class _Store:
             return entries
         with self._lock:
             entries[address : address + len(values)] = [int(one) for one in values]
+            self.written = True
         return None
 
     def _entries(self, unit: int, function: int, address: int, count: int) -> list[int] | Any:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Collection, Iterator, Sequence
+from functools import reduce
+from operator import or_
 from typing import Annotated, Any, Final, NamedTuple
 
 import msgspec
@@ -327,27 +329,55 @@ class ModbusConnector(Connector):
     # -- writing -------------------------------------------------------------------------------------------------------
 
     def write(self, writes: Sequence[Write]) -> list[str]:
-        """Write to the device, one write after the other: see :meth:`Connector.write`."""
+        """Write to the device, one write after the other: see :meth:`Connector.write`.
+
+        Writes that only together contain a whole value are written as one, in place of the last of them.
+        """
         if not self._client.connected:
             raise WriteLostError(f"not connected to {self._client.peer}", [Lost.UNSENT] * len(writes))
         self._client.begin()
-        outcomes: list[str | Lost] = []
-        for write in writes:
+        outcomes: list[str | Lost] = [Lost.UNSENT] * len(writes)
+        for places in self._joined(writes):
             done = False
             try:
-                reason = ""
-                for step in self._steps(write):
+                reason: str | Lost = ""
+                for step in self._steps([writes[place] for place in places]):
                     self._exchange(*step)
                     done = True
             except (RefusedError, ValueError) as error:
                 reason = f"a part was written, and then {error}" if done else str(error)
             except ConnectorError as error:
-                unsent = not (done or self._client.sent)
-                outcomes.append(Lost.UNSENT if unsent else Lost.UNKNOWN)
-                outcomes += [Lost.UNSENT] * (len(writes) - len(outcomes))
+                reason = Lost.UNSENT if not (done or self._client.sent) else Lost.UNKNOWN
+                for place in places:
+                    outcomes[place] = reason
                 raise WriteLostError(str(error), outcomes) from None
-            outcomes.append(reason)
+            for place in places:
+                outcomes[place] = reason
         return [str(outcome) for outcome in outcomes]
+
+    def _joined(self, writes: Sequence[Write]) -> list[list[int]]:
+        """Return the indices of the writes that are written as one, in the order in which to write them.
+
+        Such are the writes of a word and of one of its bits by two commands: the first write then
+        lacks the bit. The writes of a value are joined only if together they contain all its bits.
+        """
+        group = list(range(len(writes)))  # for each write, the last write of its group
+        for one in self._registers:
+            register = one.register
+            near = [place for place, write in enumerate(writes) if _touches(write, register)]
+            if len(near) < 2 or register.type == "BOOL":
+                continue
+            for at in {at for place in near for at in _cut(writes[place], register)}:
+                shares = {place: _share(writes[place], at, register.element.size) for place in near}
+                some = [place for place, share in shares.items() if any(share)]
+                if all(reduce(or_, column) == 0xFF for column in zip(*(shares[place] for place in some), strict=True)):
+                    joined = {group[place] for place in some}
+                    last = max(joined)
+                    group = [last if member in joined else member for member in group]
+        found: dict[int, list[int]] = {}
+        for place, last in enumerate(group):
+            found.setdefault(last, []).append(place)
+        return [found[last] for last in sorted(found)]
 
     def _exchange(self, unit: int, function: int, data: bytes) -> None:
         """Send one request of a write.
@@ -369,28 +399,26 @@ class ModbusConnector(Connector):
         word = int.from_bytes(self._client.read(unit, Table.HOLDING, start, 1), "big")
         self._client.write(unit, client.WRITE_WORD, data[:2] + (word & keep | put).to_bytes(2, "big"))
 
-    def _steps(self, write: Write) -> Iterator[tuple[int, int, bytes]]:
-        """Yield the requests (unit, function, data) of a write.
+    def _steps(self, writes: Sequence[Write]) -> Iterator[tuple[int, int, bytes]]:
+        """Yield the requests (unit, function, data) of writes that are written as one.
 
         Raises:
-            ValueError: The device cannot hold the value, or the write names nothing that can be written.
+            ValueError: The device cannot hold the value, or a write names nothing that can be written.
 
         """
-        offset, mask, data = write
         touched = False
         for one in self._registers:
             register = one.register
-            if register.offset + register.size <= offset or register.offset >= offset + len(data):
-                continue
-            if register.bit is not None and not register.dims and mask != 1 << register.bit and mask:
+            parts = [write for write in writes if _touches(write, register)]
+            if not parts:
                 continue
             touched = True
             if not one.address.table.writable:
                 raise ValueError(f"nothing can be written to the table {one.address.table.value}")
-            if mask and register.bit is None:
-                yield self._bit_of_word(one, write)
+            if register.bit is None and len(writes) == 1 and parts[0].mask:
+                yield self._bit_of_word(one, parts[0])
             else:
-                yield from self._values(one, write)
+                yield from self._values(one, parts)
         if not touched:
             raise ValueError("no register of the tag table is there")
 
@@ -412,17 +440,18 @@ class ModbusConnector(Connector):
         start = address.number + element * address.width + word
         return one.unit, client.MASK_WORD, b"".join(number.to_bytes(2, "big") for number in (start, keep, put))
 
-    def _values(self, one: _Register, write: Write) -> Iterator[tuple[int, int, bytes]]:
-        """Yield the requests that write the elements of a register that a write covers."""
+    def _values(self, one: _Register, writes: Sequence[Write]) -> Iterator[tuple[int, int, bytes]]:
+        """Yield the requests that write the elements of a register that writes cover together."""
         register, address = one.register, one.address
         image = bytearray(self._layout.size)
         covered = bytearray(self._layout.size)
-        apply(write, image)
-        apply(Write(write.offset, write.mask, b"\xff" * len(write.data)), covered)
+        for write in writes:
+            apply(write, image)
+            apply(Write(write.offset, write.mask, b"\xff" * len(write.data)), covered)
         chosen = []
         for place, (at, size, bits) in enumerate(_places(register)):
-            part = sum(1 for byte in covered[at : at + size] if byte & bits)
-            if 0 < part < size:
+            part = any(byte & bits for byte in covered[at : at + size])
+            if part and any(byte & bits != bits for byte in covered[at : at + size]):
                 raise ValueError("a part of a value cannot be written: write the whole value")
             if part:
                 chosen.append(place)
@@ -483,6 +512,30 @@ def _places(register: Register) -> Iterator[tuple[int, int, int]]:
     else:
         for place in range(register.count):
             yield register.offset + place * register.element.stride, register.element.size, 0xFF
+
+
+def _touches(write: Write, register: Register) -> bool:
+    """Return whether a write contains bits of a register."""
+    offset, mask, data = write
+    if register.offset + register.size <= offset or register.offset >= offset + len(data):
+        return False
+    return register.bit is None or bool(register.dims) or not mask or mask == 1 << register.bit
+
+
+def _cut(write: Write, register: Register) -> Iterator[int]:
+    """Yield the offsets of the elements of which a write contains a part only."""
+    offset, mask, data = write
+    stride, size = register.element.stride, register.element.size
+    for byte in (offset, offset + len(data) - 1):  # those in between are whole
+        at = register.offset + max(0, byte - register.offset) // stride * stride
+        if at < register.offset + register.size and (mask or at < offset or offset + len(data) < at + size):
+            yield at
+
+
+def _share(write: Write, at: int, size: int) -> bytes:
+    """Return for each byte of an element which bits of it a write contains."""
+    offset, mask, data = write
+    return bytes((mask or 0xFF) if offset <= place < offset + len(data) else 0 for place in range(at, at + size))
 
 
 def _runs(places: Sequence[int], most: int) -> Iterator[tuple[int, int]]:

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from shmio.connectors.base import Lost, WriteLostError
+from shmio.connectors.commands import Item, coalesce, ends
 from shmio.connectors.modbus import connector as module
 from shmio.connectors.modbus import plan
 from shmio.connectors.modbus.client import ModbusClient, RefusedError
@@ -28,6 +29,7 @@ from shmio.model.statuses import (
     GOOD,
     StatusArea,
 )
+from shmio.segment import Command
 from shmio.testing.proxy import FaultProxy
 from tests.unit.connectors.modbus.device import WORDS, Device
 
@@ -353,3 +355,80 @@ def test_a_unit_that_lacks_function_22_does_not_cost_the_others(
             assert connector.write(encode(find(layout, path), True, "little")) == [""]
         assert [function for function, _, _ in device.calls()] == [3, 6, 22, 3, 6]
         assert (device.get("holding", 0), device.get("holding", 0, unit=2)) == ([2], [0x00F2])
+
+
+def carried_out(connector: ModbusConnector, layout: Layout, *wanted: tuple[str, object]) -> list[tuple[str, str]]:
+    """Carry out commands of one cycle, one for each path; return the kind and text of each command's last event."""
+    items = [
+        Item(Command(1, number, 1, 1 << 62, (write,)), 0)
+        for number, (path, value) in enumerate(wanted, 1)
+        for write in encode(find(layout, path), value, "little")
+    ]
+    writes, superseded = coalesce(items, layout.size)
+    return [
+        (kind.name.lower(), text) for kind, text in ends(items, writes, superseded, connector.write(writes), "lost")
+    ]
+
+
+def test_word_and_bit_of_two_commands_are_written_as_one_word(device: Device) -> None:
+    tags = {"word": tag("WORD", "holding 4"), "long": tag("DWORD", "holding 6"), "other": tag("INT", "holding 9")}
+    with connected(device, tags) as (connector, layout):
+        wanted = ("word", 0x1234), ("other", -2), ("word.%X0", True), ("word.%X15", True)
+        assert carried_out(connector, layout, *wanted) == [("written", "")] * 4
+        assert device.get("holding", 4) == [0x9235]
+        assert device.get("holding", 9) == words("h", -2)
+        assert sorted(call[0] for call in device.calls()) == [6, 6]
+        assert carried_out(connector, layout, ("long", 0), ("long.%W1", 7)) == [("written", "")] * 2
+        assert device.get("holding", 6, 2) == [7, 0]
+        superseded = "superseded by a later write of the same cycle"
+        assert carried_out(connector, layout, ("word.%X0", False), ("word", 1)) == [
+            ("written", superseded),
+            ("written", ""),
+        ]
+        assert device.get("holding", 4) == [1]
+
+
+def test_bits_of_two_commands_stay_two_requests(device: Device) -> None:
+    device.set("holding", 4, [0b1000])
+    with connected(device, {"word": tag("WORD", "holding 4")}) as (connector, layout):
+        assert carried_out(connector, layout, ("word.%X0", True), ("word.%X1", True)) == [("written", "")] * 2
+        assert device.get("holding", 4) == [0b1011]
+        assert [call[0] for call in device.calls()] == [22, 22]
+
+
+def test_refusal_of_joined_writes_is_that_of_their_commands_alone(device: Device) -> None:
+    tags = {
+        "word": tag("WORD", f"holding {WORDS}"),
+        "other": tag("INT", "holding 9"),
+        "slice": tag("WORD", "holding 2"),
+    }
+    with connected(device, tags) as (connector, layout):
+        wanted = ("word", 5), ("other", 3), ("word.%X3", True), ("slice.%B0", 1), ("slice.%X9", True)
+        found = carried_out(connector, layout, *wanted)
+        assert [kind for kind, _ in found] == ["refused", "written", "refused", "refused", "written"]
+        assert "illegal data address" in found[0][1]
+        assert found[2] == found[0]
+        assert "a part of a value" in found[3][1]
+        assert device.get("holding", 9) == [3]
+        assert device.get("holding", 2) == [0x200]
+
+
+def test_loss_of_joined_writes_is_unknown_for_their_commands_alone(device: Device) -> None:
+    tags = {"word": tag("WORD", "holding 4"), "first": tag("INT", "holding 1"), "last": tag("INT", "holding 9")}
+    framing = lambda data: 6 + int.from_bytes(data[4:6], "big") if len(data) >= 6 else 0  # noqa: E731
+    with FaultProxy(device.address, framing=framing) as proxy:
+        address = proxy.address
+        with connected(device, tags, host=address.host, port=address.port, timeout=300) as (connector, layout):
+            passed = iter((True, False))
+            proxy.edit(lambda frame: frame if next(passed, False) else None)
+            wanted = ("first", 1), ("word", 5), ("word.%X3", True), ("last", 1)
+            items = [
+                Item(Command(1, number, 1, 1 << 62, (write,)), 0)
+                for number, (path, value) in enumerate(wanted, 1)
+                for write in encode(find(layout, path), value, "little")
+            ]
+            writes, superseded = coalesce(items, layout.size)
+            with pytest.raises(WriteLostError) as lost:
+                connector.write(writes)
+            found = ends(items, writes, superseded, lost.value.outcomes, "lost")
+            assert [kind.name for kind, _ in found] == ["WRITTEN", "UNKNOWN", "UNKNOWN", "EXPIRED"]
