@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
 from shmio.errors import ValueRangeError
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
@@ -13,6 +18,21 @@ from shmio.model.statuses import (
     RegisterStatus,
     StatusArea,
 )
+
+
+class Copy(NamedTuple):
+    """Registers whose bytes are those of a device's answer, in another order.
+
+    Attributes:
+        sources: For each byte its place in the answer.
+        targets: For each byte its place in the image.
+        indices: The registers' indices in the layout.
+
+    """
+
+    sources: npt.NDArray[np.intp]
+    targets: npt.NDArray[np.intp]
+    indices: frozenset[int]
 
 
 class RegisterImage:
@@ -27,6 +47,8 @@ class RegisterImage:
         self._layout = layout
         self._area = StatusArea(layout)
         self._image, _ = initial_frame(layout)
+        self._bytes = np.frombuffer(self._image, np.uint8)
+        self._not_good: set[int] = set()
         for index in range(len(layout.registers)):
             self.fail(index, BAD_WAITING_FOR_INITIAL_DATA)
 
@@ -55,15 +77,31 @@ class RegisterImage:
             codec(self._layout.registers[index], self._layout.byte_order).encode_into(value, self._image)
         except ValueRangeError as error:
             code, fault = BAD_OUT_OF_RANGE, str(error)
-        self._area.put(self._image, index, RegisterStatus(code, source_ns))
+        self._set_status(index, code, source_ns)
         return fault
 
     def put_bytes(self, index: int, data: bytes, source_ns: int = 0, code: int = GOOD) -> None:
         """Store the value of a register, given as its ``size`` bytes in the layout."""
         register = self._layout.registers[index]
         self._image[register.offset : register.offset + register.size] = data
-        self._area.put(self._image, index, RegisterStatus(code, source_ns))
+        self._set_status(index, code, source_ns)
+
+    def copy(self, copy: Copy, answer: bytes) -> None:
+        """Store the values of many registers, and make their statuses good.
+
+        The registers must never have been given a source time.
+        """
+        self._bytes[copy.targets] = np.frombuffer(answer, np.uint8)[copy.sources]
+        for index in self._not_good & copy.indices:
+            self._set_status(index, GOOD, 0)
 
     def fail(self, index: int, code: int, source_ns: int = 0) -> None:
         """Set a bad or uncertain status code; the register keeps its last value."""
+        self._set_status(index, code, source_ns)
+
+    def _set_status(self, index: int, code: int, source_ns: int) -> None:
         self._area.put(self._image, index, RegisterStatus(code, source_ns))
+        if code == GOOD:
+            self._not_good.discard(index)
+        else:
+            self._not_good.add(index)

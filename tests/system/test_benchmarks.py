@@ -212,6 +212,15 @@ def test_benchmark_of_reading_opc_ua() -> None:
         assert len(rows) == 2, found
 
 
+def test_benchmark_of_reading_modbus() -> None:
+    pytest.importorskip("pymodbus")
+    found = printed("modbus_read")
+    assert (
+        len(re.findall(r"^pymodbus, (?:words|REALs) +[1-9]\d* +\d+\.\d+ +\d+\.\d+ +\d+\.\d+$", found, re.MULTILINE))
+        == 4
+    ), found
+
+
 def test_benchmark_of_serving_opc_ua() -> None:
     pytest.importorskip("asyncua")
     found = printed("opcua_server")

@@ -10,13 +10,14 @@ from operator import or_
 from typing import Annotated, Any, Final, NamedTuple
 
 import msgspec
+import numpy as np
 
 from shmio.connectors.base import Connector, Lost, WriteLostError
 from shmio.connectors.load import Load, Requests, counted
 from shmio.connectors.modbus import client
 from shmio.connectors.modbus.client import MAX_WRITE_BITS, MAX_WRITE_WORDS, ModbusClient, RefusedError, SilentError
 from shmio.connectors.modbus.plan import MAX_PROBES, Element, Limits, ReadRequest, Refusals
-from shmio.connectors.register_image import RegisterImage
+from shmio.connectors.register_image import Copy, RegisterImage
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.addresses.modbus import Address, Order, Table, WordCodec, parse
 from shmio.layout.model import Layout, Register, bit_positions
@@ -36,6 +37,8 @@ GATEWAY_RETRY_NS: Final = 1_000_000_000
 """How long a unit that does not answer is left alone at first; the time doubles with each further attempt."""
 MAX_UNIT_RETRY_NS: Final = 10_000_000_000
 """Longest time that a unit that does not answer is left alone."""
+MAX_COPIES: Final = 10_000
+"""Maximum number of requests of which is remembered where their bytes go."""
 _STATUS: Final = {
     client.ILLEGAL_FUNCTION: BAD_NOT_SUPPORTED,
     client.ILLEGAL_ADDRESS: BAD_OUT_OF_RANGE,
@@ -104,6 +107,19 @@ class _Register:
         if not address.table.of_bits and address.bit is None:
             self.codec = WordCodec(address, register, options.word_order, options.byte_order)
 
+    def byte_places(self, byte_order: str) -> list[int] | None:
+        """Return for each byte of the register in the image its place in the device's words.
+
+        None: the value must be converted.
+        """
+        register, size = self.register, self.register.size
+        if self.codec is None or register.dims or register.scale or self.address.kind is not register.element:
+            return None
+        if register.element.base == "STRING" or size != 2 * self.address.width:
+            return None
+        places = list(self.codec.ordered(bytes(range(size))))
+        return places if byte_order == "big" else places[::-1]
+
     def element(self, place: int) -> Element:
         address = self.address
         start = address.number + place * address.width
@@ -149,6 +165,11 @@ class ModbusConnector(Connector):
         except ValueError as error:
             raise ConfigError(f"layout: {error}: raise max_registers or max_bits") from None
         self._image = RegisterImage(layout) if layout.status_offset is not None else None
+        self._byte_places = {
+            one.index: places for one in self._registers if (places := one.byte_places(layout.byte_order)) is not None
+        }
+        self._converted = [one for one in self._registers if one.index not in self._byte_places]
+        self._copies: dict[ReadRequest, Copy] = {}
         self._units = sorted({one.unit for one in self._registers})
         self._silent: dict[int, _Silence] = {}
         self._probes = 0  # that this cycle may still send
@@ -203,17 +224,17 @@ class ModbusConnector(Connector):
         for place, unit in enumerate(asked):
             until_ns = self._until_ns(len(asked) - place)
             for request in requests[unit]:
-                self._fetch(request, now_ns, until_ns, values, failed)
+                self._fetch(request, now_ns, until_ns, values, failed, self._image)
         for request in self._refusals.due(now_ns, self._probes):
             self._try_again(request, now_ns)
         if len(self._silent) == len(self._units) and all(one.mute for one in self._silent.values()):
             self._client.close()
             raise ConnectorError(f"no answer from any of {len(self._units)} units at {self._client.peer}")
-        for one in self._registers:
-            found = values.get(one.index, [])
-            if one.index in failed:
-                self._image.fail(one.index, failed[one.index])
-            else:
+        for index, status in failed.items():
+            self._image.fail(index, status)
+        for one in self._converted:
+            if one.index not in failed:
+                found = values[one.index]
                 value: Value = _nested(found, one.register.shape) if one.register.dims else found[0]
                 self._image.put(one.index, value)
         return bytes(self._image)
@@ -253,6 +274,7 @@ class ModbusConnector(Connector):
         until_ns: int | None,
         values: dict[int, list[Any]],
         failed: dict[int, int],
+        image: RegisterImage,
     ) -> None:
         """Read a request's elements; if the device refuses it, search for the addresses that it refuses.
 
@@ -285,7 +307,7 @@ class ModbusConnector(Connector):
                 parts = self._refusals.split(request, status)
                 if len(parts) > 1:
                     for part in parts:
-                        self._fetch(part, now_ns, until_ns, values, failed)
+                        self._fetch(part, now_ns, until_ns, values, failed, image)
                     return
                 news = len(parts) == 1 and self._refusals.refuse(request, status, now_ns)
             else:
@@ -296,10 +318,31 @@ class ModbusConnector(Connector):
             return
         self._answered(request.unit)
         self._refusals.suspects.pop(request, None)
+        copy = self._copies.get(request)
+        if copy is None:
+            if len(self._copies) > MAX_COPIES:
+                self._copies.clear()  # requests change while refused addresses are searched
+            copy = self._copies[request] = self._copy_of(request)
+        image.copy(copy, data)
         for one in request.elements:
+            if one.register in copy.indices:
+                continue
             register = self._registers[one.register]
             found = values.setdefault(one.register, [None] * register.register.count)
             found[one.place] = register.value(data, one.start - request.start)
+
+    def _copy_of(self, request: ReadRequest) -> Copy:
+        """Return which bytes of the answer to a request are those of registers in the image."""
+        sources: list[int] = []
+        targets: list[int] = []
+        indices = []
+        for one in request.elements:
+            if (places := self._byte_places.get(one.register)) is not None:
+                offset, first = self._registers[one.register].register.offset, 2 * (one.start - request.start)
+                sources += (first + place for place in places)
+                targets += range(offset, offset + len(places))
+                indices.append(one.register)
+        return Copy(np.array(sources, np.intp), np.array(targets, np.intp), frozenset(indices))
 
     def _may_probe(self, now_ns: int) -> bool:
         """Return whether this cycle may send more requests than it needs."""

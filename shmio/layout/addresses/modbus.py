@@ -152,7 +152,7 @@ class WordCodec:
 
     def decode(self, data: bytes) -> Scalar:
         """Return the value of an element's words, as the device sent them."""
-        data = self._ordered(data)
+        data = self.ordered(data)
         if self._text:
             return data[: self._length].partition(b"\0")[0].decode("latin-1")
         number: int | float = self._struct.unpack(data)[0]
@@ -165,16 +165,16 @@ class WordCodec:
             data = str(value).encode("latin-1", "replace")
             if len(data) > self._bytes:
                 raise ValueError(f"the device's {self._name} holds {self._bytes} characters, not {len(data)}")
-            return self._ordered(data.ljust(self._bytes, b"\0"))
+            return self.ordered(data.ljust(self._bytes, b"\0"))
         if not isinstance(value, int | float):
             raise TypeError(f"{value!r} is not a number")
         number: float = value if self._scale is None else (value - self._scale[1]) / self._scale[0]
         try:
-            return self._ordered(self._struct.pack(round(number) if self._whole_there else float(number)))
+            return self.ordered(self._struct.pack(round(number) if self._whole_there else float(number)))
         except (struct.error, OverflowError, ValueError):
             raise ValueError(f"{value} does not fit the device's {self._name}") from None
 
-    def _ordered(self, data: bytes) -> bytes:
+    def ordered(self, data: bytes) -> bytes:
         """Swap bytes and words, from the device's order to big-endian or back."""
         if not (self._swap_bytes or self._swap_words):
             return data

@@ -432,3 +432,21 @@ def test_loss_of_joined_writes_is_unknown_for_their_commands_alone(device: Devic
                 connector.write(writes)
             found = ends(items, writes, superseded, lost.value.outcomes, "lost")
             assert [kind.name for kind, _ in found] == ["WRITTEN", "UNKNOWN", "UNKNOWN", "EXPIRED"]
+
+
+@pytest.mark.parametrize("word_order", ["big", "little"])
+@pytest.mark.parametrize("byte_order", ["big", "little"])
+def test_copied_and_converted_values_are_the_same(device: Device, word_order: str, byte_order: str) -> None:
+    device.set("holding", 0, list(range(0x3FF0, 0x3FF0 + 200)))
+    kinds = {"INT": 1, "UINT": 1, "WORD": 1, "DINT": 2, "REAL": 2, "DWORD": 2, "LINT": 4, "LREAL": 4}
+    tags, number = {}, 0
+    for kind, width in kinds.items():
+        for at in range(5):
+            tags[f"{kind}{at}"] = tag(kind, f"holding {number}")
+            tags[f"list_{kind}{at}"] = tag(f"ARRAY[0..0] OF {kind}", f"holding {number}")  # arrays are converted
+            number += width
+    with connected(device, tags, word_order=word_order, byte_order=byte_order) as (connector, layout):
+        found = values(connector, layout)
+        for path in tags:
+            if not path.startswith("list"):
+                assert [found[path]] == found[f"list_{path}"], path
