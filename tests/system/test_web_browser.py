@@ -149,6 +149,22 @@ def test_user_runs_a_campaign_and_lifts_everything(cell: Cell, page: Any) -> Non
     until(lambda: reading(cell, AXIS)[1] == "live", "the end of the campaign")
 
 
+def test_user_steps_time_and_returns_to_real_time(cell: Cell, page: Any) -> None:
+    open_tab(page, "Time")
+    page.get_by_label("Number of steps").fill("5")
+    page.get_by_label("Length of a step in ms").fill("250")
+    page.get_by_role("button", name="Step").click()
+    until(lambda: cell.status()["clock"]["step"] == 5, "five steps")
+    expect(page.locator(".time dl")).to_contain_text("virtual: only steps move time")
+    page.get_by_role("button", name="Run").click()
+    expect(page.locator(".time dl")).to_contain_text("yes, at 1 times real time")
+    keep(page, "time")
+    page.get_by_role("button", name="Pause").click()
+    expect(page.locator(".time dl")).not_to_contain_text("yes, at")
+    page.get_by_role("button", name="Back to real time").click()
+    until(lambda: cell.status()["clock"]["mode"] == "wall", "real time")
+
+
 def test_page_says_that_the_instance_has_stopped(cell: Cell, page: Any) -> None:
     expect(page.locator("#state")).to_have_text("running")
     expect(page.get_by_role("cell", name="cell", exact=True).first).to_be_visible()

@@ -7,6 +7,7 @@ import { OverviewTab } from "./overview.js";
 import { PlotsTab, plot } from "./plots.js";
 import { RegistersTab } from "./registers.js";
 import { session, signIn, signOut } from "./session.js";
+import { TimeTab } from "./time.js";
 
 /**
  * @typedef {{ root: HTMLElement, close: () => void, resume?: () => void }} Tab A tab that is shown. `resume` requests again
@@ -20,6 +21,7 @@ const TABS = {
   registers: { title: "Registers", make: (context) => new RegistersTab(context) },
   plots: { title: "Plots", make: (context) => new PlotsTab(context) },
   injections: { title: "Injections", make: (context) => new InjectionsTab(context) },
+  time: { title: "Time", make: (context) => new TimeTab(context) },
 };
 
 const connection = new Connection();

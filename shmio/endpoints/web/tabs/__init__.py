@@ -7,6 +7,7 @@ from shmio.endpoints.web.tabs.injections import Injections
 from shmio.endpoints.web.tabs.overview import Overview
 from shmio.endpoints.web.tabs.plots import Plots
 from shmio.endpoints.web.tabs.registers import Registers
+from shmio.endpoints.web.tabs.time import Time
 
-TABS: Final[tuple[type[Tab], ...]] = (Overview, Registers, Plots, Injections)
+TABS: Final[tuple[type[Tab], ...]] = (Overview, Registers, Plots, Injections, Time)
 """All tabs, in the order in which a page shows them."""
