@@ -6,16 +6,13 @@ import argparse
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
 from shmio.config.model import NAME_RULE, Name
 from shmio.config.read import read_tables
-from shmio.errors import ConfigError, ControlError, NotRunningError, UnreachableError
-from shmio.local.status import supervisor_silence
+from shmio.errors import ConfigError, ControlError, NotRunningError
 from shmio.segment import Segment, running_instances
-from shmio.supervisor import control
 
 DEFAULT_CONFIG = Path("supervisor.toml")
 
@@ -96,19 +93,6 @@ def config_option(arguments: argparse.Namespace) -> str | None:
 def option_for(file: Path) -> str:
     """Return the option that selects a configuration; "" for the default file."""
     return "" if file == DEFAULT_CONFIG else f"-c {shlex.quote(str(file))}"
-
-
-def ask(segment: Segment, request: control.Request, timeout_s: float) -> dict[str, Any]:
-    """Return the supervisor's answer to a request.
-
-    Raises:
-        ControlError: The supervisor refuses, does not answer, or seems to be dead.
-
-    """
-    try:
-        return control.request(segment.header.control, request, timeout_s, lambda: supervisor_silence(segment))
-    except UnreachableError as error:
-        raise ControlError(f"{error}; kill -TERM {segment.supervisor[0]} stops the instance") from None
 
 
 def _named_in(file: Path) -> str:

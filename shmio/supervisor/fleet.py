@@ -12,12 +12,12 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from typing import Final
 
+from shmio.control import Answer
 from shmio.local.status import complaint as complaint_of
 from shmio.logs import fields
 from shmio.plan.processes import Job, rank
 from shmio.segment import Activity, ProcessSlot, ProcessSpec, Segment, Supervised, stale_segment
 from shmio.supervisor import policy
-from shmio.supervisor.control import Answer
 from shmio.supervisor.policy import PHASES, Action, Event, Life, Limits, State
 from shmio.supervisor.process import AdoptedProcess, ChildProcess, describe_end
 

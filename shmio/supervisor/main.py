@@ -15,13 +15,13 @@ from contextlib import ExitStack, contextmanager
 from types import FrameType
 from typing import Final
 
+from shmio.control import Answer, ControlServer, Reload, Request, Restart, Stop, socket_path
 from shmio.errors import ShmioError
 from shmio.logs import fields
 from shmio.plan.processes import MODULES, Plan
 from shmio.segment import Segment
 from shmio.segment import State as InstanceState
 from shmio.supervisor import policy
-from shmio.supervisor.control import Answer, ControlServer, Reload, Request, Restart, Stop, socket_path
 from shmio.supervisor.fleet import TICK_S, Fleet, brief, log
 from shmio.supervisor.health import Health, LogFolder, Notifier
 from shmio.supervisor.policy import Event, Limits, State

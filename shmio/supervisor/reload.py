@@ -11,12 +11,12 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
+from shmio.control import Answer
 from shmio.errors import ShmioError
 from shmio.logs import fields
 from shmio.plan.processes import Job, Plan
 from shmio.segment import Block, BlockSpec, Segment
 from shmio.supervisor import policy
-from shmio.supervisor.control import Answer
 from shmio.supervisor.fleet import Fleet, brief, digest, log
 from shmio.supervisor.health import Notifier
 from shmio.supervisor.policy import Event, Limits, State

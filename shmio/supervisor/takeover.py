@@ -8,11 +8,11 @@ import stat
 import time
 from dataclasses import dataclass, field
 
+from shmio.control import remove_socket
 from shmio.errors import FormatError, SegmentError, UnfinishedError
 from shmio.plan.processes import Plan
 from shmio.segment import Activity, ProcessSlot, Segment, shm, stale_segment
 from shmio.segment.shm import SharedObject
-from shmio.supervisor.control import remove_socket
 from shmio.supervisor.policy import Limits
 from shmio.supervisor.process import AdoptedProcess
 

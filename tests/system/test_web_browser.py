@@ -165,6 +165,14 @@ def test_user_steps_time_and_returns_to_real_time(cell: Cell, page: Any) -> None
     until(lambda: cell.status()["clock"]["mode"] == "wall", "real time")
 
 
+def test_user_restarts_a_process(cell: Cell, page: Any) -> None:
+    before = cell.processes()["cell"]["pid"]
+    page.on("dialog", lambda dialog: dialog.accept())
+    page.get_by_role("button", name="Restart cell").click()
+    expect(page.get_by_text("cell runs again")).to_be_visible()
+    assert cell.processes()["cell"]["pid"] != before
+
+
 def test_page_says_that_the_instance_has_stopped(cell: Cell, page: Any) -> None:
     expect(page.locator("#state")).to_have_text("running")
     expect(page.get_by_role("cell", name="cell", exact=True).first).to_be_visible()

@@ -9,13 +9,14 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+from shmio import control
 from shmio.cli.run import dumps
-from shmio.cli.target import ask, target
+from shmio.cli.target import target
+from shmio.control import remove_socket, socket_path
 from shmio.errors import FormatError, NotRunningError, UnfinishedError
+from shmio.local.supervisor import ask_supervisor
 from shmio.logs import printable
 from shmio.segment import Segment, instances, stale_segment
-from shmio.supervisor import control
-from shmio.supervisor.control import remove_socket, socket_path
 
 STOP_S = 30.0
 EXIT_S = 5.0
@@ -59,7 +60,7 @@ def _stop(segment: Segment) -> None:
     print(f"stopping {segment.instance}, supervisor pid {pid}", flush=True)
     pidfd = _pidfd(pid)
     try:
-        ask(segment, control.Stop(), STOP_S)
+        ask_supervisor(segment, control.Stop(), STOP_S)
         if pidfd is not None:
             select.select([pidfd], [], [], EXIT_S)
     finally:
@@ -78,7 +79,7 @@ def _pidfd(pid: int) -> int | None:
 def reload(arguments: argparse.Namespace) -> int:
     """Apply the changes of the configuration; return 1 if a changed process does not run."""
     with target(arguments).open_supervised() as segment:
-        answer = ask(segment, control.Reload(), RELOAD_S)
+        answer = ask_supervisor(segment, control.Reload(), RELOAD_S)
     status = 1 if answer["problems"] else 0
     if arguments.json:
         told = {key: answer[key] for key in ("done", "kept", "warnings", "problems")}
@@ -98,9 +99,9 @@ def reload(arguments: argparse.Namespace) -> int:
 def restart(arguments: argparse.Namespace) -> int:
     """Stop and start one process; return when it runs again."""
     with target(arguments).open_supervised() as segment:
-        ask(segment, control.Restart(arguments.name), RESTART_S)
+        ask_supervisor(segment, control.Restart(arguments.name), RESTART_S)
         print(f"{arguments.name} runs again")
-        where = ask(segment, control.Where(), WHERE_S)
+        where = ask_supervisor(segment, control.Where(), WHERE_S)
     file = Path(where["config"])
     if _changed(file, where["read_ns"]):
         print(f"{file} has changed since it was read; restart keeps the old configuration, reload takes the new")

@@ -15,13 +15,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
+from shmio import control
 from shmio.cli.run import dumps
-from shmio.cli.target import Target, ask, target
+from shmio.cli.target import Target, target
 from shmio.config import load
 from shmio.errors import ConfigError, SegmentError
+from shmio.local.supervisor import ask_supervisor
 from shmio.logs import printable
 from shmio.plan.processes import process_names
-from shmio.supervisor import control
 
 WHERE_S = 5.0
 SUPERVISOR = "supervisor"
@@ -73,7 +74,7 @@ def _where(arguments: argparse.Namespace) -> tuple[Path, list[str]]:
         return config.log_dir, list(dict.fromkeys([*process_names(config), *_running(wanted)]))
     with wanted.open_supervised() as segment:
         names = [slot.name for slot in segment.processes]
-        return Path(ask(segment, control.Where(), WHERE_S)["log_dir"]), names
+        return Path(ask_supervisor(segment, control.Where(), WHERE_S)["log_dir"]), names
 
 
 def _running(wanted: Target) -> list[str]:

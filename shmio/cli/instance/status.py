@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import msgspec
 
+from shmio import control
 from shmio.cli.target import config_option, target
 from shmio.errors import ControlError, NotRunningError, SegmentError
 from shmio.local.status import (
@@ -22,7 +23,6 @@ from shmio.local.status import (
 from shmio.logs import printable
 from shmio.model.clock import ClockMode
 from shmio.segment import Segment, instances
-from shmio.supervisor import control
 
 _HEADINGS = ("NAME", "KIND", "STATE", "PID", "RESTARTS", "UPTIME", "")
 _LIST_HEADINGS = ("NAME", "STATE", "FILE", "LISTENS ON")

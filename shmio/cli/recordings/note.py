@@ -6,12 +6,12 @@ import argparse
 from contextlib import suppress
 from pathlib import Path
 
+from shmio import control
 from shmio.cli.target import target
 from shmio.config import load
 from shmio.errors import ConfigError, ControlError
 from shmio.local.attach import Attachment
 from shmio.segment import Segment
-from shmio.supervisor import control
 
 WHERE_S = 2.0
 

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from shmio import control
 from shmio.cli.run import say, say_json, stop_on_signals
 from shmio.cli.target import target
 from shmio.config import Recorder as Settings
@@ -20,7 +21,6 @@ from shmio.recorder.recorder import AttachedFiles, ConfigFiles, RotatingRecorder
 from shmio.recorder.triggered import TriggeredRecorder
 from shmio.recording.selection import Selection
 from shmio.segment import Segment
-from shmio.supervisor import control
 
 BY = "shmio-dump"
 WHERE_S = 2.0

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from shmio import control
 from shmio.cli import target
 from shmio.cli.supervisor import main
 from shmio.config import load
@@ -20,7 +21,6 @@ from shmio.layout.model import Layout, Register
 from shmio.local import status
 from shmio.plan.prepare import prepare
 from shmio.segment import Activity, BlockSpec, ProcessSpec, Quality, Report, Segment, instances
-from shmio.supervisor import control
 
 ROOT = Path(__file__).parents[3]
 SEED = ROOT / "tests" / "golden" / "layout" / "db201-as-printed.db"

@@ -14,9 +14,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from shmio import control
 from shmio.local.status import InstanceStatus, ProcessStatus, read_status
 from shmio.segment import Segment, stale_segment
-from shmio.supervisor import control
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[2]

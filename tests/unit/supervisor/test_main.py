@@ -14,11 +14,11 @@ from pathlib import Path
 
 import pytest
 
+from shmio import control
+from shmio.control import Restart, Stop, Where
 from shmio.errors import ControlError
 from shmio.plan.processes import Job
 from shmio.segment import Segment, instances
-from shmio.supervisor import control
-from shmio.supervisor.control import Restart, Stop, Where
 from tests.unit.supervisor.harness import CELL, DEADLINE_S, HERE, ROOT, Launch, until
 
 

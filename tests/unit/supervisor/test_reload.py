@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 import shmio
+from shmio.control import Reload, Restart, Where
 from shmio.errors import ControlError
 from shmio.segment import Quality, Segment
-from shmio.supervisor.control import Reload, Restart, Where
 from tests.unit.supervisor.harness import CELL, Job, Launch, Launched, until
 
 PRESS: Job = ("press", "source", ["good"])

@@ -1,17 +1,20 @@
 // The overview tab: processes and sources.
 
-import { element, replace, setText } from "./dom.js";
+import { element, notify, replace, setText } from "./dom.js";
 import { bytes, duration, fixed } from "./format.js";
 
 /** @typedef {import("./main.js").Context} Context */
 
-const PROCESS = ["Process", "Kind", "State", "pid", "Restarts", "CPU %", "Memory", "Up", "Note", "Counters"];
+const PROCESS = ["Process", "Kind", "State", "pid", "Restarts", "CPU %", "Memory", "Up", "Note", "Counters", ""];
 const SOURCE = ["Source", "Quality", "Reason", "Registers", "Period ms", "Rate Hz", "Cycle", "Overruns", "Round trip ms", "Age", "Lost / recovered in 1, 10, 30 min"];
 
 /** Tables with one row for each process and each source. Rows stay, so that a selection survives an update. */
 export class OverviewTab {
   /** @param {Context} context */
   constructor(context) {
+    this.context = context;
+    /** @type {Map<string, HTMLButtonElement>} */
+    this.buttons = new Map();
     this.sources = new Table(SOURCE, "sources");
     this.processes = new Table(PROCESS, "processes");
     this.root = element(
@@ -60,8 +63,35 @@ export class OverviewTab {
         one.pid === null ? "" : duration(one.uptime_s),
         one.note,
         Object.entries(one.counters).map(([name, value]) => `${name.replaceAll("_", " ")} ${value}`).join(", "),
+        this.restartButton(one.name),
       ]),
     );
+  }
+
+  /** @param {string} name @returns {HTMLButtonElement} The button that restarts a process; it stays the same. */
+  restartButton(name) {
+    let button = this.buttons.get(name);
+    if (button === undefined) {
+      const allowed = this.context.may("control");
+      button = element(
+        "button",
+        { type: "button", "aria-label": `Restart ${name}`, disabled: !allowed, title: allowed ? null : "your roles do not allow to restart a process", click: () => this.restart(name) },
+        "Restart",
+      );
+      this.buttons.set(name, button);
+    }
+    return button;
+  }
+
+  /** @param {string} name */
+  async restart(name) {
+    if (!confirm(`Restart ${name}?`)) return;
+    try {
+      await this.context.connection.call("overview.restart", { name });
+      notify(`${name} runs again`);
+    } catch (error) {
+      notify(name === "web" ? "This page connects again as soon as its server runs." : String(/** @type {Error} */ (error).message), name === "web" ? "info" : "problem");
+    }
   }
 }
 
@@ -74,13 +104,17 @@ class Table {
     this.root = element("table", { "aria-label": name, id: name }, element("thead", {}, head), this.body);
   }
 
-  /** @param {(string | number | [string, string])[][]} rows A pair is a text and its class. */
+  /** @param {(string | number | [string, string] | HTMLElement)[][]} rows A pair is a text and its class. */
   update(rows) {
     while (this.body.rows.length > rows.length) this.body.deleteRow(-1);
     rows.forEach((cells, index) => {
       const row = this.body.rows[index] ?? this.body.insertRow();
       cells.forEach((cell, column) => {
         const target = row.cells[column] ?? row.insertCell();
+        if (cell instanceof HTMLElement) {
+          if (target.firstChild !== cell) replace(target, cell);
+          return;
+        }
         const [text, style] = Array.isArray(cell) ? cell : [String(cell), typeof cell === "number" ? "number" : ""];
         setText(target, text);
         if (target.className !== style) target.className = style;

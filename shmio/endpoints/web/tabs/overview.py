@@ -3,12 +3,31 @@
 from __future__ import annotations
 
 import asyncio
-from typing import ClassVar, Final
+import logging
+from typing import Annotated, ClassVar, Final
 
+import msgspec
+from msgspec import Meta
+from starlette.concurrency import run_in_threadpool
+
+from shmio.control import Restart
 from shmio.endpoints.web.page import Nothing, Page, Tab, call
+from shmio.local.supervisor import ask_supervisor
 
 INTERVAL_S: Final = 1.0
 """Interval at which the overview is sent, in s."""
+
+
+RESTART_S: Final = 40.0
+"""Longest time in s until a process runs again."""
+
+_log = logging.getLogger("shmio.web")
+
+
+class Named(msgspec.Struct, forbid_unknown_fields=True):
+    """A process."""
+
+    name: Annotated[str, Meta(min_length=1, max_length=200)]
 
 
 class Overview(Tab):
@@ -25,6 +44,14 @@ class Overview(Tab):
         """Send the overview now, and then each second."""
         if self._following is None:
             self._following = self.page.start(self._follow())
+
+    @call("control", Named)
+    async def restart(self, given: Named) -> None:
+        """Stop and start a process; return when it runs again."""
+        _log.info(
+            "%s asks to restart %s", f"user {self.page.user.name!r}" if self.page.user.name else "a page", given.name
+        )
+        await run_in_threadpool(ask_supervisor, self.page.served.segment, Restart(given.name), RESTART_S)
 
     async def _follow(self) -> None:
         while True:

@@ -16,9 +16,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from shmio import control
+from shmio.control import Answer, ControlServer, Request, Restart, Stop, Where
 from shmio.errors import ControlError
-from shmio.supervisor import control
-from shmio.supervisor.control import Answer, ControlServer, Request, Restart, Stop, Where
 
 
 class Served:

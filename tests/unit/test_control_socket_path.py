@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from shmio.control import MAX_PATH_BYTES, socket_path
 from shmio.errors import ControlError
-from shmio.supervisor.control import MAX_PATH_BYTES, socket_path
 
 
 @pytest.fixture(autouse=True)

@@ -1,0 +1,23 @@
+"""Ask the supervisor of a local instance to do something."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from shmio import control
+from shmio.errors import ControlError, UnreachableError
+from shmio.local.status import supervisor_silence
+from shmio.segment import Segment
+
+
+def ask_supervisor(segment: Segment, request: control.Request, timeout_s: float) -> dict[str, Any]:
+    """Return the supervisor's answer to a request.
+
+    Raises:
+        ControlError: The supervisor refuses, does not answer, or seems to be dead.
+
+    """
+    try:
+        return control.request(segment.header.control, request, timeout_s, lambda: supervisor_silence(segment))
+    except UnreachableError as error:
+        raise ControlError(f"{error}; kill -TERM {segment.supervisor[0]} stops the instance") from None
