@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from collections.abc import Iterator
 from itertools import chain
 from typing import Annotated, Any, ClassVar, Final
@@ -16,6 +15,7 @@ from shmio.endpoints.web.page import Page, Tab, call, release
 from shmio.endpoints.web.tabs.register_tree import Node, Row, matching, rows, tree, window
 from shmio.errors import CommandError, PathError
 from shmio.layout.model import MAX_PATH, Register
+from shmio.layout.values.text import to_text
 from shmio.layout.values.typed import read_value
 from shmio.layout.values.write import bits_of, cover
 from shmio.local.attach import Attachment
@@ -201,11 +201,11 @@ class Registers(Tab):
 
 def _value(found: Reading) -> list[Any]:
     """Return what a row shows: value as text, quality, reason, provenance, source time."""
-    text = None if found.value is None else _text(found.value)
+    text = None if found.value is None else _text(found)
     return [text, str(found.quality), found.reason, found.provenance, found.source_time]
 
 
-def _text(value: Any) -> str:
+def _text(found: Reading) -> str:
     """Return a value as text: JavaScript has no exact numbers above 2**53, and JSON no infinity."""
-    text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+    text = to_text(found.value, found.register)
     return text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]}…"
