@@ -221,6 +221,14 @@ def test_benchmark_of_reading_modbus() -> None:
     ), found
 
 
+def test_benchmark_of_the_web_page() -> None:
+    pytest.importorskip("uvicorn")
+    found = printed("web_page")
+    assert (
+        len(re.findall(r"^(?:1|10) pages?, (?:20|200) signals +\d+\.\d +[1-9]\d* +\d+ +\d+", found, re.MULTILINE)) == 4
+    ), found
+
+
 def test_benchmark_of_serving_opc_ua() -> None:
     pytest.importorskip("asyncua")
     found = printed("opcua_server")
