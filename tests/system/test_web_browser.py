@@ -173,6 +173,16 @@ def test_user_restarts_a_process(cell: Cell, page: Any) -> None:
     assert cell.processes()["cell"]["pid"] != before
 
 
+def test_user_filters_the_log(page: Any) -> None:
+    open_tab(page, "Log")
+    log = page.get_by_label("Log", exact=True).last
+    expect(log).to_contain_text("supervisor: supervising")
+    keep(page, "log")
+    page.get_by_label("Filter").fill("connected")
+    expect(log).not_to_contain_text("supervising")
+    expect(log).to_contain_text("connected")
+
+
 def test_page_says_that_the_instance_has_stopped(cell: Cell, page: Any) -> None:
     expect(page.locator("#state")).to_have_text("running")
     expect(page.get_by_role("cell", name="cell", exact=True).first).to_be_visible()

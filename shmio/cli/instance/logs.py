@@ -3,43 +3,23 @@
 from __future__ import annotations
 
 import argparse
-import ctypes
-import errno
-import heapq
-import os
-import re
 import sys
-from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, BinaryIO, Final
 
 from shmio import control
 from shmio.cli.run import dumps
 from shmio.cli.target import Target, target
 from shmio.config import load
 from shmio.errors import ConfigError, SegmentError
+from shmio.local.log_files import Follower, last_lines, parse_line
 from shmio.local.supervisor import ask_supervisor
 from shmio.logs import printable
 from shmio.plan.processes import process_names
 
 WHERE_S = 5.0
 SUPERVISOR = "supervisor"
-
-_LINE = re.compile(
-    r"(?P<time>[0-9T:.-]+Z) (?P<level>[A-Z]+) +(?P<process>.+?)\[(?P<pid>[0-9]{1,10})\] (?P<text>.*)", re.DOTALL
-)
-"""The form in which shmio.logs writes a line."""
-
-MAX_LINE_BYTES: Final = 65536
-_STAMP = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{6}Z ")
-
-# inotify(7): events of a folder that concern its log files.
-_IN_MODIFY: Final = 0x0002
-_IN_MOVED_TO: Final = 0x0080
-_IN_CREATE: Final = 0x0100
-_EVENT_ROOM: Final = 65536
 
 
 def logs(arguments: argparse.Namespace) -> int:
@@ -86,136 +66,5 @@ def _running(wanted: Target) -> list[str]:
 def _print(lines: Iterable[bytes], *, as_json: bool) -> None:
     for line in lines:
         text = line.decode(errors="replace")
-        print(dumps(_parsed(text)) if as_json else printable(text))
+        print(dumps(parse_line(text)) if as_json else printable(text))
     sys.stdout.flush()
-
-
-def _parsed(line: str) -> dict[str, Any]:
-    """Split a line into its fields.
-
-    A continuation, such as a line of a traceback, has only text.
-    """
-    found = _LINE.fullmatch(line)
-    if found is None:
-        return {"time": None, "level": None, "process": None, "pid": None, "text": line}
-    return {**found.groupdict(), "pid": int(found["pid"])}
-
-
-def last_lines(files: Iterable[Path], count: int) -> list[bytes]:
-    """Return the last ``count`` lines of all files together, in the order of their time stamps.
-
-    A line without a time stamp, such as a line of a traceback, stays after the line before it.
-    """
-    merged = heapq.merge(*(_stamped(file, count) for file in files), key=lambda entry: entry[0])
-    return list(deque((line for _, line in merged), maxlen=count))
-
-
-def _stamped(file: Path, count: int) -> Iterable[tuple[bytes, bytes]]:
-    """Return the last ``count`` lines of a file.
-
-    Each has its time stamp, or else that of an earlier line.
-    """
-    try:
-        with file.open("rb") as stream:
-            return deque(_lines(stream), maxlen=count)
-    except OSError:
-        return ()
-
-
-def _lines(stream: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
-    stamp = b""
-    while line := stream.readline(MAX_LINE_BYTES):
-        found = _STAMP.match(line)
-        stamp = found[0] if found else stamp
-        yield stamp, line.rstrip(b"\r\n")
-
-
-class Follower:
-    """Follows log files from now on. It reads a rotated file to its end, and then the new file.
-
-    It waits on inotify, so that idle files cost nothing. Use it as a context manager.
-    """
-
-    def __init__(self, files: Iterable[Path]) -> None:
-        """Begin to follow the files.
-
-        Raises:
-            OSError: A folder cannot be watched.
-
-        """
-        self._files: dict[Path, BinaryIO | None] = {}
-        self._partial: dict[Path, bytes] = {}
-        files = list(files)
-        self._fd = _watch({file.parent for file in files})
-        for file in files:
-            stream = _open(file)
-            if stream is not None:
-                stream.seek(0, os.SEEK_END)
-            self._files[file] = stream
-            self._partial[file] = b""
-
-    def __enter__(self) -> Follower:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        os.close(self._fd)
-        for stream in self._files.values():
-            if stream is not None:
-                stream.close()
-
-    def wait(self) -> list[bytes]:
-        """Wait for an event in the folders; return the new complete lines."""
-        os.read(self._fd, _EVENT_ROOM)
-        return [line for file in self._files for line in self._new(file)]
-
-    def _new(self, file: Path) -> list[bytes]:
-        data = self._partial[file]
-        stream = self._files[file]
-        if stream is not None:
-            data += stream.read()
-        if _replaced(file, stream):
-            if stream is not None:
-                stream.close()
-            stream = self._files[file] = _open(file)
-            if stream is not None:
-                data += stream.read()
-        *lines, rest = data.split(b"\n")
-        if len(rest) > MAX_LINE_BYTES:
-            lines.append(rest)
-            rest = b""
-        self._partial[file] = rest
-        return lines
-
-
-def _open(file: Path) -> BinaryIO | None:
-    try:
-        return file.open("rb")
-    except FileNotFoundError:
-        return None
-
-
-def _replaced(file: Path, stream: BinaryIO | None) -> bool:
-    """Return whether the path now leads to another file than the one that is open."""
-    try:
-        found = file.stat()
-    except FileNotFoundError:
-        return False
-    return stream is None or found.st_ino != os.fstat(stream.fileno()).st_ino
-
-
-def _watch(folders: Iterable[Path]) -> int:
-    """Return an inotify descriptor for the folders.
-
-    It uses ctypes, because Python has no inotify.
-    """
-    libc = ctypes.CDLL(None, use_errno=True)
-    fd: int = libc.inotify_init1(os.O_CLOEXEC)
-    if fd < 0:
-        raise OSError(ctypes.get_errno(), f"cannot follow files: {os.strerror(ctypes.get_errno())}")
-    for folder in folders:
-        if libc.inotify_add_watch(fd, os.fsencode(folder), _IN_MODIFY | _IN_MOVED_TO | _IN_CREATE) < 0:
-            number = ctypes.get_errno()
-            os.close(fd)
-            hint = "too many watches (fs.inotify.max_user_watches)" if number == errno.ENOSPC else os.strerror(number)
-            raise OSError(number, hint, str(folder))
-    return fd

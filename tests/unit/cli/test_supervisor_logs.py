@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from shmio.cli.instance.logs import MAX_LINE_BYTES, Follower, last_lines
 from shmio.cli.supervisor import main
+from shmio.local.log_files import MAX_LINE_BYTES, TAIL_BYTES, Follower, last_lines
 from shmio.segment import ProcessSpec, Segment
 
 
@@ -36,6 +36,19 @@ def test_lines_are_merged_by_time_and_tracebacks_stay_whole(files: list[Path]) -
     assert words(last_lines(files, 100)) == ["one", "two", "four", "Traceback", "four", "five", "nine"]
     assert words(last_lines(files, 3)) == ["four", "five", "nine"]
     assert last_lines(files, 0) == []
+
+
+def test_last_lines_of_long_files_are_those_of_the_whole_file(tmp_path: Path) -> None:
+    file = tmp_path / "a.log"
+    text = "".join(
+        stamped(at % 60, f"line {at} " + "x" * (at % 700)) + "    traceback\n" * (at % 50 == 7) * 3000
+        for at in range(2000)
+    )
+    file.write_text(text)
+    assert file.stat().st_size > 10 * TAIL_BYTES
+    lines = text.encode().splitlines()
+    for count in (1, 10, 500, 2900, 3500, 40_000, 200_000):
+        assert last_lines([file], count) == lines[-count:]
 
 
 def test_a_missing_file_has_no_lines(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import { Connection } from "./connection.js";
 import { byId, element, replace, setText } from "./dom.js";
 import { InjectionsTab } from "./injections.js";
+import { LogTab } from "./log.js";
 import { OverviewTab } from "./overview.js";
 import { PlotsTab, plot } from "./plots.js";
 import { RegistersTab } from "./registers.js";
@@ -22,6 +23,7 @@ const TABS = {
   plots: { title: "Plots", make: (context) => new PlotsTab(context) },
   injections: { title: "Injections", make: (context) => new InjectionsTab(context) },
   time: { title: "Time", make: (context) => new TimeTab(context) },
+  log: { title: "Log", make: (context) => new LogTab(context) },
 };
 
 const connection = new Connection();

@@ -7,7 +7,7 @@ import http.client
 import json
 import socket
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -56,11 +56,16 @@ class Pages:
 
 
 @contextmanager
-def pages(segment: Segment, secrets: Sequence[Secret] = (), roles: Sequence[str] = ("read",)) -> Iterator[Pages]:
+def pages(
+    segment: Segment,
+    secrets: Sequence[Secret] = (),
+    roles: Sequence[str] = ("read",),
+    folders: Mapping[str, str] | None = None,
+) -> Iterator[Pages]:
     """Serve the page of a segment on a free port."""
     measurements = Measurements(segment)
     with Segment.open(segment.instance, writable=True) as mapped:
-        shown = Served(segment, Attachment(mapped), measurements, {})
+        shown = Served(segment, Attachment(mapped), measurements, folders or {})
         served = PageApp(shown, Sessions(secrets, roles), TABS, secure=False)
         server = HttpServer(served.app(measurements, ()), Address("127.0.0.1", 0), sockets=True)
         loop = asyncio.new_event_loop()
