@@ -6,6 +6,7 @@ request                                   answer                                
 ``{"do": "stop"}``                        ``{"ok": true}``                                   all is stopped
 ``{"do": "restart", "name": "cell"}``     ``{"ok": true}``                                   the process runs again
 ``{"do": "reload"}``                      ``{"ok": true, "done": [lines], …}``               the change is done
+``{"do": "reload", "dry_run": true}``     ``{"ok": true, "faults": [lines], …}``             the new plan is made
 ``{"do": "where"}``                       ``{"ok": true, "config": …, "read_ns": …, …}``     at once
 anything else                             ``{"error": "…"}``                                 at once
 ========================================  =================================================  =======================
@@ -44,7 +45,12 @@ CONNECT_S: Final = 0.05
 _TOO_MANY: Final = "too many control connections at once"
 _CREDENTIALS: Final = struct.Struct("iII")  # struct ucred: pid, uid, gid
 LINE_CHARS: Final = 2000
+_CHECK: Final = "… and {} more: shmio-supervisor check prints them"
+_REPLY: Final = "… and {} more"
 _MORE: Final = {
+    "restart": _REPLY,
+    "injections": _REPLY,
+    "faults": _CHECK,
     "warnings": "… and {} more warnings: shmio-supervisor check prints them",
     "done": "… and {} more: shmio-supervisor logs supervisor -n 500 shows them",
     "problems": "… and {} more: shmio-supervisor logs supervisor -n 500 shows them",
@@ -125,8 +131,10 @@ class Restart(_Request, tag="restart"):
     name: str
 
 
-class Reload(_Request, tag="reload"):
-    """Read the configuration again, and apply its changes."""
+class Reload(_Request, tag="reload", omit_defaults=True):
+    """Read the configuration again, and apply its changes; with ``dry_run``, only report them."""
+
+    dry_run: bool = False
 
 
 class Where(_Request, tag="where"):

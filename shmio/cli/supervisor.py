@@ -61,7 +61,10 @@ def _parser() -> argparse.ArgumentParser:
     text = "list the instances on this host, their files and the addresses on which they listen"
     add_json(verb("list", text, command="status:list_instances"), "print a JSON list")
     text = "apply changes of the configuration; leave everything else alone"
-    add_json(verb("reload", text, target, command="control:reload"))
+    reload = verb("reload", text, target, command="control:reload")
+    text = "print what it would stop, start, restart and inject, and change nothing"
+    reload.add_argument("--dry-run", action="store_true", help=text)
+    add_json(reload)
     text = "restart one process, as it was configured at the start or the last reload"
     verb("restart", text, target, command="control:restart").add_argument("name", metavar="NAME")
     check = verb("check", "validate the configuration and its layouts; start nothing", file)

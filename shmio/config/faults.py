@@ -40,7 +40,7 @@ MAX_CHARACTERS: Final = 500
 
 A message may quote text that is as long as the file.
 """
-_TOKEN: Final = re.compile(
+TOKEN: Final = re.compile(
     r"""\#[^\n]*|\"\"\"(?:\\.|[^\\])*?(?:\"{3,5}|\Z)|'''.*?(?:'{3,5}|\Z)|"(?:\\.|[^"\\\n])*"?|'[^'\n]*'?"""
     r"""|\[\[|\]\]|[\[\]{}=.,\n]|[^\s"'\#\[\]{}=.,]+""",
     re.DOTALL,
@@ -111,7 +111,7 @@ class Lines:
         table, start, header = "", True, ""
         parts: list[str] = []
         length = 0
-        for match in _TOKEN.finditer(text):
+        for match in TOKEN.finditer(text):
             piece = match[0]
             if piece == "\n":
                 start = start or depth <= 0

@@ -499,6 +499,15 @@ class Segment:
             self.processes = ProcessTable(self.shared, self.memory, self.header)
             return True
 
+    def require_blocks(self, count: int) -> None:
+        """Raise SegmentError unless the section table has room for ``count`` more blocks."""
+        vacant = (self.header.section_capacity - len(self._sections())) // _SECTIONS_PER_BLOCK
+        if count > vacant:
+            raise SegmentError(
+                f"segment {self.shared.name} has room for {vacant} more blocks, not for {count} (each new or "
+                "changed source takes one, until the instance ends): restart the instance: shmio-supervisor down, up"
+            )
+
     def reserve(self, add: Sequence[BlockSpec]) -> int:
         """Reserve room for blocks to add, so that :meth:`change` cannot fail.
 
@@ -508,12 +517,8 @@ class Segment:
         Raises:
             SegmentError: There is no room in shared memory or in the section table.
         """
+        self.require_blocks(len(add))
         entries = self._sections()
-        if len(add) > (vacant := (self.header.section_capacity - len(entries)) // _SECTIONS_PER_BLOCK):
-            raise SegmentError(
-                f"segment {self.shared.name} has room for {vacant} more blocks, not for {len(add)} (each new or "
-                "changed source takes one, until the instance ends): restart the instance: shmio-supervisor down, up"
-            )
         head = self.header
         tables = head.processes_offset + head.process_capacity * SLOT_SIZE
         at = _align(max([tables, *(entry.offset + entry.size for entry in entries)]), 64)

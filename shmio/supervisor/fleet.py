@@ -80,12 +80,17 @@ class ManagedProcess:
             True if the process was signalled, and has rules or had some.
 
         """
-        before, self._job = self._job, job
-        known = bool(job.rules or (before and before.rules))
-        if self.child is None or job.rules is None or not (known or before is None):
-            return False
-        self.child.reread()
-        return known
+        told = self.rereads(job)
+        blind = self._job is None and job.rules is not None
+        self._job = job
+        if self.child is not None and (told or blind):
+            self.child.reread()
+        return told
+
+    def rereads(self, job: Job) -> bool:
+        """Return whether :meth:`keep` would signal the process, and it has rules or had some."""
+        known = job.rules or (self._job and self._job.rules)
+        return bool(self.child is not None and job.rules is not None and known)
 
     def adopt(self, child: AdoptedProcess) -> None:
         """Adopt a running process that another supervisor has started."""

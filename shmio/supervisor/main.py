@@ -176,7 +176,7 @@ class Supervisor:
         elif isinstance(request, Restart):
             self._restart(request.name, answer)
         elif isinstance(request, Reload):
-            self._reload(answer)
+            self._reload(answer, dry_run=request.dry_run)
         else:
             plan, read_ns = self._reloader.plan, self._reloader.read_ns
             listen = {job.name: found for job in plan.jobs if (found := job.listening[:MAX_ADDRESSES])}
@@ -198,11 +198,14 @@ class Supervisor:
             self._fleet.apply(managed, Event.RESTART)
             managed.answer()  # a stuck process is reported at once
 
-    def _reload(self, answer: Answer) -> None:
-        log.info("a client asked to reload %s", self._reloader.plan.config_file)
+    def _reload(self, answer: Answer, *, dry_run: bool) -> None:
         reason = self._busy() or (None if self._started else "the instance is starting: try again when it is running")
+        if not dry_run:
+            log.info("a client asked to reload %s", self._reloader.plan.config_file)
         if reason:
             answer.error(reason)
+        elif dry_run:
+            self._reloader.preview(answer)
         else:
             self._reloader.reload(answer)
 

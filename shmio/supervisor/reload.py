@@ -1,4 +1,4 @@
-"""Reload and take-over: compares an instance with its plan, and changes it to match the plan.
+"""Reload and take-over: changes an instance to match its plan. ``changes`` compares the two.
 
 Processes and blocks that already match are not touched. For a reload, a thread makes the plan, so
 that supervision continues meanwhile. The supervisor's loop then applies the plan.
@@ -8,101 +8,18 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable
 
 from shmio.control import Answer
 from shmio.errors import ShmioError
 from shmio.logs import fields
 from shmio.plan.processes import Job, Plan
-from shmio.segment import Block, BlockSpec, Segment
+from shmio.segment import Block, Segment
 from shmio.supervisor import policy
-from shmio.supervisor.fleet import Fleet, brief, digest, log
+from shmio.supervisor.changes import injection_changes, preview, reconcile, refusal
+from shmio.supervisor.fleet import Fleet, brief, log
 from shmio.supervisor.health import Notifier
 from shmio.supervisor.policy import Event, Limits, State
-
-
-@dataclass(frozen=True, slots=True)
-class _Changes:
-    """The differences between an instance and a plan, as names.
-
-    ``replaced`` processes stop and start.
-    """
-
-    kept: tuple[str, ...]
-    started: tuple[str, ...]
-    stopped: tuple[str, ...]
-    replaced: tuple[str, ...]
-    add: tuple[BlockSpec, ...]
-    retire: tuple[str, ...]
-
-
-def _reconcile(plan: Plan, epoch: int, fleet: Fleet, blocks: Iterable[Block]) -> _Changes:
-    """Compare a plan with the present processes and blocks.
-
-    A source is replaced together with its block, because the process of a source writes to one
-    block only.
-    """
-    present = {block.source: block for block in blocks}
-    add = tuple(spec for spec in plan.blocks if spec.source not in present or not _same(spec, present[spec.source]))
-    planned = {spec.source for spec in plan.blocks}
-    retire = (*(spec.source for spec in add if spec.source in present), *(n for n in present if n not in planned))
-    changed = {spec.source for spec in add}
-    kept, started, replaced = [], [], []
-    processes = {managed.name: managed for managed in fleet}
-    stopped = [name for name in processes if name not in {job.name for job in plan.jobs}]
-    for job in plan.jobs:
-        there = processes.get(job.name)
-        if there is None:
-            started.append(job.name)
-        elif there.slot.kind != job.kind:  # the name now belongs to a process of another kind
-            stopped.append(job.name)
-            started.append(job.name)
-        elif (
-            there.well
-            and there.slot.digest == digest(job.identify(plan.instance, epoch))
-            and not (job.kind == "source" and job.name in changed)
-        ):
-            kept.append(job.name)
-        else:
-            replaced.append(job.name)
-    return _Changes(tuple(kept), tuple(started), tuple(stopped), tuple(replaced), add, retire)
-
-
-def _same(spec: BlockSpec, block: Block) -> bool:
-    """Return whether a block matches its specification."""
-    return (
-        block.layout.hash == spec.layout.hash
-        and block.ring.slot_count == spec.slots
-        and (block.period_ns, block.stale_ns) == (spec.period_ns, spec.stale_ns)
-        and block.attributes == spec.attributes
-    )
-
-
-def _refusal(plan: Plan, running: Plan) -> str | None:
-    """Return why a running instance cannot change to the plan; None if it can."""
-    fixed = {
-        "instance.name": (running.instance, plan.instance),
-        "instance.group": (running.group, plan.group),
-        "instance.clock": (_clock(running), _clock(plan)),
-        "instance.log_dir": (running.log_dir, plan.log_dir),
-    }
-    for key, (old, new) in fixed.items():
-        if old != new:
-            return (
-                f"{key}: {_shown(new)} instead of {_shown(old)} cannot be applied while the instance runs; "
-                "nothing has changed: apply it by shmio-supervisor down and up"
-            )
-    return None
-
-
-def _clock(plan: Plan) -> str:
-    return "stepped" if plan.stepped else "wall"
-
-
-def _shown(value: object) -> str:
-    return "none" if value is None else repr(str(value))
-
 
 _SETTLED = (State.RUNNING, State.BACKOFF, State.FATAL, State.STOPPED)
 
@@ -118,7 +35,7 @@ class InstanceChange:
 
         """
         self.plan = plan
-        self.changes = _reconcile(plan, segment.header.epoch, fleet, segment.blocks.values())
+        self.changes = reconcile(plan, segment.header.epoch, fleet, segment.blocks.values())
         self._unwell = {managed.name for managed in fleet if not managed.well}
         self._fleet = fleet
         self._segment = segment
@@ -192,10 +109,7 @@ class InstanceChange:
         block.declared.write(declared)
         block.commands.wake()
         after = {declaration.name: declaration for declaration in block.declared.read()}
-        for name in {**before, **after}:
-            if before.get(name) != after.get(name):
-                what = "laid" if name not in before else "changed" if name in after else "lifted"
-                self._injections.append(f"injection {name}: {what} at {block.source}")
+        self._injections += injection_changes(block.source, before, after)
 
     def outcome(self) -> tuple[list[str], list[str]]:
         """Return two lists of lines: what was done, and which problems there are."""
@@ -277,6 +191,9 @@ class Reloader:
         self._planning: _PendingPlan | None = None
         self._change: InstanceChange | None = None
         self._answer: Answer | None = None
+        self._previewing: _PendingPlan | None = None
+        self._previewers: list[Answer] = []
+        self._next_previewers: list[Answer] = []
 
     @property
     def under_way(self) -> bool:
@@ -309,11 +226,28 @@ class Reloader:
         self._notifier.reloading()
         self._planning, self._answer = _PendingPlan(self._replan, self._limits.plan_s), answer
 
+    def preview(self, answer: Answer) -> None:
+        """Make a new plan, and answer what its reload would do. This never delays a reload.
+
+        Requests that come while a plan is made share the next plan, because the files may have
+        changed since the present one was begun.
+        """
+        if reason := self.busy():
+            answer.error(reason)
+        elif self._previewing is None:
+            self._begin_preview([answer])
+        elif self._previewers:
+            self._next_previewers.append(answer)
+        else:  # the time limit has passed
+            answer.error("a file of the configuration still cannot be read: check whether a file system hangs")
+
     def drop(self) -> None:
         """Cancel the change, because the instance stops."""
-        if self._answer is not None:
-            self._answer.error("the instance is stopping")
+        waiting = [*self._previewers, *self._next_previewers]
+        for answer in [self._answer, *waiting] if self._answer else waiting:
+            answer.error("the instance is stopping")
         self._planning = self._change = self._answer = None
+        self._previewers, self._next_previewers = [], []
 
     def step(self) -> None:
         """Continue the reload as far as possible now."""
@@ -322,11 +256,55 @@ class Reloader:
             self._begin(planning)
         if self._change is not None:
             self._follow(self._change)
+        if self._previewing is not None:
+            self._follow_preview(self._previewing)
+
+    def _begin_preview(self, answers: list[Answer]) -> None:
+        self._previewing, self._previewers = _PendingPlan(self._replan, self._limits.plan_s), answers
+
+    def _follow_preview(self, planning: _PendingPlan) -> None:
+        """Answer if the plan is made or late. While its thread hangs, no other is started."""
+        if not (planning.over or planning.late):
+            return
+        answers, self._previewers = self._previewers, []
+        if answers:
+            how = self._preview_answer(planning)
+            for answer in answers:
+                how(answer)
+        if planning.over:
+            self._previewing = None
+            if self._next_previewers:
+                answers, self._next_previewers = self._next_previewers, []
+                self._begin_preview(answers)
+        else:
+            for answer in self._next_previewers:
+                self.preview(answer)
+            self._next_previewers = []
+
+    def _preview_answer(self, planning: _PendingPlan) -> Callable[[Answer], None]:
+        faults: list[str] = []
+        warnings: list[str] = []
+        changes: dict[str, list[str]] = {}
+        if reason := self.busy():
+            return lambda answer: answer.error(reason)
+        try:
+            plan = planning.result()
+            warnings = list(plan.warnings)
+            if why := refusal(plan, self.plan):
+                raise ShmioError(f"{plan.config_file}: {why}")
+            changes = preview(plan, self.plan, self._segment.header.epoch, self._fleet, self._segment)
+        except ShmioError as error:
+            faults = str(error).split("\n")
+        except Exception as error:  # noqa: BLE001  as in a reload
+            log.exception("a dry run failed")
+            failure = f"the dry run failed: {brief(error)}"
+            return lambda answer: answer.error(failure)
+        return lambda answer: answer.ok(faults=faults, warnings=warnings, **changes)
 
     def _begin(self, planning: _PendingPlan) -> None:
         try:
             plan = planning.result()
-            if reason := _refusal(plan, self.plan):
+            if reason := refusal(plan, self.plan):
                 raise ShmioError(f"{plan.config_file}: {reason}")
             self._change = InstanceChange(self._fleet, self._segment, plan)
         except Exception as error:  # noqa: BLE001 - a connector's own check may raise anything; the instance goes on

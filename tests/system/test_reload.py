@@ -111,9 +111,15 @@ def test_a_new_layout_keeps_the_streams_of_registers_that_remain(cell: Cell, stu
 
 def test_reload_prints_the_same_warnings_as_check(cell: Cell) -> None:
     edit(cell, "period_ms = 20", 'period_ms = 20\nwritable = ["Outpts"]')
-    done = cell.supervisor("reload")
     file = cell.folder / "supervisor.toml"
     warning = f"{file}: warning: source[0].writable: 'Outpts' names nothing in DB201; did you mean Outputs?"
+    dry = cell.supervisor("reload", "--dry-run")
+    assert (dry.returncode, dry.stderr) == (0, f"{warning}\n")
+    assert dry.stdout.splitlines() == [
+        'would restart cell: writable: ["Outpts"] instead of []',
+        f"{cell.instance}: 2 processes would be kept; nothing was changed",
+    ]
+    done = cell.supervisor("reload")
     assert (done.returncode, done.stderr) == (0, f"{warning}\n")
     assert "cell: restarted" in done.stdout
     assert warning in cell.supervisor("check", "-c", str(file)).stdout.splitlines()
@@ -132,6 +138,8 @@ def test_an_error_in_the_configuration_changes_nothing(cell: Cell) -> None:
     (line,) = done.stderr.splitlines()
     assert "period_ms" in line
     assert json.loads(cell.supervisor("reload", "--json").stdout) == {"error": line}
+    dry = cell.supervisor("reload", "--dry-run", "--json")
+    assert (dry.returncode, json.loads(dry.stdout)["faults"]) == (1, [line])
     edit(cell, "period_ms = -1", "period_ms = 20")
     edit(cell, "[grpc]", f'[recorder]\ndirectory = "{"x" * 300}"\n\n[grpc]')
     done = cell.supervisor("reload")

@@ -6,8 +6,10 @@ import argparse
 import os
 import select
 import sys
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Final
 
 from shmio import control
 from shmio.cli.run import dumps
@@ -23,6 +25,15 @@ EXIT_S = 5.0
 RELOAD_S = 90.0
 RESTART_S = 40.0
 WHERE_S = 5.0
+PREVIEWED: Final[Mapping[str, str]] = {
+    "stop": "would stop",
+    "start": "would start",
+    "restart": "would restart",
+    "injections": "would change",
+    "reread": "would reload the tokens and roles of",
+    "keep": "would keep",
+}
+"""What the lists of a dry run's answer mean."""
 
 
 def down(arguments: argparse.Namespace) -> int:
@@ -77,7 +88,12 @@ def _pidfd(pid: int) -> int | None:
 
 
 def reload(arguments: argparse.Namespace) -> int:
-    """Apply the changes of the configuration; return 1 if a changed process does not run."""
+    """Apply the changes of the configuration; return 1 if a changed process does not run.
+
+    With ``--dry-run``, print the changes; return 1 if they would be refused.
+    """
+    if arguments.dry_run:
+        return _preview(arguments)
     with target(arguments).open_supervised() as segment:
         answer = ask_supervisor(segment, control.Reload(), RELOAD_S)
     status = 1 if answer["problems"] else 0
@@ -94,6 +110,27 @@ def reload(arguments: argparse.Namespace) -> int:
     for line in answer["problems"]:
         print(printable(line), file=sys.stderr)
     return status
+
+
+def _preview(arguments: argparse.Namespace) -> int:
+    with target(arguments).open_supervised() as segment:
+        answer = ask_supervisor(segment, control.Reload(dry_run=True), RELOAD_S)
+    faults, warnings = answer["faults"], answer["warnings"]
+    kinds = [kind for kind in PREVIEWED if kind in answer]
+    if arguments.json:
+        told = {kind: answer[kind] for kind in kinds}
+        print(dumps({"instance": segment.instance, "faults": faults, "warnings": warnings, **told}, indent=2))
+        return 1 if faults else 0
+    for line in [*faults, *warnings]:
+        print(printable(line), file=sys.stderr)
+    if faults:
+        return 1
+    for kind in kinds[:-1]:
+        for line in answer[kind]:
+            print(printable(f"{PREVIEWED[kind]} {line}"))
+    kept = len(answer["keep"])
+    print(f"{segment.instance}: {kept} process{'es' * (kept != 1)} would be kept; nothing was changed")
+    return 0
 
 
 def restart(arguments: argparse.Namespace) -> int:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+import socket
 import threading
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +17,7 @@ import shmio
 from shmio.control import Reload, Restart, Where
 from shmio.errors import ControlError
 from shmio.segment import Quality, Segment
-from tests.unit.supervisor.harness import CELL, Job, Launch, Launched, until
+from tests.unit.supervisor.harness import CELL, DEADLINE_S, Job, Launch, Launched, until
 
 PRESS: Job = ("press", "source", ["good"])
 
@@ -336,3 +339,112 @@ def test_a_stop_ends_a_reload_in_progress(launch: Launch) -> None:
     assert outcomes == ["the instance is stopping"]
     cell.process.send_signal(signal.SIGTERM)
     assert cell.wait_end() == 0
+
+
+def dry_run(cell: Launched, jobs: list[Any], **others: Any) -> dict[str, Any]:
+    cell.plan(jobs, **others)
+    return cell.request(Reload(dry_run=True))
+
+
+def test_a_dry_run_says_what_a_reload_then_does(launch: Launch) -> None:
+    cell = launch([*CELL, PRESS])
+    cell.wait_state("running")
+    before, log = cell.pids(), cell.log()
+    none: dict[str, Any] = {key: [] for key in ("faults", "warnings", "stop", "start", "restart", "injections")}
+    names = ["plc", "cell", "grpc", "press"]
+    assert dry_run(cell, [*CELL, PRESS]) == {"ok": True, **none, "reread": [], "keep": names}
+    jobs = [CELL[0], (*CELL[1], "new"), ("grpc", "grpc", ["good", "good"]), ("robot", "source", ["good"])]
+    found = dry_run(cell, jobs, warnings=["odd"])
+    assert found == {
+        "ok": True,
+        "faults": [],
+        "warnings": ["odd"],
+        "stop": ["press"],
+        "start": ["robot"],
+        "restart": [
+            "cell: registers: 1 new, 1 changed",
+            'grpc: behaviour: ["good","good"] instead of ["good"]',
+        ],
+        "injections": [],
+        "reread": [],
+        "keep": ["plc"],
+    }
+    assert (cell.pids(), cell.log()) == (before, log)
+    with shmio.attach(cell.instance) as reader:
+        assert reader.sources == ["cell", "press"]
+    answer = cell.reload(jobs)
+    assert answer["done"] == [
+        "press: stopped",
+        "cell: restarted, as its configuration has changed",
+        "grpc: restarted, as its configuration has changed",
+        "robot: started",
+    ]
+    assert answer["kept"] == found["keep"]
+
+
+def test_a_dry_run_reports_faults_and_what_cannot_change(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    (cell.folder / "plan.json").write_text("{")
+    assert cell.request(Reload(dry_run=True)) == {"ok": True, "faults": ["plan.json: no JSON"], "warnings": []}
+    found = dry_run(cell, CELL, stepped=True)
+    assert "instance.clock" in found["faults"][0]
+    assert "keep" not in found
+
+
+def opened(pipe: Path) -> list[int]:
+    """Open a pipe for writing, if a process reads it."""
+    with suppress(OSError):
+        return [os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)]
+    return []
+
+
+def test_a_slow_dry_run_delays_no_reload_and_another_one_waits_for_its_own_plan(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    cell.plan(CELL)
+    pipe = cell.folder / "slow"
+    os.mkfifo(pipe)
+    with Segment.open(cell.instance) as segment:
+        path = segment.header.control
+    with socket.socket(socket.AF_UNIX) as first, socket.socket(socket.AF_UNIX) as second:
+        for client in (first, second):
+            client.settimeout(DEADLINE_S)
+            client.connect(path)
+        first.sendall(b'{"do": "reload", "dry_run": true}\n')
+        held: list[int] = []
+
+        def hold() -> bool:
+            held.extend(opened(pipe))
+            return bool(held)
+
+        until(hold)
+        pipe.unlink()
+        assert cell.reload([*CELL, PRESS])["done"] == ["press: started"]
+        second.sendall(b'{"do": "reload", "dry_run": true}\n')
+        cell.request(Where())  # the supervisor has read what was sent before
+        cell.plan(CELL)
+        os.close(held[0])
+        for client in (first, second):
+            assert json.loads(client.recv(65536))["stop"] == ["press"]
+
+
+def test_a_dry_run_that_hangs_is_given_up_and_no_other_is_begun(launch: Launch) -> None:
+    cell = launch(plan_s=0.2)
+    cell.wait_state("running")
+    cell.plan(CELL)
+    os.mkfifo(cell.folder / "slow")
+    assert "could not be read within 0.2 s" in cell.request(Reload(dry_run=True))["faults"][0]
+    with pytest.raises(ControlError, match="still cannot be read"):
+        cell.request(Reload(dry_run=True))
+    (cell.folder / "slow").write_bytes(b"")
+    (cell.folder / "slow").unlink()
+    until(lambda: "faults" in answered(cell))
+    assert cell.request(Reload())["done"] == []
+
+
+def answered(cell: Launched) -> dict[str, Any]:
+    try:
+        return cell.request(Reload(dry_run=True))
+    except ControlError:
+        return {}

@@ -1,0 +1,216 @@
+"""Masks secrets in the text of a configuration, so that it can be shown to others.
+
+shmio's own keys name files with secrets, or have hashes of them. The keys of a connector of another
+package may have the secret itself. Therefore the name of a key decides. In doubt, text is masked.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from shmio.config.faults import TOKEN
+
+MASK: Final = "•••"
+_WORDS: Final = frozenset({"pass", "pw", "pin", "auth"})
+_PARTS: Final = re.compile(
+    r"password|passwd|passphrase|passcode|pwd|secret|token|credential|authorization|bearer|sha256|psk"
+)
+_NO_SECRETS: Final = frozenset({"tokens_in_plain_text"})
+_PATH_SUFFIXES: Final = ("_file", "_path", "_dir")
+_KEY_FILES: Final = re.compile(r"""["']?[^"']*\.(?:pem|key|der|crt|p8)["']?""", re.IGNORECASE)
+"""The value of a plain ``key`` that is a path, as in shmio's own sections."""
+_WORD: Final = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
+_USER: Final = re.compile(r"(?<=://)[^\s/\"']*(?=@)")
+_ASSIGNED: Final = re.compile(r"(?<![A-Za-z0-9_-])([A-Za-z0-9_-]++)[\"']?\s*+(?:=(?!=)|:(?!//))\s*(?=\S)")
+_EQUATED: Final = re.compile(r"(?<![A-Za-z0-9_-])([A-Za-z0-9_-]++)[\"']?\s*+=(?!=)\s*(?=\S)")
+_MIN_QUOTED: Final = 4
+"""Number of characters from which on a secret is searched for in messages."""
+_BEFORE_EQUALS: Final = re.compile(r"[ \t]*=")
+_OWN_TABLES: Final = frozenset({("grpc", "token")})
+"""Tables whose name would hide all of their keys, although their secret keys have names of their own."""
+
+
+def is_secret(key: str) -> bool:
+    """Return whether a key of this name, without its table, may have a secret as its value.
+
+    A plain ``key`` may have one, or the path of a file: its value decides.
+    """
+    folded = key.lower()
+    if folded in _NO_SECRETS or folded.endswith(_PATH_SUFFIXES):
+        return False
+    joined = re.sub(r"[^a-z0-9]", "", folded)
+    words = {word.lower() for word in _WORD.findall(key)}
+    return bool(_PARTS.search(joined) or words & _WORDS or joined.endswith("key"))
+
+
+def mask_value(key: str, value: Any) -> Any:
+    """Return a value of a parsed configuration in which secrets are masked.
+
+    Args:
+        key: Name of its key.
+        value: Text, a number, a list or a table.
+
+    """
+    if value is None or isinstance(value, bool):
+        return value
+    if isinstance(value, dict):
+        if is_secret(key):
+            return MASK if value else value
+        return {name: mask_value(name, item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [mask_value(key, item) for item in value]
+    if is_secret(key) and not _is_key_file(key, str(value)):
+        return MASK
+    return mask_line(value) if isinstance(value, str) else value
+
+
+def mask_line(line: str, assigned: re.Pattern[str] = _ASSIGNED) -> str:
+    """Return a line with the user information of URLs, and all that follows a secret key, masked.
+
+    Args:
+        line: The line.
+        assigned: Matches a key and the sign that separates it from its value.
+
+    """
+    line = _USER.sub(MASK, line)
+    for match in assigned.finditer(line):
+        if is_secret(match[1]) and not _is_key_file(match[1], line[match.end() :].strip()):
+            return line[: match.end()] + MASK
+    return line
+
+
+@dataclass(frozen=True)
+class Masked:
+    """The text of a configuration without its secrets."""
+
+    text: str
+    """The text, with as many lines as the original."""
+    _secrets: list[str] = field(default_factory=list)
+
+    def hide(self, message: str) -> str:
+        """Return a message, which may quote the original text, without its secrets."""
+        for secret in self._secrets:
+            message = message.replace(secret, MASK)
+        return mask_line(message, _EQUATED)  # a colon ends the name of the key that a message is about
+
+
+def mask(text: str) -> Masked:
+    """Mask the secrets in the text of a TOML file, which may have faults.
+
+    Comments are masked after a secret key and ``=`` or ``:``, such as ``# password = …``.
+    """
+    masker = _Masker(text)
+    parts: list[str] = []
+    end = 0
+    for begin, stop, shown in masker.replaced():
+        parts += (text[end:begin], shown)
+        end = stop
+    lines = {line.strip() for secret in masker.secrets for line in secret.split("\n")}
+    quoted = sorted((line for line in lines if len(line) >= _MIN_QUOTED), key=len, reverse=True)
+    return Masked("".join([*parts, text[end:]]), [line for line in quoted if line not in ("true", "false")])
+
+
+class _Masker:
+    """Goes through the tokens of a file, and finds those that are secrets."""
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+        self._parts: list[str] = []
+        """The parts of the key that is being read."""
+        self._depth = 0
+        """Depth of brackets in a value."""
+        self._hidden: int | None = None
+        """Depth at which a secret value began; None outside of one."""
+        self._awaited = False
+        """Whether a secret value has not begun yet. It may be in the next line, although TOML has it in the same."""
+        self._plain_key = False
+        """Whether this value belongs to a key named ``key``, whose paths are shown."""
+        self._table_hidden = False
+        self._header = False
+        self._start = True
+        self.secrets: set[str] = set()
+        """The values that are replaced."""
+
+    def replaced(self) -> Iterable[tuple[int, int, str]]:
+        """Yield the beginning and the end of each part to replace, and what replaces it."""
+        for match in TOKEN.finditer(self._text):
+            piece = match[0]
+            if piece == "\n":
+                self._end_line()
+            elif piece[0] == "#":
+                if (shown := mask_line(piece)) != piece:
+                    yield match.start(), match.end(), shown
+            elif self._hidden is not None and self._is_value(match) and not self._shows_path(piece):
+                self.secrets.add(piece.strip("\"'"))
+                self._awaited = False
+                yield match.start(), match.end(), self._covered(piece)
+            else:
+                if (shown := _mask_lines(piece)) != piece:
+                    yield match.start(), match.end(), shown
+                self._follow(piece)
+
+    def _end_line(self) -> None:
+        self._parts = []
+        self._header = False
+        if self._depth == 0:
+            self._hidden = self._hidden if self._awaited else None
+            self._start = True
+
+    def _follow(self, piece: str) -> None:
+        first = piece[0]
+        if self._start and first == "[":
+            self._header, self._start, self._parts = True, False, []
+            self._hidden, self._awaited = None, False
+        elif self._header and first == "]":
+            self._table_hidden = tuple(self._parts) not in _OWN_TABLES and any(map(is_secret, self._parts))
+            self._header, self._parts = False, []
+        elif first == "=":
+            self._begin_value()
+        elif first in "[{":
+            self._awaited = False
+            self._depth += len(piece)
+            self._parts = []
+        elif first in "]}":
+            self._depth = max(self._depth - len(piece), 0)
+            self._parts = []
+            if self._hidden is not None and self._depth < self._hidden:
+                self._hidden = None
+        elif first == ",":
+            self._parts = []
+            if self._hidden == self._depth:
+                self._hidden = None
+        elif first != ".":
+            self._parts.append(piece.strip("\"'"))
+            if self._start and piece.endswith(":") and is_secret(piece[:-1]):  # a slip for =
+                self._hidden, self._awaited = self._depth, True
+        self._start = False
+
+    def _begin_value(self) -> None:
+        if self._hidden is None and (self._table_hidden or any(map(is_secret, self._parts))):
+            self._hidden, self._awaited = self._depth, True
+            self._plain_key = not self._table_hidden and self._parts[-1:] == ["key"]
+        self._parts = []
+
+    def _is_value(self, match: re.Match[str]) -> bool:
+        """Return whether a token is neither a bracket nor the key of an inline table."""
+        return match[0][0] not in "[]{}=,." and _BEFORE_EQUALS.match(self._text, match.end()) is None
+
+    def _shows_path(self, piece: str) -> bool:
+        return self._plain_key and piece[0] in "\"'" and _KEY_FILES.fullmatch(piece) is not None
+
+    @staticmethod
+    def _covered(piece: str) -> str:
+        """Return what replaces a secret. It has as many lines."""
+        lines = "\n" * piece.count("\n")
+        return f'"{MASK}"{lines}' if piece[0] in "\"'" else MASK
+
+
+def _mask_lines(piece: str) -> str:
+    return "\n".join(map(mask_line, piece.split("\n")))
+
+
+def _is_key_file(key: str, value: str) -> bool:
+    return key.lower() == "key" and _KEY_FILES.fullmatch(value) is not None

@@ -1,0 +1,190 @@
+"""Compares an instance with a plan: what has to change, why, and what cannot change."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import msgspec
+
+from shmio.config import Declaration
+from shmio.config.masking import is_secret, mask_value
+from shmio.plan.processes import Plan
+from shmio.segment import Block, BlockSpec, Segment
+from shmio.supervisor.fleet import Fleet, digest
+
+
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """The differences between an instance and a plan, as names.
+
+    ``replaced`` processes stop and start.
+    """
+
+    kept: tuple[str, ...]
+    started: tuple[str, ...]
+    stopped: tuple[str, ...]
+    replaced: tuple[str, ...]
+    add: tuple[BlockSpec, ...]
+    retire: tuple[str, ...]
+
+
+def reconcile(plan: Plan, epoch: int, fleet: Fleet, blocks: Iterable[Block]) -> Changes:
+    """Compare a plan with the present processes and blocks.
+
+    A source is replaced together with its block, because the process of a source writes to one
+    block only.
+    """
+    present = {block.source: block for block in blocks}
+    add = tuple(spec for spec in plan.blocks if spec.source not in present or not _same(spec, present[spec.source]))
+    planned = {spec.source for spec in plan.blocks}
+    retire = (*(spec.source for spec in add if spec.source in present), *(n for n in present if n not in planned))
+    changed = {spec.source for spec in add}
+    kept, started, replaced = [], [], []
+    processes = {managed.name: managed for managed in fleet}
+    stopped = [name for name in processes if name not in {job.name for job in plan.jobs}]
+    for job in plan.jobs:
+        there = processes.get(job.name)
+        if there is None:
+            started.append(job.name)
+        elif there.slot.kind != job.kind:  # the name now belongs to a process of another kind
+            stopped.append(job.name)
+            started.append(job.name)
+        elif (
+            there.well
+            and there.slot.digest == digest(job.identify(plan.instance, epoch))
+            and not (job.kind == "source" and job.name in changed)
+        ):
+            kept.append(job.name)
+        else:
+            replaced.append(job.name)
+    return Changes(tuple(kept), tuple(started), tuple(stopped), tuple(replaced), add, retire)
+
+
+def _same(spec: BlockSpec, block: Block) -> bool:
+    """Return whether a block matches its specification."""
+    return (
+        block.layout.hash == spec.layout.hash
+        and block.ring.slot_count == spec.slots
+        and (block.period_ns, block.stale_ns) == (spec.period_ns, spec.stale_ns)
+        and block.attributes == spec.attributes
+    )
+
+
+def refusal(plan: Plan, running: Plan) -> str | None:
+    """Return why a running instance cannot change to the plan; None if it can."""
+    fixed = {
+        "instance.name": (running.instance, plan.instance),
+        "instance.group": (running.group, plan.group),
+        "instance.clock": (_clock(running), _clock(plan)),
+        "instance.log_dir": (running.log_dir, plan.log_dir),
+    }
+    for key, (old, new) in fixed.items():
+        if old != new:
+            return (
+                f"{key}: {_shown(new)} instead of {_shown(old)} cannot be applied while the instance runs; "
+                "nothing has changed: apply it by shmio-supervisor down and up"
+            )
+    return None
+
+
+def _clock(plan: Plan) -> str:
+    return "stepped" if plan.stepped else "wall"
+
+
+def _shown(value: object) -> str:
+    return "none" if value is None else repr(str(value))
+
+
+MAX_REASONS: Final = 8
+"""Maximum number of reasons that are given for the restart of one process."""
+MAX_VALUE: Final = 60
+"""Number of characters from which on a changed value is not shown."""
+
+
+def preview(plan: Plan, running: Plan, epoch: int, fleet: Fleet, segment: Segment) -> dict[str, list[str]]:
+    """Return what a change of the running instance to the plan would do, in lines by kind. Nothing is changed.
+
+    Raises:
+        SegmentError: There is no room for new processes or blocks.
+
+    """
+    changes = reconcile(plan, epoch, fleet, segment.blocks.values())
+    segment.processes.require(len(changes.started) - len(changes.stopped))
+    segment.require_blocks(len(changes.add))
+    jobs = {job.name: job for job in plan.jobs}
+    return {
+        "stop": list(changes.stopped),
+        "start": list(changes.started),
+        "restart": [f"{name}: {'; '.join(_reasons(name, plan, running, fleet))}" for name in changes.replaced],
+        "injections": list(_changed_injections(plan, running)),
+        "reread": [name for name in changes.kept if fleet.named(name).rereads(jobs[name])],
+        "keep": list(changes.kept),
+    }
+
+
+def _reasons(name: str, plan: Plan, running: Plan, fleet: Fleet) -> list[str]:
+    """Return why a process is replaced. Secrets are masked."""
+    managed = fleet.named(name)
+    old, new = (next((job for job in one.jobs if job.name == name), None) for one in (running, plan))
+    blocks = [next((block for block in one.blocks if block.source == name), None) for one in (running, plan)]
+    found = [] if managed.well else [f"it does not run: {managed.life.note or managed.life.state.value}"]
+    if old is not None and new is not None:
+        found += _differences(old.config, new.config)
+    if blocks[0] is not None and blocks[1] is not None:
+        found += _block_differences(blocks[0], blocks[1])
+    found = found or ["its configuration has changed"]
+    return found if len(found) <= MAX_REASONS else [*found[:MAX_REASONS], f"{len(found) - MAX_REASONS} more"]
+
+
+def _differences(old: Mapping[str, Any], new: Mapping[str, Any], table: str = "") -> Iterator[str]:
+    """Yield the keys whose values differ, with the values if they are short."""
+    for key in {**old, **new}:
+        before, after = old.get(key), new.get(key)
+        if before == after:
+            continue
+        if isinstance(before, dict) and isinstance(after, dict) and not is_secret(key):
+            yield from _differences(before, after, f"{table}{key}.")
+            continue
+        texts = [_text(mask_value(key, value)) for value in (before, after)]
+        shown = texts[0] != texts[1] and all(len(text) <= MAX_VALUE for text in texts)
+        yield f"{table}{key}: {texts[1]} instead of {texts[0]}" if shown else f"{table}{key} has changed"
+
+
+def _text(value: Any) -> str:
+    return "none" if value is None else msgspec.json.encode(value).decode()
+
+
+def _block_differences(old: BlockSpec, new: BlockSpec) -> Iterator[str]:
+    """Yield what differs in a source's block, except for what a key of the source says."""
+    if old.layout.hash != new.layout.hash:
+        before, after = ({one.path: one for one in block.layout.registers} for block in (old, new))
+        added, gone = after.keys() - before.keys(), before.keys() - after.keys()
+        moved = sum(before[path] != after[path] for path in before.keys() & after.keys())
+        counts = {"new": len(added), "gone": len(gone), "changed": moved}
+        yield f"registers: {', '.join(f'{count} {what}' for what, count in counts.items() if count) or 'none changed'}"
+    if old.slots != new.slots:
+        yield f"ring: {new.slots} frames instead of {old.slots}"
+
+
+def _changed_injections(plan: Plan, running: Plan) -> Iterator[str]:
+    """Yield a line for each declared injection that comes, changes or goes."""
+    before = {block.source: injections_by_name(block.declared) for block in running.blocks}
+    for block in plan.blocks:
+        yield from injection_changes(block.source, before.get(block.source, {}), injections_by_name(block.declared))
+
+
+def injections_by_name(document: bytes) -> dict[str, Declaration]:
+    """Return the declared injections in a block's document."""
+    return {one.name: one for one in msgspec.json.decode(document or b"[]", type=tuple[Declaration, ...])}
+
+
+def injection_changes(
+    source: str, before: Mapping[str, Declaration], after: Mapping[str, Declaration]
+) -> Iterator[str]:
+    """Yield a line for each injection that differs."""
+    for name in {**before, **after}:
+        if before.get(name) != after.get(name):
+            what = "laid" if name not in before else "changed" if name in after else "lifted"
+            yield f"injection {name}: {what} at {source}"
