@@ -27,7 +27,7 @@ from shmio.layout.values.typed import read_value
 from shmio.layout.values.write import Write, paths_of
 from shmio.logs import printable
 from shmio.model.cell import Campaign, Cell
-from shmio.model.injection import Happening
+from shmio.model.injection import InjectionEvent
 
 TURN_S: Final = 0.2
 """Interval in s at which to check for a campaign's events, signals and the end of the time."""
@@ -222,8 +222,8 @@ def run_campaign(cell: Cell, options: argparse.Namespace) -> int:
         _refuse_past(declarations, now_s)
     with stop_on_signals() as over, cell.declare(declarations, keep=options.keep) as campaign:
         if any(declaration.seed is None for declaration in read):
-            told = dumps({"seed": seed}) if options.json else f"seed {seed}: --seed {seed} does the same again"
-            print(told, flush=True)
+            line = dumps({"seed": seed}) if options.json else f"seed {seed}: --seed {seed} does the same again"
+            print(line, flush=True)
         clock = cell.clock()
         if clock.virtual and not clock.playing and any(one.start_s or one.end_s for one in declarations):
             stands = f"time is paused at {clock.present_ns / 1e9:.3f} s"
@@ -238,17 +238,17 @@ def _follow(campaign: Campaign, over: threading.Event, options: argparse.Namespa
     names = {(one.source, one.number): one.name for one in campaign.declared}
     unheard = set(names)
     while unheard:  # the events begin with the start of each injection
-        happening = next(campaign)
-        unheard.discard((happening.source, happening.number))
-        _print_event(happening, names, as_json=options.json)
+        event = next(campaign)
+        unheard.discard((event.source, event.number))
+        _print_event(event, names, as_json=options.json)
     if options.keep:
         return
-    told: queue.SimpleQueue[Happening | ShmioError | None] = queue.SimpleQueue()
-    threading.Thread(target=_queue, args=(campaign, told), daemon=True).start()  # the thread ends with the campaign
+    waiting: queue.SimpleQueue[InjectionEvent | ShmioError | None] = queue.SimpleQueue()
+    threading.Thread(target=_queue, args=(campaign, waiting), daemon=True).start()  # the thread ends with the campaign
     while True:
         ended = over.is_set() or (deadline_s is not None and time.monotonic() > deadline_s)
-        while not told.empty():
-            one = told.get()
+        while not waiting.empty():
+            one = waiting.get()
             if one is None:
                 return
             if isinstance(one, ShmioError):
@@ -259,14 +259,14 @@ def _follow(campaign: Campaign, over: threading.Event, options: argparse.Namespa
         over.wait(TURN_S)
 
 
-def _queue(campaign: Campaign, told: queue.SimpleQueue[Happening | ShmioError | None]) -> None:
+def _queue(campaign: Campaign, waiting: queue.SimpleQueue[InjectionEvent | ShmioError | None]) -> None:
     """Put the events of a campaign into a queue, then None, or the error that ended the campaign."""
     try:
-        for happening in campaign:
-            told.put(happening)
+        for event in campaign:
+            waiting.put(event)
     except ShmioError as error:
-        told.put(error)
-    told.put(None)
+        waiting.put(error)
+    waiting.put(None)
 
 
 def _refuse_past(declarations: Sequence[Declaration], now_s: float) -> None:
@@ -295,13 +295,13 @@ def _shifted(declaration: Declaration, now_s: float) -> Declaration:
     return msgspec.structs.replace(declaration, start_s=(declaration.start_s or 0) + now_s, end_s=end_s)
 
 
-def _print_event(happening: Happening, names: Mapping[tuple[str, int], str], *, as_json: bool) -> None:
+def _print_event(event: InjectionEvent, names: Mapping[tuple[str, int], str], *, as_json: bool) -> None:
     """Print an event as a line: time, cycle, injection, and what happened."""
-    source, number, time_s = happening.source, happening.number, happening.clock_ns / 1e9
-    text = happening.text or names[source, number]
+    source, number, time_s = event.source, event.number, event.clock_ns / 1e9
+    text = event.text or names[source, number]
     if as_json:
-        what = {"cycle": happening.cycle, "source": source, "id": number, "what": happening.what, "text": text}
+        what = {"cycle": event.cycle, "source": source, "id": number, "what": event.what, "text": text}
         print(dumps({"time_s": time_s, **what}), flush=True)
         return
-    line = f"{time_s:11.3f} s  cycle {happening.cycle}  {number} {happening.what}: {text}"
+    line = f"{time_s:11.3f} s  cycle {event.cycle}  {number} {event.what}: {text}"
     print(printable(line), flush=True)

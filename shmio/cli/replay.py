@@ -12,7 +12,7 @@ import msgspec
 from shmio.cli.run import dumps
 from shmio.logs import printable
 from shmio.model.cell import Cell
-from shmio.model.replay import Playing, Wish
+from shmio.model.replay import ReplayChanges, ReplayStatus
 
 _VERBS: Final = {
     "status": "show how they play (default)",
@@ -57,7 +57,7 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
         PathError: A source or register does not exist.
         ValueRangeError: A number or time is out of range.
     """
-    found = cell.replay(**_wish(options))
+    found = cell.replay(**_changes(options))
     if options.json:
         print(dumps([msgspec.to_builtins(one) for one in found]))
     else:
@@ -65,7 +65,7 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
     return 0
 
 
-def _wish(options: argparse.Namespace) -> Wish:
+def _changes(options: argparse.Namespace) -> ReplayChanges:
     """Return the changes that the action makes to the state of a replay."""
     action, value = options.action, options.value
     if (value is None) != (action in _ALONE):
@@ -74,7 +74,7 @@ def _wish(options: argparse.Namespace) -> Wish:
         options.refuse("--speed is only for the action play")
     if options.jump and action not in ("to-change", "to-event"):
         options.refuse("--jump is only for the actions to-change and to-event")
-    wishes: dict[str, Wish] = {
+    by_action: dict[str, ReplayChanges] = {
         "status": {},
         "pause": {"paused": True},
         "play": {"paused": False} if options.speed is None else {"paused": False, "speed": options.speed},
@@ -87,7 +87,7 @@ def _wish(options: argparse.Namespace) -> Wish:
     }
     if action == "loop" and value not in ("on", "off"):
         options.refuse(f"loop is on or off, not {value!r}")
-    return {**wishes[action], "sources": options.source}
+    return {**by_action[action], "sources": options.source}
 
 
 def _number(options: argparse.Namespace) -> float:
@@ -98,7 +98,7 @@ def _number(options: argparse.Namespace) -> float:
         raise
 
 
-def _lines(found: Iterable[Playing]) -> Iterable[str]:
+def _lines(found: Iterable[ReplayStatus]) -> Iterable[str]:
     for one in found:
         state = "over" if one.over else "paused" if one.paused else "playing"
         at = datetime.fromtimestamp(one.time_s).astimezone().isoformat(" ", timespec="milliseconds")[:23]

@@ -27,8 +27,8 @@ from shmio.client.table import Change, Register, Table
 from shmio.client.update import Piece, Snapshot, Update
 from shmio.model.clock import Clock
 from shmio.model.event import Event, EventKind
-from shmio.model.injection import Declared, Happening, Injection, Lifted, Running
-from shmio.model.replay import Playing, Wish
+from shmio.model.injection import Declared, Injection, InjectionEvent, Lifted, Running
+from shmio.model.replay import ReplayChanges, ReplayStatus
 from shmio.model.values import Column, Outcome, OutcomeKind, Provenance, Quality
 
 __all__ = [
@@ -42,16 +42,17 @@ __all__ = [
     "Event",
     "EventKind",
     "Events",
-    "Happening",
     "Injection",
+    "InjectionEvent",
     "Lifted",
     "Outcome",
     "OutcomeKind",
     "Piece",
-    "Playing",
     "Provenance",
     "Quality",
     "Register",
+    "ReplayChanges",
+    "ReplayStatus",
     "Running",
     "Shadow",
     "Simulation",
@@ -62,7 +63,6 @@ __all__ = [
     "Table",
     "Target",
     "Update",
-    "Wish",
     "Work",
     "connect",
     "connect_aio",

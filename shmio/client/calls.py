@@ -23,7 +23,7 @@ from shmio.errors import (
 )
 from shmio.messages import value_to_wire
 from shmio.model.clock import Clock, ClockMode
-from shmio.model.replay import Playing, Wish
+from shmio.model.replay import ReplayChanges, ReplayStatus
 from shmio.model.values import Outcome, OutcomeKind
 from shmio.wire import shmio_v1_pb2 as wire
 
@@ -288,18 +288,18 @@ def _process(found: Any) -> dict[str, Any]:
     return process
 
 
-def replay_request(wish: Wish) -> Any:
+def replay_request(changes: ReplayChanges) -> Any:
     """Return the request for Replay; times are sent as text."""
-    keys: dict[str, Any] = {**wish}
+    keys: dict[str, Any] = {**changes}
     for key in {"seek", "until"} & keys.keys():
         keys[key] = str(keys[key])
     return wire.ReplayRequest(**keys)
 
 
-def playing(found: Any) -> list[Playing]:
+def replay_status(found: Any) -> list[ReplayStatus]:
     """Convert the answer to Replay."""
     return [
-        Playing(
+        ReplayStatus(
             one.source, one.time_s, one.position_s, one.length_s, one.speed, one.paused, one.loop, one.over,
             one.until_s if one.HasField("until_s") else None,
         )
@@ -307,6 +307,6 @@ def playing(found: Any) -> list[Playing]:
     ]  # fmt: skip
 
 
-def replay_patience_s(wish: Wish) -> float | None:
+def replay_patience_s(changes: ReplayChanges) -> float | None:
     """Return the time-out of a request to replay, in s; None: the client's time-out applies."""
-    return _SEARCH_PATIENCE_S if "change" in wish or "event" in wish else None
+    return _SEARCH_PATIENCE_S if "change" in changes or "event" in changes else None

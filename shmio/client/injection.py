@@ -14,7 +14,7 @@ from shmio.client.table import DTYPES, FIELDS, Array, InjectRequest, Table
 from shmio.client.update import Piece, Tables, Update
 from shmio.errors import RemoteError, ValueRangeError
 from shmio.messages import declaration_from_wire, declaration_to_wire
-from shmio.model.injection import Declared, Happening, Injection, Lifted, Running
+from shmio.model.injection import Declared, Injection, InjectionEvent, Lifted, Running
 from shmio.model.values import Column, Outcome
 from shmio.wire import shmio_v1_pb2 as wire
 
@@ -60,7 +60,7 @@ def lay(
     return bytes(request.SerializeToString())
 
 
-class Held:
+class ShadowState:
     """An injection of this client, with its table of registers."""
 
     def __init__(self, found: Any) -> None:
@@ -157,11 +157,11 @@ def declared(found: Any) -> tuple[Declared, ...]:
     return tuple(Declared(one.source, one.number, one.name, one.seed) for one in found.declared.injections)
 
 
-def happenings(found: Any) -> list[Happening]:
+def events(found: Any) -> list[InjectionEvent]:
     """Convert the events in an answer to Declare."""
     known = wire.Happening.Kind.values()
     return [
-        Happening(
+        InjectionEvent(
             one.source, one.number,
             wire.Happening.Kind.Name(one.kind).removeprefix("KIND_").lower() if one.kind in known else "unknown",
             one.clock_ns, one.utc_ns, one.frame, one.cycle, one.run, one.text,

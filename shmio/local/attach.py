@@ -32,7 +32,7 @@ from shmio.layout.overlay import names_in
 from shmio.layout.topic import Topic, look_up, parse_topic
 from shmio.layout.values.codec import Value
 from shmio.local.events import Events
-from shmio.local.injection import Campaign, Diversion, Shadow, as_given, by_path, lift_all, written
+from shmio.local.injection import Campaign, ObservedWrite, Shadow, as_given, by_path, lift_all, written
 from shmio.local.reading import View, reading
 from shmio.local.replays import Replays
 from shmio.local.subscription import Following, Subscription
@@ -366,13 +366,13 @@ class Attachment:
             raise PathError("an injection covers /out or /in, not both")
         direction = Direction.IN if "in" in directions else Direction.OUT
         source_writer = self._source_writer(block)
-        events = block.events.cursor()  # created before the shadow is laid, so that no diversion is missed
+        events = block.events.cursor()  # created before the shadow is laid, so that no diverted write is missed
         patterns = [topic.path or "**" for topic in topics]
         number = source_writer.inject(patterns, direction=direction, priority=priority, keep=keep, name=name)
         names = names_in(block.layout, patterns)
         return Shadow(source_writer, number, direction, events, partial(self._next, block), keep=keep, names=names)
 
-    def written(self, *paths: str, timeout_s: float | None = None) -> Iterator[Diversion]:
+    def written(self, *paths: str, timeout_s: float | None = None) -> Iterator[ObservedWrite]:
         """Iterate over the commands that write to registers of one source, from now on.
 
         It yields each accepted command when its outcome is known. The commands are in order.

@@ -24,7 +24,7 @@ from shmio.layout.values.codec import Value
 from shmio.layout.values.write import cover, merge
 from shmio.local.subscription import Following
 from shmio.local.writer import PendingCommand, SourceWriter
-from shmio.model.injection import Declared, Happening
+from shmio.model.injection import Declared, InjectionEvent
 from shmio.model.values import Outcome
 from shmio.segment.block import Block, Cursor, Layouts
 from shmio.segment.commands import CommandAssembler, CommandWrites, Direction, apply, decode_writes
@@ -46,7 +46,7 @@ if the instance has stopped.
 
 
 @dataclass(frozen=True, slots=True)
-class Diversion:
+class ObservedWrite:
     """The values that one command wrote to a source, or the part of them that an injection took.
 
     Attributes:
@@ -56,7 +56,7 @@ class Diversion:
         command: Number that the writer gave the command, as in events.
         clock_ns: Time of the instance's clock.
         utc_ns: UTC time.
-        missed: Number of events lost since the previous diversion. Some may have been about other
+        missed: Number of events lost since the previous item. Some may have been about other
             writes.
     """
 
@@ -135,16 +135,16 @@ class Shadow:
         paths = by_path([parse_topic(path, (self.source,), self.source) for path in values], values)
         return as_given(values, self._source_writer.shadow(self.number, paths, timeout_s))
 
-    def diverted(self, timeout_s: float | None = None) -> Iterator[Diversion]:
+    def diverted(self, timeout_s: float | None = None) -> Iterator[ObservedWrite]:
         """Iterate over the commands whose values this shadow has taken since its creation.
 
         A shadow over ``/in`` takes the writes of other programs. A shadow over ``/out`` takes the
         values of inner shadows; the values that the source delivers are in the frames. If there are
-        two iterators, each diversion goes to one of them. The iterator ends when the shadow is
+        two iterators, each command goes to one of them. The iterator ends when the shadow is
         lifted.
 
         Args:
-            timeout_s: The iterator also ends after this time without a diversion; None waits
+            timeout_s: The iterator also ends after this time without such a command; None waits
                 forever.
 
         Raises:
@@ -154,17 +154,19 @@ class Shadow:
         while (event := self._next_event(self._events, _rest(until_s))) is not None:
             for diverted in self._gathered.follow(event):
                 if diverted.injection == self.number:
-                    yield self._diversion(diverted)
+                    yield self._observed(diverted)
                     until_s = _deadline(timeout_s)
             if event.kind == EventKind.LIFTED and event.injection == self.number:
                 return
 
-    def _diversion(self, diverted: CommandWrites) -> Diversion:
+    def _observed(self, diverted: CommandWrites) -> ObservedWrite:
         apply(self._image, diverted.writes)
         event = diverted.event
         layout = self._source_writer.block.layout
         written = decode_writes(layout, bytes(self._image), diverted.writes, self._names)
-        return Diversion(written, event.writer, event.command, event.clock_ns, event.utc_ns, self._events.take_missed())
+        return ObservedWrite(
+            written, event.writer, event.command, event.clock_ns, event.utc_ns, self._events.take_missed()
+        )
 
     def lift(self) -> None:
         """Lift the shadow.
@@ -196,7 +198,7 @@ class Shadow:
 
 def written(
     block: Block, patterns: Iterable[str], events: Cursor[Event], next_event: Next, timeout_s: float | None
-) -> Iterator[Diversion]:
+) -> Iterator[ObservedWrite]:
     """Iterate over the accepted commands to registers. Yield a command when its outcome is known.
 
     Args:
@@ -224,7 +226,7 @@ def _written(
     events: Cursor[Event],
     next_event: Next,
     timeout_s: float | None,
-) -> Iterator[Diversion]:
+) -> Iterator[ObservedWrite]:
     layout, gatherer = block.layout, CommandAssembler(EventKind.ACCEPTED)
     last = block.latest()
     image = bytearray(layout.size if last is None else last.image)
@@ -237,8 +239,8 @@ def _written(
             mask = bytearray(a & b for a, b in zip(mask, bits, strict=True))
             if any(mask):
                 found = decode_writes(layout, bytes(image), merge(image, mask, [(0, layout.size)]), names)
-                told = accepted.event
-                yield Diversion(found, told.writer, told.command, told.clock_ns, told.utc_ns, events.take_missed())
+                event, missed = accepted.event, events.take_missed()
+                yield ObservedWrite(found, event.writer, event.command, event.clock_ns, event.utc_ns, missed)
                 until_s = _deadline(timeout_s)
 
 
@@ -333,7 +335,7 @@ def _read(declarations: Iterable[Mapping[str, Any] | Declaration]) -> list[Decla
     return [msgspec.structs.replace(one, seed=secrets.randbits(53)) if one.seed is None else one for one in read]
 
 
-class Campaign(Following[Happening]):
+class Campaign(Following[InjectionEvent]):
     """Declared injections that this program has created.
 
     Iterate over the campaign to get their events. The iteration ends when all injections are
@@ -381,12 +383,12 @@ class Campaign(Following[Happening]):
         for source in sources:
             self._follow(blocks[source])
 
-    def _take(self) -> Happening | None:
+    def _take(self) -> InjectionEvent | None:
         for source, (block, cursor) in self._cursors.items():
             retired = block.retired  # before reading
             while (event := cursor.poll()) is not None:
                 if event.kind in _EVENTS and event.offset == 0 and (source, event.injection) in self._left:
-                    return self._happening(source, event)  # the first part, if the event has several
+                    return self._injection_event(source, event)  # the first part, if the event has several
             if cursor.take_missed():  # a lost event may have been that of a lifted injection
                 present = {one.number for one in block.standing.read() if not one.lifted}
                 self._left = {key: one for key, one in self._left.items() if key[0] != source or key[1] in present}
@@ -396,12 +398,12 @@ class Campaign(Following[Happening]):
             raise StopIteration
         return None
 
-    def _happening(self, source: str, event: Event) -> Happening:
+    def _injection_event(self, source: str, event: Event) -> InjectionEvent:
         lifted = event.kind == EventKind.LIFTED
         if lifted:
             del self._left[source, event.injection]
         run = event.item if event.kind in (EventKind.ACTIVATED, EventKind.DEACTIVATED) else 0
-        return Happening(
+        return InjectionEvent(
             source, event.injection, str(EventKind(event.kind)), event.clock_ns, event.utc_ns, event.frame,
             event.cycle, run, event.text if lifted else "",
         )  # fmt: skip

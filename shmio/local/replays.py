@@ -16,7 +16,7 @@ import msgspec
 
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.topic import look_up, parse_topic
-from shmio.model.replay import Playing, Wish
+from shmio.model.replay import ReplayChanges, ReplayStatus
 from shmio.segment.block import Block
 from shmio.segment.playhead import (
     MAX_SPEED,
@@ -80,16 +80,16 @@ class Replays:
         """Create the object. ``segment`` must be writable for any method but :meth:`status`."""
         self._segment = segment
 
-    def __call__(self, **wish: Unpack[Wish]) -> list[Playing]:
+    def __call__(self, **changes: Unpack[ReplayChanges]) -> list[ReplayStatus]:
         """Control the replays, and return their status: see ``replay`` of :class:`shmio.Cell`."""
         self._segment.require_running()
-        keys: dict[str, Any] = {**wish, "sources": tuple(wish.get("sources", ()))}
+        keys: dict[str, Any] = {**changes, "sources": tuple(changes.get("sources", ()))}
         for key in {"seek", "until"} & keys.keys():
             keys[key] = str(keys[key])
         wanted = ReplayRequest(**keys)
         return self.status(wanted.sources) if wanted.nothing else self.change(wanted)
 
-    def status(self, sources: Collection[str] = ()) -> list[Playing]:
+    def status(self, sources: Collection[str] = ()) -> list[ReplayStatus]:
         """Return the status of each replay.
 
         Args:
@@ -104,11 +104,11 @@ class Replays:
         plays = self._chosen(ReplayRequest(sources=tuple(sources)))
         return [_replay_status(source, play, now_ns) for source, play in plays.items()]
 
-    def pause(self) -> list[Playing]:
+    def pause(self) -> list[ReplayStatus]:
         """Pause all replays, and return their status."""
         return self.change(ReplayRequest(paused=True))
 
-    def play(self, speed: float | None = None) -> list[Playing]:
+    def play(self, speed: float | None = None) -> list[ReplayStatus]:
         """Resume all replays, and return their status. A replay at its end starts again.
 
         Args:
@@ -119,7 +119,7 @@ class Replays:
         """
         return self.change(ReplayRequest(paused=False, speed=speed))
 
-    def speed(self, speed: float) -> list[Playing]:
+    def speed(self, speed: float) -> list[ReplayStatus]:
         """Set the speed relative to the instance's clock, 0.01 to 1000, and return the status.
 
         Raises:
@@ -127,7 +127,7 @@ class Replays:
         """
         return self.change(ReplayRequest(speed=speed))
 
-    def seek(self, to: float | str) -> list[Playing]:
+    def seek(self, to: float | str) -> list[ReplayStatus]:
         """Go to a position, and return the status.
 
         Args:
@@ -138,15 +138,15 @@ class Replays:
         """
         return self.change(ReplayRequest(seek=str(to)))
 
-    def loop(self, on: bool = True) -> list[Playing]:
+    def loop(self, on: bool = True) -> list[ReplayStatus]:
         """Set whether replays start again at the end, and return their status."""
         return self.change(ReplayRequest(loop=on))
 
-    def play_until(self, to: float | str) -> list[Playing]:
+    def play_until(self, to: float | str) -> list[ReplayStatus]:
         """Play until a position, in the same form as for :meth:`seek`, and pause there."""
         return self.change(ReplayRequest(paused=False, until=str(to)))
 
-    def to_change(self, path: str, *, jump: bool = False) -> list[Playing]:
+    def to_change(self, path: str, *, jump: bool = False) -> list[ReplayStatus]:
         """Play until the next change of a register, and pause there.
 
         Args:
@@ -159,7 +159,7 @@ class Replays:
         """
         return self.change(ReplayRequest(change=path, jump=jump))
 
-    def to_event(self, kind: str, *, jump: bool = False) -> list[Playing]:
+    def to_event(self, kind: str, *, jump: bool = False) -> list[ReplayStatus]:
         """Play until the next event of a kind, of any source, and pause there.
 
         Args:
@@ -171,7 +171,7 @@ class Replays:
         """
         return self.change(ReplayRequest(event=kind, jump=jump))
 
-    def change(self, wanted: ReplayRequest, given_up: Callable[[], bool] = lambda: False) -> list[Playing]:
+    def change(self, wanted: ReplayRequest, given_up: Callable[[], bool] = lambda: False) -> list[ReplayStatus]:
         """Carry out a request, and return the status of the replays.
 
         Args:
@@ -367,9 +367,9 @@ def _position(play: PlayState, text: str) -> int:
     return position_ns
 
 
-def _replay_status(source: str, play: PlayState, clock_ns: int) -> Playing:
+def _replay_status(source: str, play: PlayState, clock_ns: int) -> ReplayStatus:
     position_ns = play.at_ns(clock_ns)
-    return Playing(
+    return ReplayStatus(
         source,
         (play.utc_ns + position_ns) / 1e9,
         (position_ns - play.begin_ns) / 1e9,

@@ -10,12 +10,12 @@ if TYPE_CHECKING:
     from shmio.layout.model import Layout
     from shmio.model.clock import Clock
     from shmio.model.event import Event
-    from shmio.model.injection import Declared, Happening, Injection, Lifted
-    from shmio.model.replay import Playing, Wish
+    from shmio.model.injection import Declared, Injection, InjectionEvent, Lifted
+    from shmio.model.replay import ReplayChanges, ReplayStatus
     from shmio.model.values import Outcome, Provenance, Quality, Reading
 
 
-class Held(Protocol):
+class Closable(Protocol):
     """A resource that stays open until the program closes it or leaves its ``with`` block."""
 
     def close(self) -> None:
@@ -90,7 +90,7 @@ class Update(Protocol):
         """
 
 
-class Subscription(Held, Protocol):
+class Subscription(Closable, Protocol):
     """Iterator over updates, for one thread. Any thread may close it, which ends the iteration."""
 
     def __iter__(self) -> Iterator[Update]:
@@ -107,7 +107,7 @@ class Subscription(Held, Protocol):
         """
 
 
-class Events(Held, Protocol):
+class Events(Closable, Protocol):
     """Iterator over events, for one thread. Any thread may close it, which ends the iteration.
 
     Events of one source come in order. When a reload has removed all sources, the iteration waits
@@ -121,7 +121,7 @@ class Events(Held, Protocol):
         """Wait for the next event. Raise NotRunningError if the instance has ended."""
 
 
-class Shadow(Held, Protocol):
+class Shadow(Closable, Protocol):
     """An injection to which this program gives values.
 
     Closing the object lifts the injection, unless the program laid it with ``keep``.
@@ -146,7 +146,7 @@ class Shadow(Held, Protocol):
         """
 
 
-class Campaign(Held, Protocol):
+class Campaign(Closable, Protocol):
     """Declared injections that this program has laid, and their events.
 
     Iterate over the campaign for the events. The iteration ends when all injections are lifted.
@@ -157,10 +157,10 @@ class Campaign(Held, Protocol):
     def declared(self) -> tuple[Declared, ...]:
         """The laid injections, in the order of the declarations."""
 
-    def __iter__(self) -> Iterator[Happening]:
+    def __iter__(self) -> Iterator[InjectionEvent]:
         """Return the object itself."""
 
-    def __next__(self) -> Happening:
+    def __next__(self) -> InjectionEvent:
         """Wait for the next event. Raise NotRunningError if the instance has ended."""
 
 
@@ -171,7 +171,7 @@ class ReadsClock(Protocol):
         """Return the present state of the clock."""
 
 
-class Cell(Held, Protocol):
+class Cell(Closable, Protocol):
     """A running cell.
 
     :func:`shmio.attach` returns a cell on this host, :func:`shmio.connect` a remote one, by gRPC.
@@ -345,13 +345,13 @@ class Cell(Held, Protocol):
             TimeError: Another program owns time, or time was virtual from the instance's start.
         """
 
-    def replay(self, **wish: Unpack[Wish]) -> list[Playing]:
+    def replay(self, **changes: Unpack[ReplayChanges]) -> list[ReplayStatus]:
         """Control the replays of recordings, and return their status.
 
         Without arguments, only return the status.
 
         Args:
-            wish: Requested changes: see :class:`shmio.model.replay.Wish`.
+            changes: Requested changes: see :class:`shmio.model.replay.ReplayChanges`.
 
         Raises:
             CommandError: The instance replays no recording, or a source does not answer.

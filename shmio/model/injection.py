@@ -72,7 +72,7 @@ class Declared:
 
 
 @dataclass(frozen=True, slots=True)
-class Happening:
+class InjectionEvent:
     """An event of a declared injection.
 
     Attributes:

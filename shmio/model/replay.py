@@ -8,7 +8,7 @@ from typing import TypedDict
 
 
 @dataclass(frozen=True, slots=True)
-class Playing:
+class ReplayStatus:
     """Status of one source that replays a recording.
 
     Unless paused, the position moves ``speed`` times as fast as the instance's clock.
@@ -36,7 +36,7 @@ class Playing:
     until_s: float | None = None
 
 
-class Wish(TypedDict, total=False):
+class ReplayChanges(TypedDict, total=False):
     """Requested changes of a replay.
 
     A time is given in seconds from the start of the played range, or as a date and time.

@@ -113,8 +113,8 @@ def local(client: Client) -> None:
                     return
             return
         while not client.stopping.is_set():
-            for diversion in shadow.diverted(timeout_s=PAUSE_S):
-                for value in diversion.values.values():
+            for write in shadow.diverted(timeout_s=PAUSE_S):
+                for value in write.values.values():
                     assert isinstance(value, int)
                     shadow.set({order.word: client.note(value + 1)})
             if not any(one.number == shadow.number for one in cell.injections(order.source)):

@@ -10,7 +10,7 @@ from shmio.client import calls, injection
 from shmio.client.aio.transport import Background, Channel, Condition, Duplex, Stream
 from shmio.client.update import Update
 from shmio.errors import CommandError, PathError, RemoteError, ShmioError
-from shmio.model.injection import Happening
+from shmio.model.injection import InjectionEvent
 from shmio.model.values import Outcome
 
 
@@ -22,14 +22,14 @@ class Shadow(AsyncIterator[Update]):
     the latest originals.
     """
 
-    def __init__(self, channel: Channel, stream: Duplex, held: injection.Held) -> None:
+    def __init__(self, channel: Channel, stream: Duplex, state: injection.ShadowState) -> None:
         self._channel = channel
         self._stream = stream
-        self._held = held
-        self.number = held.number
+        self._state = state
+        self.number = state.number
         """Number of the injection. Any program may lift the injection by its number."""
-        self.table = held.table
-        self._turn = Condition()
+        self.table = state.table
+        self._changed = Condition()
         self._answers: dict[int, Any] = {}  # by sequence number; None until the answer comes
         self._updates: list[Update] = []
         self._error: ShmioError | None = None
@@ -41,7 +41,7 @@ class Shadow(AsyncIterator[Update]):
         """Lay an injection; see :meth:`Client.inject`."""
         stream = Duplex(channel, method, first)
         try:
-            return cls(channel, stream, injection.Held(await stream.first()))
+            return cls(channel, stream, injection.ShadowState(await stream.first()))
         except BaseException:
             stream.close()
             raise
@@ -69,14 +69,14 @@ class Shadow(AsyncIterator[Update]):
             RemoteError: Somebody has lifted the injection, or the instance has ended.
         """
         values, raw = values or {}, list(raw)
-        async with self._turn:
+        async with self._changed:
             self._check()
-            sequence, data = self._held.request(values, arrays, raw, answered=True)
+            sequence, data = self._state.request(values, arrays, raw, answered=True)
             self._answers[sequence] = None
         try:
             await self._stream.write(data)
-            async with self._turn:
-                if not await self._turn.wait_until(
+            async with self._changed:
+                if not await self._changed.wait_until(
                     lambda: self._answers[sequence] is not None or self._over, calls.WRITE_PATIENCE_S
                 ):
                     raise RemoteError(f"{self._channel.target.address}: the endpoint did not answer in time")
@@ -96,21 +96,21 @@ class Shadow(AsyncIterator[Update]):
 
         A wrong value ends the injection; the next call raises the error.
         """
-        async with self._turn:
+        async with self._changed:
             self._check()
-            _, data = self._held.request(values or {}, arrays, raw, answered=False)
+            _, data = self._state.request(values or {}, arrays, raw, answered=False)
         await self._stream.write(data)
 
     async def __anext__(self) -> Update:
         """Wait for the next originals. They come only if the injection was laid with ``originals``."""
-        async with self._turn:
+        async with self._changed:
             if not self._updates:
-                await self._turn.wait_until(lambda: self._held.waits or self._over)
-                if not self._held.waits:
+                await self._changed.wait_until(lambda: self._state.waits or self._over)
+                if not self._state.waits:
                     if self._error is not None:
                         raise self._error
                     raise StopAsyncIteration
-                self._updates.extend(self._held.originals())
+                self._updates.extend(self._state.originals())
             return self._updates.pop(0)
 
     def _check(self) -> None:
@@ -123,18 +123,18 @@ class Shadow(AsyncIterator[Update]):
         error: ShmioError | None = None
         try:
             async for found in self._stream:
-                async with self._turn:
-                    self._held.keep(found)
+                async with self._changed:
+                    self._state.keep(found)
                     self._answers |= {
                         answer.sequence: answer.outcome for answer in found.answers if answer.sequence in self._answers
                     }
-                    self._turn.notify_all()
+                    self._changed.notify_all()
         except ShmioError as caught:
             error = caught
         finally:
-            async with self._turn:
+            async with self._changed:
                 self._error, self._over = error, True
-                self._turn.notify_all()
+                self._changed.notify_all()
 
     async def close(self) -> None:
         """Lift the injection, unless ``keep`` was given."""
@@ -157,7 +157,7 @@ class Lift(Protocol):
         """Lift an injection. Raise PathError or CommandError if that fails."""
 
 
-class Campaign(AsyncIterator[Happening]):
+class Campaign(AsyncIterator[InjectionEvent]):
     """Declared injections that were laid together.
 
     To follow their events, iterate over the campaign in one task. The iteration ends when all
@@ -171,7 +171,7 @@ class Campaign(AsyncIterator[Happening]):
         self._keep = keep
         self.declared = injection.declared(first)
         self._left = dict.fromkeys((one.source, one.number) for one in self.declared)
-        self._happened: list[Happening] = injection.happenings(first)
+        self._events: list[InjectionEvent] = injection.events(first)
 
     @classmethod
     async def lay(cls, stream: Stream, lift: Lift, *, keep: bool) -> Self:
@@ -182,18 +182,18 @@ class Campaign(AsyncIterator[Happening]):
             stream.close()
             raise
 
-    async def __anext__(self) -> Happening:
+    async def __anext__(self) -> InjectionEvent:
         """Wait for the next event.
 
         Raises:
             RemoteError: The events were not read fast enough, or the instance has ended.
         """
-        while not self._happened:
-            self._happened = injection.happenings(await anext(self._stream))
-        happened = self._happened.pop(0)
-        if happened.what == "lifted":
-            self._left.pop((happened.source, happened.number), None)
-        return happened
+        while not self._events:
+            self._events = injection.events(await anext(self._stream))
+        event = self._events.pop(0)
+        if event.what == "lifted":
+            self._left.pop((event.source, event.number), None)
+        return event
 
     async def close(self) -> None:
         """Lift the remaining injections, unless ``keep`` was given."""

@@ -103,7 +103,7 @@ class Duplex(Stream):
     def __init__(self, channel: Channel, method: Any, *first: Any) -> None:
         super().__init__(channel, method)
         self._first = first
-        self._turn = asyncio.Lock()  # gRPC accepts one message at a time
+        self._lock = asyncio.Lock()  # gRPC accepts one message at a time
 
     async def __anext__(self) -> Any:
         if self._first:
@@ -115,7 +115,7 @@ class Duplex(Stream):
 
         If the stream has ended, they are dropped, and reading raises the reason.
         """
-        async with self._turn:
+        async with self._lock:
             requests, self._first = (*self._first, *requests), ()
             with suppress(grpc.RpcError, asyncio.InvalidStateError), _closing():
                 for request in requests:

@@ -23,7 +23,7 @@ from shmio.errors import CommandError, ConflictError, PathError, RemoteError, Sh
 from shmio.layout.glob import choose
 from shmio.model.clock import Clock
 from shmio.model.injection import Injection, Lifted
-from shmio.model.replay import Playing, Wish
+from shmio.model.replay import ReplayChanges, ReplayStatus
 from shmio.model.values import Outcome, Reading
 from shmio.wire import shmio_v1_pb2 as wire
 from shmio.wire.shmio_v1_pb2_grpc import ShmioStub
@@ -419,13 +419,13 @@ class Client:
         """
         return self._move(self._stub.Release, wire.ReleaseRequest())
 
-    def replay(self, **wish: Unpack[Wish]) -> list[Playing]:
+    def replay(self, **changes: Unpack[ReplayChanges]) -> list[ReplayStatus]:
         """Control the replays of recordings, and return their status.
 
         Without arguments, only return the status.
 
         Args:
-            wish: Requested changes: see :class:`shmio.model.replay.Wish`. A replay that is resumed
+            changes: Requested changes: see :class:`shmio.model.replay.ReplayChanges`. A replay that is resumed
                 at its end starts again.
 
         Raises:
@@ -433,8 +433,8 @@ class Client:
             PathError: There is no such source or register.
             CommandError: There is no replay, the search found nothing, or a source does not answer.
         """
-        found = self._call(self._stub.Replay, calls.replay_request(wish), calls.replay_patience_s(wish))
-        return calls.playing(found)
+        found = self._call(self._stub.Replay, calls.replay_request(changes), calls.replay_patience_s(changes))
+        return calls.replay_status(found)
 
     def _move(self, method: Callable[..., Any], request: Any, timeout_s: float | None = None) -> Clock:
         """Call a method that controls time. Raise TimeError if the endpoint refuses, or a step failed."""

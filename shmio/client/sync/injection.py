@@ -11,7 +11,7 @@ from shmio.client import calls, injection
 from shmio.client.sync.transport import Background, Channel, Condition, Duplex, Stream
 from shmio.client.update import Update
 from shmio.errors import CommandError, PathError, RemoteError, ShmioError
-from shmio.model.injection import Happening
+from shmio.model.injection import InjectionEvent
 from shmio.model.values import Outcome
 
 
@@ -23,14 +23,14 @@ class Shadow(Iterator[Update]):
     the latest originals.
     """
 
-    def __init__(self, channel: Channel, stream: Duplex, held: injection.Held) -> None:
+    def __init__(self, channel: Channel, stream: Duplex, state: injection.ShadowState) -> None:
         self._channel = channel
         self._stream = stream
-        self._held = held
-        self.number = held.number
+        self._state = state
+        self.number = state.number
         """Number of the injection. Any program may lift the injection by its number."""
-        self.table = held.table
-        self._turn = Condition()
+        self.table = state.table
+        self._changed = Condition()
         self._answers: dict[int, Any] = {}  # by sequence number; None until the answer comes
         self._updates: list[Update] = []
         self._error: ShmioError | None = None
@@ -42,7 +42,7 @@ class Shadow(Iterator[Update]):
         """Lay an injection; see :meth:`Client.inject`."""
         stream = Duplex(channel, method, first)
         try:
-            return cls(channel, stream, injection.Held(stream.first()))
+            return cls(channel, stream, injection.ShadowState(stream.first()))
         except BaseException:
             stream.close()
             raise
@@ -70,14 +70,14 @@ class Shadow(Iterator[Update]):
             RemoteError: Somebody has lifted the injection, or the instance has ended.
         """
         values, raw = values or {}, list(raw)
-        with self._turn:
+        with self._changed:
             self._check()
-            sequence, data = self._held.request(values, arrays, raw, answered=True)
+            sequence, data = self._state.request(values, arrays, raw, answered=True)
             self._answers[sequence] = None
         try:
             self._stream.write(data)
-            with self._turn:
-                if not self._turn.wait_until(
+            with self._changed:
+                if not self._changed.wait_until(
                     lambda: self._answers[sequence] is not None or self._over, calls.WRITE_PATIENCE_S
                 ):
                     raise RemoteError(f"{self._channel.target.address}: the endpoint did not answer in time")
@@ -97,21 +97,21 @@ class Shadow(Iterator[Update]):
 
         A wrong value ends the injection; the next call raises the error.
         """
-        with self._turn:
+        with self._changed:
             self._check()
-            _, data = self._held.request(values or {}, arrays, raw, answered=False)
+            _, data = self._state.request(values or {}, arrays, raw, answered=False)
         self._stream.write(data)
 
     def __next__(self) -> Update:
         """Wait for the next originals. They come only if the injection was laid with ``originals``."""
-        with self._turn:
+        with self._changed:
             if not self._updates:
-                self._turn.wait_until(lambda: self._held.waits or self._over)
-                if not self._held.waits:
+                self._changed.wait_until(lambda: self._state.waits or self._over)
+                if not self._state.waits:
                     if self._error is not None:
                         raise self._error
                     raise StopIteration
-                self._updates.extend(self._held.originals())
+                self._updates.extend(self._state.originals())
             return self._updates.pop(0)
 
     def _check(self) -> None:
@@ -124,18 +124,18 @@ class Shadow(Iterator[Update]):
         error: ShmioError | None = None
         try:
             for found in self._stream:
-                with self._turn:
-                    self._held.keep(found)
+                with self._changed:
+                    self._state.keep(found)
                     self._answers |= {
                         answer.sequence: answer.outcome for answer in found.answers if answer.sequence in self._answers
                     }
-                    self._turn.notify_all()
+                    self._changed.notify_all()
         except ShmioError as caught:
             error = caught
         finally:
-            with self._turn:
+            with self._changed:
                 self._error, self._over = error, True
-                self._turn.notify_all()
+                self._changed.notify_all()
 
     def close(self) -> None:
         """Lift the injection, unless ``keep`` was given."""
@@ -158,7 +158,7 @@ class Lift(Protocol):
         """Lift an injection. Raise PathError or CommandError if that fails."""
 
 
-class Campaign(Iterator[Happening]):
+class Campaign(Iterator[InjectionEvent]):
     """Declared injections that were laid together.
 
     To follow their events, iterate over the campaign in one thread. The iteration ends when all
@@ -172,7 +172,7 @@ class Campaign(Iterator[Happening]):
         self._keep = keep
         self.declared = injection.declared(first)
         self._left = dict.fromkeys((one.source, one.number) for one in self.declared)
-        self._happened: list[Happening] = injection.happenings(first)
+        self._events: list[InjectionEvent] = injection.events(first)
 
     @classmethod
     def lay(cls, stream: Stream, lift: Lift, *, keep: bool) -> Self:
@@ -183,18 +183,18 @@ class Campaign(Iterator[Happening]):
             stream.close()
             raise
 
-    def __next__(self) -> Happening:
+    def __next__(self) -> InjectionEvent:
         """Wait for the next event.
 
         Raises:
             RemoteError: The events were not read fast enough, or the instance has ended.
         """
-        while not self._happened:
-            self._happened = injection.happenings(next(self._stream))
-        happened = self._happened.pop(0)
-        if happened.what == "lifted":
-            self._left.pop((happened.source, happened.number), None)
-        return happened
+        while not self._events:
+            self._events = injection.events(next(self._stream))
+        event = self._events.pop(0)
+        if event.what == "lifted":
+            self._left.pop((event.source, event.number), None)
+        return event
 
     def close(self) -> None:
         """Lift the remaining injections, unless ``keep`` was given."""

@@ -23,7 +23,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from shmio.endpoints.web.served import Served
 from shmio.endpoints.web.sessions import User
 from shmio.errors import ShmioError
-from shmio.model.cell import Held
+from shmio.model.cell import Closable
 
 MAX_CALLS: Final = 16
 """Maximum number of a page's calls that may be in progress. The page's next call waits."""
@@ -79,9 +79,9 @@ def call(
     return mark
 
 
-def release(held: Iterable[Held]) -> None:
-    """Close what a page held. What another program has ended, or a source that has ended, is skipped."""
-    for one in held:
+def release(resources: Iterable[Closable]) -> None:
+    """Close resources of a page. Skip those that another program or a source has ended."""
+    for one in resources:
         with suppress(ShmioError):
             one.close()
 

@@ -19,7 +19,7 @@ from shmio.config import Declaration
 from shmio.layout.model import Layout, Register
 from shmio.model.cell import Cell
 from shmio.model.clock import Clock, ClockMode
-from shmio.model.injection import Happening
+from shmio.model.injection import InjectionEvent
 from shmio.segment import BlockSpec, ProcessSpec, Segment
 
 LAYOUT = Layout("DB1", 1, 4, False, (Register("a", "INT", (), 0, None, 2, 1), Register("b", "INT", (), 2, None, 2, 1)))
@@ -65,7 +65,7 @@ class Still:
     clock = Clock(ClockMode.VIRTUAL, time_ns=3_000_000_000)
     declared = ()
 
-    def __iter__(self) -> Iterator[Happening]:
+    def __iter__(self) -> Iterator[InjectionEvent]:
         return iter(())
 
     @contextmanager

@@ -20,7 +20,7 @@ class InjectionFollower:
     The event loop's thread calls the methods.
     """
 
-    def happened(self, event: Event) -> None:
+    def on_event(self, event: Event) -> None:
         """Handle an event: the injection was laid, activated, deactivated or lifted."""
 
     def divert(self, diverted: CommandWrites) -> None:
@@ -72,7 +72,7 @@ class InjectionFollowers:
                 listener.accept(event)
         elif event.kind in _STACKED and not event.offset:  # only the first part of a long declaration
             if follower := self._followers.get(event.injection):
-                follower.happened(event)
+                follower.on_event(event)
                 if event.kind == EventKind.LIFTED:
                     del self._followers[event.injection]
                     follower.lifted(event.text)

@@ -154,11 +154,11 @@ class DeclareCall:
             else:
                 await self._wake.wait()
 
-    def tell(self, happening: wire.Happening) -> None:
+    def add_event(self, event: wire.Happening) -> None:
         """Queue an event of one of the injections for the client."""
         if self.over:
             return
-        if reason := self._waiting.add(field(_HAPPENINGS, happening.SerializeToString())):
+        if reason := self._waiting.add(field(_HAPPENINGS, event.SerializeToString())):
             self.end(reason)
         self._wake.set()
 
@@ -211,12 +211,12 @@ class DeclaredInjection(InjectionFollower):
         """True if the injection has ended."""
         self._campaign = campaign
 
-    def happened(self, event: Event) -> None:
+    def on_event(self, event: Event) -> None:
         """Record that the injection was laid, activated, deactivated or lifted."""
         kind = EventKind(event.kind)
         turned = kind in (EventKind.ACTIVATED, EventKind.DEACTIVATED)
         self.gone = kind is EventKind.LIFTED
-        self._campaign.tell(
+        self._campaign.add_event(
             wire.Happening(
                 source=self.source,
                 number=event.injection,
@@ -236,7 +236,7 @@ class DeclaredInjection(InjectionFollower):
             self.gone = True
             now_ns = self.commands.block.clock.read().present_ns
             lifted = wire.Happening.KIND_LIFTED
-            self._campaign.tell(
+            self._campaign.add_event(
                 wire.Happening(source=self.source, number=self.number, kind=lifted, clock_ns=now_ns, text=reason)
             )
 

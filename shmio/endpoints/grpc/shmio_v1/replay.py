@@ -12,7 +12,7 @@ import grpc
 from shmio.endpoints.grpc.server.error_status import Context, refuse
 from shmio.errors import ShmioError, ValueRangeError
 from shmio.local.replays import ReplayRequest, Replays
-from shmio.model.replay import Playing
+from shmio.model.replay import ReplayStatus
 from shmio.segment import Segment
 from shmio.wire import shmio_v1_pb2 as wire
 
@@ -51,9 +51,9 @@ class ReplayCalls:
                 found = await self._change(wanted)
         except ShmioError as error:
             await refuse(context, error)
-        return wire.ReplayResponse(sources=map(_playing, found))
+        return wire.ReplayResponse(sources=map(_to_wire, found))
 
-    async def _change(self, wanted: ReplayRequest) -> list[Playing]:
+    async def _change(self, wanted: ReplayRequest) -> list[ReplayStatus]:
         over = threading.Event()
         async with self._turn:
             try:
@@ -85,5 +85,5 @@ def _wanted(request: wire.ReplayRequest) -> ReplayRequest:
     )
 
 
-def _playing(play: Playing) -> wire.Playing:
+def _to_wire(play: ReplayStatus) -> wire.Playing:
     return wire.Playing(**dataclasses.asdict(play))

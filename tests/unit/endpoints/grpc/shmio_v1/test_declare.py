@@ -12,7 +12,7 @@ from typing import Any
 import grpc
 import pytest
 
-from shmio.client import Client, Happening, connect
+from shmio.client import Client, InjectionEvent, connect
 from shmio.errors import CommandError, ValueRangeError
 from shmio.injection import Program
 from shmio.local.reading import View
@@ -47,7 +47,7 @@ EVERY_OPERATION: list[dict[str, Any]] = [
 ]
 
 
-def until(campaign: Iterator[Happening], what: str) -> Happening:
+def until(campaign: Iterator[InjectionEvent], what: str) -> InjectionEvent:
     return next(one for one in campaign if one.what == what)
 
 

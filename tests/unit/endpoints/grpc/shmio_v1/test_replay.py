@@ -45,7 +45,7 @@ def test_a_client_controls_the_replay(tmp_path: Path, instance: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("wish", "error"),
+    ("changes", "error"),
     [
         ({"speed": 0.0}, ValueRangeError),
         ({"seek": 1}, ValueRangeError),
@@ -57,12 +57,12 @@ def test_a_client_controls_the_replay(tmp_path: Path, instance: str) -> None:
     ],
 )
 def test_invalid_replay_requests_are_refused(
-    tmp_path: Path, instance: str, wish: object, error: type[ShmioError]
+    tmp_path: Path, instance: str, changes: object, error: type[ShmioError]
 ) -> None:
     async def test(served: Endpoint, _: Playing) -> None:
         def call() -> None:
             with connect(f"127.0.0.1:{served.port}") as cell, pytest.raises(error):
-                cell.replay(**wish)  # type: ignore[arg-type]
+                cell.replay(**changes)  # type: ignore[arg-type]
 
         await asyncio.to_thread(call)
 
