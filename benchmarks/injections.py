@@ -20,7 +20,7 @@ from shmio.config import Declaration
 from shmio.connectors.commands import CommandProcessor
 from shmio.connectors.output import Image, Output
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Provenance, Quality, Segment
-from shmio.segment.standing_injections import declared_document
+from shmio.segment.injection_list import declared_document
 
 LAYOUT = db201()
 AXES = [f"cell/Robot_{robot}/Axs{axis}_Pos" for robot in (800, 825, 850) for axis in range(1, 7)]
@@ -98,7 +98,7 @@ def main() -> None:
     for name, values in samples.items():
         best, middle = min(values), statistics.median(values)
         rows.append([name, f"{best / 1000:.1f}", f"{middle / 1000:.1f}", f"{(best - none) / 1000:+.1f}"])
-    table(["standing", "best", "median", "beyond none"], rows)
+    table(["injections", "best", "median", "beyond none"], rows)
 
 
 if __name__ == "__main__":

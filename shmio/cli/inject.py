@@ -149,9 +149,9 @@ def _lift(cell: Cell, options: argparse.Namespace) -> int:
 def _list(cell: Cell, *, as_json: bool) -> None:
     """Print the present injections with their registers."""
     found: list[dict[str, Any]] = []
-    standing = cell.injections()
-    layouts = cell.layouts() if standing else {}
-    for one in standing:
+    present = cell.injections()
+    layouts = cell.layouts() if present else {}
+    for one in present:
         bits = (Write(offset, mask, bytes(size)) for offset, size, mask in one.ranges)
         over = [f"{one.source}/{path}" for path in paths_of(layouts[one.source], bits)]
         fields = msgspec.to_builtins(one)

@@ -42,7 +42,7 @@ from shmio.model.injection import Running
 from shmio.segment import NO_WRITER, Block, Command, CommandKind, Direction, EventKind, Frame, Quality, Record
 from shmio.segment.block import Layouts
 from shmio.segment.events import EVENT_SLOTS
-from shmio.segment.standing_injections import StandingInjection
+from shmio.segment.injection_list import InjectionEntry
 
 LOOK_NS: Final = 400_000_000
 """Period in ns at which owners are checked, so that an injection ends within 1 s after its client."""
@@ -157,18 +157,18 @@ class DeclaredInjections:
         time_ns = self._time_ns(frame.cycle) if self._own.playhead is None else frame.clock_ns
         self._publisher.injections.now = CycleImage(frame.cycle, time_ns, frame.raw)
 
-    def resume(self, standing: StandingInjection, running: Running[Declaration], seen: Bits) -> None:
+    def resume(self, entry: InjectionEntry, running: Running[Declaration], seen: Bits) -> None:
         """Resume an injection of the source's previous process.
 
         ``seen`` is the image that readers saw last.
         """
-        owner = Owner(standing.writer, standing.pid)
+        owner = Owner(entry.writer, entry.pid)
         try:
             program = self._program(running.declaration)
-            layer = declared(standing.number, program, owner, running.seed, keep=standing.keep)
+            layer = declared(entry.number, program, owner, running.seed, keep=entry.keep)
             layer.resume(running, seen)
         except (ConfigError, ValueError) as error:
-            log.warning("injection %s cannot be resumed: %s", standing.name, error)
+            log.warning("injection %s cannot be resumed: %s", entry.name, error)
             return
         self._publisher.restore(layer)
         self._settle()
@@ -507,9 +507,9 @@ class InjectionProcessor:
         seen = np.frombuffer(image, np.uint8)
         if last is not None:
             self.declared.seen(last)
-        standing = block.standing.read()
-        covers = [_cover(one, block.layout.size) for one in standing]
-        for place, one in enumerate(standing):
+        present = block.injections.read()
+        covers = [_cover(one, block.layout.size) for one in present]
+        for place, one in enumerate(present):
             if one.running is not None:
                 self.declared.resume(one, one.running, seen)
                 continue
@@ -518,7 +518,7 @@ class InjectionProcessor:
             layer = Layer(one.number, direction, one.priority, one.keep, one.name, owner, covers[place], seen.copy())
             self._publisher.restore(layer)
             hidden = np.zeros(block.layout.size, np.uint8)
-            for outer, cover in zip(standing[place + 1 :], covers[place + 1 :], strict=True):
+            for outer, cover in zip(present[place + 1 :], covers[place + 1 :], strict=True):
                 if outer.direction == "out" and outer.active:
                     hidden |= cover & layer.cover
             if direction is Direction.OUT and hidden.any():
@@ -539,8 +539,8 @@ class InjectionProcessor:
         return values
 
 
-def _cover(standing: StandingInjection, size: int) -> Bits:
+def _cover(entry: InjectionEntry, size: int) -> Bits:
     cover = np.zeros(size, np.uint8)
-    for offset, count, mask in standing.ranges:
+    for offset, count, mask in entry.ranges:
         cover[offset : offset + count] = mask
     return cover

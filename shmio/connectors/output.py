@@ -17,7 +17,7 @@ from shmio.connectors.injection_layers import DeclaredLayer, Layer, LayerStack
 from shmio.layout.values.write import Write
 from shmio.segment import NO_WRITER, BlockWriter, Command, Direction, EventKind, Provenance, Quality, Record, Stamp
 from shmio.segment.events import EVENT_DATA_SIZE
-from shmio.segment.standing_injections import StandingInjection, encode, ranges_of
+from shmio.segment.injection_list import InjectionEntry, encode, ranges_of
 
 EXTRA_FRAMES: Final = 4
 """Largest number of frames in a period in addition to the cycle's own frame.
@@ -306,17 +306,17 @@ class LayerPublisher:
 
         """
         items = (self._item(layer) for layer in self.injections.layers)
-        self.output.writer.block.standing.write(encode(items, growth))
+        self.output.writer.block.injections.write(encode(items, growth))
 
     def _item(self, layer: Layer) -> bytes:
         running = layer.running if isinstance(layer, DeclaredLayer) else None
         shown = self._shown.get(layer.id)
         if shown is None or shown[0] != running:
-            standing = StandingInjection(
+            entry = InjectionEntry(
                 layer.id, layer.direction.name.lower(), layer.priority, layer.keep, layer.name,
                 layer.owner.writer, layer.owner.pid, self._ranges[layer.id], running,
             )  # fmt: skip
-            shown = self._shown[layer.id] = running, msgspec.json.encode(standing)
+            shown = self._shown[layer.id] = running, msgspec.json.encode(entry)
         return shown[1]
 
 

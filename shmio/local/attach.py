@@ -43,9 +43,9 @@ from shmio.model.injection import Injection, Lifted, Running
 from shmio.model.values import Outcome, Quality, Reading
 from shmio.segment.block import Block, Cursor, Entry, Frame, Layouts
 from shmio.segment.commands import Direction
+from shmio.segment.injection_list import InjectionEntry
 from shmio.segment.processes import Activity, Report
 from shmio.segment.segment import Segment, running_instances
-from shmio.segment.standing_injections import StandingInjection
 
 _TURN_S: Final = 1.0
 """Interval at which a waiting reader checks that the instance still runs, in s."""
@@ -426,7 +426,7 @@ class Attachment:
         return [
             _with_source(source, one)
             for source in dict.fromkeys(sources) or self._blocks()
-            for one in self.block(source).standing.read()
+            for one in self.block(source).injections.read()
         ]
 
     def lift(self, source: str, number: int) -> None:
@@ -443,7 +443,7 @@ class Attachment:
         """
         self._segment.require_running()
         block = self.block(source)
-        if not any(one.number == number and not one.lifted for one in block.standing.read()):
+        if not any(one.number == number and not one.lifted for one in block.injections.read()):
             raise PathError(f"{source}: there is no injection {number}; injections() lists them")
         self._source_writer(block).lift(number)
 
@@ -459,9 +459,9 @@ class Attachment:
         """
         self._segment.require_running()
         blocks = [self.block(source) for source in dict.fromkeys(sources) or self._blocks()]
-        standing = [(block, one) for block in blocks for one in block.standing.read() if not one.lifted]
-        lift_all([(self._source_writer(block), one.number) for block, one in standing])
-        return [Lifted(block.source, one.number, one.name) for block, one in standing]
+        present = [(block, one) for block in blocks for one in block.injections.read() if not one.lifted]
+        lift_all([(self._source_writer(block), one.number) for block, one in present])
+        return [Lifted(block.source, one.number, one.name) for block, one in present]
 
     def note(self, text: str, source: str | None = None) -> None:
         """Add a note to a source's events. Recordings contain it, too.
@@ -676,7 +676,7 @@ def _of_one_source(
     return blocks[sources.pop()], topics
 
 
-def _with_source(source: str, one: StandingInjection) -> Injection[Mapping[str, Any]]:
+def _with_source(source: str, one: InjectionEntry) -> Injection[Mapping[str, Any]]:
     """Convert an injection from the form in the segment to the form that programs get."""
     now, running = one.running, None
     if now is not None:

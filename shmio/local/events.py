@@ -31,7 +31,7 @@ class EventReader:
         self.block = block
         self._cursor = block.events.cursor(after=after)
         self._explainer = Explainer(block.source, block.layout, MAX_PATHS)
-        self._explainer.know(block.standing.read())
+        self._explainer.know(block.injections.read())
         self._missed = 0  # number of events lost before the next one
         self._last: segment_events.Event | None = None
 
@@ -50,7 +50,7 @@ class EventReader:
         while (event := self._cursor.poll()) is not None:
             if missed := self._cursor.take_missed():
                 self._missed += missed
-                self._explainer.resume(self.block.standing.read(), self.block.events.head())
+                self._explainer.resume(self.block.injections.read(), self.block.events.head())
             self._last = event
             explained = self._explainer.explain(event)
             if explained.partial:

@@ -390,7 +390,7 @@ class Campaign(Following[InjectionEvent]):
                 if event.kind in _EVENTS and event.offset == 0 and (source, event.injection) in self._left:
                     return self._injection_event(source, event)  # the first part, if the event has several
             if cursor.take_missed():  # a lost event may have been that of a lifted injection
-                present = {one.number for one in block.standing.read() if not one.lifted}
+                present = {one.number for one in block.injections.read() if not one.lifted}
                 self._left = {key: one for key, one in self._left.items() if key[0] != source or key[1] in present}
             if retired:
                 self._left = {key: one for key, one in self._left.items() if key[0] != source}
@@ -438,7 +438,7 @@ def lift_all(injections: Iterable[tuple[SourceWriter, int]]) -> None:
     left = [
         number
         for source_writer, number in chosen
-        if any(one.number == number and not one.lifted for one in source_writer.block.standing.read())
+        if any(one.number == number and not one.lifted for one in source_writer.block.injections.read())
     ]
     if left:
         raise CommandError(f"{len(left)} of {len(chosen)} injections were not lifted: {'; '.join(reasons)}")

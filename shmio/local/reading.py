@@ -157,8 +157,8 @@ def injected(block: Block, registers: Sequence[Register], frame: Frame) -> bool:
     """Return whether an injection covers any of these registers in a frame."""
     if frame.effective is None:
         return False
-    standing = [one for one in block.standing.read() if one.direction == "out"]
-    return any(one.covers(register) for register in registers for one in standing)
+    present = [one for one in block.injections.read() if one.direction == "out"]
+    return any(one.covers(register) for register in registers for one in present)
 
 
 def holds_none(value: Value) -> bool:

@@ -265,7 +265,7 @@ class _Follower:
         frames.take(frame, aged=aged)
         # The reason of a stale frame contains its age. A change of the age alone is ignored.
         reason = frames.reason.partition(":")[0]
-        state = frames.quality, reason, frame.provenance, frame.incarnation, self.block.standing.sequence
+        state = frames.quality, reason, frame.provenance, frame.incarnation, self.block.injections.sequence
         if shown is None or state != self._state:
             changed: Sequence[int] = range(len(self._registers))
         elif frame is shown:

@@ -18,7 +18,7 @@ from shmio.layout.model import Layout
 from shmio.layout.values.write import cover
 from shmio.model.injection import Running
 from shmio.segment import NO_WRITER, Provenance
-from shmio.segment.standing_injections import StandingInjection, declared_document, encode, ranges_of
+from shmio.segment.injection_list import InjectionEntry, declared_document, encode, ranges_of
 
 
 def check_injections(config: Config, layouts: Mapping[str, Layout]) -> tuple[dict[str, bytes], tuple[str, ...]]:
@@ -67,16 +67,16 @@ def _document(source: str, programs: list[Program]) -> bytes:
     try:
         if len(programs) > MAX_INJECTIONS:
             raise ValueError(f"at most {MAX_INJECTIONS} are allowed")
-        encode([msgspec.json.encode(_standing(program)) for program in programs], GROWTH * len(programs))
+        encode([msgspec.json.encode(_to_entry(program)) for program in programs], GROWTH * len(programs))
         return declared_document(declarations)
     except ValueError as error:
         raise ConfigError(f"injection: source {source!r} has {len(programs)} injections: {error}") from None
 
 
-def _standing(program: Program) -> StandingInjection:
+def _to_entry(program: Program) -> InjectionEntry:
     """Return a declared injection in the form in which its source's process publishes it."""
     declaration = program.declaration
-    return StandingInjection(
+    return InjectionEntry(
         2**64 - 1, program.direction, declaration.priority, True, declaration.name, NO_WRITER, 0,
         ranges_of(program.cover.tobytes()), Running(declaration, "waiting", 2**63 - 1),
     )  # fmt: skip

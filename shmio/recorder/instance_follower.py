@@ -182,7 +182,7 @@ class ProcessWatch:
             changes += _between(name, before.get(name), now)
         return changes
 
-    def standing(self) -> list[ProcessChange]:
+    def present(self) -> list[ProcessChange]:
         """Return a process change for each process that ran or had failed at the last check."""
         found = []
         for name, state in self._known.items():
@@ -326,9 +326,9 @@ class InstanceFollower:
             entries += self._asides(self._watch.look())
         return entries, more
 
-    def standing(self) -> list[InstanceEntry]:
+    def present(self) -> list[InstanceEntry]:
         """Return the present state of the processes as entries."""
-        return self._asides(self._watch.standing())
+        return self._asides(self._watch.present())
 
     def _asides(self, changes: Iterable[ProcessChange]) -> list[InstanceEntry]:
         now_ns = self.now()

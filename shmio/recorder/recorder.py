@@ -285,7 +285,7 @@ class Recorder:
         full = self.output.full
         if self._unaware and not full:
             self._unaware = False
-            entries = [*(entry for entry in entries if not is_process_change(entry)), *self.tap.standing()]
+            entries = [*(entry for entry in entries if not is_process_change(entry)), *self.tap.present()]
         for entry in entries:
             if full:
                 self._lose(entry)

@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from shmio.segment._atomics import FrameTuple
     from shmio.segment.clock import ClockPage
     from shmio.segment.commands import CommandQueues
+    from shmio.segment.injection_list import DeclaredCell, InjectionListCell
     from shmio.segment.model_channel import ModelChannel
     from shmio.segment.playhead import Playhead
-    from shmio.segment.standing_injections import DeclaredCell, StandingCell
 
 
 class Frame(NamedTuple):
@@ -263,7 +263,7 @@ class Block:
         ring: Ring,
         events: Ring,
         commands: CommandQueues,
-        standing: StandingCell,
+        injections: InjectionListCell,
         declared: DeclaredCell,
         attributes: Attributes,
         retired: Callable[[], bool],
@@ -282,7 +282,7 @@ class Block:
         self.ring = ring
         self.events = EventRing(events, retired)
         self.commands = commands
-        self.standing = standing
+        self.injections = injections
         """The existing injections of the source."""
         self.declared = declared
         """The injections that the configuration declares for the source."""

@@ -61,7 +61,7 @@ class SectionKind(IntEnum):
     EVENTS = 3
     COMMANDS = 4
     SOURCE = 5
-    STANDING = 6
+    INJECTIONS = 6
     CLOCK = 7
     DECLARED = 8
     LINK = 9

@@ -32,11 +32,11 @@ from shmio.segment.clock import ClockPage, page_size, time_lock
 from shmio.segment.commands import CommandQueues
 from shmio.segment.events import EVENT_SIZE, EVENT_SLOTS
 from shmio.segment.header import HEADER_SIZE, SECTION_SIZE, SLOT_SIZE, Header, SectionEntry, SectionKind, State
+from shmio.segment.injection_list import CELL_SIZE, declared_cell, injection_list_cell
 from shmio.segment.model_channel import ModelChannel
 from shmio.segment.playhead import PLAYHEAD_SIZE, Playhead
 from shmio.segment.processes import GUEST_SLOTS, SUPERVISOR_LOCK, ProcessSpec, ProcessTable, supervisor_beat
 from shmio.segment.shm import SharedObject
-from shmio.segment.standing_injections import CELL_SIZE, declared_cell, standing_cell
 from shmio.version import __version__
 
 PREFIX = "shmio-"
@@ -89,7 +89,7 @@ class BlockSpec:
     """Maximum size of the frame ring, in bytes."""
     attributes: Attributes = field(default_factory=Attributes)
     declared: bytes = b""
-    """The declared injections, as a JSON document of at most STANDING_SIZE bytes."""
+    """The declared injections, as a JSON document of at most LIST_SIZE bytes."""
 
     @property
     def slot_bytes(self) -> int:
@@ -128,7 +128,7 @@ class BlockSpec:
             (SectionKind.EVENTS, _atomics.RING_HEADER_SIZE + EVENT_SLOTS * _EVENT_STRIDE, events),
             (SectionKind.COMMANDS, commands.section_size(self.layout.size), queues),
             (SectionKind.SOURCE, len(attributes), attributes),
-            (SectionKind.STANDING, CELL_SIZE, b""),
+            (SectionKind.INJECTIONS, CELL_SIZE, b""),
             (SectionKind.DECLARED, CELL_SIZE, bytes(8) + self.declared),
             *([(SectionKind.LINK, *model_channel.section(linked, self.slot_bytes))] if self.attributes.remote else []),
             *([(SectionKind.PLAYHEAD, PLAYHEAD_SIZE, b"")] if self.attributes.replay else []),
@@ -182,7 +182,7 @@ def read_block(
         frames = _atomics.Ring(memory, *part(SectionKind.FRAMES))
         events = _atomics.Ring(memory, *part(SectionKind.EVENTS))
         queues = CommandQueues(memory, *part(SectionKind.COMMANDS))
-        standing = standing_cell(memory, *part(SectionKind.STANDING))
+        injections = injection_list_cell(memory, *part(SectionKind.INJECTIONS))
         declared = declared_cell(memory, *part(SectionKind.DECLARED))
         lock_byte = head.process_capacity + _FIRST_LINK + layout_at
         channel = ModelChannel(shared, memory, *part(SectionKind.LINK), lock_byte) if attributes.remote else None
@@ -208,7 +208,7 @@ def read_block(
         return found
 
     return Block(
-        described.name, layout, frames, events, queues, standing, declared, attributes,
+        described.name, layout, frames, events, queues, injections, declared, attributes,
         lambda: header.retired(memory, head, layout_at), layout_at, clock, channel, playhead,
     )  # fmt: skip
 

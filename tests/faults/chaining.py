@@ -17,7 +17,7 @@ from tests.faults.checker import Checker
 from tests.faults.checks import Source, word_at
 from tests.faults.configuration import CHAINED, PRIORITY
 from tests.faults.inject_checks import INNER, OUTER, ChainCheck, LifeCheck
-from tests.faults.injecting import BEGIN_S, EFFECT_NS, NUMBERS, PAUSE_S, Awake, Client, standing
+from tests.faults.injecting import BEGIN_S, EFFECT_NS, NUMBERS, PAUSE_S, Awake, Client, present_injections
 from tests.faults.injector import Order
 from tests.faults.local import attached
 from tests.faults.plc import CHAINED_AT
@@ -91,7 +91,7 @@ class Chaining:
         stands = True
         while stands and self._goes_on:
             renewed = self._tick(source, check, clients, section)
-            stands = any(one.name == name for one in standing(self._attachment, source.name, "c"))
+            stands = any(one.name == name for one in present_injections(self._attachment, source.name, "c"))
             life.look(
                 time.monotonic_ns(), stands=stands, awake_since_ns=self._awake.since_ns(source.name, "grpc"),
                 slack_ns=self._checker.slack_ns, renewed=renewed,
@@ -135,7 +135,7 @@ class Chaining:
 
     def _parts(self, source: Source) -> set[str]:
         """Return which injections of the pair are on the block."""
-        return {one.name.rpartition(" ")[2] for one in standing(self._attachment, source.name, "c")}
+        return {one.name.rpartition(" ")[2] for one in present_injections(self._attachment, source.name, "c")}
 
 
 def _settled(clients: dict[str, Client]) -> bool:

@@ -116,7 +116,7 @@ class ChainCheck:
     source: Source
     complain: Complain
     counts: Counts = field(default_factory=Counts)
-    _standing: AbstractSet[str] | None = None
+    _present: AbstractSet[str] | None = None
     _since_ns: int = 0
     _relayed: bool = False
     _missed_ns: dict[str, int] = field(default_factory=dict)
@@ -125,44 +125,44 @@ class ChainCheck:
         """Begin with a new pair of clients."""
         self._missed_ns = {}
 
-    def look(self, shown: int, publish_ns: int, now_ns: int, standing: AbstractSet[str] | None) -> bool:
+    def look(self, shown: int, publish_ns: int, now_ns: int, present: AbstractSet[str] | None) -> bool:
         """Check the newest frame; return whether it shows a value of the outer client.
 
         Args:
             shown: The value of the word.
             publish_ns: CLOCK_MONOTONIC when the frame was published.
             now_ns: CLOCK_MONOTONIC.
-            standing: The injections when the frame was read; None if they changed during the read.
+            present: The injections when the frame was read; None if they changed during the read.
         """
-        if standing is None or standing != self._standing:
-            self._standing, self._since_ns, self._relayed = standing, now_ns, False
+        if present is None or present != self._present:
+            self._present, self._since_ns, self._relayed = present, now_ns, False
             return False
         self.counts.values += shown != 0
         outer = shown % 4 == 1
         settled = publish_ns > self._since_ns + SHOWN_NS
-        if standing == {INNER, OUTER}:
+        if present == {INNER, OUTER}:
             if self._relayed and not outer:
                 self._say(f"shows {shown}, which the inner injection gives, past the outer one")
             self._relayed |= outer
             self.counts.good += outer
             return outer
-        if settled and standing == {INNER} and outer:
+        if settled and present == {INNER} and outer:
             self._say(f"shows {shown}, which the outer injection gave, but only the inner one exists")
-        if settled and not standing and shown:
+        if settled and not present and shown:
             self._say(f"shows {shown}, but there is no injection")
         return False
 
-    def stay(self, laid: AbstractSet[str], standing: AbstractSet[str], now_ns: int, undisturbed_ns: int) -> None:
+    def stay(self, laid: AbstractSet[str], present: AbstractSet[str], now_ns: int, undisturbed_ns: int) -> None:
         """Check that an injection remains until its client ends.
 
         Args:
             laid: The injections whose clients are alive.
-            standing: The injections that exist.
+            present: The injections that exist.
             now_ns: CLOCK_MONOTONIC.
             undisturbed_ns: CLOCK_MONOTONIC since which no fault has hit the processes that keep the injections.
         """
-        self._missed_ns = {part: at_ns for part, at_ns in self._missed_ns.items() if part in laid - standing}
-        for part in laid - standing:
+        self._missed_ns = {part: at_ns for part, at_ns in self._missed_ns.items() if part in laid - present}
+        for part in laid - present:
             missed_ns = self._missed_ns.setdefault(part, now_ns)
             if now_ns - missed_ns > 2 * QUIET_NS and undisturbed_ns < missed_ns - QUIET_NS:
                 self._say(f"the {part} injection is gone, but its client is alive")

@@ -180,7 +180,7 @@ class Injecting:
             self._awake.look()
             block = self._attachment.block(order.source)
             now_ns = time.monotonic_ns()
-            stands = bool(self._standing(order.source))
+            stands = bool(self._present(order.source))
             renewed = block.section != section or block.retired or not self._attachment.current
             life.look(
                 now_ns, stands=stands, awake_since_ns=self._awake.since_ns(*names), slack_ns=self._checker.slack_ns,
@@ -200,11 +200,11 @@ class Injecting:
 
     def _lift_rest(self, target: Target) -> None:
         """Lift all remaining injections of these clients. CommandError: it is not possible."""
-        for one in self._standing(target.source.name):
+        for one in self._present(target.source.name):
             self._attachment.lift(target.source.name, one.number)
 
-    def _standing(self, source: str) -> list[Injection[Mapping[str, Any]]]:
-        return standing(self._attachment, source, "n")
+    def _present(self, source: str) -> list[Injection[Mapping[str, Any]]]:
+        return present_injections(self._attachment, source, "n")
 
     def _tick(self, target: Target, order: Order | None = None) -> None:
         """Write a value under the injection, and read the injected word in the newest frame."""
@@ -220,14 +220,14 @@ class Injecting:
 
     def _write(self, target: Target, *, free: bool) -> None:
         name, value = target.source.name, next(self._numbers)
-        before = {one.number for one in self._standing(name) if one.direction == "in"}
+        before = {one.number for one in self._present(name) if one.direction == "in"}
         kind, text = OutcomeKind.REJECTED, ""
         try:
             (outcome,) = self._attachment.write({f"{name}/guarded": value}, 0.5)
             kind, text = outcome.kind, outcome.text
         except CommandError as error:
             text = str(error)
-        after = {one.number for one in self._standing(name) if one.direction == "in"}
+        after = {one.number for one in self._present(name) if one.direction == "in"}
         target.guard.written(value, kind, text, stood=bool(before & after), free=free and not before | after)
         if kind is OutcomeKind.TAKEN:
             target.guard.counts.since_ns = self._effect_ns = time.monotonic_ns()
@@ -235,7 +235,7 @@ class Injecting:
         target.guard.look(target.past[0])
 
 
-def standing(attachment: Attachment, source: str, initial: str) -> list[Injection[Mapping[str, Any]]]:
+def present_injections(attachment: Attachment, source: str, initial: str) -> list[Injection[Mapping[str, Any]]]:
     """Return the injections over a source whose names begin with ``initial``.
 
     In SimlogAPI v1 the name is the last part of the shadow's path.

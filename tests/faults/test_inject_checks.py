@@ -115,8 +115,8 @@ BOTH = {INNER, OUTER}
 def test_a_chain_shows_its_outermost(source: Source, found: list[str]) -> None:
     chain = ChainCheck(source, found.append)
     told = [
-        chain.look(shown, now_ns, now_ns, standing)
-        for now_ns, (shown, standing) in enumerate(
+        chain.look(shown, now_ns, now_ns, present)
+        for now_ns, (shown, present) in enumerate(
             [
                 (0, set()),
                 (8, {INNER}),
@@ -139,7 +139,7 @@ def test_a_chain_shows_its_outermost(source: Source, found: list[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("shown", "standing", "problem"),
+    ("shown", "present", "problem"),
     [
         ((9, 12), BOTH, "shows 12, which the inner injection gives, past the outer one"),
         ((9, 0), BOTH, "shows 0, which the inner injection gives, past the outer one"),
@@ -148,11 +148,11 @@ def test_a_chain_shows_its_outermost(source: Source, found: list[str]) -> None:
     ],
 )
 def test_a_chain_in_the_wrong_order_is_found(
-    source: Source, found: list[str], shown: tuple[int, int], standing: set[str], problem: str
+    source: Source, found: list[str], shown: tuple[int, int], present: set[str], problem: str
 ) -> None:
     chain = ChainCheck(source, found.append)
     for turn, value in enumerate((0, *shown)):
-        chain.look(value, turn * 2 * SHOWN_NS, turn * 2 * SHOWN_NS, standing)
+        chain.look(value, turn * 2 * SHOWN_NS, turn * 2 * SHOWN_NS, present)
     assert len(found) == 1
     assert problem in found[0]
 

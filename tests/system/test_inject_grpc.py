@@ -80,7 +80,7 @@ def write(stub: Any, path: str, number: float) -> None:
     stub.Write(v2.PubRequest(topic=path, data=data), timeout=PATIENCE_S)
 
 
-def standing(local: Attachment) -> int:
+def present_injections(local: Attachment) -> int:
     return len(local.injections())
 
 
@@ -95,7 +95,7 @@ def test_version_1_on_in_and_on_out_of_a_memory(cell: Cell, local: Attachment) -
         publish(stub, f"{POSITION}/shadow", "2.5")
         assert next(watching).value == "2.5"
         originals.cancel()
-        until(lambda: standing(local) == 0, "lifted")
+        until(lambda: present_injections(local) == 0, "lifted")
         publish(other, f"{POSITION}/in", "3.5")
         assert next(watching).value == "3.5"
 
@@ -122,7 +122,7 @@ def test_version_2_toward_an_emulated_controller(cell: Cell, local: Attachment) 
         assert (original.header.path, original.value.number_value) == (answer.shadowPathOut, 9)
         assert local[PLACE] == 7
         stream.cancel()
-        until(lambda: standing(local) == 0, "lifted")
+        until(lambda: present_injections(local) == 0, "lifted")
         write(other, f"{PLACE}/in", 9)
         until(lambda: local[PLACE] == 9, "a write reaches the device again")
 
@@ -150,20 +150,20 @@ def test_injections_end_with_a_killed_client_or_endpoint(cell: Cell, local: Atta
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as injecting:
             assert injecting.stdout is not None
             assert injecting.stdout.readline() == "laid\n"
-            assert standing(local) == 2
+            assert present_injections(local) == 2
             before = local.read("cell/Robot_800/Axs1_Pos")
             assert before.provenance == "injected"
             if victim == "client":
                 os.kill(injecting.pid, signal.SIGKILL)
             else:
                 kill(cell.processes()["grpc"]["pid"])
-            until(lambda: standing(local) == 0, "lifted")
+            until(lambda: present_injections(local) == 0, "lifted")
             injecting.kill()
         until(lambda: cell.processes()["grpc"]["state"] == "running", "the endpoint is back")
         with client(cell) as (stub, _):
             assert local.read("cell/Robot_800/Axs1_Pos").provenance == "live"
             stub.GetTopic(v1.TopicDescriptor(path=PLACE), timeout=PATIENCE_S)
-            assert standing(local) == 0
+            assert present_injections(local) == 0
 
 
 def newest(local: Attachment) -> Frame:
@@ -184,7 +184,7 @@ def test_injections_of_clients_survive_a_killed_source_process(cell: Cell, local
         publish(stub, "s", "6")
         until(lambda: local[PLACE] == 6, "the device has the injected value")
         originals.cancel()
-        until(lambda: standing(local) == 0, "lifted")
+        until(lambda: present_injections(local) == 0, "lifted")
 
 
 def test_a_source_that_is_not_armed_is_named_in_the_refusal(cell: Cell) -> None:
@@ -211,4 +211,4 @@ def test_lift_all_lifts_the_injections_of_clients(cell: Cell, local: Attachment)
         with pytest.raises(grpc.RpcError) as ended:
             next(originals)
         assert ended.value.code() is grpc.StatusCode.ABORTED
-        assert standing(local) == 0
+        assert present_injections(local) == 0

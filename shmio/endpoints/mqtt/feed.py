@@ -161,10 +161,10 @@ class Feed:
 
     def _mark_injected(self, frame: Frame) -> None:
         """Mark the channels whose injections begin or end, even if their values do not change."""
-        sequence, before = self.block.standing.sequence, self._injected
+        sequence, before = self.block.injections.sequence, self._injected
         if sequence != self._injection_sequence:
             self._injection_sequence = sequence
-            over = [one for one in self.block.standing.read() if one.direction == "out"]
+            over = [one for one in self.block.injections.read() if one.direction == "out"]
             self._covered = frozenset(
                 channel for channel in self._json if any(one.covers(part) for part in channel.registers for one in over)
             )

@@ -159,10 +159,10 @@ class Feed:
         frame = self.follower.frame
         if frame is None or frame.effective is None:
             return ()
-        standing = self.block.standing
-        if standing.sequence != self._injection_sequence:
-            self._injection_sequence = standing.sequence
-            self._injected = [one for one in standing.read() if one.direction == "out"]
+        injections = self.block.injections
+        if injections.sequence != self._injection_sequence:
+            self._injection_sequence = injections.sequence
+            self._injected = [one for one in injections.read() if one.direction == "out"]
         return self._injected
 
     # ---- watches -----------------------------------------------------------------------------------------------------
@@ -255,7 +255,7 @@ class Feed:
         follower = self.follower
         old = follower.frame
         change = follower.take(frame)
-        sequence = self.block.standing.sequence
+        sequence = self.block.injections.sequence
         other = old is None or (old.effective is None) != (frame.effective is None)
         other |= frame.effective is not None and sequence != self._shown_sequence
         self._shown_sequence = sequence

@@ -67,21 +67,21 @@ def add_injections(source: SourceNode) -> None:
     """Give a source's object a list of its injections, and methods that lift them."""
     block, commands = source.feed.block, source.feed.commands
 
-    def standing() -> dict[int, str]:
-        return {one.number: f"{one.name} ({one.direction})" for one in block.standing.read() if not one.lifted}
+    def present() -> dict[int, str]:
+        return {one.number: f"{one.name} ({one.direction})" for one in block.injections.read() if not one.lifted}
 
     async def lift(number: int) -> list[ua.Variant]:
-        if number not in standing():
+        if number not in present():
             raise ServiceError(ua.StatusCodes.BadNotFound)
         kind, reason = await commands.lift(number)
-        if kind is not EventKind.LIFTED and number in standing():
+        if kind is not EventKind.LIFTED and number in present():
             raise CommandError(f"{source.name}: injection {number} was not lifted: {reason}")
         return []
 
     async def lift_all() -> list[ua.Variant]:
-        numbers = list(standing())
+        numbers = list(present())
         for number in numbers:
-            if number in standing():  # another program may have lifted it meanwhile
+            if number in present():  # another program may have lifted it meanwhile
                 await lift(number)
         return [ua.Variant(len(numbers), ua.VariantType.UInt32)]
 
@@ -90,7 +90,10 @@ def add_injections(source: SourceNode) -> None:
     every = Method(source, "LiftAll", "inject", "Lifts all injections of this source, whoever laid them", lift_all)
     every.outputs = [_argument("Lifted", ua.ObjectIds.UInt32, "how many there were")]
     listed = Property(
-        source, "Injections", ua.ObjectIds.String, _texts(lambda: [f"{n}: {text}" for n, text in standing().items()])
+        source,
+        "Injections",
+        ua.ObjectIds.String,
+        _texts(lambda: [f"{n}: {text}" for n, text in present().items()]),
     )
     listed.sizes = [0]
     for node in (one, every, listed):

@@ -132,7 +132,7 @@ class Feed:
         raw = decoded
         if any(frame.effective is not None for frame in frames):
             raw = self._codec.decode(b"".join(frame.raw for frame in frames))
-            standing = [one for one in self.block.standing.read() if one.direction == "out"]
+            present = [one for one in self.block.injections.read() if one.direction == "out"]
         columns = np.empty((1 + len(self.registers), rows), "<f8")
         columns[0] = [self._utc_s(frame) for frame in frames]
         marks = np.empty((len(self.registers), rows), np.uint8)
@@ -145,7 +145,7 @@ class Feed:
             if raw is not decoded:
                 original = raw[register.path]
                 altered = (values != original) & ((values == values) | (original == original))  # noqa: PLR0124  not both NaN
-                if any(one.covers(register) for one in standing):
+                if any(one.covers(register) for one in present):
                     altered |= np.array([frame.effective is not None for frame in frames])
                 marks[index][altered] = Provenance.INJECTED
         head = _HEAD.pack(self.number, rows, math.nan if before is None else self._utc_s(before))

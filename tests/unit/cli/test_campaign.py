@@ -56,7 +56,7 @@ def test_faulty_file_injects_nothing(
     told = capsys.readouterr().err
     assert error in told
     assert told.count("\n") == 1
-    assert segment.blocks["cell"].standing.read() == ()
+    assert segment.blocks["cell"].injections.read() == ()
 
 
 class Still:

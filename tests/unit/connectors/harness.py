@@ -14,7 +14,7 @@ from shmio.local.reading import reading
 from shmio.local.writer import SourceWriter
 from shmio.model.values import Reading
 from shmio.segment import Attributes, BlockSpec, Frame, ProcessSpec, Segment
-from shmio.segment.standing_injections import declared_document
+from shmio.segment.injection_list import declared_document
 
 PERIOD_NS = 10_000_000
 

@@ -141,20 +141,20 @@ def test_events_describe_an_injection(rig: Rig) -> None:
     number = rig.client.inject(["speed"], name="drive test", priority=3)
     laid = rig.event(EventKind.INJECTED)
     assert (laid.injection, laid.command, laid.writer, laid.text) == (number, number, 4, "drive test")
-    (standing,) = rig.block.standing.read()
+    (entry,) = rig.block.injections.read()
     assert json.loads(laid.data) == {
-        "direction": "out", "priority": 3, "keep": False, "ranges": [list(standing.ranges[0])],
+        "direction": "out", "priority": 3, "keep": False, "ranges": [list(entry.ranges[0])],
     }  # fmt: skip
-    assert (standing.number, standing.direction, standing.priority, standing.name) == (number, "out", 3, "drive test")
-    assert (standing.writer, standing.pid, standing.keep) == (4, 100, False)
-    assert [register.path for register in LAYOUT.registers if standing.covers(register)] == ["speed"]
+    assert (entry.number, entry.direction, entry.priority, entry.name) == (number, "out", 3, "drive test")
+    assert (entry.writer, entry.pid, entry.keep) == (4, 100, False)
+    assert [register.path for register in LAYOUT.registers if entry.covers(register)] == ["speed"]
     rig.other.shadow(number, {"speed": 258})
     given = rig.event(EventKind.SHADOWED)
     assert (given.injection, given.writer, given.data) == (number, 5, b"\2\1")
     rig.other.lift(number)
     lifted = rig.event(EventKind.LIFTED)
     assert (lifted.injection, lifted.writer, lifted.text) == (number, 5, "lifted")
-    assert rig.block.standing.read() == ()
+    assert rig.block.injections.read() == ()
 
 
 def test_bits_elements_structures_and_whole_blocks(rig: Rig) -> None:
@@ -286,7 +286,7 @@ def test_injections_beyond_the_space_in_the_segment_are_refused(rig: Rig) -> Non
     laid: list[int] = []
     with pytest.raises(CommandError, match="injections of one source are too large"):
         laid.extend(rig.client.inject(["speed"], name=name) for _ in range(MAX_INJECTIONS))
-    assert [standing.number for standing in rig.block.standing.read()] == laid
+    assert [entry.number for entry in rig.block.injections.read()] == laid
     rig.client.lift(laid[0])
     rig.client.inject(["speed"], name=name)
 

@@ -14,7 +14,7 @@ from shmio.config import Declaration
 from shmio.local.time_control import Coordinator
 from shmio.local.writer import SourceWriter
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Segment
-from shmio.segment.standing_injections import declared_document
+from shmio.segment.injection_list import declared_document
 from tests.unit.connectors.models.test_stepped import GUEST, LAYOUT, MS, PERIOD_NS, Adder, Running
 
 CAMPAIGN = {

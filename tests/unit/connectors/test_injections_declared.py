@@ -22,7 +22,7 @@ from shmio.local.writer import CommandSender
 from shmio.model.clock import Clock
 from shmio.model.values import OutcomeKind
 from shmio.segment import CommandKind, Event, EventKind, Frame, Provenance, Quality, Segment, Write
-from shmio.segment.standing_injections import declared_document
+from shmio.segment.injection_list import declared_document
 from shmio.testing.cell import until
 from tests.unit.connectors.harness import SourceRig, block, source_segment, tag_layout
 
@@ -143,10 +143,10 @@ def test_operation_is_visible_between_two_times(make: Callable[..., Rig]) -> Non
     laid, on, off = rig.told(EventKind.INJECTED, EventKind.ACTIVATED, EventKind.DEACTIVATED)
     assert (on.cycle, on.injection, on.text, on.item) == (3, laid.injection, "drift", 1)
     assert (off.cycle, off.injection) == (5, laid.injection)
-    (standing,) = rig.block.standing.read()
-    assert standing.running is not None
-    assert (standing.running.state, standing.configured, standing.active) == ("over", True, False)
-    told = {**msgspec.to_builtins(standing.running.declaration), "seed": standing.running.seed}
+    (entry,) = rig.block.injections.read()
+    assert entry.running is not None
+    assert (entry.running.state, entry.configured, entry.active) == ("over", True, False)
+    told = {**msgspec.to_builtins(entry.running.declaration), "seed": entry.running.seed}
     assert json.loads(laid.data) == told, "the event has the declaration, with the drawn seed"
 
 
@@ -395,7 +395,7 @@ def test_full_delay_rejects_writes(make: Callable[..., Rig]) -> None:
     assert (outcome.kind, outcome.text) == (
         OutcomeKind.REJECTED, f"the injection late delays {MAX_HELD} writes already, which is the maximum",
     )  # fmt: skip
-    rig.client.lift(rig.block.standing.read()[0].number)
+    rig.client.lift(rig.block.injections.read()[0].number)
     rig.write({"speed": 1})
 
 
@@ -417,19 +417,19 @@ def test_clients_declaration_is_lifted_when_it_is_over_or_the_client_ends(make: 
         assert event is not None
         lifted += [(event.injection, event.text)] if event.kind == EventKind.LIFTED else []
     assert lifted == [(over, "over"), (gone, "the injection's client has ended")]
-    assert [standing.number for standing in rig.block.standing.read()] == [kept]
+    assert [entry.number for entry in rig.block.injections.read()] == [kept]
 
 
 def test_lifted_injection_of_the_configuration_stays_lifted(make: Callable[..., Rig]) -> None:
     rig = make(declaration("stuck", "cell/speed", "set", value=-1))
     rig.poll({"speed": 5})
-    (standing,) = rig.block.standing.read()
-    rig.client.lift(standing.number)
+    (entry,) = rig.block.injections.read()
+    rig.client.lift(entry.number)
     rig.poll()
     assert rig.value("speed") == 5
-    assert [one.lifted for one in rig.block.standing.read()] == [True]
+    assert [one.lifted for one in rig.block.injections.read()] == [True]
     with pytest.raises(CommandError, match="the injection stuck was lifted already"):
-        rig.client.lift(standing.number)
+        rig.client.lift(entry.number)
     rig.close()
     again = Rig(rig.segment)
     try:
@@ -446,7 +446,7 @@ def test_successor_process_continues_active_injections(make: Callable[..., Rig])
         declaration("once", "cell/flags", "set", value=77, when="cell/lamps/0", for_s=0.03, times=1),
     )
     rig.poll({"lamps": FIRST, "speed": 3})
-    seeds = {one.name: one.running.seed for one in rig.block.standing.read() if one.running}
+    seeds = {one.name: one.running.seed for one in rig.block.injections.read() if one.running}
     draw = SeededRandom(seeds["noise"], "noise")
     expected = [float(5 * (2 * draw.uniform(1, place, 1)[0] - 1)) for place in range(4)]
     rig.close()
@@ -469,7 +469,7 @@ def test_the_configuration_may_change_while_the_process_runs(make: Callable[...,
     stay = declaration("stay", "cell/axis/1", "freeze")
     rig = make(stay, declaration("go", "cell/flags", "set", value=1), declaration("turn", "cell/speed", "set", value=1))
     rig.poll({"axis/1": 1})
-    before = {standing.name: standing.number for standing in rig.block.standing.read()}
+    before = {entry.name: entry.number for entry in rig.block.injections.read()}
     changed = [
         stay,
         declaration("turn", "cell/speed", "set", value=2),
@@ -478,12 +478,12 @@ def test_the_configuration_may_change_while_the_process_runs(make: Callable[...,
     rig.block.declared.write(declared_document(changed))
     rig.block.commands.wake()
     until(
-        lambda: "new" in {standing.name for standing in rig.block.standing.read()},
+        lambda: "new" in {entry.name for entry in rig.block.injections.read()},
         "the new injection, which is laid last",
     )
     rig.poll({"axis/1": 2})
     assert (rig.value("axis/1"), rig.value("flags"), rig.value("speed")) == (1, 0, 2)
-    after = {standing.name: standing.number for standing in rig.block.standing.read()}
+    after = {entry.name: entry.number for entry in rig.block.injections.read()}
     assert set(after) == {"stay", "turn", "new"}
     assert before["stay"] == after["stay"]
     assert before["turn"] != after["turn"]
@@ -507,7 +507,7 @@ def test_faulty_declaration_is_refused_by_the_source(make: Callable[..., Rig], w
     with pytest.raises(CommandError) as refused:
         rig.client.declare(wrong)
     assert reason in str(refused.value)
-    assert rig.block.standing.read() == ()
+    assert rig.block.injections.read() == ()
 
 
 def test_garbage_in_place_of_a_declaration_is_refused(make: Callable[..., Rig]) -> None:

@@ -15,7 +15,7 @@ from shmio.errors import CommandError, PathError
 from shmio.layout.values.codec import Value
 from shmio.local.attach import Attachment
 from shmio.segment import EventKind, Segment
-from shmio.segment.standing_injections import StandingInjection, encode
+from shmio.segment.injection_list import InjectionEntry, encode
 from tests.unit.connectors import test_injections as test_injector
 from tests.unit.connectors.test_injections import LAYOUT, Rig
 
@@ -202,11 +202,11 @@ def test_campaign_ends_even_if_its_reader_missed_the_end(rig: Rig, local: Attach
 
 
 def test_injection_that_cannot_be_lifted_is_named(rig: Rig, local: Attachment) -> None:
-    one = StandingInjection(5, "out", 0, keep=True, name="", writer=0, pid=0, ranges=())
-    rig.block.standing.write(encode([msgspec.json.encode(one)]))  # the source does not know this injection
+    one = InjectionEntry(5, "out", 0, keep=True, name="", writer=0, pid=0, ranges=())
+    rig.block.injections.write(encode([msgspec.json.encode(one)]))  # the source does not know this injection
     with pytest.raises(CommandError, match="1 of 1 injections were not lifted: cell: there is no injection 5"):
         local.lift_all()
-    rig.block.standing.write(encode([]))
+    rig.block.injections.write(encode([]))
 
 
 def test_program_follows_writes_toward_a_source(rig: Rig, local: Attachment) -> None:

@@ -161,7 +161,7 @@ class Polite:
                 or feed.commands.followers.busy
                 or feed.commands._in_flight
                 or served.service.waiting_bytes
-                or any(not (connected and one.name.startswith("SIMLOG")) for one in feed.block.standing.read())
+                or any(not (connected and one.name.startswith("SIMLOG")) for one in feed.block.injections.read())
             )
 
         await served.until(left)

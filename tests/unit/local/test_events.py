@@ -74,8 +74,8 @@ def test_event_has_all_its_fields(segment: Segment, cell: Attachment) -> None:
 
 def test_injection_from_before_the_stream_is_known(segment: Segment, cell: Attachment) -> None:
     writer = segment.writer("cell")
-    standing = {"id": 9, "direction": "in", "priority": 0, "keep": False, "name": "n", "writer": 0, "pid": 1}
-    writer.block.standing.write(json.dumps([standing | {"ranges": [[0, 2, 255]]}]).encode())
+    entry = {"id": 9, "direction": "in", "priority": 0, "keep": False, "name": "n", "writer": 0, "pid": 1}
+    writer.block.injections.write(json.dumps([entry | {"ranges": [[0, 2, 255]]}]).encode())
     with cell.events("cell") as events:
         writer.event(Record(Recorded.LIFTED, "lifted", injection=9))
         lifted = next(events)
@@ -159,7 +159,7 @@ def test_command_of_an_earlier_process_is_forgotten(segment: Segment, cell: Atta
 def test_an_injection_whose_end_is_lost_is_forgotten(segment: Segment, cell: Attachment) -> None:
     writer = segment.writer("cell")
     how = json.dumps({"direction": "in", "ranges": [[0, 2, 255]]}).encode()
-    standing = {"id": 9, "direction": "in", "priority": 0, "keep": False, "name": "n", "writer": 0, "pid": 1}
+    entry = {"id": 9, "direction": "in", "priority": 0, "keep": False, "name": "n", "writer": 0, "pid": 1}
     with cell.events("cell") as events:
         for number in (7, 8, 9):
             writer.event(Record(Recorded.INJECTED, "n", 0, number, 0, 1, 0, 0, len(how), how, number))
@@ -167,7 +167,7 @@ def test_an_injection_whose_end_is_lost_is_forgotten(segment: Segment, cell: Att
         for _ in range(EVENT_SLOTS + 100):
             writer.event(NOTE)
         writer.event(Record(Recorded.LIFTED, "lifted", injection=8))
-        writer.block.standing.write(json.dumps([standing | {"ranges": [[0, 2, 255]]}]).encode())
+        writer.block.injections.write(json.dumps([entry | {"ranges": [[0, 2, 255]]}]).encode())
         newest = writer.block.events.head()
         assert next(events).missed
         while (event := next(events)).number < newest:

@@ -464,8 +464,8 @@ async def have_lifted(commands: CommandClient, injection: int, name: str) -> Non
 
 def stands(commands: CommandClient, injection: int) -> bool:
     """Return whether the client's source still has this injection."""
-    standing = commands.block.standing.read()
-    return not commands.block.retired and any(one.number == injection and not one.lifted for one in standing)
+    present = commands.block.injections.read()
+    return not commands.block.retired and any(one.number == injection and not one.lifted for one in present)
 
 
 def _check(commands: CommandClient) -> None:

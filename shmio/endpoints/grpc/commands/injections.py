@@ -151,7 +151,7 @@ class InjectionBase:
         """
         before = self._inner
         bits = np.zeros(len(self.given), np.uint8)
-        for one in self._block.standing.read() if self.number else ():
+        for one in self._block.injections.read() if self.number else ():
             if one.number == self.number:
                 break
             if one.direction == "out" and one.active:

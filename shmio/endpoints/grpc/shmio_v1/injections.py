@@ -30,7 +30,7 @@ from shmio.messages import declaration_to_wire
 from shmio.model.injection import Running
 from shmio.segment import Block, Direction, EventKind, Frame
 from shmio.segment.commands import MAX_NAME_BYTES, CommandWrites, End, apply, worst
-from shmio.segment.standing_injections import StandingInjection
+from shmio.segment.injection_list import InjectionEntry
 from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_INJECTIONS: Final = 256
@@ -600,7 +600,7 @@ class InjectionCalls:
         found = wire.ListInjectionsResponse()
         try:
             for block in self._topics.blocks(request.sources):
-                found.injections.extend(_describe(block, one) for one in block.standing.read())
+                found.injections.extend(_describe(block, one) for one in block.injections.read())
         except ShmioError as error:
             await refuse(context, error)
         return found
@@ -614,10 +614,10 @@ class InjectionCalls:
         """
         try:
             (block,) = self._topics.blocks([request.source])
-            standing = [one for one in block.standing.read() if one.number == request.number and not one.lifted]
-            if not standing:
+            present = [one for one in block.injections.read() if one.number == request.number and not one.lifted]
+            if not present:
                 raise PathError(f"{request.source}: there is no injection {request.number}; ListInjections lists them")
-            lifted = await self._lift(block, standing[0])
+            lifted = await self._lift(block, present[0])
             if lifted.failure:
                 raise CommandError(f"{request.source}: {lifted.failure}")
             return wire.LiftResponse(lifted=[lifted])
@@ -634,11 +634,11 @@ class InjectionCalls:
             blocks = self._topics.blocks(request.sources)
         except ShmioError as error:
             await refuse(context, error)
-        standing = [(block, one) for block in blocks for one in block.standing.read() if not one.lifted]
-        lifted = await asyncio.gather(*(self._lift(block, one) for block, one in standing))
+        present = [(block, one) for block in blocks for one in block.injections.read() if not one.lifted]
+        lifted = await asyncio.gather(*(self._lift(block, one) for block, one in present))
         return wire.LiftResponse(lifted=lifted)
 
-    async def _lift(self, block: Block, one: StandingInjection) -> wire.Lifted:
+    async def _lift(self, block: Block, one: InjectionEntry) -> wire.Lifted:
         failure = await command_client.lift(self._topics.feed(block.source).commands, one.number)
         return wire.Lifted(source=block.source, number=one.number, name=one.name, failure=failure)
 
@@ -649,7 +649,7 @@ class InjectionCalls:
         return task
 
 
-def _describe(block: Block, one: StandingInjection) -> wire.Injection:
+def _describe(block: Block, one: InjectionEntry) -> wire.Injection:
     """Convert an injection on a block to a message."""
     return wire.Injection(
         source=block.source,

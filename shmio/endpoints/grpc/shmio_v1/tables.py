@@ -604,9 +604,9 @@ class Selection:
 
     def _under_injections(self) -> Array:
         cover = np.zeros(self.block.layout.size, np.uint8)
-        for standing in self.block.standing.read():
-            if standing.direction == "out" and standing.active:
-                for offset, size, mask in standing.ranges:
+        for entry in self.block.injections.read():
+            if entry.direction == "out" and entry.active:
+                for offset, size, mask in entry.ranges:
                     cover[offset : offset + size] |= mask
         starts, stops, masks = self._extents
         covered = np.concatenate(([0], np.cumsum(cover != 0)))

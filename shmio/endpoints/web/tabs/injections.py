@@ -126,7 +126,7 @@ class Injections(Tab):
         events: list[dict[str, Any]] | None = None
         while True:
             blocks = self.page.served.segment.blocks
-            before, present = present, {source: block.standing.read() for source, block in blocks.items()}
+            before, present = present, {source: block.injections.read() for source, block in blocks.items()}
             if present != before:
                 names = {one["pid"]: one["name"] for one in self.page.served.overview()["processes"]}
                 self.page.push("injections", await run_in_threadpool(self._describe, present, names))

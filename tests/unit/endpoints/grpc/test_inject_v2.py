@@ -18,7 +18,14 @@ from shmio.wire import simlog_v2_pb2 as v2
 from shmio.wire import simserver_pb2 as sim
 from shmio.wire.simlog_v2_pb2_grpc import SimlogAPIStub as SimlogV2Stub
 from tests.unit.endpoints.grpc.services.test_publish import counted, with_plant
-from tests.unit.endpoints.grpc.services.test_simlog_v1 import everything, inject, laid, lifted, publish, standing
+from tests.unit.endpoints.grpc.services.test_simlog_v1 import (
+    everything,
+    inject,
+    laid,
+    lifted,
+    present_injections,
+    publish,
+)
 from tests.unit.endpoints.grpc.services.test_simlog_v2 import read, request, write
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, message, plain, refusal
 from tests.unit.endpoints.plant import Plant
@@ -130,7 +137,7 @@ def test_one_prefix_gives_unique_paths_for_many_targets(segment: Segment) -> Non
         assert await shadow(served, "STEP/in".lower(), "SIMLOG://a//b/") == found[0], (
             "an equal request joins the injection"
         )
-        assert len(standing(served)) == len(found)
+        assert len(present_injections(served)) == len(found)
 
     with_plant(segment, test)
 
@@ -182,7 +189,7 @@ def test_invalid_injections_are_refused_with_the_reason(
     async def test(served: Endpoint, device: Plant) -> None:
         found, text = await refusal(shadow(served, target, prefix))
         assert (found, reason in text) == (status, True), text
-        assert standing(served) == []
+        assert present_injections(served) == []
 
     with_plant(segment, test)
 
@@ -197,7 +204,7 @@ def test_without_a_stream_the_injection_lasts_as_long_as_the_connection(segment:
             looked = asyncio.get_running_loop().time() + 1.0
             while asyncio.get_running_loop().time() < looked:  # several checks later it still exists
                 await stub.Write(request(path_in, 5), timeout=TIMEOUT_S)
-            assert len(standing(served)) == 1
+            assert len(present_injections(served)) == 1
         await lifted(served)
 
     with_plant(segment, test)
@@ -216,7 +223,7 @@ def test_a_client_whose_connection_is_invisible_must_subscribe_in_time(
         await shadow(served, "cell/running/in")
 
         async def one_left() -> bool:
-            return len(standing(served)) == 1
+            return len(present_injections(served)) == 1
 
         await served.until(one_left)
         await write(served, "cell/step", 3)
@@ -278,7 +285,7 @@ def test_a_subscriber_that_does_not_read_loses_its_injection(segment: Segment, m
         stream = await served.subscriber("injector")
         _, path_out = await shadow(served, "cell/long/in")
         await served.add("injector", path_out)
-        while standing(served):
+        while present_injections(served):
             await write(served, "cell/long", [7] * 600)
         status, text = await refusal(everything(stream))
         assert status is Status.RESOURCE_EXHAUSTED
@@ -346,7 +353,7 @@ def test_a_killed_clients_injection_is_lifted(segment: Segment, subscribed: str)
         assert client.stdout is not None
         assert client.stdin is not None
         await asyncio.wait_for(client.stdout.readline(), TIMEOUT_S)
-        assert len(standing(served)) == 1
+        assert len(present_injections(served)) == 1
         os.kill(client.pid, signal.SIGKILL)
         await client.wait()
         client.stdin.close()

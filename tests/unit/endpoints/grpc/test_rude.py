@@ -348,11 +348,11 @@ def test_a_client_that_does_not_read_its_injections_events_loses_it(segment: Seg
         await connection.send(NARROW)
         await connection.send(http2.headers(OURS + call))
         await connection.send(http2.frame(http2.DATA, 0, 1, http2.message(request.SerializeToString())))
-        standing = segment.blocks["cell"].standing
+        injections = segment.blocks["cell"].injections
 
         async def laid() -> bool:
             await asyncio.sleep(0)
-            return bool(standing.read())
+            return bool(injections.read())
 
         await served.until(laid)
         async with connect(served) as channel:
@@ -362,9 +362,9 @@ def test_a_client_that_does_not_read_its_injections_events_loses_it(segment: Seg
                     await write(put.SerializeToString(), timeout=TIMEOUT_S)
                 else:
                     await polite.goes_on()  # one odd and one even step
-                if not standing.read():
+                if not injections.read():
                     break
-        assert not standing.read()
+        assert not injections.read()
         await connection.drop(reset=True)
 
     with pytest.MonkeyPatch.context() as monkeypatch:

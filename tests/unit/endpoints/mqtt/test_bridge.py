@@ -13,7 +13,7 @@ import pytest
 from shmio.config import Mqtt, MqttTopic, Sparkplug
 from shmio.endpoints.mqtt.bridge import Bridge
 from shmio.segment import BlockWriter, ProcessSpec, Provenance, Quality, Segment
-from shmio.segment.standing_injections import StandingInjection, encode
+from shmio.segment.injection_list import InjectionEntry, encode
 from shmio.testing.mosquitto import Mosquitto
 from tests.unit.endpoints.harness import LAYOUT, image
 from tests.unit.endpoints.mqtt.harness import PREFIX, Listener, bridge, listening
@@ -109,10 +109,10 @@ def test_json_marks_injected_registers_even_with_an_equal_value(segment: Segment
 
     def stand(*places: tuple[int, int]) -> None:
         ones = [
-            StandingInjection(number, "out", 0, keep=False, name="", writer=0, pid=1, ranges=((at, size, 255),))
+            InjectionEntry(number, "out", 0, keep=False, name="", writer=0, pid=1, ranges=((at, size, 255),))
             for number, (at, size) in enumerate(places)
         ]
-        cell.standing.write(encode(map(msgspec.json.encode, ones)))
+        cell.injections.write(encode(map(msgspec.json.encode, ones)))
 
     position, step = (0, 4), (12, 2)
     writer.publish(data, cycle=1)

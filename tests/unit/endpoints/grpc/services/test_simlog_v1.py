@@ -36,13 +36,13 @@ async def publish(served: Endpoint, *values: tuple[str, str]) -> None:
     await served.stub.Publish(iter([message(path, text) for path, text in values]), timeout=TIMEOUT_S)
 
 
-def standing(served: Endpoint) -> list[tuple[str, str]]:
-    return [(one.direction, one.name) for one in served.segment.blocks["cell"].standing.read()]
+def present_injections(served: Endpoint) -> list[tuple[str, str]]:
+    return [(one.direction, one.name) for one in served.segment.blocks["cell"].injections.read()]
 
 
 async def lifted(served: Endpoint) -> None:
     async def condition() -> bool:
-        return not standing(served)
+        return not present_injections(served)
 
     await served.until(condition)
 
@@ -130,7 +130,7 @@ def test_the_shadow_is_a_topic_while_the_injection_lasts(segment: Segment) -> No
 def test_several_streams_share_an_injection_and_the_last_lifts_it(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         streams = [await laid(served, path, "s") for path in ("cell/step/in", "CELL://step/in", "/step/in")]
-        assert len(standing(served)) == 1
+        assert len(present_injections(served)) == 1
         await publish(served, ("cell/step", "7"))
         assert [await value(stream) for stream in streams] == ["7"] * 3
         streams.pop().cancel()
@@ -150,7 +150,7 @@ def test_a_shadow_in_use_for_another_target_is_refused(segment: Segment) -> None
         for target in ("cell/step/out", "cell/running/in"):
             status, text = await refusal(inject(served, target, "/s").read())
             assert (status, text) == (Status.ALREADY_EXISTS, "/s is the shadow of cell/step/in: name another path")
-        assert len(standing(served)) == 1
+        assert len(present_injections(served)) == 1
         originals.cancel()
         await lifted(served)
         (await laid(served, "cell/running/in", "s")).cancel()
@@ -237,7 +237,7 @@ def test_invalid_injections_are_refused_with_the_reason(
     async def test(served: Endpoint, device: Plant) -> None:
         found, text = await refusal(inject(served, target, shadow).read())
         assert (found, reason in text) == (status, True), text
-        assert standing(served) == []
+        assert present_injections(served) == []
 
         async def closed() -> bool:
             return served.service.counters[0] == 0
@@ -305,7 +305,7 @@ def test_the_stream_ends_with_a_reason_when_another_client_lifts_it(segment: Seg
     async def test(served: Endpoint, device: Plant) -> None:
         for target in ("cell/step/in", "cell/step/out"):
             originals = await laid(served, target, "s")
-            (one,) = segment.blocks["cell"].standing.read()
+            (one,) = segment.blocks["cell"].injections.read()
             assert one.name.startswith("s of ipv4:127.0.0.1:")
             await asyncio.to_thread(SourceWriter(segment.blocks["cell"], GUEST).lift, one.number)
             while (got := await _end(originals)) is None:
@@ -336,7 +336,7 @@ def test_a_client_that_does_not_read_originals_loses_its_injection(
         # Fills the client's window value by value, which is slow on a busy host.
         originals = await laid(served, "cell/long/in", "s", timeout=9 * TIMEOUT_S)
         sent: list[str] = []
-        while standing(served):
+        while present_injections(served):
             # One by one: a busy host would otherwise queue more than the bound before it could send any.
             sent.append(str([len(sent) % 256] * 600))
             await publish(served, ("cell/long", sent[-1]))
@@ -378,7 +378,7 @@ def test_however_a_stream_ends_its_injection_is_lifted(segment: Segment, target:
     async def test(served: Endpoint, device: Plant) -> None:
         stream = inject(served, target, "s", timeout=1 if ending is _deadline else TIMEOUT_S)
         await stream.initial_metadata()
-        assert len(standing(served)) == 1
+        assert len(present_injections(served)) == 1
         await ending(served, stream)
         await lifted(served)
 
@@ -425,7 +425,7 @@ def test_a_value_published_to_the_shadow_before_the_injection_is_laid_counts(seg
                 )
 
             await served.until(received)
-            assert standing(served) == []
+            assert present_injections(served) == []
         await call
         assert device.memory[12:14] == b"\0\x08"
         assert counted(served) == (1, 0)
@@ -450,7 +450,7 @@ def test_an_injection_that_the_source_does_not_answer_is_never_laid(
             device.cycle()
             device.run()
             await publish(served, ("cell/step", "1"))
-            assert standing(served) == []
+            assert present_injections(served) == []
             (await laid(served, "cell/step/in", "s")).cancel()
             await lifted(served)
         finally:

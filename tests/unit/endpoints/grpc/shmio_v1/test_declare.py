@@ -55,13 +55,13 @@ def test_every_operation_is_laid_as_declared(segment: Segment) -> None:
     def test(cell: Client, _: Plant, __: Endpoint) -> None:
         with cell.declare(EVERY_OPERATION) as campaign:
             assert [one.name for one in campaign.declared] == [one["name"] for one in EVERY_OPERATION]
-            standing = {one.number: one for one in cell.injections("cell")}
+            present = {one.number: one for one in cell.injections("cell")}
             for one, table in zip(campaign.declared, EVERY_OPERATION, strict=True):
-                running = standing[one.number].running
+                running = present[one.number].running
                 assert running is not None
                 assert running.declaration == table | {"seed": one.seed}
                 assert running.seed == one.seed
-                assert standing[one.number].direction == ("in" if str(table["target"]).endswith("/in") else "out")
+                assert present[one.number].direction == ("in" if str(table["target"]).endswith("/in") else "out")
             injected = {one.number for one in campaign.declared}
             while injected:
                 if (happened := next(campaign)).what == "injected":

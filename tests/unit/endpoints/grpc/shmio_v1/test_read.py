@@ -12,7 +12,7 @@ import pytest
 
 from shmio.endpoints.grpc.shmio_v1 import selection, service
 from shmio.segment import Activity, Quality, Report, Segment
-from shmio.segment.standing_injections import StandingInjection, encode
+from shmio.segment.injection_list import InjectionEntry, encode
 from shmio.wire import shmio_v1_pb2 as wire
 from tests.unit.endpoints.grpc.shmio_v1.harness import read, stub, values
 from tests.unit.endpoints.harness import LAYOUT, TIMEOUT_S, WRITABLE, Endpoint, image, refusal, serve
@@ -109,7 +109,7 @@ def test_injected_registers_are_marked_and_have_their_originals(segment: Segment
     async def test(served: Endpoint) -> None:
         block = segment.blocks["cell"]
         ranges = ((0, 4, 0xFF), (8, 1, 1 << 3))
-        block.standing.write(encode([msgspec.json.encode(StandingInjection(7, "out", 0, False, "x", 0, 1, ranges))]))
+        block.injections.write(encode([msgspec.json.encode(InjectionEntry(7, "out", 0, False, "x", 0, 1, ranges))]))
         served.writer.publish(image(1.0, 2.0), cycle=1, effective=image(9.0, 2.0, True))
         answer = await read(served, "cell/axis", "cell/running", "cell/step", originals=True)
         registers, update = answer.tables[0].registers, answer.updates[0]

@@ -1,7 +1,7 @@
 """Lists of a block's injections: the existing ones, and those that the configuration declares.
 
 Each list is a section of the block: a cell (docs/reference/segment-format.md) with a JSON document
-of at most STANDING_SIZE bytes. The source writes the existing injections, which every process can
+of at most LIST_SIZE bytes. The source writes the existing injections, which every process can
 read, and which the source resumes after a restart. The supervisor writes the configured ones.
 """
 
@@ -19,11 +19,11 @@ from shmio.model.injection import Injection
 from shmio.segment import _atomics
 from shmio.segment.events import NO_WRITER
 
-STANDING_SIZE: Final = 32_768
-CELL_SIZE: Final = 8 + STANDING_SIZE
+LIST_SIZE: Final = 32_768
+CELL_SIZE: Final = 8 + LIST_SIZE
 
 
-class StandingInjection(Injection[Declaration], frozen=True, omit_defaults=True):
+class InjectionEntry(Injection[Declaration], frozen=True, omit_defaults=True):
     """An existing injection of a source. In the list of its block, the innermost comes first."""
 
     @property
@@ -60,7 +60,7 @@ class StandingInjection(Injection[Declaration], frozen=True, omit_defaults=True)
 
 
 # As in layout/document.py: built before there are threads.
-_STANDING = msgspec.json.Decoder(tuple[StandingInjection, ...])
+_ENTRIES = msgspec.json.Decoder(tuple[InjectionEntry, ...])
 _DECLARED = msgspec.json.Decoder(tuple[Declaration, ...])
 _Item = TypeVar("_Item")
 
@@ -85,14 +85,14 @@ def encode(items: Iterable[bytes], growth: int = 0) -> bytes:
         ValueError: The document, with ``growth`` more bytes, would be too long.
     """
     document = b"[" + b",".join(items) + b"]"
-    if len(document) + growth > STANDING_SIZE:
+    if len(document) + growth > LIST_SIZE:
         raise ValueError(
             "the injections of one source are too large: create fewer, or cover whole structures or arrays"
         )
     return document
 
 
-class DocumentCell(Generic[_Item]):
+class ListCell(Generic[_Item]):
     """A section of a block that holds a list of items. Only one process writes it."""
 
     def __init__(self, memory: memoryview, offset: int, size: int, decoder: msgspec.json.Decoder[tuple[_Item, ...]]):
@@ -110,7 +110,7 @@ class DocumentCell(Generic[_Item]):
 
     def read(self) -> tuple[_Item, ...]:
         """Read all items. Return an empty tuple if the section is corrupt."""
-        data = _atomics.cell_read(self._memory, self._offset, STANDING_SIZE)
+        data = _atomics.cell_read(self._memory, self._offset, LIST_SIZE)
         document = (data or b"").rstrip(b"\0")
         try:
             return self._decoder.decode(document) if document else ()
@@ -119,20 +119,20 @@ class DocumentCell(Generic[_Item]):
 
     def write(self, document: bytes) -> None:
         """Write a document made by :func:`encode`."""
-        _atomics.cell_write(self._memory, self._offset, document.ljust(STANDING_SIZE, b"\0"))
+        _atomics.cell_write(self._memory, self._offset, document.ljust(LIST_SIZE, b"\0"))
 
 
-StandingCell = DocumentCell[StandingInjection]
-DeclaredCell = DocumentCell[Declaration]
+InjectionListCell = ListCell[InjectionEntry]
+DeclaredCell = ListCell[Declaration]
 
 
-def standing_cell(memory: memoryview, offset: int, size: int) -> StandingCell:
+def injection_list_cell(memory: memoryview, offset: int, size: int) -> InjectionListCell:
     """Open the section of existing injections, which the source writes.
 
     Raises:
         ValueError: The section is too short.
     """
-    return DocumentCell(memory, offset, size, _STANDING)
+    return ListCell(memory, offset, size, _ENTRIES)
 
 
 def declared_cell(memory: memoryview, offset: int, size: int) -> DeclaredCell:
@@ -141,7 +141,7 @@ def declared_cell(memory: memoryview, offset: int, size: int) -> DeclaredCell:
     Raises:
         ValueError: The section is too short.
     """
-    return DocumentCell(memory, offset, size, _DECLARED)
+    return ListCell(memory, offset, size, _DECLARED)
 
 
 def declared_document(declarations: Iterable[Declaration]) -> bytes:
