@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,9 +19,8 @@ OLD, NEW = 6, 7
 @pytest.fixture
 def source(tmp_path: Path) -> Iterator[Source]:
     truth = Truth(tmp_path / "truth", create=True)
-    for generation in range(1, NEW):
-        truth.record(generation, generation)
-    truth.record(NEW, time.monotonic_ns() - 3600 * 10**9)
+    for generation in range(1, NEW + 1):
+        truth.record(generation, generation)  # long ago: just after the host has started
     yield Source("cell", 72, 1, 10**9, 10**9, True, truth)
     truth.close()
 
