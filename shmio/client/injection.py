@@ -30,7 +30,7 @@ Ranges = Iterable[tuple[int, int] | tuple[int, int, int]]
 """Each item is (offset, size) for bytes of a frame, or (offset, size, mask) for bits of these bytes."""
 
 
-def lay(
+def inject_request(
     patterns: Iterable[str],
     *,
     ranges: Ranges,
@@ -41,7 +41,7 @@ def lay(
     for_s: float | None,
     originals: bool,
 ) -> bytes:
-    """Return the first message, which lays an injection.
+    """Return the first message of a call Inject, which creates an injection.
 
     Raises:
         ValueRangeError: An argument is invalid.

@@ -119,7 +119,7 @@ class LayerStack:
     layers: list[Layer] = field(default_factory=list)
     now: CycleImage = field(default_factory=lambda: CycleImage(-1, 0, b""))
 
-    def lay(self, injection: Layer) -> str:
+    def add(self, injection: Layer) -> str:
         """Add a layer; return the reason why it cannot be added, or "" if it was added."""
         if any(layer.id == injection.id for layer in self.layers):
             return f"there is an injection {injection.id} already"

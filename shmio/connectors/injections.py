@@ -186,7 +186,7 @@ class DeclaredInjections:
         except (msgspec.MsgspecError, ConfigError, RecursionError) as error:
             return str(error)
         layer = declared(command.id, program, owner, _seed(declaration), keep=command.keep)
-        return self._lay(layer, command)
+        return self._add(layer, command)
 
     def lift(self, layer: DeclaredLayer, command: Command) -> str:
         """Lift a configured injection; it stays lifted until its declaration changes.
@@ -218,7 +218,7 @@ class DeclaredInjections:
         there = {layer.name for layer in self._layers if layer.configured}
         for declaration in wanted.values():
             if declaration.name not in there:
-                self._lay_configured(declaration)
+                self._add_configured(declaration)
 
     def settle(self) -> None:
         """Update the list of declared layers after layers were added or lifted."""
@@ -229,7 +229,7 @@ class DeclaredInjections:
         self._layers = [layer for layer in self._publisher.injections.layers if isinstance(layer, DeclaredLayer)]
         self._output.advance = self._advance if self._layers else None
 
-    def _lay_configured(self, declaration: Declaration) -> None:
+    def _add_configured(self, declaration: Declaration) -> None:
         try:
             program = self._program(declaration)
         except ConfigError as error:
@@ -238,12 +238,12 @@ class DeclaredInjections:
         document = msgspec.json.encode(declaration)
         number = int.from_bytes(hashlib.sha256(document).digest()[:8], "little") | 1
         layer = declared(number, program, CONFIGURED, _seed(declaration), keep=True)
-        if reason := self._lay(layer, None):
+        if reason := self._add(layer, None):
             log.warning("injection %s: %s", declaration.name, reason)
 
-    def _lay(self, layer: DeclaredLayer, command: Command | None) -> str:
+    def _add(self, layer: DeclaredLayer, command: Command | None) -> str:
         with self._output.turn:
-            if reason := self._publisher.lay(layer):
+            if reason := self._publisher.add(layer):
                 return reason
             if self._output.advance is None:  # evaluate the injection from the next cycle on
                 injections = self._publisher.injections
@@ -430,7 +430,7 @@ class InjectionProcessor:
                 return "no live process owns the queue from which the command came"
             if command.kind is CommandKind.DECLARE:
                 return self.declared.declare(command, owner)
-            return self._lay(command, owner)
+            return self._add(command, owner)
         layer = self.injections.find(command.injection)
         if layer is None:
             return f"there is no injection {command.injection}; it may have been lifted"
@@ -462,7 +462,7 @@ class InjectionProcessor:
             self._publisher.lift(lambda layer: layer.id in gone, "the injection's client has ended")
             self.declared.settle()
 
-    def _lay(self, command: Command, owner: Owner) -> str:
+    def _add(self, command: Command, owner: Owner) -> str:
         try:
             cover = covering(self._writer.block.layout.size, command.writes)
         except ValueError as error:
@@ -471,12 +471,12 @@ class InjectionProcessor:
             layer = Layer(
                 command.id, command.direction, command.priority, command.keep, command.name, owner, cover, cover
             )
-            if reason := self._publisher.lay(layer):
+            if reason := self._publisher.add(layer):
                 return reason
             layer.values = self.injections.before(self._output.base, layer)
             above = [layer, *self.injections.outer(layer)] if layer.direction is Direction.OUT else []
             end = layer_event(EventKind.INJECTED, layer, command.name)
-            self._output.show([*self._publisher.inner_values(above, end), *self._publisher.laid(layer, end)])
+            self._output.show([*self._publisher.inner_values(above, end), *self._publisher.created(layer, end)])
         return ""
 
     def _shadow(self, layer: Layer, command: Command) -> str:

@@ -210,7 +210,7 @@ class LayerPublisher:
         """All layers of the source."""
         return self.output.injections
 
-    def lay(self, layer: Layer) -> str:
+    def add(self, layer: Layer) -> str:
         """Add a layer; return the reason why it was refused, or "".
 
         The caller holds the output's ``turn``.
@@ -220,7 +220,7 @@ class LayerPublisher:
                 return self._refuse_in
             if (layer.cover & ~self._writable).any():
                 return "the injection covers registers that are not writable; name them in the source's `writable`"
-        if reason := self.injections.lay(layer):
+        if reason := self.injections.add(layer):
             return reason
         self._ranges[layer.id] = ranges_of(layer.cover.tobytes())
         try:
@@ -233,7 +233,7 @@ class LayerPublisher:
     def restore(self, layer: Layer) -> None:
         """Add a layer that the source's previous process has already published."""
         self._ranges[layer.id] = ranges_of(layer.cover.tobytes())
-        self.injections.lay(layer)
+        self.injections.add(layer)
 
     def lift(self, which: Callable[[Layer], bool], reason: str, command: Command | None = None) -> None:
         """Remove the layers that ``which`` selects, and publish the reason."""
@@ -254,11 +254,11 @@ class LayerPublisher:
             self._computed.pop(layer.id, None)
         self.publish()
         ends = [layer_event(EventKind.LIFTED, layer, reason, command) for layer in gone]
-        held = [record for layer in gone if isinstance(layer, DeclaredLayer) for record in lost(layer, reason)]
+        lost_values = [record for layer in gone if isinstance(layer, DeclaredLayer) for record in lost(layer, reason)]
         left = [layer for layer in self.injections.layers if layer.id in above]
         for layer in left:
             self._computed.pop(layer.id, None)  # published below, without the removed layers
-        return [*held, *self.inner_values(left, ends[0]), *ends] if ends else []
+        return [*lost_values, *self.inner_values(left, ends[0]), *ends] if ends else []
 
     def inner_values(self, layers: Iterable[Layer], end: Record) -> Iterator[Record]:
         """Yield events with the values that clients now receive from layers inside their own.
@@ -288,7 +288,7 @@ class LayerPublisher:
                 parts = list(_parts(Record(EventKind.DIVERTED, layer.name, injection=layer.id), writes))
                 yield from (part._replace(item=item, items=len(parts)) for item, part in enumerate(parts))
 
-    def laid(self, layer: Layer, end: Record) -> Iterator[Record]:
+    def created(self, layer: Layer, end: Record) -> Iterator[Record]:
         """Yield the events about a client's new layer: direction, priority, ``keep`` and ranges."""
         how = {
             "direction": layer.direction.name.lower(),

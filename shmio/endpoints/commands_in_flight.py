@@ -40,7 +40,7 @@ class CommandCost(NamedTuple):
 
         Args:
             sizes: Size of each item, in bytes.
-            name: Name of the injection, if the command lays one.
+            name: Name of the injection, if the command creates one.
 
         """
         events = sum(2 + size // EVENT_DATA_SIZE for size in sizes)

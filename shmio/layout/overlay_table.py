@@ -68,7 +68,7 @@ class OverlayTable:
             self.block = table.block
             self._registers, self.line_of = table.registers, Lines(data.decode()).line_of
 
-    def lay(self, layout: Layout, report: Report) -> Layout:
+    def apply(self, layout: Layout, report: Report) -> Layout:
         """Return the layout with the table's registers behind those that it has; report errors."""
         placer = _Placer(self, layout, report)
         with suppress(TooManyErrors):
@@ -219,7 +219,7 @@ def lay_tables(
             what = f"the table lies over {table.block}, but {layouts[0].name} is read: its names are left out"
             report.add(Diagnostic(table.file, 1, 1, what, "warning"))
         layouts = [
-            table.lay(layout, report) if table.block.lower() in ("", layout.name.lower()) else layout
+            table.apply(layout, report) if table.block.lower() in ("", layout.name.lower()) else layout
             for layout in layouts
         ]
     return layouts

@@ -366,7 +366,7 @@ class Attachment:
             raise PathError("an injection covers /out or /in, not both")
         direction = Direction.IN if "in" in directions else Direction.OUT
         source_writer = self._source_writer(block)
-        events = block.events.cursor()  # created before the shadow is laid, so that no diverted write is missed
+        events = block.events.cursor()  # created before the shadow is created, so that no diverted write is missed
         patterns = [topic.path or "**" for topic in topics]
         number = source_writer.inject(patterns, direction=direction, priority=priority, keep=keep, name=name)
         names = names_in(block.layout, patterns)

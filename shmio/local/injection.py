@@ -96,7 +96,7 @@ class Shadow:
             events: A cursor that is older than the injection.
             next_event: Waits for the cursor's next event.
             keep: Whether the injection stays when it is closed.
-            names: The registers over the block that it was laid over by their names.
+            names: The registers over the block by whose names the program chose what it covers.
         """
         self.source = source_writer.block.source
         self.number = number
@@ -244,7 +244,7 @@ def _written(
                 until_s = _deadline(timeout_s)
 
 
-class _Laid(NamedTuple):
+class _Created(NamedTuple):
     """A declared injection that this program has created."""
 
     source_writer: SourceWriter
@@ -291,20 +291,20 @@ def compile_declarations(
     return programs
 
 
-def _lay(
+def _create(
     declarations: Sequence[Declaration],
     blocks: Mapping[str, Block],
     source_writer: Callable[[Block], SourceWriter],
     *,
     keep: bool,
-) -> list[_Laid]:
+) -> list[_Created]:
     """Create all declared injections, or none of them.
 
     Raises:
         ConfigError: A declaration is wrong.
         CommandError: A source refuses an injection, or does not answer.
     """
-    laid: list[_Laid] = []
+    created: list[_Created] = []
     try:
         for program in compile_declarations(declarations, blocks):
             sender = source_writer(blocks[program.source])
@@ -312,12 +312,12 @@ def _lay(
                 number = sender.declare(program.declaration, keep=keep)
             except CommandError as error:
                 raise CommandError(f'{error} (injection "{program.declaration.name}")') from None
-            laid.append(_Laid(sender, number, program))
+            created.append(_Created(sender, number, program))
     except BaseException:
-        for one in laid:
+        for one in created:
             one.lift()
         raise
-    return laid
+    return created
 
 
 def _read(declarations: Iterable[Mapping[str, Any] | Declaration]) -> list[Declaration]:
@@ -369,16 +369,16 @@ class Campaign(Following[InjectionEvent]):
         self._keep = keep
         events = {source: block.events.cursor() for source, block in blocks.items()}
         try:
-            laid = _lay(_read(declarations), blocks, source_writer, keep=keep)
+            created = _create(_read(declarations), blocks, source_writer, keep=keep)
         except ConfigError as error:
             raise DeclarationError(str(error)) from None
         self.declared = tuple(
             Declared(one.program.source, one.number, one.program.declaration.name, one.program.declaration.seed or 0)
-            for one in laid
+            for one in created
         )
         """The injections, in the order of the declarations."""
-        self._left = {(one.program.source, one.number): one for one in laid}
-        sources = dict.fromkeys(one.program.source for one in laid)
+        self._left = {(one.program.source, one.number): one for one in created}
+        sources = dict.fromkeys(one.program.source for one in created)
         self._cursors = {source: (blocks[source], events[source]) for source in sources}
         for source in sources:
             self._follow(blocks[source])

@@ -71,7 +71,7 @@ class CommandSender:
         deadline_ns: int,
         kind: CommandKind = CommandKind.WRITE,
         injection: int = 0,
-        **laid: Unpack[InjectionOptions],
+        **options: Unpack[InjectionOptions],
     ) -> int:
         """Send a command to the source's present process, without waiting.
 
@@ -80,7 +80,7 @@ class CommandSender:
             deadline_ns: CLOCK_MONOTONIC after which the command must not be started.
             kind: Kind of command.
             injection: Number of the injection to lift, or to give values to.
-            laid: Options of the injection to create.
+            options: Options of the injection to create.
 
         Returns:
             The command's number.
@@ -94,7 +94,7 @@ class CommandSender:
         with self._turn:
             number, self._next = self._next, self._next + 1
             incarnation = self.block.incarnation
-            command = Command(self.writer, number, incarnation, deadline_ns, tuple(writes), kind, injection, **laid)
+            command = Command(self.writer, number, incarnation, deadline_ns, tuple(writes), kind, injection, **options)
             record = command.pack()
             queues = self.block.commands
             if len(record) + 8 > queues.capacity:
@@ -221,7 +221,9 @@ class SourceWriter:
         """
         return self._send(("",) * len(writes), writes, timeout_s, CommandKind.SHADOW, injection)
 
-    def inject(self, patterns: Iterable[str], timeout_s: float | None = None, **laid: Unpack[InjectionOptions]) -> int:
+    def inject(
+        self, patterns: Iterable[str], timeout_s: float | None = None, **options: Unpack[InjectionOptions]
+    ) -> int:
         """Create an injection over all registers that patterns name, and return its number.
 
         Consumers see no change until the injection gets values. See
@@ -234,12 +236,12 @@ class SourceWriter:
         bits = cover(self.block.layout, patterns)
         if not any(bits):
             raise PathError(f"{self.block.source}: {', '.join(patterns)} names no register")
-        ticket = self.lay(merge(bits, bits, [(0, len(bits))]), timeout_s, **laid)
+        ticket = self.ask_to_inject(merge(bits, bits, [(0, len(bits))]), timeout_s, **options)
         self._expect(ticket, EventKind.INJECTED)
         return ticket.number
 
-    def lay(
-        self, bits: Sequence[Write], timeout_s: float | None = None, **laid: Unpack[InjectionOptions]
+    def ask_to_inject(
+        self, bits: Sequence[Write], timeout_s: float | None = None, **options: Unpack[InjectionOptions]
     ) -> PendingCommand:
         """Request an injection over the bits that are set in ``bits``, without waiting.
 
@@ -248,7 +250,7 @@ class SourceWriter:
         Raises:
             CommandError: The command could not be sent.
         """
-        return self._send(("",), bits, timeout_s, CommandKind.INJECT, **laid)
+        return self._send(("",), bits, timeout_s, CommandKind.INJECT, **options)
 
     def declare(self, declaration: Declaration, timeout_s: float | None = None, *, keep: bool = False) -> int:
         """Create a declared injection, which the source runs by itself, and return its number.
@@ -348,12 +350,12 @@ class SourceWriter:
         timeout_s: float | None,
         kind: CommandKind = CommandKind.WRITE,
         injection: int = 0,
-        **laid: Unpack[InjectionOptions],
+        **options: Unpack[InjectionOptions],
     ) -> PendingCommand:
         wait_s = self.timeout_s if timeout_s is None else timeout_s
         deadline_ns = time.monotonic_ns() + round(wait_s * 1e9)
         events, incarnation = self.block.events.cursor(), self.block.incarnation
-        number = self._sender.submit(writes, deadline_ns, kind, injection, **laid)
+        number = self._sender.submit(writes, deadline_ns, kind, injection, **options)
         return PendingCommand(number, paths, incarnation, deadline_ns + round(PATIENCE_S * 1e9), events)
 
     def outcomes(self, ticket: PendingCommand) -> list[Outcome]:

@@ -124,7 +124,7 @@ class Events(Closable, Protocol):
 class Shadow(Closable, Protocol):
     """An injection to which this program gives values.
 
-    Closing the object lifts the injection, unless the program laid it with ``keep``.
+    Closing the object lifts the injection, unless the program created it with ``keep``.
     """
 
     @property
@@ -147,15 +147,15 @@ class Shadow(Closable, Protocol):
 
 
 class Campaign(Closable, Protocol):
-    """Declared injections that this program has laid, and their events.
+    """Declared injections that this program has created, and their events.
 
     Iterate over the campaign for the events. The iteration ends when all injections are lifted.
-    Closing the campaign lifts the remaining injections, unless they were laid with ``keep``.
+    Closing the campaign lifts the remaining injections, unless they were created with ``keep``.
     """
 
     @property
     def declared(self) -> tuple[Declared, ...]:
-        """The laid injections, in the order of the declarations."""
+        """The created injections, in the order of the declarations."""
 
     def __iter__(self) -> Iterator[InjectionEvent]:
         """Return the object itself."""
@@ -248,7 +248,7 @@ class Cell(Closable, Protocol):
         """
 
     def inject(self, *patterns: str, priority: int = 0, keep: bool = False, name: str = "") -> Shadow:
-        """Lay an injection over registers of one source, all ``/out`` (default) or all ``/in``.
+        """Create an injection over registers of one source, all ``/out`` (default) or all ``/in``.
 
         Args:
             patterns: As for :meth:`get`.
@@ -262,7 +262,7 @@ class Cell(Closable, Protocol):
         """
 
     def declare(self, declarations: Iterable[Any], *, keep: bool = False) -> Campaign:
-        """Lay declared injections, all or none. Their sources run them without this program.
+        """Create declared injections, all or none. Their sources run them without this program.
 
         Args:
             declarations: Mappings with the keys of an ``[[injection]]`` table, or
@@ -270,8 +270,8 @@ class Cell(Closable, Protocol):
             keep: Whether the injections stay when this program ends, until they are over or lifted.
 
         Raises:
-            ValueRangeError: A declaration is wrong; nothing was laid.
-            CommandError: A source refuses an injection, or does not answer; nothing was laid.
+            ValueRangeError: A declaration is wrong; nothing was created.
+            CommandError: A source refuses an injection, or does not answer; nothing was created.
         """
 
     def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
@@ -281,7 +281,7 @@ class Cell(Closable, Protocol):
         """
 
     def lift(self, source: str, number: int) -> None:
-        """Lift an injection, whoever laid it.
+        """Lift an injection, whichever program created it.
 
         Raises:
             PathError: There is no such source or injection.
@@ -289,7 +289,7 @@ class Cell(Closable, Protocol):
         """
 
     def lift_all(self, *sources: str) -> list[Lifted]:
-        """Lift all injections of these sources, or of all sources, whoever laid them.
+        """Lift all injections of these sources, or of all sources, whichever program created them.
 
         Return the result for each injection.
 

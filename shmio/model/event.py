@@ -36,7 +36,7 @@ class EventKind(StrEnum):
     TAKEN = "taken"
     """Injections took all values of the item, so that the device got none of them."""
     INJECTED = "injected"
-    """An injection was laid."""
+    """An injection was created."""
     LIFTED = "lifted"
     """An injection was lifted."""
     SHADOWED = "shadowed"

@@ -39,11 +39,11 @@ class Injection(msgspec.Struct, Generic[DeclarationT], frozen=True, omit_default
         number: Number of the injection. Any program may lift the injection by its number.
         direction: ``out`` or ``in``.
         priority: An injection with a higher priority covers those with a lower one.
-        keep: True if the injection stays when the program that laid it ends.
+        keep: True if the injection stays when the program that created it ends.
         name: Name of the injection.
         writer: Number of the command queue that the injection came from; 4294967295: the injection
             comes from the configuration.
-        pid: Process that laid the injection; 0: the injection comes from the configuration.
+        pid: Process that created the injection; 0: the injection comes from the configuration.
         ranges: The covered bits, as (offset in bytes, size in bytes, mask).
         running: State of a declared injection; None: a program gives the values.
         source: Name of the source; empty in the segment, where the block has the name.
@@ -63,7 +63,7 @@ class Injection(msgspec.Struct, Generic[DeclarationT], frozen=True, omit_default
 
 @dataclass(frozen=True, slots=True)
 class Declared:
-    """A declared injection that was laid. ``seed`` is random if the declaration has no seed."""
+    """A declared injection of a campaign. ``seed`` is random if the declaration has no seed."""
 
     source: str
     number: int

@@ -92,21 +92,21 @@ def derive(dump: Dump) -> Derived:
 class _Source:
     def __init__(self, found: Derived) -> None:
         self._found = found
-        self._laid: dict[int, _RecordedInjection] = {}
+        self._injections: dict[int, _RecordedInjection] = {}
         self._declared: list[tuple[int, Declaration]] = []
         self._count = 0
         self._unknown: set[int] = set()
 
     def follow(self, event: Event, explained: Explained) -> None:
-        if event.kind == EventKind.INJECTED and explained.laid is not None:
-            self._lay(event, explained)
+        if event.kind == EventKind.INJECTED and explained.definition is not None:
+            self._create(event, explained)
         elif event.kind == EventKind.SHADOWED:
             self._shadow(event, explained)
-        elif event.kind == EventKind.LIFTED and event.injection in self._laid:
-            self._lift(self._laid.pop(event.injection), event)
+        elif event.kind == EventKind.LIFTED and event.injection in self._injections:
+            self._lift(self._injections.pop(event.injection), event)
 
-    def _lay(self, event: Event, explained: Explained) -> None:
-        how = dict(explained.laid or {})
+    def _create(self, event: Event, explained: Explained) -> None:
+        how = dict(explained.definition or {})
         declaration = None
         if event.writer == NO_WRITER:
             self._found.left_out.append(
@@ -126,13 +126,13 @@ class _Source:
             return
         priority = how.get("priority", 0)
         self._count += 1
-        self._laid[event.injection] = _RecordedInjection(
+        self._injections[event.injection] = _RecordedInjection(
             self._count, event.text, event.clock_ns, declaration, priority if isinstance(priority, int) else 0
         )
 
     def _shadow(self, event: Event, explained: Explained) -> None:
-        laid = self._laid.get(event.injection)
-        if laid is None:
+        injection = self._injections.get(event.injection)
+        if injection is None:
             if event.injection not in self._unknown:
                 self._unknown.add(event.injection)
                 self._found.left_out.append(
@@ -140,55 +140,55 @@ class _Source:
                 )
             return
         for place in explained.places:
-            before = laid.held.get(place.path)
+            before = injection.held.get(place.path)
             if not place.valued:
                 continue
             if before is not None and before.place.value == place.value:
                 continue
             if before is not None:
-                self._set(laid, before, event.clock_ns)
-            laid.held[place.path] = _HeldValue(place, event.clock_ns)
+                self._set(injection, before, event.clock_ns)
+            injection.held[place.path] = _HeldValue(place, event.clock_ns)
 
-    def _lift(self, laid: _RecordedInjection, event: Event) -> None:
-        for held in laid.held.values():
-            self._set(laid, held, event.clock_ns)
-        if laid.declaration is not None:
-            self._declare(laid, laid.declaration, None if event.text == "over" else event.clock_ns)
+    def _lift(self, injection: _RecordedInjection, event: Event) -> None:
+        for held in injection.held.values():
+            self._set(injection, held, event.clock_ns)
+        if injection.declaration is not None:
+            self._declare(injection, injection.declaration, None if event.text == "over" else event.clock_ns)
 
     def end(self) -> None:
         """Add the declarations of the source. Injections that exist at the end get no end time."""
-        for laid in self._laid.values():
-            for held in laid.held.values():
-                self._set(laid, held, None)
-            if laid.declaration is not None:
-                self._declare(laid, laid.declaration, None)
+        for injection in self._injections.values():
+            for held in injection.held.values():
+                self._set(injection, held, None)
+            if injection.declaration is not None:
+                self._declare(injection, injection.declaration, None)
         self._declared.sort(key=lambda pair: pair[0])
         self._found.declarations += [one for _, one in self._declared]
 
-    def _set(self, laid: _RecordedInjection, held: _HeldValue, until_ns: int | None) -> None:
+    def _set(self, injection: _RecordedInjection, held: _HeldValue, until_ns: int | None) -> None:
         place = held.place
         value = place.plain
         if value is None or (isinstance(value, float) and not math.isfinite(value)):
             value = place.text
-        name = laid.name or place.path.replace("/", "-")
-        one = Declaration(name=name, target=place.path, operation="set", value=value, priority=laid.priority)
-        self._declare(laid, one, until_ns, held.since_ns)
+        name = injection.name or place.path.replace("/", "-")
+        one = Declaration(name=name, target=place.path, operation="set", value=value, priority=injection.priority)
+        self._declare(injection, one, until_ns, held.since_ns)
 
     def _declare(
-        self, laid: _RecordedInjection, one: Declaration, until_ns: int | None, since_ns: int | None = None
+        self, injection: _RecordedInjection, one: Declaration, until_ns: int | None, since_ns: int | None = None
     ) -> None:
         """Add a declaration, limited to a range of time.
 
         The method adds 1 ns to both times, because readers see a change only from the next cycle
         on.
         """
-        since_s = (max(0, laid.since_ns if since_ns is None else since_ns) + 1) / NS
+        since_s = (max(0, injection.since_ns if since_ns is None else since_ns) + 1) / NS
         if since_s > max(one.start_s or 0.0, 1 / NS):
             one = msgspec.structs.replace(one, start_s=_round(since_s))
         if until_ns is not None and (one.end_s is None or one.end_s > (until_ns + 1) / NS):
             one = msgspec.structs.replace(one, end_s=_round((until_ns + 1) / NS))
         if one.end_s is None or one.end_s > (one.start_s or 0.0):
-            self._declared.append((laid.place, one))
+            self._declared.append((injection.place, one))
 
 
 def _named(found: Derived) -> Iterator[Declaration]:

@@ -23,7 +23,7 @@ from shmio.segment.processes import GUEST_SLOTS, WRITERS
 
 MAX_REMEMBERED: Final = 4096
 """An explainer remembers at most this many unfinished commands and this many injections."""
-MAX_LAID_BYTES: Final = 1 << 16
+MAX_DEFINITION_BYTES: Final = 1 << 16
 
 _INWARD: Final = frozenset(
     {
@@ -74,14 +74,14 @@ class Explained(NamedTuple):
         places: The registers that the event concerns.
         direction: ``in``, ``out`` or empty.
         by: Who caused the event, such as grpc, mqtt or ``program 1``; empty: no client, or unknown.
-        laid: Definition of the new injection. Only the last event of the definition has it.
+        definition: Definition of the new injection. Only the last event of the definition has it.
         partial: True if the event has a part of a definition, and further parts follow.
     """
 
     places: tuple[Place, ...]
     direction: str
     by: str
-    laid: dict[str, Any] | None
+    definition: dict[str, Any] | None
     partial: bool = False
 
 
@@ -144,7 +144,7 @@ class Explainer:
         if event.kind == EventKind.STARTED:  # commands to the previous process get no further events
             for key in [key for key in self._under_way if key[0] != event.incarnation]:
                 del self._under_way[key]
-        laid = self._laid(event) if event.kind == EventKind.INJECTED else None
+        definition = self._definition(event) if event.kind == EventKind.INJECTED else None
         known = self._injections.get(event.injection)
         direction, places = "", tuple[Place, ...]()
         if event.kind in _OF_INJECTIONS:
@@ -160,8 +160,8 @@ class Explainer:
         if event.kind == EventKind.LIFTED:
             self._injections.pop(event.injection, None)
             self._documents.pop(event.injection, None)
-        partial = event.kind == EventKind.INJECTED and laid is None and len(event.data) == EVENT_DATA_SIZE
-        return Explained(places, direction, by(event.writer), laid, partial)
+        partial = event.kind == EventKind.INJECTED and definition is None and len(event.data) == EVENT_DATA_SIZE
+        return Explained(places, direction, by(event.writer), definition, partial)
 
     def _of_command(self, event: Event) -> tuple[Place, ...]:
         """Return the registers that the event's items write.
@@ -220,7 +220,7 @@ class Explainer:
 
     # ---- injections --------------------------------------------------------------------------------------------------
 
-    def _laid(self, event: Event) -> dict[str, Any] | None:
+    def _definition(self, event: Event) -> dict[str, Any] | None:
         """Add an event's part to the definition of an injection; return the complete definition.
 
         Return None if parts are missing. When the definition is complete, remember what the
@@ -228,23 +228,23 @@ class Explainer:
         """
         document = (self._documents.pop(event.injection, b"") if event.offset else b"") + event.data
         try:
-            laid = msgspec.json.decode(document, type=dict[str, Any])
+            definition = msgspec.json.decode(document, type=dict[str, Any])
         except (msgspec.MsgspecError, RecursionError):
-            if document and len(document) < MAX_LAID_BYTES and len(self._documents) < MAX_REMEMBERED:
+            if document and len(document) < MAX_DEFINITION_BYTES and len(self._documents) < MAX_REMEMBERED:
                 self._documents[event.injection] = document
             return None
         if len(self._injections) >= MAX_REMEMBERED:
             self._injections.pop(next(iter(self._injections)))
-        if "ranges" in laid:
+        if "ranges" in definition:
             self._injections[event.injection] = _Injection(
-                str(laid.get("direction", "")), self._over(laid.pop("ranges"))
+                str(definition.get("direction", "")), self._over(definition.pop("ranges"))
             )
         else:
-            target = laid.get("target", "")
+            target = definition.get("target", "")
             targets = [str(one) for one in target] if isinstance(target, list) else [str(target)]
             inward = any(one.endswith("/in") for one in targets)
             self._injections[event.injection] = _Injection("in" if inward else "out", ())
-        return laid
+        return definition
 
     def _over(self, ranges: object) -> tuple[Place, ...]:
         """Return the registers that ranges cover; a range is (offset, size, bits in each byte)."""
@@ -291,7 +291,7 @@ def object_of(event: Event, explained: Explained) -> dict[str, Any]:
         "direction": explained.direction,
         "paths": [place.path for place in places],
         "values": {place.path: place.plain for place in places if place.valued},
-        "laid": explained.laid,
+        "laid": explained.definition,
         "injection": event.injection,
         **{name: getattr(event, name) for name in ("command", "item", "items", "offset", "mask", "size", "text")},
         "data": event.data.hex(),

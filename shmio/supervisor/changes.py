@@ -186,5 +186,5 @@ def injection_changes(
     """Yield a line for each injection that differs."""
     for name in {**before, **after}:
         if before.get(name) != after.get(name):
-            what = "laid" if name not in before else "changed" if name in after else "lifted"
+            what = "created" if name not in before else "changed" if name in after else "lifted"
             yield f"injection {name}: {what} at {source}"

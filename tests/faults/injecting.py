@@ -26,7 +26,7 @@ from tests.faults.plc import SHOWN_AT
 
 PAUSE_S: Final = 0.05
 BEGIN_S: Final = 20.0
-"""Maximum time for a client to lay its injection."""
+"""Maximum time for a client to create its injection."""
 EFFECT_NS: Final = 90 * 10**9
 """Maximum time without any effect of an injection."""
 KEPT_NS: Final = 1_500_000_000

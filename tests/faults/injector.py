@@ -1,6 +1,6 @@
 """A client that injects until it is killed: ``python -m tests.faults.injector ORDER``.
 
-``injecting`` and ``chaining`` start it. It lays an injection over one word, prints a line when that
+``injecting`` and ``chaining`` start it. It creates an injection over one word, prints a line when that
 is done, and gives values until its standard input ends. Then it lifts the injection. It also ends
 when its injection is lifted, or when it cannot reach the instance any more.
 """

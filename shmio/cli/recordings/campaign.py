@@ -35,7 +35,7 @@ def campaign(arguments: argparse.Namespace) -> int:
     tables = [_table(msgspec.to_builtins(one)) for one in declarations]
     with new_file(arguments.output) as stream:
         stream.write("\n".join(tables).encode())
-    say(f"{arguments.output}: {len(tables)} injections; shmio inject --file {arguments.output} lays them")
+    say(f"{arguments.output}: {len(tables)} injections; shmio inject --file {arguments.output} creates them")
     return int(report.any)
 
 

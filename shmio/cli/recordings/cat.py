@@ -233,9 +233,9 @@ def _where(event: Event, explained: Explained, room: int | None) -> str:
     return ", ".join(texts) + (f" and {more} more" if more > 0 else "")
 
 
-def _laid(laid: dict[str, Any]) -> str:
+def _definition(definition: dict[str, Any]) -> str:
     """Return the definition of an injection as text, without what the event itself already states."""
-    return ", ".join(f"{key} = {dumps(value)}" for key, value in laid.items() if key not in ("name", "direction"))
+    return ", ".join(f"{key} = {dumps(value)}" for key, value in definition.items() if key not in ("name", "direction"))
 
 
 class JsonLines:
@@ -331,8 +331,8 @@ class Table:
         if event.command and event.kind != EventKind.NOTED:
             what += f", command {event.command}.{event.item}"
         text = f": {printable(event.text)}" if event.text else ""
-        laid = f" {printable(_laid(explained.laid))}" if explained.laid else ""
-        return f"{local(time_ns)}  {source}  event {event.number} after frame {event.frame}: {what}{text}{laid}"
+        definition = f" {printable(_definition(explained.definition))}" if explained.definition else ""
+        return f"{local(time_ns)}  {source}  event {event.number} after frame {event.frame}: {what}{text}{definition}"
 
     def gap(self, time_ns: int, gap: Gap) -> str:
         """Format a gap: the number of missing frames or events, their range, and the reason."""

@@ -203,7 +203,7 @@ class Client:
         for_s: float | None = None,
         originals: bool = False,
     ) -> Shadow:
-        """Lay an injection over registers of one source, all of /out or all of /in.
+        """Create an injection over registers of one source, all of /out or all of /in.
 
         The injection is lifted when you close it, at the end of its ``async with`` block, when this
         program ends, or after ``for_s``.
@@ -224,16 +224,16 @@ class Client:
             ValueRangeError: An argument is out of range.
             CommandError: The source refuses the injection.
         """
-        first = injection.lay(
+        first = injection.inject_request(
             patterns, ranges=ranges, source=source, priority=priority, keep=keep, name=name, for_s=for_s,
             originals=originals,
         )  # fmt: skip
-        return await Shadow.lay(self._channel, self._inject, first)
+        return await Shadow.create(self._channel, self._inject, first)
 
     async def declare(
         self, declarations: Iterable[Mapping[str, Any] | msgspec.Struct], *, keep: bool = False
     ) -> Campaign:
-        """Lay declared injections, all or none. Their sources run them without this program.
+        """Create declared injections, all or none. Their sources run them without this program.
 
         The injections are lifted when you close the campaign, at the end of its ``async with``
         block, or when this program ends. Iterate over the campaign for its events.
@@ -247,7 +247,7 @@ class Client:
             CommandError: A source refuses an injection.
         """
         request = injection.declare_request(declarations, keep=keep)
-        return await Campaign.lay(Stream(self._channel, self._stub.Declare, request), self.lift, keep=keep)
+        return await Campaign.create(Stream(self._channel, self._stub.Declare, request), self.lift, keep=keep)
 
     async def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
         """Return the present injections of these sources, or of all sources.
@@ -258,7 +258,7 @@ class Client:
         return injection.injections(await self._call(self._stub.ListInjections, request))
 
     async def lift(self, source: str, number: int) -> None:
-        """Lift an injection, whoever laid it.
+        """Lift an injection, whichever program created it.
 
         Raises:
             PathError: There is no such injection.
@@ -267,7 +267,7 @@ class Client:
         await self._call(self._stub.Lift, wire.LiftRequest(source=source, number=number))
 
     async def lift_all(self, *sources: str) -> list[Lifted]:
-        """Lift all injections of these sources, or of all sources, whoever laid them.
+        """Lift all injections of these sources, or of all sources, whichever program created them.
 
         Return the result for each injection.
 

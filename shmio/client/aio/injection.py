@@ -37,8 +37,8 @@ class Shadow(AsyncIterator[Update]):
         self._reading = Background(self._read, f"shadow-{self.number}")
 
     @classmethod
-    async def lay(cls, channel: Channel, method: Any, first: bytes) -> Self:
-        """Lay an injection; see :meth:`Client.inject`."""
+    async def create(cls, channel: Channel, method: Any, first: bytes) -> Self:
+        """Create an injection; see :meth:`Client.inject`."""
         stream = Duplex(channel, method, first)
         try:
             return cls(channel, stream, injection.ShadowState(await stream.first()))
@@ -102,7 +102,7 @@ class Shadow(AsyncIterator[Update]):
         await self._stream.write(data)
 
     async def __anext__(self) -> Update:
-        """Wait for the next originals. They come only if the injection was laid with ``originals``."""
+        """Wait for the next originals. They come only if the injection was created with ``originals``."""
         async with self._changed:
             if not self._updates:
                 await self._changed.wait_until(lambda: self._state.waits or self._over)
@@ -158,7 +158,7 @@ class Lift(Protocol):
 
 
 class Campaign(AsyncIterator[InjectionEvent]):
-    """Declared injections that were laid together.
+    """Declared injections that were created together.
 
     To follow their events, iterate over the campaign in one task. The iteration ends when all
     injections have ended. ``declared`` has the injections in the order of the declarations, with
@@ -174,7 +174,7 @@ class Campaign(AsyncIterator[InjectionEvent]):
         self._events: list[InjectionEvent] = injection.events(first)
 
     @classmethod
-    async def lay(cls, stream: Stream, lift: Lift, *, keep: bool) -> Self:
+    async def create(cls, stream: Stream, lift: Lift, *, keep: bool) -> Self:
         """Read the first answers to the call Declare, and return the campaign."""
         try:
             return cls(stream, await stream.first(), lift, keep=keep)

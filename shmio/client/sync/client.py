@@ -204,7 +204,7 @@ class Client:
         for_s: float | None = None,
         originals: bool = False,
     ) -> Shadow:
-        """Lay an injection over registers of one source, all of /out or all of /in.
+        """Create an injection over registers of one source, all of /out or all of /in.
 
         The injection is lifted when you close it, at the end of its ``with`` block, when this
         program ends, or after ``for_s``.
@@ -225,14 +225,14 @@ class Client:
             ValueRangeError: An argument is out of range.
             CommandError: The source refuses the injection.
         """
-        first = injection.lay(
+        first = injection.inject_request(
             patterns, ranges=ranges, source=source, priority=priority, keep=keep, name=name, for_s=for_s,
             originals=originals,
         )  # fmt: skip
-        return Shadow.lay(self._channel, self._inject, first)
+        return Shadow.create(self._channel, self._inject, first)
 
     def declare(self, declarations: Iterable[Mapping[str, Any] | msgspec.Struct], *, keep: bool = False) -> Campaign:
-        """Lay declared injections, all or none. Their sources run them without this program.
+        """Create declared injections, all or none. Their sources run them without this program.
 
         The injections are lifted when you close the campaign, at the end of its ``with``
         block, or when this program ends. Iterate over the campaign for its events.
@@ -246,7 +246,7 @@ class Client:
             CommandError: A source refuses an injection.
         """
         request = injection.declare_request(declarations, keep=keep)
-        return Campaign.lay(Stream(self._channel, self._stub.Declare, request), self.lift, keep=keep)
+        return Campaign.create(Stream(self._channel, self._stub.Declare, request), self.lift, keep=keep)
 
     def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
         """Return the present injections of these sources, or of all sources.
@@ -257,7 +257,7 @@ class Client:
         return injection.injections(self._call(self._stub.ListInjections, request))
 
     def lift(self, source: str, number: int) -> None:
-        """Lift an injection, whoever laid it.
+        """Lift an injection, whichever program created it.
 
         Raises:
             PathError: There is no such injection.
@@ -266,7 +266,7 @@ class Client:
         self._call(self._stub.Lift, wire.LiftRequest(source=source, number=number))
 
     def lift_all(self, *sources: str) -> list[Lifted]:
-        """Lift all injections of these sources, or of all sources, whoever laid them.
+        """Lift all injections of these sources, or of all sources, whichever program created them.
 
         Return the result for each injection.
 

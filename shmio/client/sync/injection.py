@@ -38,8 +38,8 @@ class Shadow(Iterator[Update]):
         self._reading = Background(self._read, f"shadow-{self.number}")
 
     @classmethod
-    def lay(cls, channel: Channel, method: Any, first: bytes) -> Self:
-        """Lay an injection; see :meth:`Client.inject`."""
+    def create(cls, channel: Channel, method: Any, first: bytes) -> Self:
+        """Create an injection; see :meth:`Client.inject`."""
         stream = Duplex(channel, method, first)
         try:
             return cls(channel, stream, injection.ShadowState(stream.first()))
@@ -103,7 +103,7 @@ class Shadow(Iterator[Update]):
         self._stream.write(data)
 
     def __next__(self) -> Update:
-        """Wait for the next originals. They come only if the injection was laid with ``originals``."""
+        """Wait for the next originals. They come only if the injection was created with ``originals``."""
         with self._changed:
             if not self._updates:
                 self._changed.wait_until(lambda: self._state.waits or self._over)
@@ -159,7 +159,7 @@ class Lift(Protocol):
 
 
 class Campaign(Iterator[InjectionEvent]):
-    """Declared injections that were laid together.
+    """Declared injections that were created together.
 
     To follow their events, iterate over the campaign in one thread. The iteration ends when all
     injections have ended. ``declared`` has the injections in the order of the declarations, with
@@ -175,7 +175,7 @@ class Campaign(Iterator[InjectionEvent]):
         self._events: list[InjectionEvent] = injection.events(first)
 
     @classmethod
-    def lay(cls, stream: Stream, lift: Lift, *, keep: bool) -> Self:
+    def create(cls, stream: Stream, lift: Lift, *, keep: bool) -> Self:
         """Read the first answers to the call Declare, and return the campaign."""
         try:
             return cls(stream, stream.first(), lift, keep=keep)

@@ -85,9 +85,9 @@ def add_injections(source: SourceNode) -> None:
                 await lift(number)
         return [ua.Variant(len(numbers), ua.VariantType.UInt32)]
 
-    one = Method(source, "Lift", "inject", "Lifts an injection, whoever laid it", lift)
+    one = Method(source, "Lift", "inject", "Lifts an injection of any program", lift)
     one.inputs = [_argument("Number", ua.ObjectIds.UInt64, "as in Injections")]
-    every = Method(source, "LiftAll", "inject", "Lifts all injections of this source, whoever laid them", lift_all)
+    every = Method(source, "LiftAll", "inject", "Lifts all injections of this source, of all programs", lift_all)
     every.outputs = [_argument("Lifted", ua.ObjectIds.UInt32, "how many there were")]
     listed = Property(
         source,

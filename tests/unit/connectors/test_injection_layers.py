@@ -30,26 +30,26 @@ def bit(offset: int, number: int) -> Write:
     return Write(offset, 1 << number, bytes([1 << number]))
 
 
-def laid(*layers: Layer) -> LayerStack:
+def stacked(*layers: Layer) -> LayerStack:
     injections = LayerStack(SIZE)
     for one in layers:
-        assert injections.lay(one) == ""
+        assert injections.add(one) == ""
     return injections
 
 
 def test_image_without_injections_is_unchanged() -> None:
-    assert laid().effective(bytes(SIZE)) is None
-    assert laid(layer(1, whole(0, 2), direction=Direction.IN)).effective(bytes(SIZE)) is None
+    assert stacked().effective(bytes(SIZE)) is None
+    assert stacked(layer(1, whole(0, 2), direction=Direction.IN)).effective(bytes(SIZE)) is None
 
 
 def test_injection_changes_only_covered_bits() -> None:
-    injections = laid(layer(1, whole(2, 2), bit(5, 3), values=b"\xaa" * SIZE))
+    injections = stacked(layer(1, whole(2, 2), bit(5, 3), values=b"\xaa" * SIZE))
     assert injections.effective(b"\x11" * SIZE) == b"\x11\x11\xaa\xaa\x11\x19\x11\x11"
     assert injections.effective(b"\xff" * SIZE) == b"\xff\xff\xaa\xaa\xff\xff\xff\xff"
 
 
 def test_the_highest_priority_is_outermost_then_the_newest() -> None:
-    injections = laid(
+    injections = stacked(
         layer(1, whole(0, 4), priority=5, values=b"\x01" * SIZE),
         layer(2, whole(1, 4), values=b"\x02" * SIZE),
         layer(3, whole(2, 4), values=b"\x03" * SIZE),
@@ -64,16 +64,16 @@ def test_the_highest_priority_is_outermost_then_the_newest() -> None:
 def test_shadow_accepts_only_values_that_it_covers() -> None:
     one = layer(1, whole(0, 2), bit(4, 0))
     assert shadow(one, [Write(0, 0, b"\x12\x34"), Write(4, 1, b"\xff")]) == ""
-    assert laid(one).effective(bytes(SIZE)) == b"\x12\x34\0\0\x01\0\0\0"
+    assert stacked(one).effective(bytes(SIZE)) == b"\x12\x34\0\0\x01\0\0\0"
     for beyond in (Write(1, 0, b"\1\1"), Write(4, 2, b"\2"), Write(4, 0, b"\1"), Write(SIZE, 0, b"\1")):
         assert "not covered by the injection s1" in shadow(one, [Write(0, 0, b"\x99"), beyond])
-    assert laid(one).effective(bytes(SIZE)) == b"\x12\x34\0\0\x01\0\0\0", "a refused value has no effect"
+    assert stacked(one).effective(bytes(SIZE)) == b"\x12\x34\0\0\x01\0\0\0", "a refused value has no effect"
 
 
 def test_write_is_diverted_to_the_outermost_injection() -> None:
     inner = layer(1, whole(0, 4), direction=Direction.IN)
     outer = layer(2, whole(2, 1), bit(6, 1), direction=Direction.IN, priority=1)
-    injections = laid(inner, outer, layer(3, whole(0, 8)))
+    injections = stacked(inner, outer, layer(3, whole(0, 8)))
     taken, left, data, by = injections.divert(Write(1, 0, b"abcde"), None)
     assert taken == [(outer, [Write(2, 0, b"b")]), (inner, [Write(1, 0, b"a"), Write(3, 0, b"c")])]
     assert (left, data, by) == (b"\0\0\0\xff\xff", b"abcde", None)
@@ -84,13 +84,13 @@ def test_write_is_diverted_to_the_outermost_injection() -> None:
 
 
 def test_invalid_injections_are_refused() -> None:
-    injections = laid(layer(1, whole(0, 1)))
-    assert "an injection 1 already" in injections.lay(layer(1, whole(0, 1)))
+    injections = stacked(layer(1, whole(0, 1)))
+    assert "an injection 1 already" in injections.add(layer(1, whole(0, 1)))
     with pytest.raises(ValueError, match="byte 8 lies outside"):
         covering(SIZE, [whole(6, 3)])
     for number in range(2, MAX_INJECTIONS + 1):
-        assert injections.lay(layer(number, whole(0, 1))) == ""
-    assert "64 injections cover" in injections.lay(layer(99, whole(0, 1)))
+        assert injections.add(layer(number, whole(0, 1))) == ""
+    assert "64 injections cover" in injections.add(layer(99, whole(0, 1)))
 
 
 def has(parts: list[Write], at: int, mask: int, byte: int) -> bool:
@@ -108,7 +108,7 @@ images = st.binary(min_size=SIZE, max_size=SIZE)
 def test_each_bit_belongs_to_the_outermost_layer_that_covers_it(
     raw: bytes, layers: list[tuple[bytes, bytes, int, Direction]], data: bytes
 ) -> None:
-    injections = laid(
+    injections = stacked(
         *(
             layer(number, Write(0, 0, cover), values=values, priority=priority, direction=direction)
             for number, (cover, values, priority, direction) in enumerate(layers)

@@ -479,7 +479,7 @@ def test_the_configuration_may_change_while_the_process_runs(make: Callable[...,
     rig.block.commands.wake()
     until(
         lambda: "new" in {entry.name for entry in rig.block.injections.read()},
-        "the new injection, which is laid last",
+        "the new injection, which is created last",
     )
     rig.poll({"axis/1": 2})
     assert (rig.value("axis/1"), rig.value("flags"), rig.value("speed")) == (1, 0, 2)

@@ -45,24 +45,24 @@ def compiled(names: str | bytes, block: bytes = A50, file: str = "names.toml") -
     return compile_sources([Source("db201.db", block), Source(file, data)])
 
 
-def laid(names: str | bytes, block: bytes = A50, file: str = "names.toml") -> Layout:
+def overlaid(names: str | bytes, block: bytes = A50, file: str = "names.toml") -> Layout:
     return compiled(names, block, file).layouts[0]
 
 
 def small(address: str, kind: str = "") -> Register:
     given_type = f', type = "{kind}"' if kind else ""
-    return laid(f'[registers]\nit = {{ address = "{address}"{given_type} }}', SMALL).registers[-1]
+    return overlaid(f'[registers]\nit = {{ address = "{address}"{given_type} }}', SMALL).registers[-1]
 
 
 def refusal(names: str | bytes, block: bytes = SMALL, file: str = "names.toml") -> str:
     with pytest.raises(LayoutError) as error:
-        laid(names, block, file)
+        overlaid(names, block, file)
     assert "\n" not in str(error.value)
     return str(error.value)
 
 
 def test_names_follow_the_registers_of_the_block_which_stay_as_they_are() -> None:
-    layout, bare = laid(NAMES), compile_sources([Source("db201.db", A50)]).layouts[0]
+    layout, bare = overlaid(NAMES), compile_sources([Source("db201.db", A50)]).layouts[0]
     assert layout.own == bare.registers
     assert layout.base.hash == bare.hash != layout.hash
     assert (layout.size, layout.name, layout.number) == (bare.size, bare.name, bare.number)
@@ -81,13 +81,13 @@ def test_names_follow_the_registers_of_the_block_which_stay_as_they_are() -> Non
 
 
 def test_a_stored_layout_keeps_the_names() -> None:
-    layout = laid(NAMES)
+    layout = overlaid(NAMES)
     assert load_layout(layout.to_json()) == layout
     assert load_layout(layout.with_statuses().to_json()) == layout.with_statuses()
 
 
 def test_a_csv_names_bits_too() -> None:
-    layout = laid("path;address;type;writable\nDoor;Inputs/8.%X0;;x\nSpeed;Inputs/10;REAL;\n", file="names.csv")
+    layout = overlaid("path;address;type;writable\nDoor;Inputs/8.%X0;;x\nSpeed;Inputs/10;REAL;\n", file="names.csv")
     assert layout.registers[-2:] == (
         Register("Door", "BOOL", (), 8, 0, 1, 1, over="Inputs/8.%X0", writable=True),
         Register("Speed", "REAL", (), 10, None, 4, 1, over="Inputs/10"),
@@ -98,7 +98,7 @@ def test_a_csv_names_bits_too() -> None:
 def test_the_examples_of_the_pages_lie_over_the_a50_block(page: str) -> None:
     text = (ROOT / "docs" / page).read_text()
     (example,) = [toml for toml in re.findall(r"```toml\n(.*?)```", text, re.DOTALL) if "Inputs/8.%X0" in toml]
-    door = find(laid(example), "DoorClosed")
+    door = find(overlaid(example), "DoorClosed")
     assert (door.type, door.offset, door.bit) == ("BOOL", 8, 0)
 
 
@@ -206,16 +206,16 @@ def test_a_path_that_differs_only_in_case_gets_a_warning() -> None:
 def test_initial_values_are_those_of_the_block() -> None:
     names = '[registers]\na = "Text"\nb = { address = "Inputs/0", type = "STRING[8]" }'
     bare = compile_sources([Source("cell.db", SMALL)]).layouts[0]
-    assert initial_frame(laid(names, SMALL)) == initial_frame(bare)
+    assert initial_frame(overlaid(names, SMALL)) == initial_frame(bare)
 
 
 def test_writes_are_named_by_the_block() -> None:
-    layout = laid(NAMES)
+    layout = overlaid(NAMES)
     assert paths_of(layout, encode(find(layout, "Release"), True)) == ["Outputs/13.%X6"]
 
 
 def test_elements_and_slices_of_a_row_that_begins_within_a_byte() -> None:
-    layout = laid(NAMES)
+    layout = overlaid(NAMES)
     places = [(one.offset, one.bit) for one in elements(layout, find(layout, "lamps"))]
     assert places == [(1020, bit) for bit in range(2, 8)] + [(1021, bit) for bit in range(3)]
     part = find(layout, "lamps/6..8")
@@ -227,12 +227,12 @@ def test_elements_and_slices_of_a_row_that_begins_within_a_byte() -> None:
 
 
 def test_patterns_cover_the_bits_of_a_row_and_no_others() -> None:
-    layout = laid('[registers]\nrow = { address = "Inputs/3.%X2", type = "ARRAY[0..2] OF BOOL" }', SMALL)
+    layout = overlaid('[registers]\nrow = { address = "Inputs/3.%X2", type = "ARRAY[0..2] OF BOOL" }', SMALL)
     assert cover(layout, ["row"]) == bytes([0, 0, 0, 0b11100]).ljust(layout.size, b"\0")
 
 
 def test_a_name_has_the_status_of_what_it_lies_over() -> None:
-    layout = laid('[registers]\na = "Status.%X9"\nb = "Level"\nc = "Inputs/9"', SMALL).with_statuses()
+    layout = overlaid('[registers]\na = "Status.%X9"\nb = "Level"\nc = "Inputs/9"', SMALL).with_statuses()
     area, image = StatusArea(layout), bytearray(layout.size)
     area.put(image, layout.by_path["Status"], RegisterStatus(0x80050000, 7))
     codes = [area.get(image, area.index(find(layout, path))).code for path in "abc"]
@@ -251,7 +251,7 @@ def test_a_name_has_the_status_of_what_it_lies_over() -> None:
     ],
 )
 def test_a_stored_layout_that_contradicts_itself_is_refused(old: str, new: str) -> None:
-    text = laid(NAMES).to_json().decode()
+    text = overlaid(NAMES).to_json().decode()
     assert text.count(old) == 1
     with pytest.raises(LayoutError):
         load_layout(text.replace(old, new).encode())
@@ -261,7 +261,7 @@ def test_a_stored_layout_that_contradicts_itself_is_refused(old: str, new: str) 
 def test_any_address_and_type_are_laid_or_refused(address: str, kind: str) -> None:
     names = "path,address,type\n" + ",".join('"' + text.replace('"', '""') + '"' for text in ("a", address, kind))
     try:
-        layout = laid(names, SMALL, "names.csv")
+        layout = overlaid(names, SMALL, "names.csv")
     except LayoutError:
         return
     assert load_layout(layout.to_json()) == layout
@@ -278,7 +278,7 @@ _KIND = st.from_regex(r"(ARRAY\[[0-3]\.\.[0-9]\] OF )?(BOOL|BYTE|INT|REAL|LREAL|
 def test_any_table_is_laid_or_refused(text: str) -> None:
     for body in (text, f"[registers]\n{text}", f"[registers]\na = '{text}'", f"[registers]\n'{text}' = 'Level'"):
         try:
-            layout = laid(body, SMALL)
+            layout = overlaid(body, SMALL)
         except LayoutError:
             continue
         assert load_layout(layout.to_json()) == layout
@@ -292,7 +292,7 @@ def test_a_name_never_reaches_beyond_what_it_lies_over(address: str, kind: str) 
         return
     member = re.match("[A-Za-z]+(/Position)?", address)
     assert member is not None
-    holder = find(laid('[registers]\nit = "Level"', SMALL), member[0])
+    holder = find(overlaid('[registers]\nit = "Level"', SMALL), member[0])
     assert holder.offset <= found.offset
     assert found.offset + found.size <= holder.offset + holder.size
     for at, bits in enumerate(bits_of(found), found.offset - holder.offset):
@@ -332,7 +332,7 @@ def cells(draw: st.DrawFn) -> tuple[Layout, bytes]:
     body = f"STRUCT {' '.join(members)} END_STRUCT; BEGIN END_DATA_BLOCK"
     text = f"DATA_BLOCK DB1 {{ S7_Optimized_Access := 'FALSE' }} {body}"
     table = "[registers]\n" + "\n".join(f"{path} = {over}" for path, over in names.items())
-    layout = laid(table, text.encode())
+    layout = overlaid(table, text.encode())
     return layout, draw(st.binary(min_size=layout.size, max_size=layout.size))
 
 

@@ -173,14 +173,14 @@ class CommandClient:
         cost = CommandCost.of([len(write.data) for write in writes])
         await self._send(partial(self._source_writer.give, injection, writes), cost, done, accepted)
 
-    def lay(self, bits: bytes, follower: InjectionFollower, done: Done, **laid: Unpack[InjectionOptions]) -> int:
-        """Ask the source to lay an injection, without waiting for the outcome.
+    def inject(self, bits: bytes, follower: InjectionFollower, done: Done, **options: Unpack[InjectionOptions]) -> int:
+        """Ask the source to create an injection, without waiting for the outcome.
 
         Args:
             bits: Mask of the block, with the bits set that the injection covers.
             follower: Receives the injection's events.
             done: Called once, with the outcome.
-            laid: Options of the injection, such as its name and priority.
+            options: Options of the injection, such as its name and priority.
 
         Returns:
             The injection's number.
@@ -190,11 +190,11 @@ class CommandClient:
 
         """
         writes = merge(bits, bits, [(0, len(bits))])
-        cost = CommandCost.of([len(write.data) for write in writes], laid.get("name", ""))
-        return self._lay(self._source_writer.lay(writes, **laid), cost, follower, done)
+        cost = CommandCost.of([len(write.data) for write in writes], options.get("name", ""))
+        return self._create(self._source_writer.ask_to_inject(writes, **options), cost, follower, done)
 
     def declare(self, declaration: Declaration, follower: InjectionFollower, done: Done, *, keep: bool) -> int:
-        """Ask the source to lay a declared injection, without waiting for the outcome.
+        """Ask the source to create a declared injection, without waiting for the outcome.
 
         Args:
             declaration: The injection, which the source runs itself.
@@ -210,9 +210,9 @@ class CommandClient:
 
         """
         cost = CommandCost.of([len(msgspec.json.encode(declaration))], declaration.name)
-        return self._lay(self._source_writer.ask_to_declare(declaration, keep=keep), cost, follower, done)
+        return self._create(self._source_writer.ask_to_declare(declaration, keep=keep), cost, follower, done)
 
-    def _lay(self, ticket: PendingCommand, cost: CommandCost, follower: InjectionFollower, done: Done) -> int:
+    def _create(self, ticket: PendingCommand, cost: CommandCost, follower: InjectionFollower, done: Done) -> int:
         self._in_flight.add(ticket, cost, done)
         self._start_timer()
         self.followers.add(ticket.number, follower)
@@ -393,29 +393,29 @@ async def give(
     return await answer
 
 
-async def lay(
-    commands: CommandClient, bits: bytes, follower: InjectionFollower, **laid: Unpack[InjectionOptions]
+async def inject(
+    commands: CommandClient, bits: bytes, follower: InjectionFollower, **options: Unpack[InjectionOptions]
 ) -> int:
-    """Lay an injection, wait until the source has done so, and return its number.
+    """Create an injection, wait until the source has done so, and return its number.
 
     Raises:
         CommandError: The source refuses the injection, or does not answer.
 
     """
-    return await _laid(commands, lambda done: commands.lay(bits, follower, done, **laid))
+    return await _created(commands, lambda done: commands.inject(bits, follower, done, **options))
 
 
 async def declare(commands: CommandClient, declaration: Declaration, follower: InjectionFollower, *, keep: bool) -> int:
-    """Lay a declared injection, which the source runs itself; return its number.
+    """Create a declared injection, which the source runs itself; return its number.
 
     Raises:
         CommandError: The source refuses the injection, or does not answer.
 
     """
-    return await _laid(commands, lambda done: commands.declare(declaration, follower, done, keep=keep))
+    return await _created(commands, lambda done: commands.declare(declaration, follower, done, keep=keep))
 
 
-async def _laid(commands: CommandClient, send: Callable[[Done], int]) -> int:
+async def _created(commands: CommandClient, send: Callable[[Done], int]) -> int:
     _check(commands)
     answer = Answer()
     number = send(answer.done)
@@ -427,7 +427,7 @@ async def _laid(commands: CommandClient, send: Callable[[Done], int]) -> int:
     if kind is EventKind.INJECTED:
         return number
     commands.followers.remove(number)
-    if kind is EventKind.UNKNOWN:  # the source may have laid it
+    if kind is EventKind.UNKNOWN:  # the source may have created it
         await lift(commands, number)
     raise CommandError(f"{commands.block.source}: {reason}")
 

@@ -21,7 +21,7 @@ class InjectionFollower:
     """
 
     def on_event(self, event: Event) -> None:
-        """Handle an event: the injection was laid, activated, deactivated or lifted."""
+        """Handle an event: the injection was created, activated, deactivated or lifted."""
 
     def divert(self, diverted: CommandWrites) -> None:
         """Handle a command whose values the injection diverted."""
@@ -29,7 +29,7 @@ class InjectionFollower:
     def restack(self) -> None:
         """Handle a change of another injection on the source.
 
-        The other injection was laid, lifted, activated or deactivated.
+        The other injection was created, lifted, activated or deactivated.
         """
 
     def lifted(self, reason: str) -> None:

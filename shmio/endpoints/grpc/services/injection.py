@@ -80,7 +80,7 @@ class _Tap:
 
 
 class Injection(InjectionFollower):
-    """An injection over the registers of ``shape``, from laying to lifting.
+    """An injection over the registers of ``shape``, from its creation to its end.
 
     ``shape`` has the registers that ``target`` names in the layout of ``feed``. The *originals* of
     an injection are the values that it diverts. Over ``/out``, the source or inner injections
@@ -89,7 +89,7 @@ class Injection(InjectionFollower):
     """
 
     def __init__(self, target: Topic, shape: Shape, feed: Feed, name: str) -> None:
-        """Begin to lay the injection.
+        """Begin to create the injection.
 
         Args:
             target: The topic of the injection.
@@ -112,29 +112,29 @@ class Injection(InjectionFollower):
         self._scan = ChangeScan(shape.registers, feed.block.statuses)
         self._subjects: dict[Subject, None] = {}
         self._diverted, self._given = _Tap(), _Tap()
-        self._laid = asyncio.get_running_loop().create_task(self._lay(name))
-        self._laid.add_done_callback(lambda laid: laid.cancelled() or laid.exception())  # laid() raises the error
+        self._creating = asyncio.get_running_loop().create_task(self._create(name))
+        self._creating.add_done_callback(lambda task: task.cancelled() or task.exception())  # see created()
         self._lifting: asyncio.Task[None] | None = None
 
-    # ---- laid, and lifted --------------------------------------------------------------------------------------
+    # ---- created, and lifted --------------------------------------------------------------------------------------
 
-    async def laid(self) -> None:
-        """Wait until the source has laid the injection.
+    async def created(self) -> None:
+        """Wait until the source has created the injection.
 
         Raises:
             CommandError: The source refuses the injection, or does not answer.
 
         """
-        await asyncio.shield(self._laid)
+        await asyncio.shield(self._creating)
 
-    async def _lay(self, name: str) -> None:
+    async def _create(self, name: str) -> None:
         direction = Direction.IN if self.inward else Direction.OUT
         try:
             if self.feed.block.retired:
                 raise CommandError(RETIRED)
             answer = command_client.Answer()
             bits = covering(self.shape.registers, self.feed.block.layout.size)
-            self._base.number = self.feed.commands.lay(bits, self, answer.done, direction=direction, name=name)
+            self._base.number = self.feed.commands.inject(bits, self, answer.done, direction=direction, name=name)
             ((kind, reason),) = await answer
             if kind is not EventKind.INJECTED:
                 raise CommandError(f"{kind}: {reason}")
@@ -142,7 +142,7 @@ class Injection(InjectionFollower):
             self._finish(str(error))
             raise CommandError(f"{self.target}: {error}") from None
         finally:
-            if self.over:  # it ended meanwhile, or the source may have laid it although it did not answer
+            if self.over:  # it ended meanwhile, or the source may have created it although it did not answer
                 self._have_it_lifted()
 
     def end(self, reason: str) -> None:
@@ -154,7 +154,7 @@ class Injection(InjectionFollower):
         """
         if not self.over:
             self._finish(reason)
-            if self._laid.done():
+            if self._creating.done():
                 self._have_it_lifted()
 
     def _have_it_lifted(self) -> None:
@@ -171,7 +171,7 @@ class Injection(InjectionFollower):
 
     def ready(self, values: Mapping[str, object]) -> bool:
         """Return whether :meth:`give` would send these values without waiting."""
-        return self._laid.done() and self.feed.commands.ready(values)
+        return self._creating.done() and self.feed.commands.ready(values)
 
     async def give(self, values: Mapping[str, object], done: Done, accepted: Callable[[], None] | None = None) -> None:
         """Send values to the source as the given values of this injection.
@@ -187,7 +187,7 @@ class Injection(InjectionFollower):
             ValueRangeError: A value does not fit its register. Nothing was sent.
 
         """
-        await self.laid()
+        await self.created()
         if self.over:
             raise PathError(f"the injection over {self.target} has ended: {self.over}")
         shown = False
@@ -336,13 +336,13 @@ class Shadows:
         """Return the shadow topic that a path names, or None."""
         return self._named.get(self._topics.name(path)) if self._named else None
 
-    async def lay(
+    async def create(
         self, target: Topic, shape: Shape, kinds: Mapping[str, ShadowKind], holder: object, peer: str
     ) -> Injection:
-        """Lay an injection with these shadow topics, or join the one that has them.
+        """Create an injection with these shadow topics, or join the one that has them.
 
         Args:
-            target: The topic to lay the injection over.
+            target: The topic to create the injection over.
             shape: The registers that the target names.
             kinds: The shadow topics, by path.
             holder: The object that holds the injection until :meth:`release`.
@@ -368,7 +368,7 @@ class Shadows:
             injection.ends[self] = partial(self._forget, injection)
         self._holders[injection].add(holder)
         try:
-            await injection.laid()
+            await injection.created()
         except BaseException:
             self.release(injection, holder)
             raise
@@ -377,7 +377,7 @@ class Shadows:
     async def lay_for_client(
         self, target: Topic, shape: Shape, kinds: Mapping[str, ShadowKind], peer: str
     ) -> Injection:
-        """Lay an injection as :meth:`lay` does.
+        """Create an injection as :meth:`create` does.
 
         The client's connection holds the injection until a stream does.
         """
@@ -385,7 +385,7 @@ class Shadows:
         if seen not in await asyncio.to_thread(connected):
             seen = None
         client = _Client(seen, time.monotonic() + UNSEEN_S)
-        injection = await self.lay(target, shape, kinds, client, peer)
+        injection = await self.create(target, shape, kinds, client, peer)
         if self._looking is None:
             self._looking = asyncio.get_running_loop().create_task(self._look())
         return injection

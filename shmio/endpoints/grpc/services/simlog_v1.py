@@ -250,7 +250,7 @@ class InjectCalls:
         return shadow.injection
 
     async def inject(self, request: wire.InjectRequest, context: Context) -> AsyncIterator[bytes]:
-        """Lay or join an injection that lasts while the stream is open, and stream its originals.
+        """Create or join an injection that lasts while the stream is open, and stream its originals.
 
         Over ``/in``, the originals are the written values, which no longer reach the source. Over
         ``/out``, or without suffix, they are the source's values, beginning with the present value.
@@ -270,7 +270,7 @@ class InjectCalls:
         with self._outboxes.opened() as outbox:
             try:
                 kinds = {shadow_path(request.injected.path): ShadowKind.GIVEN}
-                injection = await self._shadows.lay(topic, found, kinds, outbox, context.peer())
+                injection = await self._shadows.create(topic, found, kinds, outbox, context.peer())
             except ShmioError as error:
                 await refuse(context, error)
             release = partial(self._shadows.release, injection, outbox)

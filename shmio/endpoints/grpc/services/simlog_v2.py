@@ -631,7 +631,7 @@ class SimlogV2:
         return Empty()
 
     async def inject(self, request: wire.InjectRequest, context: Context) -> wire.InjectResponse:
-        """Lay an injection over a topic. Return the paths for its given values and its originals.
+        """Create an injection over a topic. Return the paths for its given values and its originals.
 
         The injection lasts while a subscriber has ``shadowPathOut``. Before the first subscriber,
         it lasts as long as the connection of this call.

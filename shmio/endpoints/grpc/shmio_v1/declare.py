@@ -78,14 +78,14 @@ class DeclareCall:
         self._members: list[DeclaredInjection] = []
         self._waiting = SendQueue()  # serialised fields of a DeclareResponse
         self._wake = asyncio.Event()
-        self._laid = False
+        self._complete = False
         self._abandoned = False
         self._lifting: asyncio.Task[None] | None = None
         self.over = ""
         """Reason why the call has to end before its injections; otherwise empty."""
 
     async def open(self) -> bytes:
-        """Lay all injections or none, and return the first message.
+        """Create all injections or none, and return the first message.
 
         Raises:
             ConfigError: A declaration does not fit the sources.
@@ -119,13 +119,13 @@ class DeclareCall:
         except BaseException:
             await self._lift()
             raise
-        self._laid = True
+        self._complete = True
         return field(_DECLARED, declared.SerializeToString()) + self._waiting.all()
 
     def abandon(self) -> None:
-        """Stop laying injections, because the client has disconnected.
+        """Stop creating injections, because the client has disconnected.
 
-        Injections that :meth:`open` has laid are lifted, unless it has already laid all.
+        Injections that :meth:`open` has created are lifted, unless it has already created all.
         """
         self._abandoned = True
 
@@ -169,7 +169,7 @@ class DeclareCall:
         of the stream, which a client that does not read would delay.
         """
         self.over = self.over or reason
-        if self._laid and not self._keep and self._lifting is None:
+        if self._complete and not self._keep and self._lifting is None:
             self._lifting = asyncio.get_running_loop().create_task(self._lift())
         self._wake.set()
 
@@ -212,7 +212,7 @@ class DeclaredInjection(InjectionFollower):
         self._campaign = campaign
 
     def on_event(self, event: Event) -> None:
-        """Record that the injection was laid, activated, deactivated or lifted."""
+        """Record that the injection was created, activated, deactivated or lifted."""
         kind = EventKind(event.kind)
         turned = kind in (EventKind.ACTIVATED, EventKind.DEACTIVATED)
         self.gone = kind is EventKind.LIFTED

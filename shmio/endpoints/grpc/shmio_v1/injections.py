@@ -52,7 +52,7 @@ class InjectTarget(NamedTuple):
     ranges: tuple[wire.Range, ...]
 
 
-def target_of(topics: Topics, lay: wire.Lay) -> InjectTarget:
+def target_of(topics: Topics, options: wire.Lay) -> InjectTarget:
     """Read the target of an injection.
 
     Raises:
@@ -61,29 +61,31 @@ def target_of(topics: Topics, lay: wire.Lay) -> InjectTarget:
             is not valid.
 
     """
-    if not (lay.patterns or lay.ranges):
+    if not (options.patterns or options.ranges):
         raise ValueRangeError("no pattern and no range is given: name the registers to inject into")
-    for name, given in (("patterns", len(lay.patterns)), ("ranges", len(lay.ranges))):
+    for name, given in (("patterns", len(options.patterns)), ("ranges", len(options.ranges))):
         if given > MAX_PATTERNS:
             raise ValueRangeError(
                 f"{given} {name} are given, at most {MAX_PATTERNS} are allowed: use stars or structures"
             )
-    found = tuple(dict.fromkeys(topics.topic(pattern) for pattern in lay.patterns))
+    found = tuple(dict.fromkeys(topics.topic(pattern) for pattern in options.patterns))
     places = {SourceDirection(topic.source, topic.direction == "in") for topic in found}
     if len({place.source for place in places}) > 1:
-        raise PathError("an injection covers one source: lay one for each source, each with its own stream")
+        raise PathError("an injection covers one source: create one for each source, each with its own stream")
     if len(places) > 1:
-        raise PathError(f"{shorten(lay.patterns[0])}, …: an injection covers /out or /in, not both")
-    if lay.direction not in wire.Direction.values():
-        raise ValueRangeError(f"direction: {lay.direction} is invalid; 0 is /out, 1 is /in")
-    if lay.source:
-        topic = topics.topic(lay.source)
+        raise PathError(f"{shorten(options.patterns[0])}, …: an injection covers /out or /in, not both")
+    if options.direction not in wire.Direction.values():
+        raise ValueRangeError(f"direction: {options.direction} is invalid; 0 is /out, 1 is /in")
+    if options.source:
+        topic = topics.topic(options.source)
         if topic.path or topic.direction:
-            raise PathError(f"source: {shorten(lay.source)} is not a source's name")
-        places.add(SourceDirection(topic.source, places.pop().inward if places else lay.direction == wire.DIRECTION_IN))
+            raise PathError(f"source: {shorten(options.source)} is not a source's name")
+        places.add(
+            SourceDirection(topic.source, places.pop().inward if places else options.direction == wire.DIRECTION_IN)
+        )
     if len(places) != 1:
         raise PathError("source: this field is needed for ranges without a pattern")
-    return InjectTarget(places.pop(), found, tuple(lay.ranges))
+    return InjectTarget(places.pop(), found, tuple(options.ranges))
 
 
 class ByteRanges:
@@ -185,7 +187,7 @@ def raw_writes(pieces: Collection[wire.Piece], bits: bytes) -> list[Write]:
 class InjectCall(InjectionFollower):
     """An Inject call with its injection."""
 
-    def __init__(self, topics: Topics, selections: Selections, wake_ups: WakeUps, lay: wire.Lay) -> None:
+    def __init__(self, topics: Topics, selections: Selections, wake_ups: WakeUps, options: wire.Lay) -> None:
         """Check the request.
 
         Raises:
@@ -193,11 +195,11 @@ class InjectCall(InjectionFollower):
             ValueRangeError: An option is not valid, or there is no target.
 
         """
-        _check(lay)
+        _check(options)
         self._topics = topics
         self._selections = selections
         self._wake_ups = wake_ups
-        self._lay = lay
+        self._options = options
         self.over = ""
         """Why the call has to end: another client lifted the injection, or this one does not read.
 
@@ -205,7 +207,7 @@ class InjectCall(InjectionFollower):
         """
         self._lifted = self._ended = False
         self._lifting: asyncio.Task[None] | None = None
-        self._target = target_of(topics, lay)
+        self._target = target_of(topics, options)
         self._wake = asyncio.Event()
         self._waiting = SendQueue()  # serialised fields of an InjectResponse
         self.failure: ShmioError | None = None
@@ -228,7 +230,7 @@ class InjectCall(InjectionFollower):
         return self._target.place.inward
 
     async def open(self) -> bytes:
-        """Lay the injection, and return the first message.
+        """Create the injection, and return the first message.
 
         Raises:
             PathError: There is no such register.
@@ -246,28 +248,28 @@ class InjectCall(InjectionFollower):
         self._commands = self._selections.commands(self.source)
         if self._commands.block is not view.block:
             raise CommandError(f"{self.source}: a reload changed this source concurrently; try again")
-        lay = self._lay
-        self._base.number = await command_client.lay(
+        options = self._options
+        self._base.number = await command_client.inject(
             self._commands,
             self._bits,
             self,
             direction=Direction.IN if self._inward else Direction.OUT,
-            priority=lay.priority,
-            keep=lay.keep,
-            name=lay.name,
+            priority=options.priority,
+            keep=options.keep,
+            name=options.name,
         )
         self.restack()
-        if lay.lifetime_ms:
-            self._timer = asyncio.get_running_loop().call_later(lay.lifetime_ms / 1000, self._end)
+        if options.lifetime_ms:
+            self._timer = asyncio.get_running_loop().call_later(options.lifetime_ms / 1000, self._end)
         if self._originals:
             self._wake_ups.join(view.block, self._wake.set)
-        laid = wire.Laid(number=self._base.number).SerializeToString()
-        return field(1, laid + field(2, view.table + self._ranges.table))
+        created = wire.Laid(number=self._base.number).SerializeToString()
+        return field(1, created + field(2, view.table + self._ranges.table))
 
     @property
     def _originals(self) -> bool:
         """True if the call sends originals, and takes them from frames."""
-        return not (self._inward or self._lay.quiet)
+        return not (self._inward or self._options.quiet)
 
     async def close(self) -> None:
         """Lift the injection, unless it is to be kept. Retry until the source has done so."""
@@ -278,14 +280,14 @@ class InjectCall(InjectionFollower):
         if self._originals:
             self._wake_ups.leave(self._view.block, self._wake.set)
         number = self._base.number
-        if self._lay.keep or self._lifted:
+        if self._options.keep or self._lifted:
             self._commands.followers.remove(number)
         else:
             self._lifting = self._lifting or self._lift()
             await self._lifting
 
     def _lift(self) -> asyncio.Task[None]:
-        name = f"{self.source}: {self._lay.name}"
+        name = f"{self.source}: {self._options.name}"
         return asyncio.get_running_loop().create_task(
             command_client.have_lifted(self._commands, self._base.number, name)
         )
@@ -321,7 +323,7 @@ class InjectCall(InjectionFollower):
         """
         async for request in requests:
             if request.WhichOneof("what") != "shadow":
-                raise ValueRangeError("the first message lays an injection, all others must give values")
+                raise ValueRangeError("the first message creates an injection, all others must give values")
             await self._room.acquire()
             task = asyncio.get_running_loop().create_task(self._give(request.shadow))
             self._giving.add(task)
@@ -407,7 +409,7 @@ class InjectCall(InjectionFollower):
         self._base.divert(diverted.writes)
         if not self._inward:
             self.restack()
-        elif not self._lay.quiet:
+        elif not self._options.quiet:
             mask = bytearray(len(self._bits))
             apply(mask, (write._replace(data=b"\xff" * len(write.data)) for write in diverted.writes))
             image, touched = bytes(self._base.given), bytes(mask)
@@ -428,7 +430,7 @@ class InjectCall(InjectionFollower):
         delay.
         """
         self.over = self.over or reason
-        if self._base.number and not (self._lay.keep or self._lifted):
+        if self._base.number and not (self._options.keep or self._lifted):
             self._lifting = self._lifting or self._lift()
         self._wake.set()
 
@@ -449,17 +451,17 @@ class InjectCall(InjectionFollower):
 
         Over ``/out`` the originals come from frames, so nothing is missing.
         """
-        if self._inward and not self._lay.quiet:
+        if self._inward and not self._options.quiet:
             self._give_up(reason)
 
 
-def _check(lay: wire.Lay) -> None:
+def _check(options: wire.Lay) -> None:
     """Raise ValueRangeError if options are not valid or exclude each other."""
-    if len(lay.name.encode()) > MAX_NAME_BYTES:
+    if len(options.name.encode()) > MAX_NAME_BYTES:
         raise ValueRangeError(f"name: at most {MAX_NAME_BYTES} bytes are allowed")
-    if lay.lifetime_ms > MAX_LIFETIME_MS:
+    if options.lifetime_ms > MAX_LIFETIME_MS:
         raise ValueRangeError(f"lifetime_ms: at most {MAX_LIFETIME_MS} (a day) is allowed")
-    if lay.keep and lay.lifetime_ms:
+    if options.keep and options.lifetime_ms:
         raise ValueRangeError("keep and lifetime_ms exclude each other: a kept injection stays until somebody lifts it")
 
 
@@ -491,7 +493,7 @@ class InjectionCalls:
         }
 
     async def inject(self, requests: AsyncIterator[wire.InjectRequest], context: Context) -> AsyncIterator[bytes]:
-        """Lay an injection that ends with the stream, unless the client asks to keep it.
+        """Create an injection that ends with the stream, unless the client asks to keep it.
 
         The call streams the originals to the client. The client streams other values to the call.
 
@@ -533,7 +535,7 @@ class InjectionCalls:
 
         Raises:
             PathError: There is no such source, or the patterns differ in source or direction.
-            ValueRangeError: The message does not lay an injection, or an option is not valid.
+            ValueRangeError: The message does not create an injection, or an option is not valid.
             EndpointError: There are too many calls.
 
         """
@@ -544,7 +546,7 @@ class InjectionCalls:
                 self._open.add(injection)
                 return injection
             break
-        raise ValueRangeError("the first message of Inject must lay an injection, all others give values")
+        raise ValueRangeError("the first message of Inject must create an injection, all others give values")
 
     def _check_room(self) -> None:
         """Raise EndpointError if there are too many calls."""
@@ -560,7 +562,7 @@ class InjectionCalls:
             self._open.discard(one)
 
     async def declare(self, request: wire.DeclareRequest, context: Context) -> AsyncIterator[bytes]:
-        """Lay declared injections, all or none.
+        """Create declared injections, all or none.
 
         The injections end with the stream, unless the client asks to keep them. The call streams a
         record of their events.

@@ -1,4 +1,4 @@
-"""Declare over real sockets: how a campaign lays injections, its events, and how it ends."""
+"""Declare over real sockets: how a campaign creates injections, its events, and how it ends."""
 
 from __future__ import annotations
 
