@@ -2,6 +2,7 @@
 
 from shmio.config.address import Address, UnixAddress, parse_address
 from shmio.config.model import (
+    Alert,
     Config,
     Declaration,
     Emulator,
@@ -25,6 +26,7 @@ from shmio.config.read import RESERVED_SOURCES, load
 __all__ = [
     "RESERVED_SOURCES",
     "Address",
+    "Alert",
     "Config",
     "Declaration",
     "Emulator",

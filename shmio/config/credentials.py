@@ -28,6 +28,8 @@ A password is checked once per connection.
 _KEY: Final = "mqtt.password_file"
 _HASH: Final = re.compile(r"\$[0-9a-z-]{1,16}\$")
 """Matches the beginning of a hash of any kind."""
+_HEADER: Final = re.compile(r"[A-Za-z0-9!#$%&'*+.^_`|~-]{1,100}")
+_OWN_HEADERS: Final = ("connection", "content-length", "content-type", "host", "transfer-encoding")
 _OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
 
 
@@ -98,6 +100,32 @@ def read_password(name: str, key: str = _KEY) -> str:
     if not password:
         raise ConfigError(f"{key}: {name}: its first line, the password, is empty")
     return password
+
+
+def read_headers(name: str, key: str) -> dict[str, str]:
+    """Return the HTTP headers in a file with lines ``Name: value``.
+
+    Args:
+        name: Path of the file.
+        key: The configuration key that has this path, for messages.
+
+    Raises:
+        ConfigError: The file cannot be used; the message never quotes a value.
+
+    """
+    headers: dict[str, str] = {}
+    for number, line in enumerate(_read_passwords(name, key).splitlines(), 1):
+        if not line.strip():
+            continue
+        header, colon, value = line.partition(":")
+        if not colon or not _HEADER.fullmatch(header) or not (value.strip().isascii() and value.strip().isprintable()):
+            raise ConfigError(f"{key}: {name}: line {number}: expected a header such as Authorization: Bearer TOKEN")
+        if header.lower() in _OWN_HEADERS:
+            raise ConfigError(f"{key}: {name}: line {number}: shmio itself sets the header {header}")
+        headers[header] = value.strip()
+    if not headers:
+        raise ConfigError(f"{key}: {name}: it has no header; expected lines such as Authorization: Bearer TOKEN")
+    return headers
 
 
 def read_accounts(name: str, roles: Sequence[MqttAccount] = ()) -> dict[str, str]:

@@ -23,7 +23,10 @@ from shmio.config.model import (
     DistributionName,
     OperationName,
     PayloadName,
+    ProcessState,
+    QualityName,
     ReplayedInjections,
+    Severity,
 )
 from shmio.errors import ConfigError, LayoutError
 
@@ -46,7 +49,7 @@ TOKEN: Final = re.compile(
     re.DOTALL,
 )
 _KEY: Final = re.compile(r"[A-Za-z0-9_-]+(?:\[[0-9]+\]|\.[A-Za-z0-9_-]+)*(?=[:\s])")
-_PLACE: Final = re.compile(r"\b(source|emulator|injection)\[([0-9]+)\]")
+_PLACE: Final = re.compile(r"\b(source|emulator|injection|alert)\[([0-9]+)\]")
 _QUOTES: Final = "'"
 _DOUBLE: Final = ("Cannot overwrite", "Cannot declare", "Duplicate inline table key")
 _ESCAPE: Final = ("Unescaped", "Invalid hex", "Escaped character", "Illegal character")
@@ -60,6 +63,9 @@ _WORDS: Final = {
     "injections": ReplayedInjections,
     "operation": OperationName,
     "payload": PayloadName,
+    "quality": QualityName,
+    "severity": Severity,
+    "state": ProcessState,
 }
 """The keys whose value must be one of a few words, with the type that lists these words."""
 _TYPES: Final = {
@@ -197,7 +203,7 @@ def explain(error: ValidationError, key: str = "") -> str:
     if repr(NAME_PATTERN) in text:
         text = f"expected a name: {NAME_RULE}"
     elif unknown := re.fullmatch(r"Invalid enum value ('.*')", text):
-        words = get_args(_WORDS[path.rpartition(".")[2]])
+        words = get_args(_WORDS[path.rpartition(".")[2].partition("[")[0]])
         text = f"{unknown[1]} is unknown; valid: {', '.join(words)}{meant(unknown[1].strip(_QUOTES), words)}"
     elif text.endswith("of length >= 1"):
         text = "must not be empty"
@@ -281,8 +287,8 @@ def _slip(message: str, line: str, column: int) -> str:
 
 
 def named(message: str, tables: Mapping[str, Any]) -> str:
-    """Add the name of a source, emulator or injection to a message that has only its number."""
-    key = re.match(r"(source|emulator|injection)\[(\d+)\](?!\.name:)", message)
+    """Add the name of a source, emulator, injection or alert to a message that has only its number."""
+    key = re.match(r"(source|emulator|injection|alert)\[(\d+)\](?!\.name:)", message)
     if key is None:
         return message
     try:

@@ -23,6 +23,9 @@ DistributionName = Literal["uniform", "gaussian"]
 OperationName = Literal["set", "offset", "scale", "clamp", "noise", "random", "freeze", "delay", "drop", "flip"]
 BrokerName = Literal["embedded", "mosquitto", "external"]
 PayloadName = Literal["text", "json", "structure", "frames"]
+ProcessState = Literal["starting", "running", "backoff", "stopped", "fatal"]
+QualityName = Literal["bad", "uncertain", "good"]
+Severity = Literal["info", "warning", "critical"]
 TypeBytes = Annotated[dict[Text, Annotated[int, Meta(ge=1, le=1 << 20)]], Meta(max_length=1000)]
 """For types whose members are unknown: the size in bytes by type name."""
 RealtimePriority = Annotated[int, Meta(ge=1, le=99)]
@@ -361,6 +364,70 @@ class Web(Metrics):
     roles: Annotated[list[Text], Meta(max_length=len(ROLES))] | None = None
 
 
+class Alert(Section):
+    """``[[alert]]``: what to watch, and whom to notify.
+
+    It watches one of these: a condition over registers (``when``), the state of processes, or the
+    quality of sources.
+    """
+
+    name: Name | None = None
+    when: Text | None = None
+    process: Text | Texts | None = None
+    state: ProcessState | Annotated[list[ProcessState], Meta(min_length=1)] | None = None
+    source: Text | Texts | None = None
+    quality: QualityName | Annotated[list[QualityName], Meta(min_length=1)] | None = None
+    for_s: Seconds = 0.0
+    every_s: Annotated[float, Meta(ge=0.1, le=1e9)] = 60.0
+    resolved: bool = False
+    severity: Severity = "warning"
+    text: Annotated[str, Meta(max_length=1000)] = ""
+    command: Annotated[list[Text], Meta(min_length=1, max_length=100)] | None = None
+    command_timeout_s: Annotated[float, Meta(gt=0, le=3600)] = 10.0
+    mqtt_topic: Text | None = None
+    mqtt_retain: bool = False
+    webhook: Text | None = None
+    webhook_header_file: Text | None = None
+    webhook_ca: Text | None = None
+    webhook_timeout_s: Annotated[float, Meta(gt=0, le=300)] = 10.0
+    insecure: bool = False
+
+    @property
+    def title(self) -> str:
+        """The name; without one, what the alert watches."""
+        return self.watches if self.name is None else self.name
+
+    @property
+    def watches(self) -> str:
+        """What the alert watches, as text."""
+        what = f"process {', '.join(self.processes)}" if self.processes else f"source {', '.join(self.sources)}"
+        return self.when or what
+
+    @property
+    def processes(self) -> list[str]:
+        """Patterns of the processes whose state is watched."""
+        return _listed(self.process)
+
+    @property
+    def states(self) -> list[str]:
+        """The states of processes in which the alert is active."""
+        return _listed(self.state) or ["backoff", "fatal"]
+
+    @property
+    def sources(self) -> list[str]:
+        """Patterns of the sources whose quality is watched."""
+        return _listed(self.source)
+
+    @property
+    def qualities(self) -> list[str]:
+        """The qualities of sources with which the alert is active."""
+        return _listed(self.quality) or ["bad"]
+
+
+def _listed(value: str | list[Any] | None) -> list[str]:
+    return [value] if isinstance(value, str) else value or []
+
+
 class Config(Section):
     """The whole configuration. Its paths are relative to ``folder``."""
 
@@ -375,6 +442,7 @@ class Config(Section):
     web: Web | None = None
     recorder: Recorder | None = None
     replay: Replay | None = None
+    alert: list[Alert] = []
     folder: str = "."
 
     def path(self, text: str) -> Path:

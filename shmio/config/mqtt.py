@@ -209,3 +209,22 @@ def _overlap(one: Sequence[str], other: Sequence[str]) -> bool:
     if not one or not other:
         return not one and not other
     return (one[0] == other[0] or "+" in (one[0], other[0])) and _overlap(one[1:], other[1:])
+
+
+def check_publish_topic(key: str, topic: str, mqtt: Mqtt, config: Config) -> None:
+    """Check a topic on which the instance publishes something other than its registers.
+
+    Raises:
+        ConfigError: It is not a topic, or it is one of those of the bridge.
+
+    """
+    if len(topic) > MAX_PREFIX or set("+#").intersection(topic) or topic.startswith("$") or _is_no_text(topic):
+        raise ConfigError(
+            f"{key}: {topic!r} is not a topic: at most {MAX_PREFIX} characters are allowed, no control characters, "
+            "no + and #, no $ at the beginning; an example is plant/alerts/a50"
+        )
+    prefix = f"{mqtt.prefix or f'shmio/{config.instance.name}'}/"
+    first = topic.removeprefix(prefix).partition("/")[0] if topic.startswith(prefix) else None
+    taken = {"status", "simlog", *(source.name for source in config.source)}
+    if first in taken or topic.startswith("spBv1.0/"):
+        raise ConfigError(f"{key}: {topic!r} is a topic of the bridge; an example of another one is {prefix}alerts")

@@ -11,10 +11,12 @@ from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
+from shmio.config.alert import alert_faults, resolve_alert
 from shmio.config.declaration import declaration_faults
 from shmio.config.faults import MAX_KEY, MAX_PARTS, Faults, decode, explain, explain_toml, hint, near, too_long
 from shmio.config.listening import check_listening, resolve
 from shmio.config.model import (
+    Alert,
     Client,
     Config,
     Declaration,
@@ -44,7 +46,7 @@ from shmio.config.web import check_web, resolve_web
 from shmio.errors import ConfigError
 
 RESERVED_SOURCES = frozenset({"simlog", "model", "shmio"})
-SECTION_PROCESSES = frozenset({"broker", "grpc", "metrics", "mqtt", "opcua", "recorder", "supervisor", "web"})
+SECTION_PROCESSES = frozenset({"alerts", "broker", "grpc", "metrics", "mqtt", "opcua", "recorder", "supervisor", "web"})
 MAX_FILE_BYTES = 1 << 20
 MAX_PROPERTIES_BYTES = 64 << 10
 MAX_DEPTH = 64
@@ -76,11 +78,13 @@ _TABLES: dict[str, type[Section]] = {
     "recorder": Recorder,
     "recorder.trigger": Trigger,
     "replay": Replay,
+    "alert": Alert,
 }
 _SEVERAL = {
     "source",
     "emulator",
     "injection",
+    "alert",
     "grpc.token",
     "grpc.client",
     "grpc.address",
@@ -255,6 +259,8 @@ def _examine(tables: dict[str, Any], folder: Path, faults: Faults) -> Examined:
             faults.add(fault)
     for fault in (*_time_faults(config), *_rotation_faults(config), *declaration_faults(config.injection)):
         faults.add(fault)
+    for fault in alert_faults(config):
+        faults.add(fault)
     check_listening(config, faults.catching)
     with faults.catching():
         check_mqtt(config)
@@ -270,6 +276,8 @@ def _examine(tables: dict[str, Any], folder: Path, faults: Faults) -> Examined:
     if config.opcua:
         resolve_opcua(config.opcua, config)
     resolve_web(config)
+    for alert in config.alert:
+        resolve_alert(alert, config)
     return Examined(config, faults, broken)
 
 

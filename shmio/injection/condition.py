@@ -99,9 +99,19 @@ class Expression(NamedTuple):
     """The registers that the expression reads, as written."""
 
     def holds(self, values: Sequence[Number | None], memory: Memory) -> bool:
+        """Return whether the expression is known to be true.
+
+        Args:
+            values: The value of each reference; None if it is unknown.
+            memory: The last arguments of the edge functions. They are updated.
+
+        """
+        return self.evaluate(values, memory) is True
+
+    def evaluate(self, values: Sequence[Number | None], memory: Memory) -> bool | None:
         """Return whether the expression is true.
 
-        The result is False if a value is unknown, or if the expression divides by zero.
+        The result is None if a value is unknown, or if the expression divides by zero.
 
         Args:
             values: The value of each reference; None if it is unknown.
@@ -118,7 +128,7 @@ class Expression(NamedTuple):
         except ArithmeticError:
             pass
         memory.seen.clear()
-        return False
+        return None
 
 
 def parse(text: str) -> Expression:

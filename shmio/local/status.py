@@ -186,11 +186,12 @@ def _state(told: InstanceState, processes: list[SourceStatus | ProcessStatus], n
 def complaint(kind: str, note: str) -> str:
     """Return the note of a running process if the note reports a problem, else an empty text.
 
-    The note ``to FILE`` of a recorder is no problem.
+    The note ``to FILE`` of a recorder is no problem, nor is ``active: …`` of the alerts.
     """
-    return (
-        note if kind in ("mqtt", "grpc", "opcua", "web") or (kind == "recorder" and not note.startswith("to ")) else ""
-    )
+    harmless = {"recorder": "to ", "alerts": "active: "}.get(kind)
+    if harmless is not None:
+        return "" if note.startswith(harmless) else note
+    return note if kind in ("mqtt", "grpc", "opcua", "web") else ""
 
 
 def assess(running: Sequence[bool], qualities: Sequence[Quality | None], note: str = "") -> InstanceState:

@@ -5,14 +5,15 @@ from __future__ import annotations
 import grp
 import os
 import pwd
+import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Final
 
 from shmio import realtime
-from shmio.config import Config, Metrics, Mqtt, OpcUa, UnixAddress, parse_address
-from shmio.config.credentials import read_accounts, read_password, read_tokens
+from shmio.config import Alert, Config, Metrics, Mqtt, OpcUa, UnixAddress, parse_address
+from shmio.config.credentials import read_accounts, read_headers, read_password, read_tokens
 from shmio.config.folder import unwritable
 from shmio.config.listening import encrypted
 from shmio.config.model import ROLES, MqttTls
@@ -63,6 +64,9 @@ def check_host(config: Config, catching: Callable[[], AbstractContextManager[Non
     for key, section in http_sections(config):
         with catching():
             _check_http(key, section)
+    for index, alert in enumerate(config.alert):
+        with catching():
+            _check_alert(f"alert[{index}]", alert)
     return warnings
 
 
@@ -105,6 +109,23 @@ def _check_http(key: str, section: Metrics) -> None:
     check_web_library(key)
     if section.certificate and section.key:
         server_context(MqttTls(certificate=section.certificate, key=section.key), f"{key}.")
+
+
+def _check_alert(key: str, alert: Alert) -> None:
+    """Check that the program of an alert exists, and that the files of its webhook can be used."""
+    if alert.command is not None:
+        program = alert.command[0]
+        if shutil.which(program) is None:
+            there = Path(program).is_file()
+            raise ConfigError(
+                f"{key}.command: {program}: "
+                + ("not executable: chmod +x" if there else "no such program; give its full path")
+                + ". The list holds the program and its arguments; no shell reads it"
+            )
+    if alert.webhook_header_file is not None:
+        read_headers(alert.webhook_header_file, f"{key}.webhook_header_file")
+    if alert.webhook_ca is not None:
+        client_context(MqttTls(ca=alert.webhook_ca), f"{key}.webhook_")
 
 
 def _check_group(name: str | None) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
-from shmio.config import Address, Config, Emulator, Mqtt, Source
+from shmio.config import Address, Alert, Config, Emulator, Mqtt, Source
 from shmio.config.credentials import read_accounts
 from shmio.config.faults import Faults, meant
 from shmio.config.read import examine
@@ -32,7 +32,7 @@ from shmio.plan.host import check_host, exposure
 from shmio.plan.injections import check_injections
 from shmio.plan.layouts import LayoutFiles
 from shmio.plan.ports import check_listening
-from shmio.plan.processes import Plan, make_plan
+from shmio.plan.processes import ALERTS, Plan, make_plan, process_names
 from shmio.plan.replay import Recordings, replayed
 from shmio.plan.sources import check_sources, note_options
 from shmio.recording.selection import Selection
@@ -113,6 +113,11 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
     if config.recorder and config.recorder.trigger:
         with faults.catching():
             _check_trigger(config.recorder.trigger.when, layouts)
+    for index, alert in enumerate(
+        config.alert if mode != "replay" else ()
+    ):  # a replay has other sources, and no alerts
+        with faults.catching():
+            _check_alert(f"alert[{index}]", alert, config, layouts)
     odd = [*notices, *files.odd]
     for found in (
         lambda: _odd(config, layouts, faults),
@@ -204,6 +209,21 @@ def _check_trigger(when: str, layouts: dict[str, Layout]) -> None:
         compile_condition(when, layouts)
     except ConfigError as error:
         raise ConfigError(f"recorder.trigger.{error}") from None
+
+
+def _check_alert(key: str, alert: Alert, config: Config, layouts: dict[str, Layout]) -> None:
+    """Check that what an alert watches exists."""
+    try:
+        if alert.when is not None:
+            compile_condition(alert.when, layouts)
+        others = [name for name in process_names(config) if name != ALERTS]
+        for name, patterns, known in (("process", alert.processes, others), ("source", alert.sources, list(layouts))):
+            for pattern in patterns:
+                if not any(map(Glob(pattern).matches, known)):
+                    what = f"{name}: no {name} {pattern!r}; there are: {', '.join(known)}{meant(pattern, known)}"
+                    raise ConfigError(what)
+    except (ConfigError, PathError) as error:
+        raise ConfigError(f"{key}.{error}") from None
 
 
 def _check_emulator(index: int, emulator: Emulator, config: Config, files: LayoutFiles) -> tuple[Served, ...]:

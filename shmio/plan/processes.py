@@ -22,9 +22,11 @@ RANKS: Final[Mapping[str, int]] = {
     "mqtt": 2,
     "opcua": 2,
     "web": 2,
+    "alerts": 3,
 }
-"""Order of start by kind: emulators first, then sources, then endpoints.
+"""Order of start by kind: emulators first, then sources, then endpoints, then the alerts.
 
+The alerts stop first, so that the stop of the others is no alert.
 The recorder starts before the sources and stops after them, so that it records all their frames and
 events.
 """
@@ -36,6 +38,10 @@ It starts before the bridge and stops after it, so that the bridge can disconnec
 """
 
 
+ALERTS: Final = "alerts"
+"""The process of the alerts."""
+
+
 def rank(name: str, kind: str) -> int:
     """Return a process's place in the order of start.
 
@@ -45,6 +51,7 @@ def rank(name: str, kind: str) -> int:
 
 
 MODULES: Final[Mapping[str, str]] = {
+    "alerts": "shmio.endpoints.alerts",
     "source": "shmio.connectors",
     "emulator": "shmio.emulators",
     "grpc": "shmio.endpoints.grpc",
@@ -60,7 +67,11 @@ RULES: Final[Mapping[str, tuple[str, ...]]] = {"grpc": ("token", "client")}
 
 MAX_PROCESSES = 200
 MODES = ("live", "log", "replay")
-"""Modes of an instance. ``log`` starts no endpoints; ``replay`` replaces sources by a recording."""
+"""Modes of an instance.
+
+``log`` starts no endpoints; ``replay`` replaces sources by a recording. Only ``live`` starts the
+alerts.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,6 +186,7 @@ def make_plan(
         ConfigError: The instance has too many processes.
 
     """
+    log_dir = config.log_dir
     ring_bytes = round(config.instance.ring_mb * 1e6)
     blocks = tuple(
         BlockSpec(
@@ -217,13 +229,14 @@ def make_plan(
         tokens = msgspec.to_builtins(config.grpc.token) if config.grpc else []
         more = {"folders": _folders(config), "token": tokens, "config_file": str(config_file.resolve())}
         sections.append(("web", "web", msgspec.to_builtins(config.web) | more))
+    if config.alert and mode == "live":
+        sections.append((ALERTS, "alerts", _alerts(config, log_dir)))
     if config.recorder:
         paths = {"directory": config.path(config.recorder.directory), "config_file": config_file.resolve()}
         recorder = msgspec.to_builtins(config.recorder) | {key: str(path) for key, path in paths.items()}
         sections.append(("recorder", "recorder", recorder))
     if len(sections) > MAX_PROCESSES:
         raise ConfigError(f"there are {len(sections)} processes, but an instance has at most {MAX_PROCESSES}")
-    log_dir = config.log_dir
     return Plan(
         instance=config.instance.name,
         mode=mode,
@@ -246,6 +259,7 @@ def process_names(config: Config) -> list[str]:
     names += ["opcua"] if config.opcua else []
     names += ["metrics"] if config.metrics else []
     names += ["web"] if config.web else []
+    names += [ALERTS] if config.alert else []
     return [*names, "recorder"] if config.recorder else names
 
 
@@ -255,6 +269,17 @@ def _folders(config: Config) -> dict[str, str]:
     if config.recorder:
         folders["recordings"] = str(config.path(config.recorder.directory))
     return folders
+
+
+def _alerts(config: Config, log_dir: Path) -> dict[str, Any]:
+    """Return the section of the alerts, with that of the MQTT bridge if an alert publishes."""
+    publishes = config.mqtt is not None and any(alert.mqtt_topic for alert in config.alert)
+    bridge = _mqtt(config.mqtt)[-1][2] if config.mqtt is not None and publishes else None
+    return {
+        "alert": msgspec.to_builtins(config.alert),
+        "mqtt": bridge,
+        "log_dir": str(log_dir),
+    }
 
 
 def _mqtt(mqtt: Mqtt) -> list[tuple[str, str, dict[str, Any]]]:

@@ -40,6 +40,7 @@ COUNTERS: Final[Mapping[str, tuple[str, ...]]] = {
     "opcua": ("sessions", "items", "writes", "refused"),
     "recorder": ("frames", "events", "missed", "bytes"),
     "web": ("requests", "refused", "connections"),
+    "alerts": ("active", "notices", "suppressed", "waiting", "failed", "missed"),
 }
 """Names of a worker's counters, at most 8, by kind of process.
 
@@ -84,7 +85,7 @@ class Activity(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class ProcessSpec:
-    """A process of the instance. Its ``kind`` is source, emulator, grpc, mqtt, opcua, web or recorder."""
+    """A process of the instance. Its ``kind`` is a key of :data:`COUNTERS`."""
 
     name: str
     kind: str

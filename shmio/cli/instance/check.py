@@ -7,10 +7,11 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import urlsplit
 
 from shmio.cli.run import dumps
 from shmio.cli.target import config_file
-from shmio.config import Address, Source
+from shmio.config import Address, Alert, Source
 from shmio.connectors.load import Requests, counted
 from shmio.errors import ConfigError, ShmioError
 from shmio.layout.topic import shorten
@@ -42,6 +43,7 @@ def check(arguments: argparse.Namespace) -> int:
             _described(block, peer(source)) | one.found for (source, block), one in zip(sources, figures, strict=True)
         ],
         "injections": list(prepared.injections),
+        "alerts": [_alert(alert) for alert in prepared.config.alert],
         "replay": [],
         "segment": f"{PREFIX}{plan.instance}",
         "segment_bytes": plan.segment_bytes,
@@ -96,13 +98,22 @@ def _lines(found: dict[str, Any], *, would_fail: bool) -> list[str]:
     return [
         f"{found['config']}: instance {found['instance']}, {processes} process{'es' * (processes != 1)}",
         *(f"  {line}" for source in found["sources"] for line in (_line(source), *_load_lines(source))),
-        *(f"  {text}" for text in found["injections"]),
+        *(f"  {text}" for text in (*found["injections"], *found["alerts"])),
         *(f"  with --mode replay: {_line(source)}" for source in found["replay"]),
         f"  segment {found['segment']}: {found['segment_bytes'] / 1e6:.2f} MB of shared memory",
         *found["notes"],
         *found["warnings"],
         end,
     ]
+
+
+def _alert(alert: Alert) -> str:
+    """Return a line that says what an alert watches and does."""
+    actions = [f"command {alert.command[0]}"] if alert.command else []
+    actions += [f"MQTT topic {alert.mqtt_topic}"] if alert.mqtt_topic else []
+    actions += [f"webhook at {urlsplit(alert.webhook).hostname}"] if alert.webhook else []
+    name = f"{alert.name}: " if alert.name else ""
+    return f"alert {name}{alert.watches}: {', '.join(actions) or 'no action, only shown and logged'}"
 
 
 def _described(block: BlockSpec, peer: str) -> dict[str, Any]:

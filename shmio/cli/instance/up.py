@@ -139,6 +139,8 @@ def _describe(job: Job, prepared: Prepared) -> str:
     if job.kind == "web":
         scheme = "https" if config["certificate"] else "http"
         return f"{scheme}://{config['listen']}/{'' if job.name == 'web' else 'metrics'}"
+    if job.kind == "alerts":
+        return f"watching {counted(len(config['alert']), 'alert')}"
     return f"on {', '.join(job.listening)}"
 
 

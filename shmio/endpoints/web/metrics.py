@@ -18,6 +18,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from shmio.endpoints.alerts.state_file import alert_states
 from shmio.endpoints.web.measurements import Histogram, Measurements
 from shmio.errors import SegmentError
 from shmio.layout.glob import Glob
@@ -89,6 +90,14 @@ _COUNTERS: Final[Mapping[str, Mapping[str, _Named]]] = {
         "requests": _Named("shmio_web_requests", "Requests that were answered."),
         "refused": _Named("shmio_web_refused", "Requests and connections that were refused."),
         "connections": _Named("shmio_web_connections", "Connections that are open.", gauge=True),
+    },
+    "alerts": {
+        "active": _Named("shmio_alerts_active", "Alerts that are active.", gauge=True),
+        "notices": _Named("shmio_alerts_notices", "Notices of alerts that were made."),
+        "suppressed": _Named("shmio_alerts_suppressed", "Activations of alerts that no notice reported in time."),
+        "waiting": _Named("shmio_alerts_waiting_notices", "Notices that are not delivered yet.", gauge=True),
+        "failed": _Named("shmio_alerts_failed_notices", "Notices that were lost, because an action failed."),
+        "missed": _Named("shmio_alerts_missed_frames", "Frames that were not evaluated, because they came too fast."),
     },
 }
 _LABELS: Final[Mapping[str, str]] = {"source": "source", "emulator": "emulator", "web": "process"}
@@ -172,6 +181,7 @@ class InstanceCollector(Collector):
         yield from self._frames()
         yield from self._timing()
         yield from self._disks()
+        yield self._alerts()
         if self._globs:
             yield self._registers()
 
@@ -261,6 +271,12 @@ class InstanceCollector(Collector):
             free.add_metric([purpose], found.f_bavail * found.f_frsize)
             size.add_metric([purpose], found.f_blocks * found.f_frsize)
         yield from (free, size)
+
+    def _alerts(self) -> Metric:
+        family = GaugeMetricFamily("shmio_alert_active", "1 if the alert is active.", labels=["alert", "severity"])
+        for name, alert in alert_states(self._folders, self._segment).items():
+            family.add_metric([name, alert.severity], alert.progress.active)
+        return family
 
     def _registers(self) -> Metric:
         family = GaugeMetricFamily(

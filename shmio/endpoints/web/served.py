@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import msgspec
 
+from shmio.endpoints.alerts.state_file import alert_states
 from shmio.endpoints.web.measurements import Measurements
 from shmio.endpoints.web.signals import Feeds
 from shmio.endpoints.web.timeline import Timeline
@@ -93,6 +94,12 @@ class Served:
         self._usages = usages
         return msgspec.structs.asdict(status) | {
             "processes": processes,
+            "alerts": [
+                {"name": name, "severity": alert.severity, "text": alert.text, "reason": alert.reason}
+                | {"active_s": round(status.clock.time_s - alert.progress.since_ns / 1e9) if status.clock else 0}
+                for name, alert in alert_states(self.folders, self.segment).items()
+                if alert.progress.active
+            ],
             "clock": status.clock and msgspec.structs.asdict(status.clock),
             "supervisor": status.supervisor and msgspec.structs.asdict(status.supervisor),
         }

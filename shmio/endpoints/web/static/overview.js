@@ -7,6 +7,7 @@ import { bytes, duration, fixed } from "./format.js";
 
 const PROCESS = ["Process", "Kind", "State", "pid", "Restarts", "CPU %", "Memory", "Up", "Note", "Counters", ""];
 const SOURCE = ["Source", "Quality", "Reason", "Registers", "Period ms", "Rate Hz", "Cycle", "Overruns", "Round trip ms", "Age", "Lost / recovered in 1, 10, 30 min"];
+const ALERT = ["Alert", "Severity", "Text", "Reason", "Active for"];
 
 /** Tables with one row for each process and each source. Rows stay, so that a selection survives an update. */
 export class OverviewTab {
@@ -17,9 +18,12 @@ export class OverviewTab {
     this.buttons = new Map();
     this.sources = new Table(SOURCE, "sources");
     this.processes = new Table(PROCESS, "processes");
+    this.alerts = new Table(ALERT, "alerts");
+    this.alertsPart = element("div", { hidden: true }, element("h2", {}, "Active alerts"), this.alerts.root);
     this.root = element(
       "div",
       {},
+      this.alertsPart,
       element("h2", {}, "Sources"),
       this.sources.root,
       element("h2", {}, "Processes"),
@@ -49,6 +53,16 @@ export class OverviewTab {
         fixed(one.round_trip_ms, 2),
         one.age_s === null ? "" : duration(one.age_s),
         one.lost.map((/** @type {number} */ count, /** @type {number} */ i) => `${count} / ${one.recovered[i]}`).join(", "),
+      ]),
+    );
+    this.alertsPart.hidden = overview.alerts.length === 0;
+    this.alerts.update(
+      overview.alerts.map((/** @type {any} */ one) => [
+        one.name,
+        [one.severity, one.severity === "info" ? "" : "bad"],
+        one.text,
+        one.reason,
+        duration(Math.max(0, one.active_s)),
       ]),
     );
     this.processes.update(

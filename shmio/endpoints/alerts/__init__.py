@@ -1,0 +1,1 @@
+"""The alerts: a process that watches conditions, and notifies people and programs."""

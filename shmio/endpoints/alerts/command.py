@@ -1,0 +1,143 @@
+"""Runs a program for a notice: without a shell, with limits of time and output."""
+
+from __future__ import annotations
+
+import logging
+import os
+import select
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Final
+
+from shmio.endpoints.alerts.notice import Notice
+from shmio.endpoints.alerts.sender import DeliveryError
+from shmio.logs import printable
+
+MAX_AT_ONCE: Final = 4
+"""Maximum number of commands that run at the same time, of all alerts."""
+MAX_OUTPUT_BYTES: Final = 8192
+"""Maximum amount of a command's output that goes to the log. The rest is read, and dropped."""
+LEAVE_S: Final = 1.0
+"""How long a running command may go on when this process is stopped, in s."""
+
+log = logging.getLogger("shmio.alerts")
+
+
+class Command:
+    """Runs a program with the notice as JSON on its standard input, and in its environment.
+
+    The program has its own session. If it takes too long, all its processes in that session's group
+    are killed.
+    """
+
+    once = True  # it is unknown what a program did that was interrupted
+
+    def __init__(self, arguments: Sequence[str], timeout_s: float) -> None:
+        """Prepare to run a program with these arguments, the first being its name."""
+        self.text = f"command {arguments[0]}"
+        self._arguments, self._timeout_s = list(arguments), timeout_s
+        self._stopping = threading.Event()
+        self._stop = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+
+    def stop(self) -> None:
+        """Let a running command go on for at most ``LEAVE_S``."""
+        self._stopping.set()
+        os.eventfd_write(self._stop, 1)
+
+    def deliver(self, notice: Notice) -> None:
+        """Run the program, and log its output.
+
+        Raises:
+            DeliveryError: It could not be started, failed, or took too long.
+
+        """
+        stdin = os.memfd_create("notice")  # not a pipe: a program that does not read cannot block us
+        try:
+            os.write(stdin, notice.json())
+            os.lseek(stdin, 0, os.SEEK_SET)
+            process = subprocess.Popen(
+                self._arguments,
+                stdin=stdin,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, **notice.environment()},
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise DeliveryError(f"cannot be started: {error.strerror}") from None
+        finally:
+            os.close(stdin)
+        output = _Output(process, notice.alert)
+        try:
+            ended = self._await(process, output)
+            if not ended:
+                with suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
+            code = process.wait()
+        finally:
+            output.close()
+        if not ended:
+            what = "this process stops" if self._stopping.is_set() else f"it took longer than {self._timeout_s:g} s"
+            raise DeliveryError(f"killed: {what}")
+        if code < 0:
+            raise DeliveryError(f"ended by signal {-code}")
+        if code > 0:
+            raise DeliveryError(f"exit status {code}")
+
+    def _await(self, process: subprocess.Popen[bytes], output: _Output) -> bool:
+        """Read the output until the program ends, and return whether it has ended in time."""
+        until_s = time.monotonic() + self._timeout_s
+        poll = select.poll()
+        pidfd = os.pidfd_open(process.pid)
+        try:
+            for descriptor in (pidfd, output.descriptor, self._stop):
+                poll.register(descriptor, select.POLLIN)
+            while (rest_s := until_s - time.monotonic()) > 0:
+                ready = [descriptor for descriptor, _ in poll.poll(1000 * rest_s)]
+                if output.descriptor in ready and not output.read():
+                    poll.unregister(output.descriptor)
+                if pidfd in ready:
+                    output.read()
+                    return True
+                if self._stop in ready:
+                    poll.unregister(self._stop)
+                    until_s = min(until_s, time.monotonic() + LEAVE_S)
+            return False
+        finally:
+            os.close(pidfd)
+
+
+class _Output:
+    """Copies the beginning of a program's output to the log."""
+
+    def __init__(self, process: subprocess.Popen[bytes], alert: str) -> None:
+        assert process.stdout is not None  # noqa: S101  it is a pipe
+        self._pipe = process.stdout
+        self._alert = alert
+        self._kept = bytearray()
+        self._size = 0
+        self.descriptor = self._pipe.fileno()
+        os.set_blocking(self.descriptor, False)
+
+    def read(self) -> bool:
+        """Read what is there, at most 64 kB; return False at the end of the output."""
+        try:
+            data = os.read(self.descriptor, 1 << 16)
+        except BlockingIOError:
+            return True
+        self._size += len(data)
+        self._kept += data[: MAX_OUTPUT_BYTES - len(self._kept)]
+        return bool(data)
+
+    def close(self) -> None:
+        """Log the output."""
+        self._pipe.close()
+        for line in self._kept.decode(errors="replace").splitlines():
+            if line.strip():
+                log.info("alert %s: command says: %s", self._alert, printable(line))
+        if self._size > len(self._kept):
+            log.info("alert %s: the command's other %d bytes are left out", self._alert, self._size - len(self._kept))

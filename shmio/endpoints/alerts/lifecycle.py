@@ -1,0 +1,105 @@
+"""Decides when an alert becomes active, when it ends, and which of these changes give a notice.
+
+No I/O, no clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+
+import msgspec
+
+
+class Change(StrEnum):
+    """What a notice reports."""
+
+    ACTIVE = "active"
+    RESOLVED = "resolved"
+
+
+class Progress(msgspec.Struct):
+    """How far an alert is: what must outlive a restart of the process. Times are those of the instance's clock."""
+
+    active: bool = False
+    since_ns: int = 0
+    """When the alert last became active."""
+    announced: bool = False
+    """True if a notice has reported that the alert is active now."""
+    notice_ns: int | None = None
+    """When the last notice of an activation was made."""
+    suppressed: int = 0
+    """Number of activations since then without a notice."""
+    notices: int = 0
+    """Number of notices so far, of both kinds."""
+
+
+@dataclass(slots=True)
+class Lifecycle:
+    """The state of one alert.
+
+    An alert becomes active when its condition has been true for ``for_ns``, and ends when it is
+    false. An unknown condition (None) changes nothing, but interrupts ``for_ns``. Two notices of
+    activations are at least ``every_ns`` apart. An activation that comes sooner is announced at the
+    end of this interval, if the alert is still active then. Otherwise it only counts as suppressed.
+    """
+
+    for_ns: int
+    every_ns: int
+    resolved: bool
+    """Whether the end of an announced activation gives a notice, too."""
+    progress: Progress
+    held_ns: int | None = None
+    """Since when the condition has been true; None if it is not, or the alert is active."""
+
+    def observe(self, holds: bool | None, now_ns: int) -> Iterator[Change]:
+        """Evaluate the condition's present value, and yield the notices to send.
+
+        Args:
+            holds: Whether the condition is true; None: unknown.
+            now_ns: The instance's clock.
+
+        """
+        yield from self.advance(now_ns)
+        progress = self.progress
+        if holds:
+            if not progress.active and self.held_ns is None:
+                self.held_ns = now_ns
+                yield from self.advance(now_ns)
+            return
+        self.held_ns = None
+        if holds is None or not progress.active:
+            return
+        progress.active = False
+        if not progress.announced:
+            progress.suppressed += 1
+        elif self.resolved:
+            progress.notices += 1
+            yield Change.RESOLVED
+        progress.announced = False
+
+    def advance(self, now_ns: int) -> Iterator[Change]:
+        """Do what is due by time, and yield the notices to send."""
+        progress = self.progress
+        if self.held_ns is not None and now_ns >= self.held_ns + self.for_ns:
+            self.held_ns, progress.active, progress.since_ns = None, True, now_ns
+        if progress.active and not progress.announced and not self._too_soon(now_ns):
+            progress.announced, progress.notice_ns = True, now_ns
+            progress.notices += 1
+            yield Change.ACTIVE
+            progress.suppressed = 0  # after the notice, which reports the number
+
+    @property
+    def due_ns(self) -> int | None:
+        """When :meth:`advance` has something to do; None: at no known time."""
+        progress = self.progress
+        if self.held_ns is not None:
+            return self.held_ns + self.for_ns
+        if progress.active and not progress.announced and progress.notice_ns is not None:
+            return progress.notice_ns + self.every_ns
+        return None
+
+    def _too_soon(self, now_ns: int) -> bool:
+        last_ns = self.progress.notice_ns
+        return last_ns is not None and 0 <= now_ns - last_ns < self.every_ns  # a replay may set the clock back

@@ -1,0 +1,258 @@
+"""Follows the sources and processes that alerts watch, and makes notices of their changes."""
+
+from __future__ import annotations
+
+import logging
+import selectors
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import UTC, datetime
+from functools import partial
+from typing import Final
+
+from shmio.config import Alert
+from shmio.endpoints.alerts.lifecycle import Change, Lifecycle, Progress
+from shmio.endpoints.alerts.notice import MAX_REASON, Notice
+from shmio.endpoints.alerts.watching import UNKNOWN, ProcessWatch, QualityWatch, Watch, make_watch
+from shmio.layout.topic import shorten
+from shmio.model.clock import Clock
+from shmio.segment import Block, Frame, Segment
+from shmio.segment.block import FrameFollower, QualityChange
+from shmio.segment.doorbell import TURN_NS, Relay
+
+TURN_S: Final = TURN_NS / 1e9
+LOOK_S: Final = 0.1
+"""Interval in s at which the process table is checked, which has no doorbell."""
+CATCH_UP_S: Final = 2.0
+"""If more time than this is unread, in s, the monitor skips to the newest frame."""
+BATCH: Final = 500
+"""Maximum number of frames to read from one source in a turn."""
+
+log = logging.getLogger("shmio.alerts")
+
+
+class WatchedAlert:
+    """One alert: its configuration, what it watches, and its state."""
+
+    def __init__(self, alert: Alert, progress: Progress, watch: Watch) -> None:
+        self.alert = alert
+        self.watch = watch
+        self.finding = UNKNOWN
+        """What the alert has last seen."""
+        self.lifecycle = Lifecycle(round(alert.for_s * 1e9), round(alert.every_s * 1e9), alert.resolved, progress)
+
+    @property
+    def active(self) -> bool:
+        """True if the alert is active."""
+        return self.lifecycle.progress.active
+
+
+class Monitor:
+    """Evaluates all alerts. Use it from one thread."""
+
+    def __init__(
+        self,
+        segment: Segment,
+        alerts: Sequence[Alert],
+        progress: Mapping[str, Progress],
+        selector: selectors.BaseSelector,
+    ) -> None:
+        """Start to follow the sources.
+
+        Args:
+            segment: The instance's segment.
+            alerts: The alerts.
+            progress: The state of alerts that an earlier process has watched, by name.
+            selector: The monitor registers descriptors that are ready when a source has published.
+                Their ``data`` is to be called then.
+
+        """
+        self._segment, self._selector = segment, selector
+        self.alerts = [
+            WatchedAlert(alert, progress.get(alert.title, Progress()), make_watch(alert, segment)) for alert in alerts
+        ]
+        self.changed = True
+        """Set when the state of an alert has changed; the user of this object resets it."""
+        self.suppressed = 0
+        """Number of activations without a notice, since the process started."""
+        self.done = 0
+        """Number of the last step of virtual time whose frames have all been evaluated."""
+        self._missed = 0
+        self._followers: dict[str, FrameFollower] = {}
+        self._relays: dict[int, Relay] = {}
+        self._blocks: Mapping[str, Block] = {}
+        self._looked_s = 0.0
+        self._now_ns = 0
+        self._follow()
+
+    @property
+    def missed(self) -> int:
+        """Number of frames that were overwritten or skipped before they could be evaluated."""
+        return self._missed + sum(follower.missed for follower in self._followers.values())
+
+    def turn(self) -> tuple[list[tuple[WatchedAlert, Notice]], bool]:
+        """Evaluate what is new. Return notices, and whether there are more frames."""
+        clock = self._segment.clock.read()  # before the frames, so that those of a finished step are evaluated
+        if self._segment.refresh() or self._blocks is not self._segment.blocks:
+            self._bind()
+        self._now_ns = clock.present_ns
+        notices: list[tuple[WatchedAlert, Notice]] = []
+        frames, more = self._read()
+        for source, frame in frames:
+            notices += self._take(source, frame, self._time_ns(source, frame, clock))
+        for source, follower in self._followers.items():
+            if follower.became_stale():
+                notices += self._evaluate(self._concerned(source), self._now_ns)
+        notices += self._look()
+        if not more:
+            self.done = clock.done
+            for one in self.alerts:
+                notices += self._notices(one, one.lifecycle.advance(self._now_ns), self._now_ns)
+        return notices, more
+
+    def pause_s(self) -> float:
+        """Return the time in s until the next turn, if no source publishes."""
+        clock = self._segment.clock.read()
+        due_ns = min((due for one in self.alerts if (due := one.lifecycle.due_ns) is not None), default=None)
+        if due_ns is None or clock.virtual:
+            return TURN_S
+        return min(TURN_S, max(0.0, (due_ns - clock.present_ns) / 1e9))
+
+    def close(self) -> None:
+        """Stop following."""
+        for relay in self._relays.values():
+            self._selector.unregister(relay.descriptor)
+            relay.stop()
+        for relay in self._relays.values():
+            relay.join()
+        self._relays.clear()
+
+    # ---- frames ------------------------------------------------------------------------------------------------------
+
+    def _bind(self) -> None:
+        """Find registers and sources again, after a reload."""
+        for one in self.alerts:
+            if not isinstance(one.watch, ProcessWatch):
+                one.watch = make_watch(one.alert, self._segment)
+        self._follow()
+
+    def _follow(self) -> None:
+        self._blocks = self._segment.blocks
+        wanted = {source for one in self.alerts for source in one.watch.sources}
+        for source, follower in list(self._followers.items()):
+            if source not in wanted or self._blocks.get(source) is not follower.block:
+                self._missed += self._followers.pop(source).missed
+                relay = self._relays.pop(follower.block.section)
+                self._selector.unregister(relay.descriptor)
+                relay.stop()
+        for source in wanted - self._followers.keys():
+            block = self._blocks[source]
+            self._followers[source] = FrameFollower(block, catch_up_s=CATCH_UP_S, notice_gaps=True)
+            relay = self._relays[block.section] = Relay(block.ring, f"alerts-{source}", min(TURN_NS, block.stale_ns))
+            self._selector.register(relay.descriptor, selectors.EVENT_READ, partial(_heard, relay))
+
+    def _read(self) -> tuple[list[tuple[str, Frame]], bool]:
+        """Return the new frames of all sources in the order of their publication, and whether there are more."""
+        frames: list[tuple[str, Frame]] = []
+        more = False
+        for source, follower in self._followers.items():
+            taken = list(follower.read(BATCH))
+            more |= len(taken) == BATCH
+            frames += ((source, frame) for frame in taken)
+        frames.sort(key=lambda one: one[1].publish_ns)  # stable: frames of a source stay in order
+        return frames, more
+
+    def _time_ns(self, source: str, frame: Frame, clock: Clock) -> int:
+        """Return the time of the instance's clock at which to evaluate a frame.
+
+        Frames of devices do not follow the instance's clock once it was stepped, and those of a
+        replay may have the clock of the recording.
+        """
+        block = self._followers[source].block
+        follows = block.attributes.stepped if clock.virtual or clock.offset_ns else True
+        if not follows or block.playhead is not None:
+            return self._now_ns
+        return min(frame.clock_ns, self._now_ns)
+
+    def _take(self, source: str, frame: Frame, now_ns: int) -> Iterator[tuple[WatchedAlert, Notice]]:
+        change = self._followers[source].take(frame, aged=False)
+        for one in self._concerned(source):
+            if isinstance(one.watch, QualityWatch):
+                if change is not QualityChange.NONE:
+                    yield from self._evaluate([one], now_ns)
+                continue
+            if change is QualityChange.GAP:  # the value was stale for some time
+                yield from self._notices(one, one.lifecycle.observe(None, now_ns), now_ns)
+            yield from self._evaluate([one], now_ns)
+
+    def _concerned(self, source: str) -> list[WatchedAlert]:
+        return [one for one in self.alerts if source in one.watch.sources]
+
+    def _look(self) -> list[tuple[WatchedAlert, Notice]]:
+        """Check the process table, and sources that have no frame yet."""
+        now_s = time.monotonic()
+        if now_s < self._looked_s + LOOK_S:
+            return []
+        self._looked_s = now_s
+        silent = {source for source, follower in self._followers.items() if follower.frame is None}
+        watched = [
+            one
+            for one in self.alerts
+            if isinstance(one.watch, ProcessWatch)
+            or (isinstance(one.watch, QualityWatch) and not silent.isdisjoint(one.watch.sources))
+        ]
+        return list(self._evaluate(watched, self._now_ns))
+
+    # ---- notices -----------------------------------------------------------------------------------------------------
+
+    def _evaluate(self, alerts: Iterable[WatchedAlert], now_ns: int) -> Iterator[tuple[WatchedAlert, Notice]]:
+        for one in alerts:
+            finding = one.watch.look(self._followers)
+            if finding.holds is not None:
+                one.finding = finding
+            yield from self._notices(one, one.lifecycle.observe(finding.holds, now_ns), now_ns)
+
+    def _notices(
+        self, one: WatchedAlert, changes: Iterator[Change], now_ns: int
+    ) -> Iterator[tuple[WatchedAlert, Notice]]:
+        progress = one.lifecycle.progress
+        before = progress.active, progress.suppressed
+        for change in changes:
+            self.changed = True
+            yield one, self._notice(one, change, now_ns)
+        if (progress.active, progress.suppressed) != before:
+            self.changed = True
+            self._log(one, was_active=before[0])
+
+    def _log(self, one: WatchedAlert, *, was_active: bool) -> None:
+        progress, name = one.lifecycle.progress, one.alert.title
+        if progress.active and not was_active:
+            waits = "" if progress.announced else f"; its notice waits for every_s = {one.alert.every_s:g}"
+            log.warning("alert %s is active: %s%s", name, one.finding.reason, waits)
+        elif was_active and not progress.active:
+            log.info("alert %s has ended: %s", name, one.finding.reason)
+
+    def _notice(self, one: WatchedAlert, change: Change, now_ns: int) -> Notice:
+        alert, progress, finding = one.alert, one.lifecycle.progress, one.finding
+        self.suppressed += progress.suppressed if change is Change.ACTIVE else 0
+        return Notice(
+            id=f"{self._segment.instance}-{self._segment.header.epoch:x}-{alert.title}-{progress.notices}",
+            instance=self._segment.instance,
+            alert=alert.title,
+            state=change,
+            severity=alert.severity,
+            text=alert.text,
+            watches=alert.watches,
+            reason=shorten(finding.reason, MAX_REASON),
+            values=dict(finding.values),
+            injected=finding.injected,
+            provenance=finding.provenance,
+            clock_s=now_ns / 1e9,
+            since_s=progress.since_ns / 1e9,
+            time=datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z"),
+            suppressed=progress.suppressed,
+        )
+
+
+def _heard(relay: Relay, _events: int) -> None:
+    relay.heard()

@@ -1,0 +1,148 @@
+"""The file with the state of the alerts, so that a restart of their process repeats no notice.
+
+The web page and the figures for Prometheus read it, too.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import threading
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from shmio.config import Alert
+from shmio.endpoints.alerts.lifecycle import Progress
+from shmio.endpoints.alerts.notice import Notice
+from shmio.segment import Segment
+
+FILE_NAME: Final = "alerts.json"
+"""The file's name; it is in the folder of the logs."""
+MAX_BYTES: Final = 64 << 20
+
+log = logging.getLogger("shmio.alerts")
+
+
+class AlertState(msgspec.Struct):
+    """The state of one alert. ``digest`` identifies what it watches."""
+
+    digest: str
+    severity: str
+    text: str
+    reason: str
+    progress: Progress
+
+
+class Waiting(msgspec.Struct):
+    """Notices that could not be delivered yet, by the kind of action."""
+
+    command: list[Notice] = []
+    mqtt: list[Notice] = []
+    webhook: list[Notice] = []
+
+
+class State(msgspec.Struct):
+    """The state of all alerts by name. It belongs to one run of the instance, that with this epoch."""
+
+    epoch: int = 0
+    alerts: dict[str, AlertState] = {}
+    waiting: Waiting = msgspec.field(default_factory=Waiting)
+
+    def progress(self, alerts: list[Alert]) -> dict[str, Progress]:
+        """Return the state of those alerts that still watch the same."""
+        return {
+            alert.title: self.alerts[alert.title].progress
+            for alert in alerts
+            if alert.title in self.alerts and self.alerts[alert.title].digest == digest(alert)
+        }
+
+
+_DECODER: Final = msgspec.json.Decoder(State)
+
+
+def digest(alert: Alert) -> str:
+    """Return a text that changes with what the alert watches."""
+    watched = alert.when, alert.processes, alert.states, alert.sources, alert.qualities
+    return hashlib.sha256(msgspec.json.encode(watched)).hexdigest()[:16]
+
+
+def read_state(file: Path, epoch: int) -> State:
+    """Read the state of this run of the instance; an empty one if there is none, or it is damaged."""
+    with suppress(OSError, msgspec.MsgspecError):
+        with file.open("rb") as stream:
+            state = _DECODER.decode(stream.read(MAX_BYTES))
+        if state.epoch == epoch:
+            return state
+    return State(epoch)
+
+
+class StateWriter:
+    """Writes the newest state to the file, in a thread, because a disk may hang."""
+
+    def __init__(self, file: Path) -> None:
+        self.problem = ""
+        """Why the state could not be written; empty if it could."""
+        self._file = file
+        self._turn = threading.Condition()
+        self._newest: bytes | None = None
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name="alerts' state", daemon=True)
+        self._thread.start()
+
+    def write(self, state: State) -> None:
+        """Write this state soon."""
+        data = msgspec.json.encode(state)
+        with self._turn:
+            self._newest = data
+            self._turn.notify()
+
+    def close(self, timeout_s: float) -> None:
+        """Write the last state, and end the thread, waiting at most ``timeout_s``."""
+        with self._turn:
+            self._stopping = True
+            self._turn.notify()
+        self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        while True:
+            with self._turn:
+                self._turn.wait_for(lambda: self._newest is not None or self._stopping)
+                data, self._newest = self._newest, None
+            if data is None:
+                return
+            try:
+                _replace(self._file, data)
+            except OSError as error:
+                problem = f"{self._file}: {error.strerror}; after a restart of this process, notices may come again"
+                if problem != self.problem:
+                    log.warning("%s", problem)
+                self.problem = problem
+            else:
+                self.problem = ""
+
+
+def _replace(file: Path, data: bytes) -> None:
+    """Write a file that only this user may read. A reader sees the old or the new content."""
+    new = file.with_name(f".{file.name}.new")
+    descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+    with open(descriptor, "wb") as stream:  # noqa: PTH123  a descriptor
+        stream.write(data)
+    new.replace(file)
+
+
+def alert_states(folders: Mapping[str, str], segment: Segment) -> Mapping[str, AlertState]:
+    """Return the state of all alerts by name, as their process has last written it.
+
+    Args:
+        folders: The folders in which the instance writes files, by purpose.
+        segment: The instance's segment.
+
+    """
+    if not any(slot.kind == "alerts" for slot in segment.processes):
+        return {}
+    return read_state(Path(folders["logs"]) / FILE_NAME, segment.header.epoch).alerts
