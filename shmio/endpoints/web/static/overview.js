@@ -8,6 +8,8 @@ import { bytes, duration, fixed } from "./format.js";
 const PROCESS = ["Process", "Kind", "State", "pid", "Restarts", "CPU %", "Memory", "Up", "Note", "Counters", ""];
 const SOURCE = ["Source", "Quality", "Reason", "Registers", "Period ms", "Rate Hz", "Cycle", "Overruns", "Round trip ms", "Age", "Lost / recovered in 1, 10, 30 min"];
 const ALERT = ["Alert", "Severity", "Text", "Reason", "Active for"];
+/** The class of each severity. @type {Record<string, string>} */
+const SEVERITY = { warning: "uncertain", critical: "bad" };
 
 /** Tables with one row for each process and each source. Rows stay, so that a selection survives an update. */
 export class OverviewTab {
@@ -59,7 +61,7 @@ export class OverviewTab {
     this.alerts.update(
       overview.alerts.map((/** @type {any} */ one) => [
         one.name,
-        [one.severity, one.severity === "info" ? "" : "bad"],
+        [one.severity, SEVERITY[one.severity] ?? ""],
         one.text,
         one.reason,
         duration(Math.max(0, one.active_s)),
