@@ -63,6 +63,7 @@ START_PROCESSES = (
     "tests/unit/cli/test_completion.py",
     "tests/unit/cli/test_supervisor.py::test_up_detach_reports_faults",
     "tests/unit/client/test_generated.py",
+    "tests/unit/endpoints/alerts/test_command.py",
     "tests/unit/endpoints/mqtt/broker/",
     "tests/unit/plan/test_sources_models.py",
     "tests/unit/simulation/test_a50.py::test_runs_as_a_source_on_db201",

@@ -88,8 +88,10 @@ class Webhook:
             raise TimeoutError
         path = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
         connection.request("POST", path, notice.json(), headers)
-        response = connection.getresponse()
-        status, reason = response.status, response.reason[:100]
+        with connection.getresponse() as response:
+            status, reason = response.status, response.reason[:100]
+        if self._late:  # the end of the connection looks like the end of the answer's headers
+            raise TimeoutError
         if 300 <= status < 400:
             where = (response.getheader("Location") or "elsewhere")[:200]
             raise DeliveryError(f"the server answers {status}, which points to {where}: redirects are not followed")

@@ -35,6 +35,15 @@ def test_true_conditions(text: str) -> None:
     assert not holds(f"not ({text})")
 
 
+def test_unknown_is_neither_true_nor_false() -> None:
+    for text in ("a > 1", "not (a > 1)", "on or a > 1", "on and 1 / (b - b) > 0"):
+        expression = parse(text)
+        values = [None if path == "a" else VALUES[path] for path in expression.references]
+        assert expression.evaluate(values, Memory()) is None
+        assert not expression.holds(values, Memory())
+    assert parse("on").evaluate([False], Memory()) is False
+
+
 def test_path_is_one_token() -> None:
     expression = parse("cell/Outputs/13.%X0 and sim/Kuka.j1/R>2 and cell/Outputs/13.%X0")
     assert expression.references == ("cell/Outputs/13.%X0", "sim/Kuka.j1/R")

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from shmio.config import Config, Emulator, Grpc, Instance, Mqtt, Recorder, Source, Token
+from shmio.config import Alert, Config, Emulator, Grpc, Instance, Mqtt, Recorder, Source, Token
 from shmio.errors import ConfigError
 from shmio.layout.document import load_layout
 from shmio.layout.model import Layout, Register
@@ -49,13 +49,14 @@ def test_blocks_and_processes_follow_the_configuration(tmp_path: Path) -> None:
         {"mqtt": Mqtt(), "recorder": Recorder()},
         {"mqtt": Mqtt(broker="mosquitto"), "grpc": None},
         {"mqtt": Mqtt(broker="external", host="broker.example"), "emulator": []},
+        {"alert": [Alert(when="a > 1")]},
     ],
 )
 def test_process_names_agree_with_the_plan(tmp_path: Path, sections: dict[str, Any], mode: str) -> None:
     settings = msgspec.structs.replace(config(tmp_path, sources=2), **sections)
     layouts = {"cell0": LAYOUT, "cell1": LAYOUT}
     plan = make_plan(settings, layouts, PLAYED, config_file=tmp_path / "s.toml", mode=mode)
-    left_out = ("grpc", "broker", "mqtt") if mode == "log" else ()
+    left_out = {"log": ("grpc", "broker", "mqtt", "alerts"), "replay": ("alerts",)}.get(mode, ())
     assert [job.name for job in plan.jobs] == [name for name in process_names(settings) if name not in left_out]
 
 

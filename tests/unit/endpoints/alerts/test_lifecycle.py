@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -90,4 +92,4 @@ def test_notices_alternate_and_keep_their_distance(
         Change.ACTIVE
     ] * (len(seen) % 2)
     times = [at for at, change, _ in seen if change is Change.ACTIVE]
-    assert all(later - earlier >= every_ns for earlier, later in zip(times, times[1:], strict=False))
+    assert all(later - earlier >= every_ns for earlier, later in pairwise(times))

@@ -20,7 +20,8 @@ def test_each_frame_is_evaluated_once(instance: str) -> None:
             one.publish(time_s, position=9 if time_s % 2 else 1)
         notices = one.until(7)
         assert [(n.alert, str(n.state), n.clock_s) for n in notices] == [
-            ("hot", "active", 1), ("edge", "active", 1), ("hot", "resolved", 2), ("edge", "active", 3), ("edge", "active", 5),
+            ("hot", "active", 1), ("edge", "active", 1), ("hot", "resolved", 2), ("edge", "active", 3),
+            ("edge", "active", 5),
         ]  # fmt: skip
         assert one.monitor.missed == 0
         assert one.monitor.done == 7
