@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -13,6 +13,7 @@ from shmio.recording.format.encoding import EVENT, FRAME, Channel, Gap
 from shmio.recording.format.records import BROKEN, U32, U64, Damage, DamageLog, Record
 from shmio.recording.reading.reader import Reader
 from shmio.recording.reading.survey import MAX_BLOCKS, Count, read_index
+from shmio.recording.times import lost
 
 MAX_TOLD: Final = 1000
 """Largest number of damaged places, and of problems, that a result lists. It counts all of them."""
@@ -37,6 +38,12 @@ class Findings:
         """True if the recording is intact."""
         return self.count == 0
 
+    def texts(self) -> list[str]:
+        """Return a message about each place, and one about those that are not listed."""
+        found = [lost(damage) for damage in self.damage] + self.problems
+        more = self.count - len(found)
+        return [*found, f"and {more} more such places"] if more else found
+
 
 def check(reader: Reader, at: Callable[[int], object] = lambda _: None) -> Findings:
     """Verify all CRCs and messages, and that a gap is recorded for each missing frame or event.
@@ -50,9 +57,23 @@ def check(reader: Reader, at: Callable[[int], object] = lambda _: None) -> Findi
     Raises:
         RecordingError: The file is not a recording of shmio.
     """
+    steps = check_by_record(reader)
+    while True:
+        try:
+            at(next(steps))
+        except StopIteration as end:
+            found: Findings = end.value
+            return found
+
+
+def check_by_record(reader: Reader) -> Generator[int, None, Findings]:
+    """Do what :func:`check` does, and yield the byte offset of each record before it is checked.
+
+    Between two records, the caller may do other work, or give up.
+    """
     work = _Check(reader)
     for record in reader.records.walk():
-        at(record.start)
+        yield record.start
         work.take(record)
     return work.end()
 

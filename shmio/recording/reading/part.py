@@ -159,10 +159,24 @@ class Part:
         RecordingError: The file is not a recording of shmio.
     """
 
-    def __init__(self, file: Path, damaged: Damaged | None) -> None:
-        """Open a file. Call ``damaged`` for damage; if it is None, damage raises RecordingError."""
+    def __init__(
+        self,
+        file: Path,
+        damaged: Damaged | None,
+        *,
+        own: bool = False,
+        beat: Callable[[], object] = lambda: None,
+    ) -> None:
+        """Open a file.
+
+        Args:
+            file: The path.
+            damaged: Called for damage; if it is None, damage raises RecordingError.
+            own: True to accept only a regular file of this user.
+            beat: Called at intervals during reading. If it raises an exception, reading ends.
+        """
         self.file = file
-        self.reader = Reader(file)
+        self.reader = Reader(file, own=own, beat=beat)
         self._damaged = damaged
         try:
             found = survey_by_index(self.reader)
