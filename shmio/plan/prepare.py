@@ -79,6 +79,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
             f"{file}: --mode log records the sources and needs a [recorder] section: "
             'add one, such as [recorder] with directory = "dumps", or leave out --mode log'
         )
+    directory = config.path(config.recorder.directory) if config.recorder else None  # a replay leaves out the recorder
     with Recordings() as recordings:
         if mode == "replay":
             faults.raise_any()
@@ -143,6 +144,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
         replayed=sources.replayed,
         remote=sources.remote,
         origin=origin,
+        recordings=directory,
     )
     open_to = None if mode == "log" else exposure(config)  # mode log has no endpoints
     return Prepared(config, plan, layouts, emulated, described, (open_to,) if open_to else ())

@@ -164,6 +164,7 @@ def make_plan(
     replayed: Collection[str] = (),
     remote: Mapping[str, tuple[Sequence[str], Sequence[str]]] | None = None,
     origin: Origin | None = None,
+    recordings: Path | None = None,
 ) -> Plan:
     """Plan an instance.
 
@@ -181,6 +182,7 @@ def make_plan(
         remote: For sources that a remote program computes, by source name: patterns of their
             outputs and in-outs.
         origin: The clock's origin in a replayed recording; None if there is none.
+        recordings: The directory of the configured recorder, also if the mode leaves it out; None if there is none.
 
     Raises:
         ConfigError: The instance has too many processes.
@@ -228,6 +230,7 @@ def make_plan(
     if config.web and mode != "log":
         tokens = msgspec.to_builtins(config.grpc.token) if config.grpc else []
         more = {"folders": _folders(config), "token": tokens, "config_file": str(config_file.resolve())}
+        more["recordings"] = recordings and str(recordings)
         sections.append(("web", "web", msgspec.to_builtins(config.web) | more))
     if config.alert and mode == "live":
         sections.append((ALERTS, "alerts", _alerts(config, log_dir)))

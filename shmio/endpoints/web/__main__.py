@@ -48,6 +48,7 @@ async def _serve(worker: Worker) -> None:
     folders: dict[str, str] = worker.config.pop(FOLDERS)
     given: list[dict[str, Any]] = worker.config.pop("token", [])
     file: str = worker.config.pop("config_file", "")
+    recordings: str | None = worker.config.pop("recordings", None)
     config = msgspec.convert(worker.config, Web if worker.name == "web" else Metrics)
     loop = asyncio.get_running_loop()
     stopping = asyncio.Event()
@@ -57,7 +58,7 @@ async def _serve(worker: Worker) -> None:
     if isinstance(config, Web):
         cell = attach(worker.segment.instance, writable=True)
         sessions = Sessions(read_tokens(msgspec.convert(given, list[Token])), config.roles or ())
-        served = Served(worker.segment, cell, measurements, folders, file)
+        served = Served(worker.segment, cell, measurements, folders, file, recordings)
         page = PageApp(served, sessions, TABS, secure=config.certificate is not None)
         app = page.app(measurements, config.registers)
     else:

@@ -14,6 +14,7 @@ import msgspec
 
 from shmio.endpoints.alerts.state_file import alert_states
 from shmio.endpoints.web.measurements import Measurements
+from shmio.endpoints.web.recordings import Recordings
 from shmio.endpoints.web.signals import Feeds
 from shmio.endpoints.web.timeline import Timeline
 from shmio.local.attach import Attachment
@@ -47,6 +48,7 @@ class Served:
         measurements: Measurements,
         folders: Mapping[str, str],
         config_file: str = "",
+        recordings: str | None = None,
     ) -> None:
         """Begin without an overview.
 
@@ -56,6 +58,7 @@ class Served:
             measurements: The timing of the sources.
             folders: Folders in which the instance writes files, by purpose.
             config_file: Path of the configuration.
+            recordings: The recorder's directory; None if no recorder is configured.
 
         """
         self.segment, self.cell, self.measurements, self.folders = segment, cell, measurements, folders
@@ -64,6 +67,7 @@ class Served:
         """What pages plot."""
         self.timeline = Timeline(segment)
         """The newest events."""
+        self.recordings = Recordings(recordings)
         self._overview: dict[str, Any] = {}
         self._overview_s = -OVERVIEW_S
         self._usages: dict[int, _Usage] = {}

@@ -43,7 +43,8 @@ MAX_IMAGE_BYTES: Final = 32 << 20
 """Maximum size of the images from which a batch is made."""
 LEAST_GAP_NS: Final = 100_000_000
 """Time without frames that is a gap, unless the source's period or its stale time is longer."""
-_HEAD: Final = struct.Struct("<IId")
+HEAD: Final = struct.Struct("<IId")
+"""The head of a batch."""
 _MILLISECOND: Final = np.timedelta64(1, "ms")
 
 _log = logging.getLogger("shmio.web")
@@ -140,7 +141,7 @@ class Feed:
         bad = np.array([frame.quality is Quality.BAD or not frame.source_ns for frame in frames])
         for index, register in enumerate(self.registers):
             values = decoded[register.path]
-            columns[1 + index] = _numbers(values)
+            columns[1 + index] = numbers(values)
             columns[1 + index][bad | self._bad(register, frames)] = math.nan
             if raw is not decoded:
                 original = raw[register.path]
@@ -148,7 +149,7 @@ class Feed:
                 if any(one.covers(register) for one in present):
                     altered |= np.array([frame.effective is not None for frame in frames])
                 marks[index][altered] = Provenance.INJECTED
-        head = _HEAD.pack(self.number, rows, math.nan if before is None else self._utc_s(before))
+        head = HEAD.pack(self.number, rows, math.nan if before is None else self._utc_s(before))
         return head + columns.tobytes() + marks.tobytes()
 
     def _utc_s(self, frame: Frame) -> float:
@@ -209,7 +210,8 @@ class Feeds:
     def __init__(self) -> None:
         self._feeds: dict[tuple[int, tuple[str, ...]], Feed] = {}
         self._number = 0
-        self._utc_ns = time.time_ns() - time.monotonic_ns()  # one for all feeds: a frame has the same time in each
+        self.utc_ns = time.time_ns() - time.monotonic_ns()
+        """UTC minus the time of CLOCK_MONOTONIC, in ns. All feeds have one: a frame has the same time in each."""
         self._task: asyncio.Task[None] | None = None
 
     async def follow(self, block: Block, registers: Sequence[Register], follower: Follower) -> Feed:
@@ -225,7 +227,7 @@ class Feeds:
         feed = self._feeds.get(key)
         if feed is None:
             self._number += 1
-            feed = self._feeds[key] = Feed(self._number, block, registers, self._utc_ns)
+            feed = self._feeds[key] = Feed(self._number, block, registers, self.utc_ns)
         last = feed.last
         batches, before = await run_in_threadpool(feed.history, last)
         self._feeds[key] = feed  # it may have been removed, because nobody followed it yet
@@ -288,7 +290,7 @@ def _first(register: Register) -> str:
     return f"{register.path}[{','.join(str(low) for low, _ in register.dims)}]"
 
 
-def _numbers(values: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-    """Return values as numbers; durations in ms."""
+def numbers(values: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+    """Return values of a plottable register as numbers; durations in ms."""
     found: npt.NDArray[np.float64] = values / _MILLISECOND if values.dtype.kind == "m" else values.astype(np.float64)
     return found

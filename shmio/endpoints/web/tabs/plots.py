@@ -1,20 +1,28 @@
-"""The plots tab: the course of registers, live."""
+"""The plots tab: the course of registers, live, and their past from the recording of this run."""
 
 from __future__ import annotations
 
 import asyncio
+import time
+from functools import partial
 from typing import Annotated, Any, ClassVar, Final
 
 import msgspec
 from msgspec import Meta
 
+from shmio.endpoints.web.course import Part, Window, first_time, past, signals_of
 from shmio.endpoints.web.page import Page, Tab, call
+from shmio.endpoints.web.recordings import Opened, Work
+from shmio.endpoints.web.served import Served
 from shmio.endpoints.web.signals import Feed, check_plottable
 from shmio.errors import PathError
 from shmio.layout.model import MAX_PATH
 
 MAX_SIGNALS: Final = 200
 """Maximum number of registers that one page plots."""
+MAX_COLUMNS: Final = 4000
+RECORDED_S: Final = 2.0
+"""Time in s after which a frame is in the recorder's file."""
 
 
 class Plotted(msgspec.Struct, forbid_unknown_fields=True):
@@ -23,6 +31,22 @@ class Plotted(msgspec.Struct, forbid_unknown_fields=True):
     source: Annotated[str, Meta(min_length=1, max_length=MAX_PATH)]
     paths: Annotated[list[Annotated[str, Meta(min_length=1, max_length=MAX_PATH)]], Meta(max_length=MAX_SIGNALS)]
     """Paths with the source, of registers or elements."""
+
+
+class Wanted(msgspec.Struct, forbid_unknown_fields=True):
+    """A window of the past (s, UTC, as in batches), the registers of one source, and the width in pixels."""
+
+    source: Annotated[str, Meta(min_length=1, max_length=MAX_PATH)]
+    paths: Annotated[list[Annotated[str, Meta(min_length=1, max_length=MAX_PATH)]], Meta(min_length=1, max_length=32)]
+    from_s: Annotated[float, Meta(ge=0, le=9e9)]
+    to_s: Annotated[float, Meta(ge=0, le=9e9)]
+    columns: Annotated[int, Meta(ge=1, le=MAX_COLUMNS)]
+
+
+class Numbered(msgspec.Struct, forbid_unknown_fields=True):
+    """A part of the past that the page has requested."""
+
+    number: int
 
 
 class Plots(Tab):
@@ -34,11 +58,61 @@ class Plots(Tab):
         super().__init__(page)
         self._feeds: dict[str, Feed] = {}
         self._changing = asyncio.Lock()
+        self._past: dict[str, dict[int, Work[Part]]] = {}
+        self._past_number = 0
 
     def close(self) -> None:
-        """Leave all feeds."""
+        """Leave all feeds, and stop reading the past."""
         for source in tuple(self._feeds):
             self._leave(source)
+        for source in tuple(self._past):
+            self._forget(source)
+
+    @call("read", Wanted)
+    async def past(self, given: Wanted) -> list[int]:
+        """Begin to read the past of registers, in place of what was requested before for this source.
+
+        Returns:
+            A number for each file that has a part of it, in the order of time; ``more`` returns the
+            parts. Empty: the recorder has nothing of it.
+
+        """
+        async with self._changing:
+            self._forget(given.source)
+            served = self.page.served
+            epoch = f"{served.segment.header.epoch:016x}"
+            utc_ns = served.feeds.utc_ns
+            window = Window(round(given.from_s * 1e9), round(given.to_s * 1e9), given.columns)
+            since_s = min((window.to_ns - utc_ns) / 1e9 + RECORDED_S, time.monotonic() - RECORDED_S)
+            works: list[Work[Part]] = []
+            async for opened in served.recordings.of_run(served.segment.instance, epoch, since_s):
+                try:
+                    work, first_ns = await served.recordings.in_thread(partial(_work, served, opened, given, window))
+                except BaseException:
+                    served.recordings.release(opened)
+                    for other in works:
+                        other.stop()
+                    raise
+                if work is None:
+                    served.recordings.release(opened)
+                    continue
+                works.insert(0, work)
+                if first_ns + utc_ns <= window.from_ns:
+                    break
+            numbers = range(self._past_number + 1, self._past_number + 1 + len(works))
+            self._past_number += len(works)
+            self._past[given.source] = dict(zip(numbers, works, strict=True))
+            return list(numbers)
+
+    @call("read", Numbered)
+    async def more(self, given: Numbered) -> Part | None:
+        """Return the next part of the past; None if there is none, or other registers were requested since."""
+        work = next((works[given.number] for works in self._past.values() if given.number in works), None)
+        return None if work is None else await work.next()
+
+    def _forget(self, source: str) -> None:
+        for work in self._past.pop(source, {}).values():
+            work.stop()
 
     @call("read", Plotted)
     async def follow(self, given: Plotted) -> dict[str, Any] | None:
@@ -85,3 +159,19 @@ class Plots(Tab):
         feed = self._feeds.pop(source, None)
         if feed is not None:
             self.page.served.feeds.leave(feed, self)
+
+
+def _work(served: Served, opened: Opened, given: Wanted, window: Window) -> tuple[Work[Part] | None, int]:
+    """Return the work with one file, and the monotonic time of its first frame; None if it has nothing to read.
+
+    Raises:
+        PathError: The file has no such register.
+
+    """
+    with opened.lock:
+        first_ns = first_time(opened.dump, given.source) if given.source in opened.dump.sources else None
+        if first_ns is None or first_ns + served.feeds.utc_ns > window.to_ns:
+            return None, 0
+        signals = signals_of(opened.dump, given.paths)
+        dump, utc_ns = opened.dump, served.feeds.utc_ns
+        return Work(served.recordings, lambda _: past(dump, signals, window, utc_ns), opened), first_ns

@@ -9,6 +9,7 @@ import socket
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -61,11 +62,13 @@ def pages(
     secrets: Sequence[Secret] = (),
     roles: Sequence[str] = ("read",),
     folders: Mapping[str, str] | None = None,
+    recordings: Path | None = None,
 ) -> Iterator[Pages]:
     """Serve the page of a segment on a free port."""
     measurements = Measurements(segment)
     with Segment.open(segment.instance, writable=True) as mapped:
-        shown = Served(segment, Attachment(mapped), measurements, folders or {})
+        folder = recordings and str(recordings)
+        shown = Served(segment, Attachment(mapped), measurements, folders or {}, recordings=folder)
         served = PageApp(shown, Sessions(secrets, roles), TABS, secure=False)
         server = HttpServer(served.app(measurements, ()), Address("127.0.0.1", 0), sockets=True)
         loop = asyncio.new_event_loop()

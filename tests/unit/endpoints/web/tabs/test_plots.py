@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import base64
 import json
 import math
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,9 +15,14 @@ from websockets.sync.connection import Connection
 
 from shmio.endpoints.web import signals
 from shmio.endpoints.web.tabs import plots
+from shmio.recorder.file_output import Output, create
+from shmio.recorder.instance_follower import FROM_THE_FIRST, InstanceFollower, StartPositions
+from shmio.recorder.recorder import Recorder
+from shmio.recording.format.encoding import SUPERVISED
 from shmio.segment import BlockWriter, Provenance, Quality, Segment
+from shmio.testing.cell import until
 from tests.unit.endpoints.harness import LAYOUT
-from tests.unit.endpoints.web.harness import TIMEOUT_S
+from tests.unit.endpoints.web.harness import TIMEOUT_S, processes, spec
 from tests.unit.endpoints.web.test_page import Pages, pages, said
 
 POSITION = "cell/axis/position"
@@ -196,3 +203,62 @@ def test_number_of_registers_is_bounded(segment: Segment, monkeypatch: pytest.Mo
     monkeypatch.setattr(plots, "MAX_SIGNALS", 1)
     with pages(segment) as server, server.open() as browser:
         assert "at most 1" in said(browser, "plots.follow", source="cell", paths=[POSITION, "cell/step"])["error"]
+
+
+def recorder(segment: Segment, folder: Path, start: StartPositions = FROM_THE_FIRST) -> Recorder:
+    path, fd = create(folder, segment.instance)
+    return Recorder(InstanceFollower(segment, start), Output(path, fd, limit_bytes=1 << 24), by=SUPERVISED)
+
+
+def flush(work: Recorder) -> None:
+    while work.turn():
+        pass
+    work._writer.flush()
+    work.output.flush()
+    until(lambda: work.output.path.stat().st_size == work.output.written > 0, "the bytes in the file")
+
+
+def recorded(browser: Connection, **given: Any) -> tuple[list[float], list[float]]:
+    """Return times and values of a register's past."""
+    found = said(browser, "plots.past", **{"source": "cell", "paths": [POSITION], "columns": 4000} | given)
+    times, values = [], []
+    for number in found["result"]:
+        while (part := said(browser, "plots.more", number=number)["result"]) is not None:
+            for batch in filter(None, map(base64.b64decode, part["batches"])):
+                times += decoded(batch, 1).times
+                values += decoded(batch, 1).values[0]
+    return times, values
+
+
+def test_past_comes_from_the_file_that_is_being_written(
+    segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plots, "RECORDED_S", 0.0)
+    writer = segment.writer("cell")
+    publish(writer, range(1, 101))
+    work = recorder(segment, tmp_path)
+    with pages(segment, recordings=tmp_path) as server, server.open() as browser:
+        follow(server, browser, POSITION)
+        times, (values,), _ = course(browser, 100)
+        assert recorded(browser, from_s=times[0] - 1, to_s=times[-1]) == ([], [])
+        flush(work)
+        assert recorded(browser, from_s=times[0], to_s=times[-1]) == (times, values)
+        some_times, some = recorded(browser, from_s=times[40], to_s=times[60])
+        assert set(times[40:61]) <= set(some_times)
+        assert len(some) <= 100
+        assert recorded(browser, from_s=times[0] - 9, to_s=times[0] - 8) == ([], [])
+        missing = said(browser, "plots.past", source="cell", paths=["cell/x"], from_s=0, to_s=9e9, columns=9)
+        assert "cell/x" in missing["error"]
+    assert work.close()
+
+
+def test_past_of_another_run_is_not_taken(segment: Segment, instance: str, tmp_path: Path) -> None:
+    publish(segment.writer("cell"), range(1, 101))
+    work = recorder(segment, tmp_path)
+    flush(work)
+    assert work.close()
+    segment.unlink()
+    with Segment.create(instance, [spec()], processes()) as other:
+        with pages(other, recordings=tmp_path) as server, server.open() as browser:
+            assert recorded(browser, from_s=0, to_s=9e9) == ([], [])
+        other.unlink()
