@@ -48,6 +48,8 @@ class Decimator:
         self._begin_ns = begin_ns
         self._width_ns = max(1, (end_ns - begin_ns) // max(1, columns))
         self._rest = NO_SAMPLES
+        self.reduced = False
+        """Whether samples were left out so far."""
 
     def add(self, samples: Samples) -> Samples:
         """Add later samples; return what remains of the columns before the last one."""
@@ -56,6 +58,7 @@ class Decimator:
             return NO_SAMPLES
         column = (whole.time_ns - self._begin_ns) // self._width_ns
         kept = _kept(whole, column)
+        self.reduced |= len(kept) < len(column)
         whole, column = whole.take(kept), column[kept]
         complete = column != column[-1]
         self._rest = whole.take(~complete)

@@ -84,6 +84,8 @@ class Part(msgspec.Struct):
     batches: list[bytes]
     events: list[MarkedEvent]
     share: float
+    reduced: bool = False
+    """Whether frames were left out so far that a plot does not need."""
 
 
 def signals_of(dump: Dump, paths: Sequence[str]) -> list[Signal]:
@@ -198,7 +200,8 @@ class _Course:
                 yield from self._flushed(min(1.0, done))
                 started_s, size, count = time.monotonic(), 0, 0
         yield from self._flushed(1.0)
-        yield Part([self._batch(index, one.end()) for index, one in self._decimators.items()], [], 1.0)
+        reduced = any(one.reduced for one in self._decimators.values())
+        yield Part([self._batch(index, one.end()) for index, one in self._decimators.items()], [], 1.0, reduced)
 
     def _including_next(self, source: str, from_ns: int, to_ns: int) -> Iterator[tuple[DumpBlock, Batch]]:
         yield from self._dump.batches(source, from_ns, to_ns)

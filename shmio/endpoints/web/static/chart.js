@@ -4,12 +4,17 @@ import { INJECTED } from "./series.js";
 
 /** @typedef {import("./series.js").Series} Series */
 /** @typedef {{ series: Series, color: string, steps: boolean }} Line A line; `steps` for values that jump, such as BOOL. */
-/** @typedef {{ from: number, to: number, cursor: number | null, mark: number | null }} View Times in s, UTC. */
+/** @typedef {{ time: number, text: string }} Mark An event: its time, and what happened. */
+/** @typedef {{ from: number, to: number, cursor: number | null, mark: number | null, marks: Mark[] }} View Times in s, UTC. */
 
 export const LEFT_PX = 70;
 const BOTTOM_PX = 20;
 const TOP_PX = 6;
 const TICK_PX = 110;
+const POINT_PX = 8; // samples that are farther apart are drawn as points, too
+const DAY_S = 86_400;
+const LABEL_PX = 60; // the text of an event is left out if it has less room
+const MAX_LABEL_PX = 260;
 
 /**
  * Draw a lane.
@@ -50,6 +55,7 @@ export function draw(pen, width, height, lines, view) {
   pen.clip();
   for (const { series } of lines) shade(pen, series, view, x, bottom, color("--injected"));
   for (const line of lines) trace(pen, line, view, x, y, width);
+  drawMarks(pen, view, x, width, bottom, color);
   for (const [time, dash] of /** @type {[number | null, number[]][]} */ ([[view.mark, [4, 3]], [view.cursor, []]])) {
     if (time === null) continue;
     pen.setLineDash(dash);
@@ -99,6 +105,53 @@ function shade(pen, series, view, x, bottom, color) {
 }
 
 /**
+ * Draw the events: a triangle for each, and its text where there is room.
+ *
+ * @param {CanvasRenderingContext2D} pen
+ * @param {View} view
+ * @param {(time: number) => number} x
+ * @param {number} width
+ * @param {number} bottom
+ * @param {(name: string) => string} color
+ */
+function drawMarks(pen, view, x, width, bottom, color) {
+  const seen = view.marks.filter((mark) => mark.time >= view.from && mark.time <= view.to);
+  pen.textAlign = "left";
+  pen.setLineDash([2, 4]);
+  let free = -Infinity;
+  seen.forEach((mark, index) => {
+    const at = x(mark.time);
+    const next = index + 1 < seen.length ? x(seen[index + 1].time) : width;
+    pen.fillStyle = pen.strokeStyle = color("--accent");
+    pen.beginPath();
+    pen.moveTo(at, bottom);
+    pen.lineTo(at - 4, bottom - 7);
+    pen.lineTo(at + 4, bottom - 7);
+    pen.fill();
+    if (at < free || next - at < LABEL_PX) return;
+    pen.globalAlpha = 0.6;
+    segment(pen, at, 0, at, bottom - 7);
+    pen.globalAlpha = 1;
+    const text = fitting(pen, mark.text, Math.min(next - at, MAX_LABEL_PX) - 8);
+    const labelWidth = pen.measureText(text).width;
+    free = at + labelWidth + 8;
+    pen.fillStyle = color("--back");
+    pen.fillRect(at + 3, 1, labelWidth + 4, 14);
+    pen.fillStyle = color("--accent");
+    pen.fillText(text, at + 5, 8);
+  });
+  pen.setLineDash([]);
+}
+
+/** @param {CanvasRenderingContext2D} pen @param {string} text @param {number} most @returns {string} The text, cut to a width. */
+function fitting(pen, text, most) {
+  if (pen.measureText(text).width <= most) return text;
+  let length = text.length;
+  while (length > 1 && pen.measureText(`${text.slice(0, length)}…`).width > most) length -= Math.ceil(length / 8);
+  return `${text.slice(0, length)}…`;
+}
+
+/**
  * Draw a line.
  *
  * @param {CanvasRenderingContext2D} pen
@@ -136,6 +189,11 @@ function trace(pen, line, view, x, y, width) {
     }
   }
   pen.stroke();
+  if ((end - first) * POINT_PX > width) return;
+  pen.fillStyle = line.color;
+  for (let index = first; index < end; index += 1) {
+    if (Number.isFinite(series.values[index])) pen.fillRect(x(series.times[index]) - 2, y(series.values[index]) - 2, 4, 4);
+  }
 }
 
 /**
@@ -204,5 +262,6 @@ function label(value, span) {
 export function clock(time, span = 0) {
   const date = new Date(1000 * time);
   const text = date.toLocaleTimeString("en-GB");
+  if (span > DAY_S) return `${date.toLocaleDateString("en-CA").slice(5)} ${text.slice(0, 5)}`;
   return span < 10 ? `${text}.${String(date.getMilliseconds()).padStart(3, "0")}` : text;
 }

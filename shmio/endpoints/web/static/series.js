@@ -4,11 +4,36 @@
 export const INJECTED = 3;
 
 const FIRST_SIZE = 1024;
+const HEAD_BYTES = 16;
+
+/**
+ * Read a batch of samples: see shmio/endpoints/web/signals.py.
+ *
+ * @param {ArrayBuffer} batch
+ * @param {number} registers Number of registers in it.
+ * @returns {{ number: number, before: number, times: Float64Array, columns: { values: Float64Array, marks: Uint8Array }[] }}
+ */
+export function readBatch(batch, registers) {
+  const view = new DataView(batch);
+  const rows = view.getUint32(4, true);
+  const marksAt = HEAD_BYTES + 8 * rows * (1 + registers);
+  const columns = Array.from({ length: registers }, (_, index) => ({
+    values: new Float64Array(batch, HEAD_BYTES + 8 * rows * (1 + index), rows),
+    marks: new Uint8Array(batch, marksAt + rows * index, rows),
+  }));
+  return { number: batchNumber(batch), before: view.getFloat64(8, true), times: new Float64Array(batch, HEAD_BYTES, rows), columns };
+}
+
+/** @param {ArrayBuffer} batch @returns {number} The number of its feed. */
+export function batchNumber(batch) {
+  return new DataView(batch).getUint32(0, true);
+}
 
 /** Samples in the order of time. A NaN is a gap. */
 export class Series {
   constructor() {
     this.count = 0;
+    this.reduced = false; // whether samples were left out that a plot does not need
     this.times = new Float64Array(FIRST_SIZE);
     this.values = new Float64Array(FIRST_SIZE);
     this.marks = new Uint8Array(FIRST_SIZE);
