@@ -67,7 +67,7 @@ def pages(
     """Serve the page of a segment on a free port."""
     measurements = Measurements(segment)
     with Segment.open(segment.instance, writable=True) as mapped:
-        folder = recordings and str(recordings)
+        folder = None if recordings is None else str(recordings)
         shown = Served(segment, Attachment(mapped), measurements, folders or {}, recordings=folder)
         served = PageApp(shown, Sessions(secrets, roles), TABS, secure=False)
         server = HttpServer(served.app(measurements, ()), Address("127.0.0.1", 0), sockets=True)

@@ -176,7 +176,7 @@ def test_zoomed_plot_reads_only_its_chunks(browser: Connection, folder: Path, mo
         return unpacked(self, record)
 
     monkeypatch.setattr(Records, "unpacked", noted)
-    window = {"from_s": moment(505) - 0.001, "to_s": moment(507) + 0.001}
+    window: dict[str, Any] = {"from_s": moment(505) - 0.001, "to_s": moment(507) + 0.001}
     ((times, values, _),), _ = plot(browser, "a.mem", "cell/count", **window)
     assert values == [504, 505, 506, 507, 508]  # and the frames on both sides, so that the line goes to the edges
     assert times[1] == moment(505)
