@@ -9,10 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from shmio.endpoints.alerts.lifecycle import Progress
+from shmio.endpoints.alerts.state_file import FILE_NAME, AlertState, State, StateWriter
 from shmio.endpoints.web import metrics
 from shmio.endpoints.web.measurements import BOUNDS_S, Histogram, SourceTiming
 from shmio.endpoints.web.metrics import usage
-from shmio.segment import EventKind, Quality, Record, Report, Segment
+from shmio.segment import EventKind, ProcessSpec, Quality, Record, Report, Segment
 from shmio.segment.processes import Activity
 from shmio.version import __version__
 from tests.unit.endpoints.harness import image
@@ -89,6 +91,21 @@ def test_free_space(segment: Segment, tmp_path: Path) -> None:
         assert size is not None
         assert 0 < free <= size
         assert endpoint.figure("shmio_disk_free_bytes", folder="recordings") is None
+
+
+def test_alerts(instance: str, tmp_path: Path) -> None:
+    alerts = {
+        name: AlertState("", severity, "", "", Progress(active=active))
+        for name, severity, active in (("hot", "critical", True), ("cold", "info", False))
+    }
+    with Segment.create(instance, [spec()], [*processes(), ProcessSpec("alerts", "alerts")]) as segment:
+        writer = StateWriter(tmp_path / FILE_NAME)
+        writer.write(State(segment.header.epoch, alerts))
+        writer.close(30)
+        with served(segment, folders={"logs": str(tmp_path)}) as endpoint:
+            assert endpoint.figure("shmio_alert_active", alert="hot", severity="critical") == 1
+            assert endpoint.figure("shmio_alert_active", alert="cold", severity="info") == 0
+        segment.unlink()
 
 
 def test_use_of_a_process() -> None:

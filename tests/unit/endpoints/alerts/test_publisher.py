@@ -1,0 +1,70 @@
+"""Notices at a real broker: they wait while it is away, and each arrives."""
+
+from __future__ import annotations
+
+import json
+import os
+import selectors
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shmio.config import Alert, Mqtt
+from shmio.endpoints.alerts.publisher import Publisher, queued
+from shmio.endpoints.alerts.sender import MAX_WAITING
+from shmio.segment import Segment
+from shmio.testing.mosquitto import Mosquitto, missing
+from shmio.testing.ports import reserved_port
+from tests.unit.endpoints.alerts.harness import notice
+from tests.unit.endpoints.mqtt.harness import listening
+
+ALERT = Alert(name="hot", when="x", mqtt_topic="plant/hot", mqtt_retain=True)
+pytestmark = pytest.mark.skipif(bool(missing()), reason=missing())
+
+
+class Running:
+    """A publisher, and the loop that runs it."""
+
+    def __init__(self, segment: Segment, settings: Mqtt) -> None:
+        self.selector = selectors.DefaultSelector()
+        self._wakeup = os.eventfd(0, os.EFD_NONBLOCK)
+        self.selector.register(self._wakeup, selectors.EVENT_READ, lambda _: os.eventfd_read(self._wakeup))
+        self.publisher = Publisher(settings, segment, self.selector, lambda: os.eventfd_write(self._wakeup, 1))
+
+    def until(self, condition: Any) -> None:
+        while not condition():
+            rest_s = self.publisher.turn()
+            for key, events in self.selector.select(min(rest_s, 0.1)):
+                key.data(events)
+
+    def close(self) -> None:
+        self.publisher.close()
+        self.selector.close()
+        os.close(self._wakeup)
+
+
+def test_notices_wait_for_the_broker(segment: Segment, tmp_path: Path) -> None:
+    with reserved_port() as address:
+        broker = Mosquitto(tmp_path, address)
+        one = Running(segment, Mqtt(broker="external", host=str(address)))
+        try:
+            for number in range(MAX_WAITING + 5):
+                one.publisher.put(ALERT, notice(number=number))
+            one.until(lambda: one.publisher.problem)
+            assert (one.publisher.waiting_count, one.publisher.failed) == (MAX_WAITING, 5)
+            broker.start()
+            one.until(lambda: not one.publisher.waiting_count)
+            assert one.publisher.problem == ""
+            with listening(address, "plant/#") as late:
+                message = late.message()
+                assert message.retain
+                assert json.loads(message.payload)["id"] == notice(number=MAX_WAITING + 4).id
+                queued(one.publisher, [ALERT], [notice(number=7), notice("removed")])
+                one.until(lambda: not one.publisher.waiting_count)
+                assert json.loads(late.message().payload)["id"] == notice(number=7).id
+                late.taken()
+                assert len(late.heard) == 2
+        finally:
+            one.close()
+            broker.stop()
