@@ -197,7 +197,7 @@ class OpcUaConnector(Connector):
 
     def _store(self, image: RegisterImage, item: Item, sample: Sample) -> None:
         index = item.index
-        item.code = sample.code
+        item.code, item.seen = sample.code, sample
         if quality_of(sample.code) is Quality.BAD or not sample.kind:
             code = sample.code or BAD_NO_DATA
             image.fail(index, code, sample.source_ns)

@@ -92,6 +92,8 @@ class Item:
     subscription: Subscription | None = None
     monitored: int = 0
     """The server's number of the monitored item."""
+    seen: Sample | None = None
+    """The sample that came last."""
     last: Sample | None = None
     """The last sample with a value."""
     settles_ns: int = 0
@@ -474,8 +476,7 @@ class Session:
         now_ns = time.monotonic_ns()
         for item, sample in zip(items, found, strict=True):
             if item.subscription is not None:
-                settle_s = 2 * (item.subscription.publishing_s + max(0, self._options.sampling_ms) / 1000) + 0.2
-                item.settles_ns, item.written_ns = now_ns + round(settle_s * 1e9), sample.source_ns
+                item.settles_ns, item.written_ns = now_ns + round(self._settle_s(item) * 1e9), sample.source_ns
         self._deliver(list(zip(items, found, strict=True)))
 
     async def has_ranges(self, item: Item, elements: str, count: int) -> bool:
@@ -747,26 +748,37 @@ class Session:
                 or (subscribes and item.subscription is None)  # the server refused it
             ]
             try:
-                await self._find_removed([item for item in self._items if item.subscription is not None])
+                dead = await self._find_dead([item for item in self._items if item.subscription is not None])
                 if unknown:
                     await self._resolve(unknown)
-                if unknown and subscribes:
-                    await self._subscribe_again([item for item in unknown if item.node is not None])
+                if subscribes:
+                    await self._subscribe_again([item for item in (*unknown, *dead) if item.node is not None])
             except Exception as error:  # noqa: BLE001
                 self.fail(self.explained(error))
                 return
 
-    async def _find_removed(self, items: Sequence[Item]) -> None:
-        """Turn those bad whose nodes no longer exist: some servers just send no more changes of them."""
+    async def _find_dead(self, items: Sequence[Item]) -> list[Item]:
+        """Return the monitored items of which the server sends no more changes, although their values differ.
+
+        Some servers keep silent about nodes that were removed, even after they were added again.
+        Items whose nodes do not exist turn bad.
+        """
         items = [item for item in items if item.code & 0xFFFF0000 not in _AGAIN]
-        found = await self._samples([item.node for item in items], ua.AttributeIds.NodeClass) if items else []
-        self._deliver(
-            [
-                (item, Sample(0, None, None, one.code, 0))
-                for item, one in zip(items, found, strict=True)
-                if one.code & 0xFFFF0000 in _AGAIN
-            ]
-        )
+        found = await self._samples([item.node for item in items]) if items else []
+        removed = [(item, one) for item, one in zip(items, found, strict=True) if one.code & 0xFFFF0000 in _AGAIN]
+        self._deliver([(item, Sample(0, None, None, one.code, 0)) for item, one in removed])
+        doubtful = [(item, item.seen) for item, one in zip(items, found, strict=True) if _differs(item, one)]
+        if not doubtful:
+            return []
+        await asyncio.sleep(max(self._settle_s(item) for item, _ in doubtful))  # changes may be on their way
+        silent = [item for item, seen in doubtful if item.seen is seen and item.subscription is not None]
+        again = await self._samples([item.node for item in silent]) if silent else []
+        return [item for item, one in zip(silent, again, strict=True) if _differs(item, one)]
+
+    def _settle_s(self, item: Item) -> float:
+        """Return how long samples may be on their way, in s."""
+        publishing_s = item.subscription.publishing_s if item.subscription is not None else 0.0
+        return 2 * (publishing_s + max(0, self._options.sampling_ms) / 1000) + 0.2
 
     async def _subscribe_again(self, items: Sequence[Item]) -> None:
         there = await self._samples([item.node for item in items]) if items else []
@@ -809,6 +821,19 @@ class _Protocol(UASocketProtocol):
         if (too_long or self._connection._incoming_size > MAX_MESSAGE_BYTES) and self.transport is not None:
             self.reason = "the server sent what is not OPC UA, or a message that is too large"
             self.transport.abort()
+
+
+def _differs(item: Item, found: Sample) -> bool:
+    """Whether the server should have sent another sample than the last one, because a read found this one."""
+    seen = item.seen
+    if seen is None or (seen.code ^ found.code) & 0xFFFF0000:
+        return True
+    if seen.value == found.value or repr(seen.value) == repr(found.value):  # NaN is not equal to itself
+        return False
+    before, now = (one.value if isinstance(one.value, list) else [one.value] for one in (seen, found))
+    if item.deadband and len(before) == len(now) and all(isinstance(one, int | float) for one in (*before, *now)):
+        return any(abs(one - other) > item.deadband for one, other in zip(before, now, strict=True))
+    return True
 
 
 def _asked_too_much(code: int) -> bool:

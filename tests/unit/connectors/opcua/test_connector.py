@@ -126,6 +126,22 @@ def test_a_node_that_is_removed_turns_bad_and_comes_back(device: Device, monkeyp
     device.ask("remove", "going")
 
 
+def test_a_node_that_is_removed_and_added_at_once_is_monitored_again(
+    device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The server sends no more changes of it, and says nothing."""
+    monkeypatch.setattr("shmio.connectors.opcua.session.RETRY_S", 0.5)
+    device.ask("add", "swapped", "Int16", 5)
+    with connected(device.url, {"swapped": "INT", "mode": "INT"}) as source:
+        assert source.value("swapped") == 5
+        device.ask("remove", "swapped")
+        device.ask("add", "swapped", "Int16", 6)
+        until(lambda: source.value("swapped") == 6 and source.status("swapped").code == GOOD, "the node")
+        device.ask("set", "swapped", "Int16", 7)
+        until(lambda: source.value("swapped") == 7, "a change")
+    device.ask("remove", "swapped")
+
+
 def test_a_namespace_that_is_unknown(device: Device) -> None:
     tags = {
         "here": {"type": "INT", "address": "nsu=http://test/device;s=mode"},
