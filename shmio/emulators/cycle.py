@@ -10,7 +10,9 @@ from collections.abc import Callable
 class Cycle:
     """Runs a program's step in each period. Start it once.
 
-    The schedule is absolute, so the cycles do not drift; late cycles are skipped and counted.
+    The schedule is absolute, so the cycles do not drift; late cycles are skipped and counted. A cycle
+    is followed by a pause of at least its own length, so that a slow program leaves the device half
+    of the time to answer its clients.
     """
 
     def __init__(
@@ -52,19 +54,21 @@ class Cycle:
             self._thread.join()
 
     def _run(self) -> None:
-        begun_s = time.monotonic()
+        begun_s = free_s = time.monotonic()
         tick = cycle = 0
         try:
             while True:
                 elapsed = int((time.monotonic() - begun_s) / self._period_s)
                 missed = max(0, elapsed - tick - 1)
                 tick += missed + 1
-                if self._stopping.wait(begun_s + tick * self._period_s - time.monotonic()):
+                if self._stopping.wait(max(begun_s + tick * self._period_s, free_s) - time.monotonic()):
                     return
                 if self._active():
                     self.overruns += missed
                     cycle += missed + 1
+                    step_s = time.monotonic()
                     self._step(cycle * self._period_s)
                     self.cycles += 1
+                    free_s = 2 * time.monotonic() - step_s
         except Exception as error:  # noqa: BLE001 - a program's defect is its runner's to report
             self.failure = error

@@ -7,6 +7,7 @@ for values that nobody else changes.
 from __future__ import annotations
 
 import logging
+import struct
 import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -44,39 +45,39 @@ class _Place:
     """A register of a tag table, and its entries in the device."""
 
     def __init__(self, register: Register, address: Place, unit: int, orders: tuple[Order, Order]) -> None:
-        self.register, self.address = register, address
+        self.register, self.address, self.width = register, address, address.width
         self.where = (unit if address.unit is None else address.unit, address.table)
         self._words = None
         if not address.table.of_bits and address.bit is None:
             self._words = WordCodec(address, register, *orders)
+        self._starts = range(address.number, self.stop, self.width)
+        self._packed = struct.Struct(f">{self.width}H")
 
     @property
     def stop(self) -> int:
         """Number of the entry behind the last one of the register."""
-        return self.address.number + self.register.count * self.address.width
+        return self.address.number + self.register.count * self.width
 
     def read(self, entries: Sequence[int]) -> Any:
         """Return the register's value."""
-        address, width = self.address, self.address.width
         flat: list[Any] = []
-        for at in range(address.number, self.stop, width):
+        for at in self._starts:
             if self._words is None:
-                flat.append(bool(entries[at] >> (address.bit or 0) & 1))
+                flat.append(bool(entries[at] >> (self.address.bit or 0) & 1))
             else:
-                flat.append(self._words.decode(b"".join(word.to_bytes(2, "big") for word in entries[at : at + width])))
+                flat.append(self._words.decode(self._packed.pack(*entries[at : at + self.width])))
         return nest(flat, self.register.shape) if self.register.dims else flat[0]
 
     def write(self, entries: list[int], value: Any) -> None:
         """Store a value of the register; ValueError: the device's type cannot hold it."""
-        address, width, register = self.address, self.address.width, self.register
-        flat = list(flatten(value, register.shape, register.path)) if register.dims else [value]
-        for at, one in zip(range(address.number, self.stop, width), flat, strict=True):
+        register = self.register
+        flat = flatten(value, register.shape, register.path) if register.dims else (value,)
+        for at, one in zip(self._starts, flat, strict=True):
             if self._words is None:
-                mask = 1 << (address.bit or 0)
+                mask = 1 << (self.address.bit or 0)
                 entries[at] = entries[at] & ~mask | (mask if one else 0)
             else:
-                data = self._words.encode(one)  # type: ignore[arg-type]
-                entries[at : at + width] = [int.from_bytes(data[i : i + 2], "big") for i in range(0, len(data), 2)]
+                entries[at : at + self.width] = self._packed.unpack(self._words.encode(one))  # type: ignore[arg-type]
 
 
 class _TableImage:
