@@ -46,6 +46,10 @@ class WriteLostError(ConnectorError):
         self.outcomes = tuple(outcomes)
 
 
+class UnconfirmedError(WriteLostError):
+    """The device did not confirm all writes in time. The connection is in order, and stays open."""
+
+
 class Connector(ABC):
     """Base class for the protocol of one device.
 
@@ -53,7 +57,8 @@ class Connector(ABC):
     method has raised an exception, the loop calls :meth:`close`, and later :meth:`connect` again. A
     late reply is therefore never taken for the reply to a later request. A connector that sends a
     request and waits for its reply implements :meth:`read`. A connector that can have several
-    requests in flight implements :meth:`submit`, :meth:`collect` and ``depth``. The text of a
+    requests in flight implements :meth:`submit`, :meth:`collect` and ``depth``. A connector
+    that can write implements :meth:`write`, or :meth:`send` and :meth:`confirm`. The text of a
     ConnectorError is for the operator of the cell.
     """
 
@@ -61,7 +66,7 @@ class Connector(ABC):
     """The connector's own keys of ``[[source]]``. The struct must refuse unknown keys."""
 
     can_write: ClassVar[bool] = False
-    """Whether :meth:`write` is implemented."""
+    """Whether the connector can write."""
 
     provenance: ClassVar[Provenance] = Provenance.LIVE
     """Where the values come from; each frame of the source states it."""
@@ -224,6 +229,41 @@ class Connector(ABC):
 
         """
         raise ConnectorError("this connector cannot write")
+
+    _outcomes: Sequence[str] = ()
+
+    def send(self, writes: Sequence[Write]) -> None:
+        """Send writes, and do not wait until the device confirms them.
+
+        A connector implements this and :meth:`confirm` if a device that works may take longer to
+        confirm a write than a cycle. The loop sends further writes after the outcomes of these. By
+        default, :meth:`write` waits for the outcomes.
+
+        Args:
+            writes: As for :meth:`write`.
+
+        Raises:
+            ConnectorError: As for :meth:`write`.
+
+        """
+        self._outcomes = self.write(writes)
+
+    def confirm(self, until_ns: int) -> Sequence[str] | None:  # noqa: ARG002  write() has its own time-out
+        """Wait for the outcomes of the writes that :meth:`send` has sent.
+
+        Args:
+            until_ns: When to stop waiting, ns of CLOCK_MONOTONIC.
+
+        Returns:
+            The outcomes as :meth:`write` returns them; None if some are not known by ``until_ns``.
+
+        Raises:
+            UnconfirmedError: Some outcomes have not come within the connector's own time-out. The
+                connection stays open.
+            ConnectorError: As for :meth:`write`.
+
+        """
+        return self._outcomes
 
 
 class Computed(ABC):

@@ -287,6 +287,18 @@ def _runs(items: Sequence[Item]) -> Iterator[tuple[Item, int]]:
     yield first, count
 
 
+class _Batch(NamedTuple):
+    """Items of a cycle, their writes, and the indices of superseded items, from :func:`coalesce`."""
+
+    items: Sequence[Item]
+    writes: Sequence[Write]
+    superseded: set[int]
+
+    def ends(self, outcomes: Sequence[str | Lost], error: str) -> list[End]:
+        """Return the last events of the items; see :func:`ends`."""
+        return ends(self.items, self.writes, self.superseded, outcomes, error)
+
+
 # -- commands ----------------------------------------------------------------------------------------------------------
 
 
@@ -338,6 +350,7 @@ class CommandProcessor:
         self._verdict = threading.Lock()  # held from the publication of acceptances until the items are in _items
         self._closed = "the source is not connected yet"
         self._items: list[Item] = []
+        self._unconfirmed: _Batch | None = None
         self._held: Command | None = None  # already taken from its queue, but waits until there is room
         self._garbage_ns: dict[int, int] = {}
         self._stopped = False
@@ -353,8 +366,11 @@ class CommandProcessor:
     def close(self, reason: str) -> None:
         """Stop accepting commands, because the connection was lost.
 
-        Waiting items expire for ``reason``.
+        Waiting items expire for ``reason``, and the outcomes of unconfirmed ones remain unknown.
         """
+        if (lost := self._unconfirmed) is not None:
+            self._unconfirmed = None
+            self._end(lost.items, lost.ends([Lost.UNKNOWN] * len(lost.writes), reason))
         with self._turn:
             self._closed = f"the source is not connected: {reason}"
             items, self._items = self._items, []
@@ -381,12 +397,18 @@ class CommandProcessor:
         """True if items wait for :meth:`carry_out`."""
         return bool(self._items)
 
-    def carry_out(self, write: Callable[[Sequence[Write]], list[str]]) -> None:
+    @property
+    def unconfirmed(self) -> bool:
+        """True if the outcomes of a batch are not known yet, so that :meth:`confirm` must follow."""
+        return self._unconfirmed is not None
+
+    def carry_out(self, write: Callable[[Sequence[Write]], Sequence[str] | None]) -> None:
         """Write all waiting items in one batch, and publish the outcome of each.
 
         If two items write the same bit, the value of the item accepted later is written. If
         ``write`` raises an exception, the outcomes are published before the exception is raised
-        again.
+        again. If it returns None, call :meth:`confirm` until the batch is no longer ``unconfirmed``,
+        before this method is called again.
         """
         items = self._take(lambda _: True)
         now_ns = self._now_ns()
@@ -399,21 +421,40 @@ class CommandProcessor:
         finally:
             self._make_room()
 
-    def _write(self, items: Sequence[Item], write: Callable[[Sequence[Write]], list[str]]) -> None:
+    def confirm(self, ask: Callable[[], Sequence[str] | None]) -> None:
+        """Publish the outcomes of the unconfirmed batch, if ``ask`` returns them.
+
+        If ``ask`` raises an exception, the outcomes are published before the exception is raised
+        again.
+        """
+        if self._unconfirmed is not None:
+            self._ask(self._unconfirmed, ask)
+
+    def _write(self, items: Sequence[Item], write: Callable[[Sequence[Write]], Sequence[str] | None]) -> None:
         writes, superseded = coalesce(items, self._writer.block.layout.size)
-        outcomes: Sequence[str | Lost] = [Lost.UNKNOWN] * len(writes)
+        self._ask(_Batch(items, writes, superseded), lambda: write(writes))
+
+    def _ask(self, batch: _Batch, ask: Callable[[], Sequence[str] | None]) -> None:
+        """Publish the outcomes that ``ask`` returns or raises; None: the batch remains unconfirmed."""
+        self._unconfirmed = None
+        outcomes: Sequence[str | Lost] = [Lost.UNKNOWN] * len(batch.writes)
         error = ""
         try:
-            outcomes = one_each(write(writes), writes)
+            found = ask()
+            if found is None:
+                self._unconfirmed = batch
+            else:
+                outcomes = one_each(found, batch.writes)
         except WriteLostError as lost:
             error = str(lost)
-            outcomes = one_each(lost.outcomes, writes)
+            outcomes = one_each(lost.outcomes, batch.writes)
             raise
         except BaseException as unforeseen:
             error = str(unforeseen)
             raise
         finally:
-            self._end(items, ends(items, writes, superseded, outcomes, error))
+            if self._unconfirmed is None:
+                self._end(batch.items, batch.ends(outcomes, error))
 
     def run(self) -> None:
         """Accept and reject commands until :meth:`stop` is called."""
@@ -444,7 +485,9 @@ class CommandProcessor:
         return [item for item, wanted in kinds if wanted]
 
     def _expire(self, items: Sequence[Item]) -> None:
-        self._end(items, [(EventKind.EXPIRED, "no cycle began before the command's deadline")] * len(items))
+        busy = self._unconfirmed is not None
+        why = "the device had not confirmed earlier writes" if busy else "no cycle began"
+        self._end(items, [(EventKind.EXPIRED, f"{why} before the command's deadline")] * len(items))
 
     def _patience_ns(self) -> int:
         """Return how long :meth:`run` may wait for a command, in ns; negative: without limit."""

@@ -12,16 +12,18 @@ import re
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol, TypeVar
 
 from shmio.backoff import Backoff
-from shmio.connectors.base import Connector
+from shmio.connectors.base import Connector, UnconfirmedError
 from shmio.connectors.commands import CommandProcessor
 from shmio.connectors.injections import Blocks, OwnerOf
 from shmio.connectors.output import Image, Output
 from shmio.errors import ConnectorError
+from shmio.layout.values.write import Write
 from shmio.logs import fields
 from shmio.segment import BlockWriter, EventKind, Provenance, Quality, Record
 
@@ -29,6 +31,11 @@ RECONNECT: Final = Backoff(0.1, 2.0)
 """The waiting times before attempts to connect again."""
 STABLE_NS: Final = 1_000_000_000
 """A connection that has lasted longer than this time in ns resets the back-off."""
+CONFIRM_NS: Final = 10_000_000
+"""Longest time in ns that a cycle waits for the confirmation of its writes, and at most half a period.
+
+If it comes later, a later cycle notices it.
+"""
 _MEASURES: Final = re.compile(r"\b[0-9]+(?= (?:ms|s|bytes)\b)")
 """Numbers that may differ between two texts of the same reason: times and sizes."""
 
@@ -275,6 +282,7 @@ class SourceLoop:
                     break
         finally:
             self.commands.stop()
+            self._confirm_last()
             self._connector.close()
             self._writer.cycle = max(self._writer.cycle, self._schedule.at(self._clock.now_ns()))
             self._disconnected(self._writer.cycle, "the source was stopped")
@@ -292,9 +300,7 @@ class SourceLoop:
             if self._connected_ns is None:
                 self._connect()
             self.commands.release(cycle)
-            if self.commands.waiting:
-                self._drain()
-                self._call(lambda: self.commands.carry_out(self._connector.write))
+            self._write()
             end_ns = self._schedule.due_ns(cycle + 1)
             self._collect(end_ns, leave=self._connector.depth - 1)  # late answers make room
             if len(self._under_way) < self._connector.depth:
@@ -309,6 +315,26 @@ class SourceLoop:
 
     def _asked(self, cycle: int) -> _Submitted:
         return _Submitted(cycle, self._clock.now_ns(), time.monotonic_ns(), time.time_ns())
+
+    def _write(self) -> None:
+        """Carry out waiting commands, unless the device still has to confirm those of an earlier cycle."""
+        try:
+            self._confirm()
+            if self.commands.waiting and not self.commands.unconfirmed:
+                self._drain()
+                self._call(lambda: self.commands.carry_out(self._sent))
+        except UnconfirmedError as error:
+            log.warning("%s", error)
+
+    def _sent(self, writes: Sequence[Write]) -> Sequence[str] | None:
+        self._connector.send(writes)
+        patience_ns = min(CONFIRM_NS, self._writer.block.period_ns // 2)
+        return self._connector.confirm(time.monotonic_ns() + patience_ns)
+
+    def _confirm(self) -> None:
+        """Publish the outcomes of unconfirmed writes, if they have come since the last cycle."""
+        if self.commands.unconfirmed:
+            self._call(lambda: self.commands.confirm(lambda: self._connector.confirm(0)))
 
     def _drain(self) -> None:
         """Publish all requested images before a write: its event must not precede older frames."""
@@ -360,12 +386,18 @@ class SourceLoop:
         self.counters.failures += 1
         self._connected_ns = None
         self._under_way.clear()
+        self._confirm_last()
         self._disconnected(cycle, reason)  # first, because it may take time to close the connection
         self._connector.close()
         stop = self._clock.wait_ns(round(RECONNECT.wait_s(self._retries) * 1e9))
         self._retries += 1
         self._schedule.restart()
         return not stop
+
+    def _confirm_last(self) -> None:
+        """Publish what is known of unconfirmed writes before the connection ends."""
+        with suppress(ConnectorError):
+            self._confirm()
 
     def _disconnected(self, cycle: int, reason: str) -> None:
         """Stop accepting commands.

@@ -77,7 +77,7 @@ class _Place:
                 mask = 1 << (self.address.bit or 0)
                 entries[at] = entries[at] & ~mask | (mask if one else 0)
             else:
-                entries[at : at + self.width] = self._packed.unpack(self._words.encode(one))  # type: ignore[arg-type]
+                entries[at : at + self.width] = self._packed.unpack(self._words.encode(one))
 
 
 class _TableImage:

@@ -184,7 +184,7 @@ class Program:
             if blocks is None:
                 report.extend(self._faults())
                 for declaration in self._types.values():
-                    if not declaration.is_function_block:
+                    if declaration.body.members and not declaration.is_function_block:
                         placer.named(Named(declaration.name, True, declaration.position))
             else:
                 names = {name.lower() for name in blocks}

@@ -244,8 +244,10 @@ class Placer:
             self._report.add(fault)
         if declaration.faults and declaration.is_function_block:
             return None
-        if not declaration.body.members:  # a function block that stores nothing
+        if not declaration.body.members and declaration.is_function_block:  # it stores nothing
             return Group({}, 0, Cost(), 0)
+        if not declaration.body.members and not any(fault.severity == "error" for fault in declaration.faults):
+            self._refuse(declaration.position, f"expected at least one member in the type {declaration.name!r}")
         outside, self._constants = self._constants, Constants(declaration.constants, self._global)
         self._open[key] = declaration.name
         group = self.struct(declaration.body, max(depth, 1))

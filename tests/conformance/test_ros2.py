@@ -22,7 +22,7 @@ from shmio.layout.values.codec import codec
 from shmio.model.statuses import BAD_TIMEOUT, StatusArea
 from shmio.segment import Frame, Write
 from shmio.testing.conformance import Rig, Run
-from shmio.testing.write_conformance import SPARE, WriteConformance, Writer, WriteRig
+from shmio.testing.write_conformance import SPARE, WriteConformance, Writer, WriteRig, write
 from tests.unit.connectors.ros.dds_peer import Peer
 
 COUNTS = 20
@@ -191,10 +191,10 @@ class TestRos2(WriteConformance):
             for _ in range(1000):
                 rig.peer.ask("spare", [0] * SPARE)
                 connector.read()
-                if not connector.write([Write(rig.spare, 0, bytes(SPARE))])[0]:
+                if not write(connector, [Write(rig.spare, 0, bytes(SPARE))])[0]:
                     break
             writes = [Write(rig.spare, 0, b"one"), rig.refused, Write(rig.spare + 4, 0, b"two")]
-            outcomes = connector.write(writes)
+            outcomes = write(connector, writes)
             assert [bool(outcome) for outcome in outcomes] == [False, True, False]
             assert "no node subscribes" in outcomes[1]
             assert connector.read()[rig.spare : rig.spare + SPARE] == b"one\0two\0"
@@ -230,11 +230,11 @@ class TestRos2(WriteConformance):
             for _ in range(1000):
                 rig.peer.ask("spare", [0] * SPARE)
                 connector.read()
-                if not connector.write([Write(rig.spare, 0, bytes(SPARE))])[0]:
+                if not write(connector, [Write(rig.spare, 0, bytes(SPARE))])[0]:
                     break
             rig.proxy.freeze()
             with pytest.raises(ConnectorError) as raised:
-                connector.write([Write(rig.spare + place, 0, bytes([place + 1])) for place in range(SPARE)])
+                write(connector, [Write(rig.spare + place, 0, bytes([place + 1])) for place in range(SPARE)])
             assert isinstance(raised.value, WriteLostError)
             assert set(raised.value.outcomes) == {Lost.UNKNOWN}
         finally:

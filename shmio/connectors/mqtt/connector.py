@@ -5,7 +5,9 @@ from __future__ import annotations
 import secrets
 import ssl
 import time
+from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import ClassVar, Final
 
 from paho.mqtt.client import MQTTv5, MQTTv311
@@ -33,6 +35,22 @@ ECHO_S: Final = 0.2
 """How long a confirmed write waits for its own message to come back from the broker, in s."""
 
 
+@dataclass
+class _Sending:
+    """The messages of a cycle's writes."""
+
+    outcomes: list[str | Lost]
+    commands: list[Command]
+    until_s: float
+    """When to stop waiting for acknowledgements, s of CLOCK_MONOTONIC."""
+    left: deque[Command]
+    sent: list[Command] = field(default_factory=list)
+    ping: int = 0
+    """Number of the PINGREQ behind the messages with QoS 0; 0: none was sent."""
+    echo_until_s: float = 0.0
+    """When to stop waiting for the messages to come back; 0: the broker has not acknowledged all."""
+
+
 class MqttConnector(Connector):
     """Reads the topics of a layout's registers at a broker, and publishes commands."""
 
@@ -48,6 +66,7 @@ class MqttConnector(Connector):
         self._version = version_of(options.version)
         self._link: Link | None = None
         self._last_number = 0
+        self._sending = _Sending([], [], 0.0, deque())
         _secrets(options)  # a wrong file is an error of the configuration now, and of the connection later
 
     @classmethod
@@ -165,12 +184,11 @@ class MqttConnector(Connector):
 
     # -- writing -------------------------------------------------------------------------------------------------------
 
-    def write(self, writes: Sequence[Write]) -> list[str]:
-        """Publish the written values, and wait until the broker has confirmed the messages.
+    def send(self, writes: Sequence[Write]) -> None:
+        """Publish the written values, as many messages as may be unacknowledged.
 
         Raises:
-            WriteLostError: The connection was lost, or the broker did not confirm all messages in
-                time.
+            WriteLostError: The connection is lost.
 
         """
         link = self._link
@@ -178,42 +196,87 @@ class MqttConnector(Connector):
             raise WriteLostError(f"not connected to {self._options.address}", [Lost.UNSENT] * len(writes))
         until_s = time.monotonic() + self._options.timeout / 1000
         commands, refusals = plan(self._store, self._options, writes)
-        outcomes: list[str | Lost] = list(refusals)
-        sent: list[Command] = []
+        self._sending = _Sending([*refusals], commands, until_s, deque(commands))
         link.forget()
         try:
             link.check()
-            for command in commands:
-                if not link.fits(command.publication):
-                    command.outcome = "the message is larger than the broker accepts"
-                    continue
-                link.await_room(until_s)
+            self._publish(link, self._sending)
+        except ConnectorError as error:
+            raise self._lost(error) from None
+
+    def confirm(self, until_ns: int) -> list[str] | None:
+        """Wait until the broker has acknowledged all messages, and those that are also read came back.
+
+        Raises:
+            WriteLostError: The connection is lost, or the broker did not acknowledge all messages
+                in time.
+
+        """
+        link, sending = self._link, self._sending
+        if link is None:
+            raise self._lost(ConnectorError(f"not connected to {self._options.address}"))
+        until_s = until_ns / 1e9
+        if not sending.echo_until_s:
+            try:
+                while sending.left and link.await_room(min(until_s, sending.until_s)):
+                    self._publish(link, sending)
+                if sending.left or not self._acknowledged(link, sending, min(until_s, sending.until_s)):
+                    if time.monotonic() < sending.until_s:
+                        return None
+                    raise ConnectorError(
+                        f"no answer within {self._options.timeout} ms from {self._options.address} to PUBLISH"
+                    )
+            except ConnectorError as error:
+                raise self._lost(error) from None
+            self._take_outcomes(link, sending)
+            accepted = all(one.outcome == "" for one in sending.sent)  # else a message does not come back
+            sending.echo_until_s = time.monotonic() + min(ECHO_S, self._options.timeout / 1000) * accepted
+        if not self._store.await_expected(min(until_s, sending.echo_until_s)):
+            if time.monotonic() < sending.echo_until_s:
+                return None
+            self._store.expect_nothing()
+        _mark(sending.outcomes, sending.commands, sending.sent)
+        return [str(outcome) for outcome in sending.outcomes]
+
+    def _publish(self, link: Link, sending: _Sending) -> None:
+        """Publish messages as long as another one may be unacknowledged."""
+        while sending.left and link.await_room(0.0):
+            command = sending.left[0]
+            if link.fits(command.publication):
                 self._store.expect(command.publication.topic, command.publication.payload)
                 command.number = link.publish(command.publication)
-                sent.append(command)  # from here on, the broker may have it
-            self._confirm(link, sent, until_s)
-        except ConnectorError as error:
-            _mark(outcomes, commands, sent)
-            raise WriteLostError(str(error), outcomes) from None
-        finally:
-            link.forget()
-        _mark(outcomes, commands, sent)
-        accepted = all(command.outcome == "" for command in sent)  # else a message does not come back
-        self._store.await_expected(time.monotonic() + min(ECHO_S, self._options.timeout / 1000) * accepted)
-        return [str(outcome) for outcome in outcomes]
+                sending.sent.append(command)  # from here on, the broker may have it
+            else:
+                command.outcome = "the message is larger than the broker accepts"
+            sending.left.popleft()
 
-    def _confirm(self, link: Link, sent: Sequence[Command], until_s: float) -> None:
-        try:
-            link.wait_acknowledged((one.number for one in sent if one.number is not None), until_s)
-            if any(one.number is None for one in sent):
-                link.wait_processed(until_s)
-                for one in sent:
-                    if one.number is None:
-                        one.outcome = ""
-        finally:
-            for one in sent:
-                if one.number is not None:
-                    one.outcome = link.outcome(one.number, one.publication.topic, retain=one.publication.retain)
+    def _acknowledged(self, link: Link, sending: _Sending, until_s: float) -> bool:
+        """Wait until the broker has all messages."""
+        numbers = [one.number for one in sending.sent if one.number is not None]
+        if not link.wait_acknowledged(numbers, until_s):
+            return False
+        if len(numbers) < len(sending.sent):
+            sending.ping = sending.ping or link.ping()
+            if not link.wait_answered(sending.ping, until_s):
+                return False
+            for one in sending.sent:
+                one.outcome = "" if one.number is None else one.outcome
+        return True
+
+    def _take_outcomes(self, link: Link, sending: _Sending) -> None:
+        """Store what the broker has said about each message."""
+        for one in sending.sent:
+            if one.number is not None:
+                one.outcome = link.outcome(one.number, one.publication.topic, retain=one.publication.retain)
+
+    def _lost(self, error: ConnectorError) -> WriteLostError:
+        """Return the error about writes whose messages were not all acknowledged."""
+        sending = self._sending
+        if self._link is not None:
+            self._take_outcomes(self._link, sending)
+        self._store.expect_nothing()
+        _mark(sending.outcomes, sending.commands, sending.sent)
+        return WriteLostError(str(error), sending.outcomes)
 
 
 def _secrets(options: MqttOptions) -> tuple[str | None, ssl.SSLContext | None]:

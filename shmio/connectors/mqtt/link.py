@@ -344,15 +344,17 @@ class Link:
         size = HEAD_BYTES + len(publication.topic.encode()) + len(publication.payload)
         return bool(size <= self._limits.get("MaximumPacketSize", size))
 
-    def await_room(self, until_s: float) -> None:
-        """Wait until another message may be sent, because few enough are unacknowledged.
+    def await_room(self, until_s: float) -> bool:
+        """Wait until another message may be sent; return whether it may be by ``until_s``.
+
+        It may if few enough are unacknowledged.
 
         Raises:
-            ConnectorError: This has not happened by ``until_s``, or the connection is lost.
+            ConnectorError: The connection is lost.
 
         """
         most = min(MAX_IN_FLIGHT, self._limits.get("ReceiveMaximum", MAX_IN_FLIGHT))
-        self._wait(lambda: len(self._in_flight - self._acks.keys()) < most, until_s, "to PUBLISH")
+        return self._seen(lambda: len(self._in_flight - self._acks.keys()) < most, until_s)
 
     def publish(self, publication: Publication) -> int | None:
         """Publish a message, without waiting for its acknowledgement.
@@ -380,15 +382,15 @@ class Link:
         self._in_flight.add(info.mid)
         return info.mid
 
-    def wait_acknowledged(self, numbers: Iterable[int], until_s: float) -> None:
-        """Wait until the broker has acknowledged these messages.
+    def wait_acknowledged(self, numbers: Iterable[int], until_s: float) -> bool:
+        """Wait until the broker has acknowledged these messages; return whether it has by ``until_s``.
 
         Raises:
-            ConnectorError: It has not done so by ``until_s``, or the connection is lost.
+            ConnectorError: The connection is lost.
 
         """
         wanted = set(numbers)
-        self._wait(lambda: wanted <= self._acks.keys(), until_s, "to PUBLISH")
+        return self._seen(lambda: wanted <= self._acks.keys(), until_s)
 
     def outcome(self, number: int, topic: str, *, retain: bool) -> str | None:
         """Return "" if the broker has accepted a message, or why it refused it.
@@ -410,24 +412,31 @@ class Link:
             self._in_flight.clear()
             self._acks.clear()
 
-    def wait_processed(self, until_s: float) -> None:
-        """Wait until the broker has read all published messages, as its answer to a new ping shows.
+    def wait_answered(self, number: int, until_s: float) -> bool:
+        """Wait until the broker has answered a PINGREQ, and has thus read all messages before it.
+
+        Returns:
+            Whether it has by ``until_s``.
 
         Raises:
-            ConnectorError: The answer has not come by ``until_s``, or the connection is lost.
+            ConnectorError: The connection is lost.
 
         """
-        number = self.ping()
-        self._wait(lambda: self._client is not None and self._client.pongs >= number, until_s, "to PUBLISH")
+        return self._seen(lambda: self._client is not None and self._client.pongs >= number, until_s)
 
-    def _wait(self, condition: Callable[[], bool], until_s: float, to_what: str) -> None:
+    def _seen(self, condition: Callable[[], bool], until_s: float) -> bool:
+        """Wait until ``condition`` holds, at most until ``until_s``; return whether it holds."""
         with self._condition:
             self._condition.wait_for(lambda: condition() or self._failure, max(0.0, until_s - time.monotonic()))
             if condition():
-                return
-        raise ConnectorError(
-            self._failure or f"no answer within {self._options.timeout} ms from {self.peer} {to_what}".rstrip()
-        )
+                return True
+        if self._failure:
+            raise ConnectorError(self._failure)
+        return False
+
+    def _wait(self, condition: Callable[[], bool], until_s: float, to_what: str) -> None:
+        if not self._seen(condition, until_s):
+            raise ConnectorError(f"no answer within {self._options.timeout} ms from {self.peer} {to_what}")
 
     # -- in the thread -------------------------------------------------------------------------------------------------
 

@@ -310,12 +310,15 @@ class Store:
             if topic in self._topics and not self._topics[topic].refused:
                 self._expected[topic] = payload
 
-    def await_expected(self, until_s: float) -> None:
-        """Wait until the published payloads have come back, at most until ``until_s``.
+    def await_expected(self, until_s: float) -> bool:
+        """Wait until the published payloads have come back; return whether they have by ``until_s``.
 
         ``until_s`` is a time of CLOCK_MONOTONIC.
         """
-        self.wait(lambda: not self._expected, until_s)
+        return self.wait(lambda: not self._expected, until_s)
+
+    def expect_nothing(self) -> None:
+        """Wait no more for published payloads."""
         with self._changed:
             self._expected.clear()
 

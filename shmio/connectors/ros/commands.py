@@ -12,7 +12,7 @@ import copy
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
-from shmio.connectors.base import Lost
+from shmio.connectors.base import Lost, WriteLostError
 from shmio.connectors.ros.addresses import Address, FieldError, extract, place_of
 from shmio.connectors.ros.messages import DEFINITIONS, conforms, default, plain
 from shmio.connectors.ros.topics import Topic, Topics
@@ -31,6 +31,8 @@ class Publication:
 
     def __init__(self, topic: Topic) -> None:
         self.topic = topic
+        self.begun = False
+        """Whether it may have been published."""
         self.message: Any = None
         self.writes: set[int] = set()
         self.values: dict[int, Value] = {}
@@ -76,19 +78,41 @@ def plan(topics: Topics, writes: Sequence[Write]) -> tuple[list[Publication], li
     return drafts, outcomes
 
 
-def mark_lost(outcomes: list[str | Lost], publications: Sequence[Publication], place: int) -> None:
-    """Mark the writes whose messages were not confirmed.
+class Sending:
+    """The messages of a cycle's writes, which are published one after the other."""
 
-    The message ``place`` may have been published.
-    """
-    done = {number for publication in publications[:place] for number in publication.writes}
-    for number in publications[place].writes:
-        if outcomes[number] == "":
-            outcomes[number] = Lost.UNKNOWN
-    for publication in publications[place + 1 :]:
-        for number in publication.writes:
-            if outcomes[number] == "":
-                outcomes[number] = Lost.UNKNOWN if number in done else Lost.UNSENT
+    def __init__(self, publications: Sequence[Publication], outcomes: list[str | Lost], until_s: float) -> None:
+        """Begin with the first message.
+
+        Args:
+            publications: The messages.
+            outcomes: For each write, "" or why it is refused.
+            until_s: When to stop waiting for confirmations, s of CLOCK_MONOTONIC.
+
+        """
+        self.outcomes, self.until_s = outcomes, until_s
+        self._publications, self._place = publications, 0
+
+    @property
+    def publication(self) -> Publication | None:
+        """The message whose confirmation must come next; None if all are confirmed."""
+        return self._publications[self._place] if self._place < len(self._publications) else None
+
+    def end(self, refusal: str) -> None:
+        """Note that the message is confirmed, or why it is refused."""
+        for number in self._publications[self._place].writes:
+            self.outcomes[number] = self.outcomes[number] or refusal
+        self._place += 1
+
+    def lost(self, reason: str) -> WriteLostError:
+        """Return the error with what is known of each write, if no confirmation can come any more."""
+        done = {number for one in self._publications[: self._place] for number in one.writes}
+        for one in self._publications[self._place :]:
+            for number in one.writes:
+                if self.outcomes[number] == "":
+                    self.outcomes[number] = Lost.UNKNOWN if one.begun or number in done else Lost.UNSENT
+            done |= one.writes if one.begun else set()
+        return WriteLostError(reason, self.outcomes)
 
 
 def stamped(topics: Topics, topic: Topic) -> bool:

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import msgspec
 
-from shmio.connectors.base import Connector, Lost, WriteLostError
+from shmio.connectors.base import Connector, Lost, UnconfirmedError, WriteLostError
 from shmio.connectors.load import Load, counted
-from shmio.connectors.ros.commands import Publication, mark_lost, plan, stamped
+from shmio.connectors.ros.commands import Publication, Sending, plan, stamped
 from shmio.connectors.ros.options import TopicOptions
 from shmio.connectors.ros.topics import Topics
 from shmio.errors import ConfigError, ConnectorError
@@ -70,6 +70,7 @@ class Ros2Connector(Connector):
         self._options = options
         self._topics = Topics(layout, options, known_types=True)
         self._participant: Participant | None = None
+        self._sending = Sending([], [], 0.0)
         self._incompatible: set[str] = set()
 
     @property
@@ -160,43 +161,64 @@ class Ros2Connector(Connector):
             self._participant.close()
             self._participant = None
 
-    def write(self, writes: Sequence[Write]) -> list[str]:
-        """Publish messages. A message is confirmed once all reliable subscribers have received it.
-
-        Raises:
-            WriteLostError: A subscriber did not acknowledge a message in time.
-
-        """
+    def send(self, writes: Sequence[Write]) -> None:
+        """Plan the messages for these writes; :meth:`confirm` publishes one after the other."""
         joined = self._participant
         if joined is None:
             raise WriteLostError(f"this process has not joined DDS {self._where}", [Lost.UNSENT] * len(writes))
         self._pull(joined)
         publications, refusals = plan(self._topics, writes)
-        outcomes: list[str | Lost] = list(refusals)
-        until_s = time.monotonic() + self._options.timeout / 1000
-        for place, publication in enumerate(publications):
-            try:
-                refusal = self._publish(joined, publication, until_s)
-            except ConnectorError as error:
-                mark_lost(outcomes, publications, place)
-                raise WriteLostError(str(error), outcomes) from None
-            for number in publication.writes:
-                outcomes[number] = outcomes[number] or refusal
-        return [str(outcome) for outcome in outcomes]
+        self._sending = Sending(publications, [*refusals], time.monotonic() + self._options.timeout / 1000)
 
-    def _publish(self, joined: Participant, publication: Publication, until_s: float) -> str:
+    def confirm(self, until_ns: int) -> list[str] | None:
+        """Publish the messages. A message is confirmed once all reliable subscribers have received it.
+
+        Raises:
+            UnconfirmedError: A subscriber did not acknowledge a message in time.
+            WriteLostError: The library reports an error.
+
+        """
+        joined, sending = self._participant, self._sending
+        if joined is None:
+            raise sending.lost(f"this process has left DDS {self._where}")
+        try:
+            while (publication := sending.publication) is not None:
+                refusal = self._publish(joined, publication, min(until_ns / 1e9, sending.until_s))
+                if refusal is None:
+                    if time.monotonic() < sending.until_s:
+                        return None
+                    name = publication.topic.name
+                    lost = sending.lost(
+                        f"no answer within {self._options.timeout} ms: a subscriber of {name} did not acknowledge the "
+                        "message"
+                    )
+                    raise UnconfirmedError(str(lost), lost.outcomes)
+                sending.end(refusal)
+        except WriteLostError:
+            raise
+        except ConnectorError as error:
+            raise sending.lost(str(error)) from None
+        return [str(outcome) for outcome in sending.outcomes]
+
+    def _publish(self, joined: Participant, publication: Publication, until_s: float) -> str | None:
+        """Publish a message, unless it is published, and wait until all subscribers have received it.
+
+        Returns:
+            "" if they have, or why the message is refused; None if they have not by ``until_s``.
+
+        """
         name, message = publication.topic.name, publication.message
-        if not joined.subscribers(name):
-            return f"no node subscribes to {name}: nobody would receive the message"
-        now_ns = time.time_ns()
-        if "header" in message and not stamped(self._topics, publication.topic):
-            message["header"]["stamp"] = _time(now_ns)
-        if not joined.publish(name, message, until_s):
-            raise ConnectorError(
-                f"no answer within {self._options.timeout} ms: a subscriber of {name} did not acknowledge the message"
-            )
+        if not publication.begun:
+            if not joined.subscribers(name):
+                return f"no node subscribes to {name}: nobody would receive the message"
+            if "header" in message and not stamped(self._topics, publication.topic):
+                message["header"]["stamp"] = _time(time.time_ns())
+            publication.begun = True
+            joined.publish(name, message)
+        if not joined.received(name, until_s):
+            return None
         self._pull(joined)  # what others published before the confirmation is older
-        self._topics.take(name, message, time.monotonic_ns(), now_ns)
+        self._topics.take(name, message, time.monotonic_ns(), time.time_ns())
         return ""
 
 

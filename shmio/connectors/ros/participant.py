@@ -178,11 +178,8 @@ class Participant:
                 log.warning("%s: a message cannot be decoded: %s", name, type(error).__name__)
                 yield name, None
 
-    def publish(self, topic: str, message: Any, until_s: float) -> bool:
-        """Publish a message, and wait until all reliable subscribers have received it.
-
-        Returns:
-            Whether all have received it by ``until_s``.
+    def publish(self, topic: str, message: Any) -> None:
+        """Publish a message.
 
         Raises:
             ConnectorError: The message cannot be sent.
@@ -194,8 +191,18 @@ class Participant:
             endpoint.writer.write(to_sample(message, endpoint.kind))
         except DDSException as error:
             raise ConnectorError(f"{topic}: {error.msg or error}") from None
+
+    def received(self, topic: str, until_s: float) -> bool:
+        """Wait until all reliable subscribers have received what was published on a topic.
+
+        Returns:
+            Whether all have received it by ``until_s``, a time of CLOCK_MONOTONIC.
+
+        """
+        endpoint = self._endpoints[topic]
+        assert endpoint.writer is not None  # noqa: S101 - for the type checker
+        rest_ns = max(100_000, round((until_s - time.monotonic()) * 1e9))
         try:
-            rest_ns = max(1_000_000, round((until_s - time.monotonic()) * 1e9))
             return bool(endpoint.writer.wait_for_acks(rest_ns))
         except (DDSException, AttributeError):  # the library's own comparison for a time-out fails
             return False

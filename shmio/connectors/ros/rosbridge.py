@@ -14,7 +14,7 @@ import msgspec
 from shmio.config import Address
 from shmio.connectors.base import Connector, Lost, WriteLostError
 from shmio.connectors.load import Load, counted
-from shmio.connectors.ros.commands import Publication, mark_lost, plan, stamped
+from shmio.connectors.ros.commands import Publication, Sending, plan, stamped
 from shmio.connectors.ros.messages import finite
 from shmio.connectors.ros.options import TopicOptions
 from shmio.connectors.ros.topics import Topics
@@ -78,6 +78,7 @@ class RosbridgeConnector(Connector):
         self._topics = Topics(layout, options, known_types=False)
         self._numbers = itertools.count(1)
         self._link: Link | None = None
+        self._sending = Sending([], [], 0.0)
 
     @property
     def timeout_s(self) -> float:
@@ -143,36 +144,51 @@ class RosbridgeConnector(Connector):
             self._link.close()
             self._link = None
 
-    def write(self, writes: Sequence[Write]) -> list[str]:
-        """Publish messages. A message is confirmed once the server has sent it back.
-
-        Raises:
-            WriteLostError: The server did not send a message back, or the connection was lost.
-
-        """
+    def send(self, writes: Sequence[Write]) -> None:
+        """Plan the messages for these writes; :meth:`confirm` publishes one after the other."""
         link = self._link
         if link is None:
             raise WriteLostError(f"not connected to {self._options.address}", [Lost.UNSENT] * len(writes))
         self._pull(link)
         publications, refusals = plan(self._topics, writes)
-        outcomes: list[str | Lost] = list(refusals)
-        until_s = time.monotonic() + self._options.timeout / 1000
-        for place, publication in enumerate(publications):
-            try:
-                link.check()
-                refusal = self._publish(link, publication, until_s)
-            except ConnectorError as error:
-                mark_lost(outcomes, publications, place)
-                raise WriteLostError(str(error), outcomes) from None
-            for number in publication.writes:
-                outcomes[number] = outcomes[number] or refusal
-        return [str(outcome) for outcome in outcomes]
+        self._sending = Sending(publications, [*refusals], time.monotonic() + self._options.timeout / 1000)
 
-    def _publish(self, link: Link, publication: Publication, until_s: float) -> str:
+    def confirm(self, until_ns: int) -> list[str] | None:
+        """Publish the messages. A message is confirmed once the server has sent it back.
+
+        Raises:
+            WriteLostError: The server did not send a message back in time, or the connection was lost.
+
+        """
+        link, sending = self._link, self._sending
+        if link is None:
+            raise sending.lost(f"not connected to {self._options.address}")
+        try:
+            while (publication := sending.publication) is not None:
+                refusal = self._publish(link, publication, min(until_ns / 1e9, sending.until_s))
+                if refusal is None:
+                    if time.monotonic() < sending.until_s:
+                        return None
+                    name = publication.topic.name
+                    raise ConnectorError(
+                        f"no answer within {self._options.timeout} ms from {self._options.address}: it did not send "
+                        f"back what was published on {name}"
+                    )
+                sending.end(refusal)
+        except ConnectorError as error:
+            raise sending.lost(str(error)) from None
+        return [str(outcome) for outcome in sending.outcomes]
+
+    def _publish(self, link: Link, publication: Publication, until_s: float) -> str | None:
+        """Publish a message, unless it is published; return its outcome, or None if it has none by ``until_s``."""
         message, topic = publication.message, publication.topic
-        if not finite(message):
-            return "JSON has neither NaN nor infinity: write a finite number"
-        return link.publish(topic.name, self._stampless(message, publication), f"write:{next(self._numbers)}", until_s)
+        if not publication.begun:
+            if not finite(message):
+                return "JSON has neither NaN nor infinity: write a finite number"
+            link.check()
+            publication.begun = True
+            link.publish(topic.name, self._stampless(message, publication), f"write:{next(self._numbers)}")
+        return link.outcome(until_s)
 
     def _stampless(self, message: Any, publication: Publication) -> Any:
         """Return the message without its time stamp, which the server then sets.

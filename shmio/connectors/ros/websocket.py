@@ -166,17 +166,13 @@ class Link:
 
     # -- confirmation --------------------------------------------------------------------------------------------------
 
-    def publish(self, topic: str, message: Any, number: str, until_s: float) -> str:
-        """Publish a message, and wait until the server sends it back to this subscriber.
+    def publish(self, topic: str, message: Any, number: str) -> None:
+        """Publish a message. The server sends it back to this subscriber.
 
         Args:
             topic: The topic.
             message: The message.
             number: The id of the operation.
-            until_s: When to stop waiting, s of CLOCK_MONOTONIC.
-
-        Returns:
-            "" if the message came back, or why the server refused it.
 
         Raises:
             ConnectorError: The message may or may not have been published.
@@ -184,23 +180,26 @@ class Link:
         """
         with self._condition:
             self._expected, self._outcome = (topic, number, message), None
-        try:
-            self.send(op="publish", id=number, topic=topic, msg=message)
-            return self._await_outcome(topic, until_s)
-        finally:
-            with self._condition:
-                self._expected = None
+        self.send(op="publish", id=number, topic=topic, msg=message)
 
-    def _await_outcome(self, topic: str, until_s: float) -> str:
+    def outcome(self, until_s: float) -> str | None:
+        """Wait until the server has sent back the last published message.
+
+        Returns:
+            "" if the message came back, or why the server refused it; None if neither has happened
+            by ``until_s``, a time of CLOCK_MONOTONIC.
+
+        Raises:
+            ConnectorError: The connection is lost.
+
+        """
         with self._condition:
             self._condition.wait_for(
                 lambda: self._outcome is not None or self._failure, max(0.0, until_s - time.monotonic())
             )
-            if self._outcome is not None:
-                return self._outcome
-        raise ConnectorError(
-            self._failure or f"no answer from {self._peer}: it did not send back what was published on {topic}"
-        )
+            if self._outcome is None and self._failure:
+                raise ConnectorError(self._failure)
+            return self._outcome
 
     def _receive(self) -> None:
         """Receive until the connection ends; runs in the thread."""

@@ -339,7 +339,7 @@ class _Parser:
                 raise self.at.expected("STRUCT")
             body, _ = self.declare.sections()
             if not body.members and not found.errors:
-                found.add(position.error(f"expected at least one member in the type {name!r}"))
+                found.add(position.warning(f"the type {name!r} has no members, so that nothing can have this type"))
             self.at.accept(";")
             self.at.expect_word("END_TYPE")
         return TypeDeclaration(name, body, position, faults=(*found.errors, *found.warnings))

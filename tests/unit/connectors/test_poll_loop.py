@@ -9,7 +9,7 @@ from typing import ClassVar
 import msgspec
 import pytest
 
-from shmio.connectors.base import Connector
+from shmio.connectors.base import Connector, Lost, UnconfirmedError
 from shmio.connectors.poll_loop import Schedule, SourceLoop
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout, Register
@@ -452,6 +452,67 @@ def test_a_write_lost_with_the_connection_is_unknown_and_never_repeated(segment:
     assert kinds.count(EventKind.UNKNOWN) == 1
     assert device.calls.count("write") == 1
     assert device.reads > 10, "the loop recovers"
+
+
+class Slow(Writing):
+    """A device that confirms writes some cycles later, or never."""
+
+    def __init__(self, trouble: Callable[[str, int], None], cycles: int, error: type[ConnectorError] | None) -> None:
+        super().__init__(trouble)
+        self._cycles, self._error = cycles, error
+        self._asked = 0
+
+    def send(self, writes: Sequence[Write]) -> None:
+        self.writes, self._asked = writes, 0
+        self.calls.append("send")
+
+    def confirm(self, until_ns: int) -> list[str] | None:
+        self._asked += 1
+        if self._asked < self._cycles:
+            return None
+        if self._error is UnconfirmedError:
+            raise UnconfirmedError("late", [Lost.UNKNOWN] * len(self.writes))
+        if self._error is not None:
+            raise self._error("cut")
+        return self.write(self.writes)
+
+
+@pytest.mark.parametrize(
+    ("cycles", "error", "ends", "bad"),
+    [
+        (4, None, [EventKind.WRITTEN] * 2, 0),
+        (4, UnconfirmedError, [EventKind.UNKNOWN] * 2, 0),
+        (4, ConnectorError, [EventKind.UNKNOWN, EventKind.EXPIRED], 1),
+        (100, None, [EventKind.UNKNOWN, EventKind.EXPIRED], 0),
+    ],
+    ids=["late", "unconfirmed", "lost", "stopped"],
+)
+def test_frames_go_on_while_the_device_has_not_confirmed_a_write(
+    segment: Segment, cycles: int, error: type[ConnectorError] | None, ends: list[EventKind], bad: int
+) -> None:
+    """A second command waits for the outcome of the first."""
+    sender = CommandSender(segment.blocks["cell"], 4)
+
+    def commands(hook: str, reads: int) -> None:
+        if hook == "read" and reads in (3, 4):
+            sender.submit([Write(0, 0, (1000 * reads).to_bytes(4, "big"))], 10**18)
+            loop.commands._take_one(4)
+
+    device = Slow(commands, cycles, error)
+    clock = VirtualClock(14 * PERIOD_NS)
+    loop = SourceLoop(device, segment.writer("cell"), Schedule(0, PERIOD_NS), clock, ["count"])
+    block = segment.blocks["cell"]
+    cursor = block.cursor()
+    loop.run()
+    frames = list(iter(cursor.poll, None))
+    events = [event for n in range(1, block.events.head() + 1) if (event := block.events.read(n))]
+    found = [event for event in events if event.command]
+    assert [event.kind for event in found if event.kind != EventKind.ACCEPTED] == ends
+    first = next(event for event in found if event.kind == ends[0])
+    if cycles == 4:
+        assert first.frame == 6, "three frames came in between"
+    assert sum(frame.quality is Quality.BAD for frame in frames[:-1]) == bad
+    assert len(frames) > 8
 
 
 def test_a_doubtful_image_is_uncertain_with_its_reason(segment: Segment) -> None:

@@ -443,3 +443,14 @@ def test_anything_compiles_or_ends_in_a_layout_error(fragments: list[str]) -> No
 def test_any_bytes_compile_or_end_in_a_layout_error(data: bytes) -> None:
     result = outcome(Source("x.db", data), Source("y.db", block("a : Int;").encode() + data))
     assert isinstance(result, Compiled) or result.diagnostics
+
+
+def test_a_type_without_members_is_refused_only_where_it_is_used() -> None:
+    empty = Source("empty.udt", b'TYPE "Empty" VERSION : 0.1 STRUCT END_STRUCT; END_TYPE')
+    unused = Source("a.db", b'DATA_BLOCK "A" STRUCT x : Int; END_STRUCT; BEGIN END_DATA_BLOCK')
+    compiled = compile_sources([unused, empty])
+    assert compiled.layouts[0].size == 2
+    assert "'Empty' has no members" in compiled.warnings[0].message
+    used = Source("b.db", b'DATA_BLOCK "B" STRUCT x : "Empty"; END_STRUCT; BEGIN END_DATA_BLOCK')
+    with pytest.raises(LayoutError, match="expected at least one member in the type 'Empty'"):
+        compile_sources([used, empty])

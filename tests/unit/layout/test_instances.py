@@ -175,7 +175,6 @@ def nested(count: int, last: str) -> str:
     "last",
     [
         'FUNCTION_BLOCK "{}" VAR_TEMP i : Bool; END_VAR BEGIN END_FUNCTION_BLOCK\n',
-        'TYPE "{}" STRUCT END_STRUCT; END_TYPE\n',
         'FUNCTION_BLOCK "{}" VAR_INPUT v : Variant; END_VAR BEGIN END_FUNCTION_BLOCK\n',
     ],
 )

@@ -25,6 +25,7 @@ from shmio.layout.tags import place_tags
 from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.write import encode
 from shmio.model.statuses import StatusArea
+from shmio.testing.write_conformance import write
 
 NODE = Path(__file__).parents[2] / "endpoints/node"
 MISSING = "" if shutil.which("node") and (NODE / "node_modules/aedes").exists() else "needs Node's aedes and mqtt"
@@ -116,7 +117,7 @@ class Source:
         writes = []
         for path, value in values.items():
             writes += encode(self.layout.registers[self.layout.by_path[path]], value, self.layout.byte_order)
-        return self.connector.write(writes)
+        return write(self.connector, writes)
 
 
 @contextmanager

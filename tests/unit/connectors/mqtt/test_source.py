@@ -13,6 +13,7 @@ from shmio.errors import ConnectorError
 from shmio.layout.values.write import encode
 from shmio.model import statuses
 from shmio.testing.ports import reserved_port
+from shmio.testing.write_conformance import write
 from tests.unit.connectors.mqtt.conftest import Plant
 from tests.unit.connectors.mqtt.peer import Peer, connected
 
@@ -213,7 +214,7 @@ def test_writes_are_published(plant: Plant) -> None:
         assert source.code("lamp") == statuses.BAD_WAITING_FOR_INITIAL_DATA  # nobody has reported it
         register = source.layout.registers[source.layout.by_path["speed"]]
         pulse = [encode(register, value, source.layout.byte_order)[0] for value in (1.0, 0.0)]
-        assert source.connector.write(pulse) == ["", ""]
+        assert write(source.connector, pulse) == ["", ""]
         assert [device.ask("next", "w/speed")["payload"] for _ in range(2)] == ["1.0", "0.0"]
 
 
@@ -228,11 +229,11 @@ def test_writes_that_are_refused(plant: Plant) -> None:
         assert "nobody subscribes to w/nobody" in _write_to_nobody(plant)
         array = source.layout.registers[source.layout.by_path["list"]]
         (element,) = encode(source.layout.element(array, (2,)), 5, source.layout.byte_order)
-        assert "write the whole array" in source.connector.write([element])[0]
+        assert "write the whole array" in write(source.connector, [element])[0]
         plant.device.publish("w/list", [1, 2, 3])
         source.until(lambda: source.code("list") == 0)
         plant.device.ask("subscribe", "w/list/set")
-        assert source.connector.write([element]) == [""]
+        assert write(source.connector, [element]) == [""]
         assert plant.device.ask("next", "w/list/set")["payload"] == '{"v":[1,5,3]}'
 
 

@@ -15,6 +15,7 @@ from shmio.layout.tags import place_tags
 from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.write import encode
 from shmio.model.statuses import StatusArea
+from shmio.testing.write_conformance import write
 
 PATIENCE_S = 20.0
 _NEVER = threading.Event()
@@ -62,7 +63,7 @@ class Source:
         writes = []
         for path, value in values.items():
             writes += encode(self.layout.registers[self.layout.by_path[path]], value, self.layout.byte_order)
-        return self.connector.write(writes)
+        return write(self.connector, writes)
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from shmio.connectors.ros.rosbridge import RosbridgeConnector, RosbridgeOptions
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.values.write import encode
 from shmio.model import statuses
+from shmio.testing.write_conformance import write
 from tests.unit.connectors.ros.bridge import Bridge
 from tests.unit.connectors.ros.harness import connected, layout_of
 
@@ -139,7 +140,7 @@ def test_both_values_of_a_pulse_are_published(bridge: Bridge) -> None:
         assert source.write(vx=1.0, wz=0.5) == ["", ""]
         register = source.layout.registers[source.layout.by_path["vx"]]
         pulse = [encode(register, value, source.layout.byte_order)[0] for value in (2.0, 0.0)]
-        assert source.connector.write(pulse) == ["", ""]
+        assert write(source.connector, pulse) == ["", ""]
         assert [one["linear"]["x"] for one in bridge.ask("history", "/cmd_vel")] == [1.0, 2.0, 0.0]
 
 
