@@ -97,7 +97,7 @@ SLOW = (
     "tests/unit/layout/test_compiler.py::test_bounds_on_files",
     "tests/unit/layout/test_instances.py::test_many_",
     "tests/unit/layout/test_simlog_structures.py::test_a_table_cannot_hide_more_registers",
-    "tests/unit/recorder/test_housekeeping_closing.py::test_a_file_cut_anywhere",
+    "tests/unit/recorder/test_finalise.py::test_a_file_cut_anywhere",
     "tests/unit/recording/reading/test_reader.py::test_changed_bytes",
     "tests/unit/recording/test_check.py::test_no_",
     "tests/unit/recording/test_dump.py::test_batches_equal_frames",

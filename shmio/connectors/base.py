@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import msgspec
 
 from shmio.connectors.browsing import Browsed, Wanted
-from shmio.connectors.load import Load
+from shmio.connectors.request_count import CycleRequests
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.model import Layout
 from shmio.layout.values.codec import Value
@@ -169,7 +169,7 @@ class Connector(ABC):
         """
         return ""
 
-    def load(self) -> Load | None:
+    def cycle_requests(self) -> CycleRequests | None:
         """Return what a cycle requests from the device; None if this is not known.
 
         ``shmio-supervisor check`` shows it. The method is called without a connection, and opens

@@ -291,8 +291,14 @@ class SourceLoop:
     def poll(self, cycle: int) -> bool:
         """Run one cycle: connect if necessary, write, request an image, publish images.
 
+        An answer that comes after the end of its cycle is still published, with the number of the
+        cycle that requested it. While ``depth`` requests are in flight, a cycle requests nothing
+        and counts as an overrun. If an answer takes longer than ``stale_ms`` or the connector's
+        time-out, the loop publishes a bad frame, closes the connection and connects again; no
+        answer of the old connection is published any more.
+
         Returns:
-            False if the loop was told to stop during back-off.
+            False if the loop was stopped during back-off.
 
         """
         self._writer.cycle = cycle

@@ -74,7 +74,7 @@ class InFlightCommand:
     open_events: int = 0
     """Maximum number of events that the command may still cause."""
 
-    def hear(self, event: Event) -> bool:
+    def on_event(self, event: Event) -> bool:
         """Process an event of the command, and return whether all outcomes are known."""
         if not self.taken and event.kind == EventKind.ACCEPTED and self.accepted is not None:
             self.accepted()
@@ -136,7 +136,7 @@ class InFlightTable:
         self.untaken_bytes += cost.record_bytes
         self.open_events += cost.events
 
-    def hear(self, event: Event) -> bool:
+    def on_event(self, event: Event) -> bool:
         """Process an event of the source.
 
         Returns:
@@ -154,13 +154,13 @@ class InFlightTable:
         if pending.open_events:
             pending.open_events -= 1
             self.open_events -= 1
-        if pending.hear(event):
+        if pending.on_event(event):
             self._end(event.command)
         return True
 
-    def hurry(self) -> None:
+    def shorten_timeouts(self) -> None:
         """Shorten all time-outs after missed events, because these may have contained outcomes."""
-        self._hurry(self._by_number.values())
+        self._shorten(self._by_number.values())
 
     def expire(self) -> bool:
         """End the commands whose deadline has passed.
@@ -195,9 +195,9 @@ class InFlightTable:
         for number, pending in before:
             if pending.taken:
                 self._end(number, RESTARTED)
-        self._hurry(pending for _, pending in before if not pending.taken)
+        self._shorten(pending for _, pending in before if not pending.taken)
 
-    def _hurry(self, some: Iterable[InFlightCommand]) -> None:
+    def _shorten(self, some: Iterable[InFlightCommand]) -> None:
         soon_ns = time.monotonic_ns() + round(PATIENCE_S * 1e9)
         for pending in some:
             pending.until_ns = min(pending.until_ns, soon_ns)

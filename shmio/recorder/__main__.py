@@ -11,7 +11,7 @@ from shmio import worker
 from shmio.config import Recorder as Settings
 from shmio.recorder.housekeeping import Housekeeper
 from shmio.recorder.instance_follower import InstanceFollower, StartPositions
-from shmio.recorder.predecessor import last_positions, trigger_interrupted
+from shmio.recorder.previous_recordings import last_positions, trigger_interrupted
 from shmio.recorder.recorder import ConfigFiles, RotatingRecorder
 from shmio.recorder.triggered import TriggeredRecorder
 from shmio.recording.format.encoding import SUPERVISED, Reason

@@ -12,14 +12,14 @@ from urllib.parse import urlsplit
 from shmio.cli.run import dumps
 from shmio.cli.target import config_file
 from shmio.config import Address, Alert, Source
-from shmio.connectors.load import Requests, counted
+from shmio.connectors.request_count import Requests, counted
 from shmio.errors import ConfigError, ShmioError
 from shmio.layout.topic import shorten
 from shmio.logs import printable
-from shmio.plan.load import source_load, writable_registers
 from shmio.plan.ports import served, taken
 from shmio.plan.prepare import Prepared, peer, prepare
 from shmio.plan.processes import Plan
+from shmio.plan.request_count import source_requests, writable_registers
 from shmio.segment import PREFIX, BlockSpec, Segment
 
 MAX_PATTERNS: Final = 200
@@ -141,14 +141,14 @@ class _Figures:
     """How much a source reads and may write, and whether its period can be met."""
 
     def __init__(self, source: Source, block: BlockSpec, round_trip_ms: float | None) -> None:
-        self._load = source_load(source, block.layout)
+        self._requests = source_requests(source, block.layout)
         self._round_trip_ms = round_trip_ms
         self._period_ms = block.period_ns / 1e6
         self.found: dict[str, Any] = {
             "period_ms": self._period_ms,
-            "reads": self._load.reads if self._load else None,
-            "requests": [self._case(one) for one in self._load.requests] if self._load else [],
-            "load_note": self._load.note if self._load else "",
+            "reads": self._requests.reads if self._requests else None,
+            "requests": [self._case(one) for one in self._requests.requests] if self._requests else [],
+            "load_note": self._requests.note if self._requests else "",
             "writable": list(source.writable),
             "writable_registers": writable_registers(source, block.layout),
         }

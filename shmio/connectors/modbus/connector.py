@@ -13,11 +13,11 @@ import msgspec
 import numpy as np
 
 from shmio.connectors.base import Connector, Lost, WriteLostError
-from shmio.connectors.load import Load, Requests, counted
 from shmio.connectors.modbus import client
 from shmio.connectors.modbus.client import MAX_WRITE_BITS, MAX_WRITE_WORDS, ModbusClient, RefusedError, SilentError
 from shmio.connectors.modbus.plan import MAX_PROBES, Element, Limits, ReadRequest, Refusals
 from shmio.connectors.register_image import Copy, RegisterImage
+from shmio.connectors.request_count import CycleRequests, Requests, counted
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.addresses.modbus import Address, Order, Table, WordCodec, parse
 from shmio.layout.model import Layout, Register, bit_positions
@@ -184,7 +184,7 @@ class ModbusConnector(Connector):
         """Return the peer and the number of requests of a cycle as a text for logs."""
         return f"to {self._client.peer} in {len(self._refusals.requests)} requests a cycle"
 
-    def load(self) -> Load:
+    def cycle_requests(self) -> CycleRequests:
         """Return the requests that read all registers."""
         counts: dict[Table, int] = {}
         for request in self._refusals.requests:
@@ -192,7 +192,7 @@ class ModbusConnector(Connector):
         what = ", ".join(counted(counts[table], name) for table, name in _TABLE_NAMES.items() if table in counts)
         units = sorted({request.unit for request in self._refusals.requests})
         some = f"unit {units[0]}" if len(units) == 1 else f"{len(units)} units"
-        return Load(f"{what} of {some}", (Requests(len(self._refusals.requests)),), NOTE)
+        return CycleRequests(f"{what} of {some}", (Requests(len(self._refusals.requests)),), NOTE)
 
     def connect(self) -> None:
         """Connect to the device; ConnectorError if it cannot be reached."""
@@ -449,20 +449,20 @@ class ModbusConnector(Connector):
             ValueError: The device cannot hold the value, or a write names nothing that can be written.
 
         """
-        touched = False
+        found = False
         for one in self._registers:
             register = one.register
             parts = [write for write in writes if _touches(write, register)]
             if not parts:
                 continue
-            touched = True
+            found = True
             if not one.address.table.writable:
                 raise ValueError(f"nothing can be written to the table {one.address.table.value}")
             if register.bit is None and len(writes) == 1 and parts[0].mask:
                 yield self._bit_of_word(one, parts[0])
             else:
                 yield from self._values(one, parts)
-        if not touched:
+        if not found:
             raise ValueError("no register of the tag table is there")
 
     def _bit_of_word(self, one: _Register, write: Write) -> tuple[int, int, bytes]:

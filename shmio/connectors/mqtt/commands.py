@@ -12,7 +12,7 @@ from shmio.connectors.mqtt.address import Metric, Place
 from shmio.connectors.mqtt.link import Publication
 from shmio.connectors.mqtt.options import MqttOptions
 from shmio.connectors.mqtt.store import Store
-from shmio.connectors.touched import touched
+from shmio.connectors.written_registers import written_registers
 from shmio.layout.values.codec import Value
 from shmio.layout.values.write import Write
 
@@ -95,7 +95,7 @@ def _touched(store: Store, write: Write, open_drafts: dict[object, _Draft]) -> I
         draft = open_drafts.get(_key(_target(store, index)))
         return draft.values[index] if draft is not None and index in draft.values else store.present(index)
 
-    for index, value in touched(store.layout, write, present):
+    for index, value in written_registers(store.layout, write, present):
         register = store.layout.registers[index]
         if not register.writable:
             raise ValueError(f"{register.path}: to publish it, set `writable = true` in the tag table")

@@ -17,12 +17,12 @@ from shmio.config.model import MqttTls
 from shmio.config.tls import client_context
 from shmio.connectors.base import Connector, Lost, WriteLostError
 from shmio.connectors.browsing import Browsed, Wanted
-from shmio.connectors.load import Load, counted
 from shmio.connectors.mqtt.browse import Listener
 from shmio.connectors.mqtt.commands import Command, plan
 from shmio.connectors.mqtt.link import Link, Publication, UnsupportedVersionError, version_of
 from shmio.connectors.mqtt.options import MqttOptions
 from shmio.connectors.mqtt.store import Store
+from shmio.connectors.request_count import CycleRequests, counted
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.model import Layout
 from shmio.layout.values.write import Write
@@ -101,9 +101,9 @@ class MqttConnector(Connector):
         secured = "TLS" if self._options.tls else "plain text"
         return f"to {self._options.address} as {self._client_id}, MQTT {version}, {secured}, {self._store.describe()}"
 
-    def load(self) -> Load:
+    def cycle_requests(self) -> CycleRequests:
         """Return the number of subscriptions. A cycle needs no requests."""
-        return Load(counted(len(self._store.filters), "subscription"), note="the broker sends their messages")
+        return CycleRequests(counted(len(self._store.filters), "subscription"), note="the broker sends their messages")
 
     def connect(self) -> None:
         """Connect to the broker and subscribe.

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
-from shmio.connectors.load import counted
 from shmio.connectors.mqtt import json_path
 from shmio.connectors.mqtt.address import NAMESPACE, Address, Metric, Place, parse
 from shmio.connectors.mqtt.faults import ValueFaultError
@@ -19,6 +18,7 @@ from shmio.connectors.mqtt.topic import Message, Origin, Topic
 from shmio.connectors.mqtt.values import Fitting, decode_json
 from shmio.connectors.mqtt.watch import Watch
 from shmio.connectors.register_image import RegisterImage
+from shmio.connectors.request_count import counted
 from shmio.errors import ConfigError, ConnectorError, PathError, ValueRangeError
 from shmio.layout.glob import Glob
 from shmio.layout.model import Layout

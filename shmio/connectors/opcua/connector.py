@@ -19,11 +19,11 @@ import msgspec
 from shmio.config.credentials import read_password
 from shmio.connectors.base import Connector, Lost, WriteLostError
 from shmio.connectors.browsing import Browsed, Wanted
-from shmio.connectors.load import Load, Requests, counted
 from shmio.connectors.opcua.decode import Sample
 from shmio.connectors.opcua.options import Credentials, OpcUaOptions
 from shmio.connectors.opcua.values import Fitting, MismatchError
 from shmio.connectors.register_image import RegisterImage
+from shmio.connectors.request_count import CycleRequests, Requests, counted
 from shmio.errors import ConfigError, ConnectorError, ValueRangeError
 from shmio.layout.addresses import siemens
 from shmio.layout.addresses.opcua import Address, parse
@@ -119,18 +119,20 @@ class OpcUaConnector(Connector):
         mode = f"{subscribed} subscriptions" if options.mode == "subscribe" else "polling"
         return f"to {options.peer}, {len(self._addresses)} nodes, {mode}, sessions={len(sessions)}, {how}"
 
-    def load(self) -> Load:
-        """Return the requests of a cycle: none with subscriptions."""
+    def cycle_requests(self) -> CycleRequests:
+        """Return the requests that a cycle makes. In mode ``subscribe`` there are none."""
         options, nodes = self._options, len(self._addresses)
         reads = counted(nodes, "node")
         if options.mode == "subscribe":
-            return Load(reads, note=f"the server sends what has changed, at most every {options.publishing_ms} ms")
+            return CycleRequests(
+                reads, note=f"the server sends what has changed, at most every {options.publishing_ms} ms"
+            )
         from shmio.connectors.opcua.session import MAX_PER_CALL  # noqa: PLC0415  a library that only sources need
 
         most = options.session_items
         count = sum(-(-min(most, nodes - at) // MAX_PER_CALL) for at in range(0, nodes, most))
         note = f"a server that takes fewer than {MAX_PER_CALL} nodes in a request gets more requests"
-        return Load(reads, (Requests(count, count),), note)
+        return CycleRequests(reads, (Requests(count, count),), note)
 
     def connect(self) -> None:
         """Open the sessions, and wait for the first value of each node as long as the time-out allows.
@@ -260,8 +262,8 @@ class OpcUaConnector(Connector):
                         path = self._layout.registers[step.item.index].path
                         outcomes[step.write] = f"{path}: the server refuses it: {describe(code)}"
             if steps:
-                touched = list({step.item.index: step.item for step in steps}.values())
-                link.call(lambda: link.read_back(touched), deadline_ns)
+                written = list({step.item.index: step.item for step in steps}.values())
+                link.call(lambda: link.read_back(written), deadline_ns)
         except ConnectorError as error:
             self._mark_lost(outcomes, steps, begun, link)
             raise WriteLostError(str(error), outcomes) from None
@@ -291,7 +293,7 @@ class OpcUaConnector(Connector):
 
     def _steps(self, link: _Link, number: int, write: Write) -> Iterator[_NodeWrite]:
         """Yield the nodes' writes for a write; ValueError if it cannot be done."""
-        layout, touched = self._layout, False
+        layout, found = self._layout, False
         covered, image = bytearray(layout.size), bytearray(layout.size)
         apply(Write(write.offset, write.mask, b"\xff" * len(write.data)), covered)
         apply(write, image)
@@ -302,7 +304,7 @@ class OpcUaConnector(Connector):
             share = bytes(a & b for a, b in zip(there, wanted, strict=True))
             if not any(share):
                 continue
-            touched = True
+            found = True
             item = link.items[index]
             if item.node is None:
                 raise ValueError(f"{register.path}: the server does not know its node")
@@ -319,7 +321,7 @@ class OpcUaConnector(Connector):
                 raise ValueError(f"{register.path}: {error}") from None
             last = first + count - 1
             yield _NodeWrite(number, item, f"{first}:{last}" if last > first else str(first), sample)
-        if not touched:
+        if not found:
             raise ValueError("no register of the layout is there")
 
 

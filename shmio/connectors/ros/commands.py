@@ -16,7 +16,7 @@ from shmio.connectors.base import Lost, WriteLostError
 from shmio.connectors.ros.addresses import Address, FieldError, extract, place_of
 from shmio.connectors.ros.messages import DEFINITIONS, conforms, default, plain
 from shmio.connectors.ros.topics import Topic, Topics
-from shmio.connectors.touched import touched
+from shmio.connectors.written_registers import written_registers
 from shmio.errors import ValueRangeError
 from shmio.layout.values.codec import Value
 from shmio.layout.values.write import Write
@@ -128,7 +128,7 @@ def _touched(topics: Topics, write: Write, open_drafts: Mapping[str, Publication
         ValueError: The write is refused; the message says why.
 
     """
-    for index, value in touched(topics.layout, write, lambda index: _present(topics, index, open_drafts)):
+    for index, value in written_registers(topics.layout, write, lambda index: _present(topics, index, open_drafts)):
         topic = topics.by_name[topics.addresses[index].topic]
         if not topic.writable or topics.fittings[index].kind is None:
             path = topics.layout.registers[index].path

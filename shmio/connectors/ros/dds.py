@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import msgspec
 
 from shmio.connectors.base import Connector, Lost, UnconfirmedError, WriteLostError
-from shmio.connectors.load import Load, counted
+from shmio.connectors.request_count import CycleRequests, counted
 from shmio.connectors.ros.commands import Publication, Sending, plan, stamped
 from shmio.connectors.ros.options import TopicOptions
 from shmio.connectors.ros.topics import Topics
@@ -86,9 +86,9 @@ class Ros2Connector(Connector):
         """Return the domain and the number of topics, for the log."""
         return f"to DDS {self._where}, {len(self._topics.by_name)} topics"
 
-    def load(self) -> Load:
+    def cycle_requests(self) -> CycleRequests:
         """Return the number of topics. A cycle needs no requests."""
-        return Load(counted(len(self._topics.by_name), "topic"), note="their publishers send messages")
+        return CycleRequests(counted(len(self._topics.by_name), "topic"), note="their publishers send messages")
 
     def connect(self) -> None:
         """Join the domain, and wait until another participant publishes or subscribes to a topic.

@@ -13,7 +13,7 @@ import msgspec
 
 from shmio.config import Address
 from shmio.connectors.base import Connector, Lost, WriteLostError
-from shmio.connectors.load import Load, counted
+from shmio.connectors.request_count import CycleRequests, counted
 from shmio.connectors.ros.commands import Publication, Sending, plan, stamped
 from shmio.connectors.ros.messages import finite
 from shmio.connectors.ros.options import TopicOptions
@@ -89,9 +89,9 @@ class RosbridgeConnector(Connector):
         """Return the server's address and the number of topics, for the log."""
         return f"to {self._options.address}, {len(self._topics.by_name)} topics by rosbridge"
 
-    def load(self) -> Load:
+    def cycle_requests(self) -> CycleRequests:
         """Return the number of topics. A cycle needs no requests."""
-        return Load(counted(len(self._topics.by_name), "topic"), note="the server sends their messages")
+        return CycleRequests(counted(len(self._topics.by_name), "topic"), note="the server sends their messages")
 
     def connect(self) -> None:
         """Open the connection, and subscribe to all topics.

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from shmio.connectors.base import Connector
-from shmio.connectors.load import Load
+from shmio.connectors.request_count import CycleRequests
 from shmio.connectors.s7 import pdu
 from shmio.connectors.s7.blocks import BlockRead, BlockWrite, SizeProbe, waves
 from shmio.connectors.s7.drift import BlockWatch, Described
 from shmio.connectors.s7.explain import OUT_OF_RANGE, RefusedError, explain_size
-from shmio.connectors.s7.load import NOTE, by_pdu_size
+from shmio.connectors.s7.request_count import NOTE, by_pdu_size
 from shmio.connectors.s7.session import MAX_DEPTH, Read, S7Options, S7Session
 from shmio.connectors.s7.table import S7TableConnector
 from shmio.errors import ConfigError, ConnectorError
@@ -122,7 +122,7 @@ class S7Connector(S7Client, Connector):
         """Return the peer and the parameters of the session, for the log."""
         return f"to {self.options.peer} DB{self.db_number} pdu={self.pdu_size} jobs={self.jobs} depth={self.depth}"
 
-    def load(self) -> Load:
+    def cycle_requests(self) -> CycleRequests:
         """Return how many requests read the block, for each PDU size that the controller may grant."""
         requests = by_pdu_size(lambda pdu_size: -(-self.size // self._chunk(pdu_size)))
-        return Load(f"bytes 0 to {self.size - 1} of DB{self.db_number}", requests, NOTE)
+        return CycleRequests(f"bytes 0 to {self.size - 1} of DB{self.db_number}", requests, NOTE)

@@ -15,8 +15,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
 from shmio.connectors.base import Connector
-from shmio.connectors.load import Load, counted
 from shmio.connectors.register_image import RegisterImage
+from shmio.connectors.request_count import CycleRequests, counted
 from shmio.connectors.s7 import cpu, pdu
 from shmio.connectors.s7.blocks import ITEM_OVERHEAD, JOB_OVERHEAD, BlockWrite, WriteItem, bit_item, byte_item, touches
 from shmio.connectors.s7.drift import BlockWatch, Described
@@ -31,8 +31,8 @@ from shmio.connectors.s7.explain import (
     explain_item,
     explain_place,
 )
-from shmio.connectors.s7.load import NOTE, by_pdu_size
 from shmio.connectors.s7.plan import Field, Job, Piece, Range, merge, most_bytes, pack
+from shmio.connectors.s7.request_count import NOTE, by_pdu_size
 from shmio.connectors.s7.session import MAX_DEPTH, Read, S7Options, S7Session
 from shmio.connectors.s7.tag import Tag
 from shmio.errors import ConfigError, ConnectorError, PathError
@@ -413,7 +413,7 @@ class S7TableConnector(S7Session, Connector):
             f"depth={self.depth} in {requests} {'request' if requests == 1 else 'requests'} a cycle"
         )
 
-    def load(self) -> Load:
+    def cycle_requests(self) -> CycleRequests:
         """Return the requests of a cycle that reads all registers, for each possible PDU size."""
 
         def count(pdu_size: int) -> int:
@@ -434,7 +434,7 @@ class S7TableConnector(S7Session, Connector):
             if self._of_cpu
             else ""
         )
-        return Load(reads, by_pdu_size(count), NOTE + beside)
+        return CycleRequests(reads, by_pdu_size(count), NOTE + beside)
 
     # -- reading -------------------------------------------------------------------------------------------------------
 
@@ -528,14 +528,14 @@ class S7TableConnector(S7Session, Connector):
 
         """
         offset, mask, data = write
-        touched = False
+        found = False
         for tag in self._tags.values():
             register = tag.register
             if register.offset + register.size <= offset or register.offset >= offset + len(data):
                 continue
             if register.bit is not None and not register.dims and mask and mask != 1 << register.bit:
                 continue
-            touched = True
+            found = True
             if tag.address.area.read_only:
                 raise ValueError(f"{register.path} ({tag.address.text}): {tag.address.area.read_only}")
             start = tag.address.start
@@ -547,7 +547,7 @@ class S7TableConnector(S7Session, Connector):
                 yield tag, byte, mask.bit_length() - 1, bytes((bool(data[0] & mask),))
             else:
                 yield from self._elements(tag, write)
-        if not touched:
+        if not found:
             if any(
                 one.register.offset < offset + len(data) and offset < one.register.offset + one.register.size
                 for one in self._of_cpu

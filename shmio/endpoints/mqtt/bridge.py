@@ -26,7 +26,7 @@ from shmio.endpoints.mqtt.commands import (
     result_filters,
 )
 from shmio.endpoints.mqtt.connection.connection import MOST_IN_FLIGHT, BrokerConnection, CommandConnection, is_watched
-from shmio.endpoints.mqtt.connection.target import ReconnectPolicy, targets
+from shmio.endpoints.mqtt.connection.reconnect import ReconnectPolicy, targets
 from shmio.endpoints.mqtt.feed import Feed
 from shmio.endpoints.mqtt.outbox import Outbox
 from shmio.endpoints.mqtt.sparkplug.device import Device

@@ -95,9 +95,9 @@ class CommandClient:
     def poll(self) -> None:
         """Read new events, and end the commands whose outcome is known or overdue."""
         while (event := self._events.poll()) is not None:
-            self._pending.hear(event)
+            self._pending.on_event(event)
         if self._events.take_missed():
-            self._pending.hurry()
+            self._pending.shorten_timeouts()
         self._pending.expire()
         if self._events.ended:
             self._pending.end(REPLACED)

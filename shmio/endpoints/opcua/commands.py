@@ -76,9 +76,9 @@ class CommandClient:
     def poll(self) -> None:
         """Read new events, and end the commands whose outcome is known or overdue."""
         while (event := self._events.poll()) is not None:
-            self._in_flight.hear(event)
+            self._in_flight.on_event(event)
         if self._events.take_missed():
-            self._in_flight.hurry()
+            self._in_flight.shorten_timeouts()
         self._in_flight.expire()
         if self._events.ended:
             self._in_flight.end(REPLACED)

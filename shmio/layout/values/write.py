@@ -189,13 +189,13 @@ def paths_of(layout: Layout, writes: Iterable[Write], most: int | None = None) -
     parts, such as REAL, is named as a whole. Bytes outside the block or of no register are skipped.
     """
     bits = bytearray(layout.size)
-    touched: set[int] = set()
+    overlapping: set[int] = set()
     for offset, mask, data in writes:
         stop = min(offset + len(data), layout.size)
         for at in range(offset, stop):
             bits[at] |= mask or 0xFF
-        touched.update(_overlapping(layout, offset, stop))
-    paths = (path for index in sorted(touched) for path in _register_paths(layout, layout.own[index], bits))
+        overlapping.update(_overlapping(layout, offset, stop))
+    paths = (path for index in sorted(overlapping) for path in _register_paths(layout, layout.own[index], bits))
     return list(islice(paths, most))
 
 

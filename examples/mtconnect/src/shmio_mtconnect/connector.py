@@ -12,8 +12,8 @@ from urllib.parse import urlsplit
 import msgspec
 
 from shmio.connectors.base import Connector
-from shmio.connectors.load import Load, counted
 from shmio.connectors.register_image import RegisterImage
+from shmio.connectors.request_count import CycleRequests, counted
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout
 from shmio.model.statuses import BAD_WAITING_FOR_INITIAL_DATA
@@ -90,10 +90,10 @@ class MTConnectConnector(Connector):
         known = len(self._follower.targets) if self._follower is not None else 0
         return f"to {self._options.url}, {known} data items"
 
-    def load(self) -> Load:
+    def cycle_requests(self) -> CycleRequests:
         """Return what the agent sends. There are no repeated requests, because the agent sends a stream."""
         note = f"the agent sends what has changed, at most every {self._options.interval} ms"
-        return Load(counted(len(self._addresses), "data item"), note=note)
+        return CycleRequests(counted(len(self._addresses), "data item"), note=note)
 
     def connect(self) -> None:
         """Ask for the device model and the present state, and open the stream that continues it.

@@ -296,7 +296,7 @@ class CommandClient:
             for listener in channel.listeners:
                 listener.deliver(message)
         self.followers.follow(event)
-        if self._in_flight.hear(event):
+        if self._in_flight.on_event(event):
             self._silent = False
             if event.kind == EventKind.STARTED:
                 self._set_timer()
@@ -308,7 +308,7 @@ class CommandClient:
         self.followers.skip()
         self.write_subscriptions.fail(reason)
         self.followers.fail(reason)
-        self._in_flight.hurry()
+        self._in_flight.shorten_timeouts()
         self._set_timer()
 
     def _retired(self) -> None:

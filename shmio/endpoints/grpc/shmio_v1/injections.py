@@ -138,7 +138,7 @@ class ByteRanges:
         changed = np.full(len(image), 0xFF, np.uint8) if before is None else new ^ np.frombuffer(before, np.uint8)
         return b"".join(self._pieces(new, changed))
 
-    def touched(self, image: bytes, mask: bytes) -> bytes:
+    def pieces(self, image: bytes, mask: bytes) -> bytes:
         """Return, as fields of an ``Update``, each range from its first to its last masked byte."""
         return b"".join(self._pieces(np.frombuffer(image, np.uint8), np.frombuffer(mask, np.uint8)))
 
@@ -412,10 +412,10 @@ class InjectCall(InjectionFollower):
         elif not self._options.quiet:
             mask = bytearray(len(self._bits))
             apply(mask, (write._replace(data=b"\xff" * len(write.data)) for write in diverted.writes))
-            image, touched = bytes(self._base.given), bytes(mask)
+            image, changed = bytes(self._base.given), bytes(mask)
             columns = self._view.columns
-            values = pack_slots(columns.decode(image), columns.touched(touched))
-            body = (field(VALUES, values) if values else b"") + self._ranges.touched(image, touched)
+            values = pack_slots(columns.decode(image), columns.of_bits(changed))
+            body = (field(VALUES, values) if values else b"") + self._ranges.pieces(image, changed)
             self._tell(field(_ORIGINALS, head_of(self._view.number, diverted.event) + body))
 
     def _tell(self, message: bytes) -> None:

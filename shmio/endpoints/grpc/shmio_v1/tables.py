@@ -183,7 +183,7 @@ class Columns:
             found[column][1].append(place)
         return found
 
-    def touched(self, mask: bytes) -> dict[Column, Array]:
+    def of_bits(self, mask: bytes) -> dict[Column, Array]:
         """Return the slots of the elements that have at least one bit set in a mask of the block."""
         arrays = self.decode_numbers(mask)
         found = {column: array.view(_BITS[column]) != 0 for column, array in arrays.items()}
@@ -421,9 +421,9 @@ class WriteUpdates:
         apply(part, (ones(event),))
         if not (np.frombuffer(part, np.uint8) & self._cover).any():
             return b""
-        slots = self._columns.touched(bytes(part))
+        slots = self._columns.of_bits(bytes(part))
         if len(event.data) == EVENT_DATA_SIZE:
-            left = self._columns.touched(bytes(bits ^ 0xFF for bits in mask))
+            left = self._columns.of_bits(bytes(bits ^ 0xFF for bits in mask))
             whole = {column: np.setdiff1d(found, left[column]) for column, found in slots.items() if column in left}
             slots = {column: found for column, found in (slots | whole).items() if len(found)}
         if not slots:

@@ -22,7 +22,7 @@ from paho.mqtt.reasoncodes import ReasonCode
 from shmio.config.credentials import read_password
 from shmio.config.tls import client_context
 from shmio.endpoints.mqtt.broker.directory import BRIDGE, secret_id, secret_of
-from shmio.endpoints.mqtt.connection.target import ReconnectPolicy, Target
+from shmio.endpoints.mqtt.connection.reconnect import ReconnectPolicy, Target
 from shmio.endpoints.mqtt.topics import Message
 from shmio.errors import ConfigError
 

@@ -29,8 +29,8 @@ from shmio.endpoints.mqtt.connection.attempt import (
     ended,
     refusal,
 )
+from shmio.endpoints.mqtt.connection.reconnect import ReconnectPolicy, Target
 from shmio.endpoints.mqtt.connection.socket_io import BATCH, SocketIo
-from shmio.endpoints.mqtt.connection.target import ReconnectPolicy, Target
 from shmio.endpoints.mqtt.topics import Message
 from shmio.layout.topic import shorten
 

@@ -17,7 +17,7 @@ from paho.mqtt.client import MQTTMessage
 from shmio.config import Mqtt, Sparkplug
 from shmio.endpoints.mqtt.broker.directory import own_socket
 from shmio.endpoints.mqtt.connection.connection import FEW_IN_FLIGHT, BrokerConnection
-from shmio.endpoints.mqtt.connection.target import ReconnectPolicy, targets
+from shmio.endpoints.mqtt.connection.reconnect import ReconnectPolicy, targets
 from shmio.endpoints.mqtt.feed import Feed
 from shmio.endpoints.mqtt.outbox import OVERHEAD_BYTES, Backlog
 from shmio.endpoints.mqtt.sparkplug.device import Device, DeviceEvent

@@ -26,7 +26,7 @@ AWAY = "nothing listens there"
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorten the back-off of a bridge that reconnects."""
-    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.RECONNECT", Backoff(0.02, 0.1))
+    monkeypatch.setattr("shmio.endpoints.mqtt.connection.reconnect.RECONNECT", Backoff(0.02, 0.1))
 
 
 def test_changes_are_kept_while_the_broker_is_away(segment: Segment, broker: Mosquitto) -> None:

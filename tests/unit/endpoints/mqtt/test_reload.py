@@ -88,7 +88,7 @@ def test_the_topics_of_a_removed_source_are_cleared(segment: Segment, broker: Mo
 def test_topics_of_a_source_removed_during_an_outage_are_cleared_afterwards(
     segment: Segment, broker: Mosquitto, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.RECONNECT", Backoff(0.1, 0.1))
+    monkeypatch.setattr("shmio.endpoints.mqtt.connection.reconnect.RECONNECT", Backoff(0.1, 0.1))
     segment.writer("cell").publish(image(step=3), cycle=1)
     with (
         Segment.open(segment.instance, writable=True) as opened,

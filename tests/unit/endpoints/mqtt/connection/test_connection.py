@@ -13,7 +13,7 @@ import pytest
 from shmio.backoff import Backoff
 from shmio.config import Mqtt
 from shmio.endpoints.mqtt.connection.connection import BrokerConnection
-from shmio.endpoints.mqtt.connection.target import ReconnectPolicy, targets
+from shmio.endpoints.mqtt.connection.reconnect import ReconnectPolicy, targets
 from shmio.endpoints.mqtt.topics import Message
 
 TIMEOUT_S = 30
@@ -113,7 +113,7 @@ class Broker:
 
 def test_repeated_disconnections_suggest_another_client_with_the_same_id(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two clients have the same id, and the broker does not say why it disconnects one."""
-    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.RECONNECT", Backoff(0.0, 0.0))
+    monkeypatch.setattr("shmio.endpoints.mqtt.connection.reconnect.RECONNECT", Backoff(0.0, 0.0))
     with socket.create_server(("127.0.0.1", 0)) as server:
         broker = Broker(server)
         try:

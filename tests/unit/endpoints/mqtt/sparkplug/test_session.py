@@ -96,7 +96,7 @@ def node(segment: Segment, address: Address, **settings: Any) -> Iterator[Runnin
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.RECONNECT", Backoff(0.02, 0.1))
+    monkeypatch.setattr("shmio.endpoints.mqtt.connection.reconnect.RECONNECT", Backoff(0.02, 0.1))
 
 
 def bd_seq(heard: Heard) -> int:

@@ -23,7 +23,7 @@ WAITING = Sparkplug(group="plant", node="a50", primary_host="scada")
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.RECONNECT", Backoff(0.02, 0.1))
+    monkeypatch.setattr("shmio.endpoints.mqtt.connection.reconnect.RECONNECT", Backoff(0.02, 0.1))
 
 
 def say(listener: Listener, payload: Any, topic: str = STATE) -> None:

@@ -12,7 +12,7 @@ import pytest
 from mcap.opcode import Opcode
 
 from shmio.errors import RecordingError
-from shmio.recorder.housekeeping import finalise
+from shmio.recorder.finalise import finalise
 from shmio.recorder.recorder import AttachedFile
 from shmio.recording.check import check
 from shmio.recording.reading.reader import Reader

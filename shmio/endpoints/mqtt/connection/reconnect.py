@@ -1,4 +1,4 @@
-"""The addresses of the brokers, and the rules when to try which broker."""
+"""Decides which broker to try next, and how long to wait before."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.write import Write, apply, bits_of
 
 
-def touched(layout: Layout, write: Write, present: Callable[[int], Value]) -> Iterator[tuple[int, Value]]:
+def written_registers(layout: Layout, write: Write, present: Callable[[int], Value]) -> Iterator[tuple[int, Value]]:
     """Yield the registers that a write sets, with their new values.
 
     Args:

@@ -28,7 +28,7 @@ class Requests:
 
 
 @dataclass(frozen=True)
-class Load:
+class CycleRequests:
     """What a source requests from its device in each cycle."""
 
     reads: str

@@ -5,12 +5,12 @@ from __future__ import annotations
 from shmio.config import Source
 from shmio.connectors import registry
 from shmio.connectors.base import Connector
-from shmio.connectors.load import Load
+from shmio.connectors.request_count import CycleRequests
 from shmio.layout.model import Layout
 from shmio.layout.values.write import bits_of, cover
 
 
-def source_load(source: Source, layout: Layout) -> Load | None:
+def source_requests(source: Source, layout: Layout) -> CycleRequests | None:
     """Return what a source requests from its device in a cycle.
 
     None if the source has no device, or its connector does not report it.
@@ -25,7 +25,7 @@ def source_load(source: Source, layout: Layout) -> Load | None:
         return None
     made = connector.for_layout(layout)(registry.convert_options(source.connector, source.options), layout.base)
     try:
-        return made.load()
+        return made.cycle_requests()
     finally:
         made.close()
 

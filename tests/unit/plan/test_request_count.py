@@ -13,14 +13,14 @@ from snap7.type import SrvArea
 from shmio.config import Address, Source
 from shmio.connectors import registry
 from shmio.connectors.base import Connector
-from shmio.connectors.load import Load, Requests
-from shmio.connectors.s7.load import PDU_SIZES
+from shmio.connectors.request_count import CycleRequests, Requests
+from shmio.connectors.s7.request_count import PDU_SIZES
 from shmio.emulators.s7 import S7Server, Traits
 from shmio.layout.compiler import Source as SourceFile
 from shmio.layout.compiler import compile_sources
 from shmio.layout.model import Layout
 from shmio.layout.tags import place_tags
-from shmio.plan.load import source_load, writable_registers
+from shmio.plan.request_count import source_requests, writable_registers
 from shmio.testing.proxy import FaultProxy
 
 
@@ -50,14 +50,14 @@ def connector_of(source: Source, layout: Layout) -> Connector:
     return kind.for_layout(layout)(registry.convert_options(source.connector, source.options), layout)
 
 
-def load(connector: str, layout: Layout, **options: Any) -> Load:
-    found = source_load(of(connector, layout, **options), layout)
+def requests_of(connector: str, layout: Layout, **options: Any) -> CycleRequests:
+    found = source_requests(of(connector, layout, **options), layout)
     assert found is not None
     return found
 
 
 def test_a_data_block_takes_requests_by_the_size_of_a_pdu() -> None:
-    found = load("s7", block(2180), host="plc")
+    found = requests_of("s7", block(2180), host="plc")
     assert found.reads == "bytes 0 to 2179 of DB5"
     assert found.requests == (
         Requests(10, 1, "PDU of 240 bytes"), Requests(5, 1, "PDU of 480 bytes"), Requests(3, 1, "PDU of 960 bytes")
@@ -65,12 +65,12 @@ def test_a_data_block_takes_requests_by_the_size_of_a_pdu() -> None:
 
 
 def test_sizes_with_the_same_count_share_a_line() -> None:
-    assert load("s7", block(300), host="plc").requests == (
+    assert requests_of("s7", block(300), host="plc").requests == (
         Requests(2, assumption="PDU of 240 bytes"),
         Requests(1, assumption="PDU of 480 or 960 bytes"),
     )
-    assert load("s7", block(222), host="plc").requests == (Requests(1),)
-    assert load("s7", block(2180), host="plc", packetSize=96).requests == (Requests(23),)
+    assert requests_of("s7", block(222), host="plc").requests == (Requests(1),)
+    assert requests_of("s7", block(2180), host="plc", packetSize=96).requests == (Requests(23),)
 
 
 FAR = {f"r{number}": f"DB{5 + number % 2}.DBW{100 * number}" for number in range(40)}
@@ -82,7 +82,7 @@ SEQUENCE = {f"h{number}": f"holding {30 * number}" for number in range(20)} | {"
 @pytest.mark.parametrize("pdu_size", PDU_SIZES)
 def test_a_controller_gets_as_many_requests_as_check_says(layout: Layout, pdu_size: int) -> None:
     source = of("s7", layout, host="127.0.0.1")
-    found = source_load(source, layout)
+    found = source_requests(source, layout)
     assert found is not None
     said = next(one.count for one in found.requests if not one.assumption or str(pdu_size) in one.assumption)
     reads = []
@@ -109,7 +109,7 @@ def test_a_controller_gets_as_many_requests_as_check_says(layout: Layout, pdu_si
 
 
 def test_a_table_says_which_blocks_and_areas_it_reads() -> None:
-    found = load(
+    found = requests_of(
         "s7", table({"a": "DB7.DBW0", "b": "DB5.DBW0", "c": "%MW2", "slow": "%IW2"}), host="plc", every={"slow": 5}
     )
     assert found.reads == "4 registers in DB5, DB7, inputs, markers, 1 of them not in each cycle"
@@ -117,16 +117,16 @@ def test_a_table_says_which_blocks_and_areas_it_reads() -> None:
     layout = place_tags(
         "t", {"a": {"type": "INT", "address": "%MW2"}, "state": {"type": "STRING[12]", "address": "cpu.state"}}
     )
-    assert load("s7", layout.with_statuses(), host="plc").note.endswith(
+    assert requests_of("s7", layout.with_statuses(), host="plc").note.endswith(
         "values of the CPU (1 register) are requested in addition"
     )
 
 
 def test_a_modbus_device_gets_one_request_after_the_other() -> None:
-    found = load("modbus", table(SEQUENCE), host="device")
+    found = requests_of("modbus", table(SEQUENCE), host="device")
     assert found.reads == "20 holding registers, 1 input register of unit 1"
     assert found.requests == (Requests(21),)
-    found = load("modbus", table({"a": "holding 0", "b": "holding 10", "c": "unit 2 holding 0"}), host="device")
+    found = requests_of("modbus", table({"a": "holding 0", "b": "holding 10", "c": "unit 2 holding 0"}), host="device")
     assert found.reads == "12 holding registers of 2 units"
     assert found.requests == (Requests(2),)
 
@@ -134,12 +134,12 @@ def test_a_modbus_device_gets_one_request_after_the_other() -> None:
 def test_an_opc_ua_server_is_asked_only_if_it_is_polled() -> None:
     nodes = table({f"n{number}": f"ns=2;i={number}" for number in range(2500)})
     url = "opc.tcp://127.0.0.1:4840"
-    pushed = load("opcua", nodes, url=url, publishing_ms=50)
+    pushed = requests_of("opcua", nodes, url=url, publishing_ms=50)
     assert (pushed.reads, pushed.requests) == ("2500 nodes", ())
     assert pushed.note == "the server sends what has changed, at most every 50 ms"
-    assert load("opcua", nodes, url=url, mode="poll").requests == (Requests(3, 3),)
-    assert load("opcua", nodes, url=url, mode="poll", session_items=1500).requests == (Requests(3, 3),)
-    assert load("opcua", nodes, url=url, mode="poll", session_items=500).requests == (Requests(5, 5),)
+    assert requests_of("opcua", nodes, url=url, mode="poll").requests == (Requests(3, 3),)
+    assert requests_of("opcua", nodes, url=url, mode="poll", session_items=1500).requests == (Requests(3, 3),)
+    assert requests_of("opcua", nodes, url=url, mode="poll", session_items=500).requests == (Requests(5, 5),)
     assert Requests(5, 5).round_trips == 1
 
 
@@ -152,14 +152,14 @@ def test_an_opc_ua_server_is_asked_only_if_it_is_polled() -> None:
     ],
 )
 def test_messages_are_not_asked_for(connector: str, address: str, options: dict[str, Any], reads: str) -> None:
-    found = load(connector, table({"a": address}, "LREAL"), **options)
+    found = requests_of(connector, table({"a": address}, "LREAL"), **options)
     assert (found.reads, found.requests) == (reads, ())
 
 
 def test_sources_without_a_device_and_connectors_that_do_not_say() -> None:
     layout = block(8)
-    assert source_load(of("memory", layout), layout) is None
-    assert Connector.load(connector_of(of("s7", layout, host="plc"), layout)) is None
+    assert source_requests(of("memory", layout), layout) is None
+    assert Connector.cycle_requests(connector_of(of("s7", layout, host="plc"), layout)) is None
 
 
 def test_registers_that_commands_may_write() -> None:

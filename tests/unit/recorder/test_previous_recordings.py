@@ -9,8 +9,8 @@ import pytest
 import zstandard
 from mcap.opcode import Opcode
 
-from shmio.recorder import predecessor
-from shmio.recorder.predecessor import last_positions
+from shmio.recorder import previous_recordings
+from shmio.recorder.previous_recordings import last_positions
 from shmio.recording.format.encoding import BlockPosition
 from shmio.recording.format.records import MAGIC, Record
 from shmio.recording.reading.reader import Reader
@@ -61,7 +61,7 @@ def test_of_many_files_the_last_by_name_are_searched(
     publish(segment.writer("cell"), 5, first=20)
     work = recorder(segment, tmp_path)
     assert work.close()
-    monkeypatch.setattr(predecessor, "MAX_FILES", 1)
+    monkeypatch.setattr(previous_recordings, "MAX_FILES", 1)
     found, _ = look(segment, tmp_path)
     assert found["cell"].frame == 25
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from itertools import groupby
 from typing import Final
 
-from shmio.connectors.load import Requests
+from shmio.connectors.request_count import Requests
 
 PDU_SIZES: Final = (240, 480, 960)
 """The usual PDU sizes in bytes: S7-300 and S7-1200 mostly grant 240, S7-400 480, S7-1500 960."""

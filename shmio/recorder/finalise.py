@@ -1,0 +1,318 @@
+"""Closes a recording that a dead recorder has left open: repairs its end, and adds index and footer."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    AttachmentIndex,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    McapRecord,
+    MessageIndex,
+    MetadataIndex,
+    Statistics,
+    SummaryOffset,
+)
+
+from shmio.errors import RecordingError
+from shmio.recording.format.records import (
+    BROKEN,
+    CHUNK,
+    FOOTER,
+    HEAD,
+    INDEX,
+    LOOK_BYTES,
+    MAGIC,
+    MAX_CHUNK_BYTES,
+    U32,
+    U64,
+    Record,
+    stream,
+)
+from shmio.recording.reading.reader import Reader
+
+CHECKED: Final = 128
+"""Number of chunks at the end of a file to verify. After a power cut, they may have zeros."""
+ZEROS_BYTES: Final = 1 << 20
+
+_MESSAGE: Final = struct.Struct("<HIQ")  # channel, sequence, log time
+_ENTRY_BYTES: Final = 16
+
+
+def finalise(file: Path, beat: Callable[[], object] = lambda: None) -> bool:
+    """Close a recording that a recorder of this user has left unclosed.
+
+    Args:
+        file: The file.
+        beat: Called at intervals, so that the process can write its heartbeat.
+
+    Returns:
+        False if another process is still writing the file.
+
+    Raises:
+        RecordingError: The file is not a recording, or is so damaged that only ``shmio-dump
+            recover`` can read it.
+        OSError: The disk is full. The file is unchanged, except that its incomplete end is cut off.
+    """
+    with Reader(file, own=True, beat=beat) as reader:
+        fd = os.open(file, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
+        try:
+            try:
+                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return False
+            before = os.fstat(fd)
+            if before.st_size != reader.records.size:
+                return False
+            _write(fd, _RecordingEnd(reader))
+            os.utime(fd, ns=(before.st_atime_ns, before.st_mtime_ns))  # keep the times: nothing was recorded since
+        finally:
+            os.close(fd)
+    return True
+
+
+def _write(fd: int, ending: _RecordingEnd) -> None:
+    """Cut off the incomplete end of a file, and append the index and the footer."""
+    data = ending.data()
+    os.ftruncate(fd, ending.cut)
+    try:
+        done = 0
+        while done < len(data):
+            done += os.pwrite(fd, data[done:], ending.cut + done)
+        os.fsync(fd)
+    except OSError:
+        os.ftruncate(fd, ending.cut)
+        raise
+
+
+@dataclass(slots=True)
+class _Chunk:
+    """A chunk of a recording, with the number of its messages by channel."""
+
+    record: Record
+    index: ChunkIndex
+    counts: dict[int, int] = field(default_factory=dict)
+
+
+class _RecordingEnd:
+    """Builds the index and the footer that close a recording after its last complete record."""
+
+    def __init__(self, reader: Reader) -> None:
+        """Read the file.
+
+        Raises:
+            RecordingError: The file is not a recording, or is damaged before its end.
+        """
+        self._reader = reader
+        self._records = reader.records
+        self._schemas: dict[int, bytes] = {}
+        self._channels: dict[int, bytes] = {}
+        self._chunks: list[_Chunk] = []
+        self._attachments: list[AttachmentIndex] = []
+        self._metadata: list[MetadataIndex] = []
+        self.cut = len(MAGIC)
+        """Offset in the file at which the last complete record ends."""
+        self._anew = b""
+        """New message indexes for the last chunk, which replace those in the file."""
+        self._walk()
+        self._check()
+
+    def _walk(self) -> None:
+        over = False
+        last = BROKEN
+        for record in self._records.walk():
+            opcode = record.opcode
+            if over and opcode in (Opcode.CHUNK, Opcode.ATTACHMENT):
+                raise self._damaged(record.start, "there is data after its end")
+            if opcode == Opcode.DATA_END:
+                over = True
+            if over:
+                continue
+            if opcode == Opcode.CHUNK:
+                self._chunk(record)
+            elif opcode == Opcode.MESSAGE_INDEX and last in (Opcode.CHUNK, Opcode.MESSAGE_INDEX):
+                self._index(record)
+            elif opcode == Opcode.ATTACHMENT:
+                self._attachment(record)
+            elif opcode == Opcode.METADATA:
+                self._metadatum(record)
+            self.cut = record.at + record.size
+            last = opcode
+        self._reader.require_ours()
+        if not over:
+            self._tail()
+        if last in (Opcode.CHUNK, Opcode.MESSAGE_INDEX) and self._chunks:
+            self._index_anew()
+
+    def _tail(self) -> None:
+        """Check that only zeros or the start of one record follow the last complete record."""
+        size = self._records.size - self.cut
+        if size < HEAD.size:
+            return
+        opcode, length = HEAD.unpack(self._records.read(self.cut, HEAD.size))
+        cut_short = opcode != BROKEN and size - HEAD.size < length <= MAX_CHUNK_BYTES
+        if not cut_short and not self._zeros():
+            raise self._damaged(self.cut, "the file is damaged to its end")
+
+    def _zeros(self) -> bool:
+        end = self._records.size
+        return not any(
+            any(self._records.read(at, min(ZEROS_BYTES, end - at))) for at in range(self.cut, end, ZEROS_BYTES)
+        )
+
+    def _damaged(self, at: int, why: str) -> RecordingError:
+        return RecordingError(f"{self._reader.file}: {why}, at byte {at}: shmio-dump recover saves what is intact")
+
+    # ---- reading the records of the file -----------------------------------------------------------------------------
+
+    def _chunk(self, record: Record) -> None:
+        head = self._records.read(record.at, min(record.size, LOOK_BYTES))
+        begin_ns, end_ns, size, _ = CHUNK.unpack_from(head)
+        (name_size,) = U32.unpack_from(head, CHUNK.size)
+        at = CHUNK.size + U32.size
+        name = head[at : at + name_size].decode("ascii", "replace")
+        (packed,) = U64.unpack_from(head, at + name_size)
+        index = ChunkIndex(
+            chunk_length=record.size + HEAD.size,
+            chunk_start_offset=record.start,
+            compression=name,
+            compressed_size=packed,
+            message_end_time=end_ns,
+            message_index_length=0,
+            message_index_offsets={},
+            message_start_time=begin_ns,
+            uncompressed_size=size,
+        )
+        self._chunks.append(_Chunk(record, index))
+
+    def _index(self, record: Record) -> None:
+        """Add a message index to the last chunk.
+
+        If its channel is new, read the channel's description.
+        """
+        chunk = self._chunks[-1]
+        number, size = INDEX.unpack(self._records.read(record.at, INDEX.size))
+        if number not in self._channels:
+            self._describe(chunk.record)
+        chunk.index.message_index_offsets[number] = record.start
+        chunk.index.message_index_length += record.size + HEAD.size
+        chunk.counts[number] = size // _ENTRY_BYTES
+
+    def _describe(self, chunk: Record) -> None:
+        for opcode, content in self._records.chunk(chunk):
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                (number,) = struct.unpack_from("<H", content)
+                known = self._schemas if opcode == Opcode.SCHEMA else self._channels
+                known[number] = HEAD.pack(opcode, len(content)) + bytes(content)
+
+    def _index_anew(self) -> None:
+        """Create the message indexes of the last chunk again, because some may be missing."""
+        chunk = self._chunks[-1]
+        self.cut = chunk.record.at + chunk.record.size
+        found: dict[int, MessageIndex] = {}
+        at = 0
+        with suppress(RecordingError, struct.error):  # _check() reports the damage
+            self._describe(chunk.record)
+            for opcode, content in self._records.chunk(chunk.record):
+                if opcode == Opcode.MESSAGE:
+                    number, _, log_ns = _MESSAGE.unpack_from(content)
+                    found.setdefault(number, MessageIndex(number, [])).records.append((log_ns, at))
+                at += HEAD.size + len(content)
+        chunk.index.message_index_offsets = {}
+        builder = RecordBuilder()
+        for number, entries in found.items():
+            chunk.index.message_index_offsets[number] = self.cut + builder.count
+            entries.write(builder)
+        chunk.index.message_index_length = builder.count
+        chunk.counts = {number: len(entries.records) for number, entries in found.items()}
+        self._anew = builder.end()
+
+    def _attachment(self, record: Record) -> None:
+        self._reader.note(record)
+        data = stream(self._records.read(record.at, min(record.size, LOOK_BYTES)))
+        log_ns, changed_ns = data.read8(), data.read8()
+        name, media_type = data.read_prefixed_string(), data.read_prefixed_string()
+        length = record.size + HEAD.size
+        index = AttachmentIndex(record.start, length, log_ns, changed_ns, data.read8(), name, media_type)
+        self._attachments.append(index)
+
+    def _metadatum(self, record: Record) -> None:
+        self._reader.note(record)
+        name = stream(self._records.read(record.at, record.size)).read_prefixed_string()
+        self._metadata.append(MetadataIndex(record.start, record.size + HEAD.size, name))
+
+    def _check(self) -> None:
+        """Leave damaged chunks near the end of the file out of the index."""
+        whole = self._chunks[:-CHECKED]
+        for chunk in self._chunks[-CHECKED:]:
+            with suppress(RecordingError):
+                self._records.check_crc(chunk.record)
+                whole.append(chunk)
+        self._chunks = whole
+
+    # ---- the index and footer to write -------------------------------------------------------------------------------
+
+    def data(self) -> bytes:
+        """Return the bytes to write at offset :attr:`cut`."""
+        builder = RecordBuilder()
+        builder.write(self._anew)
+        DataEnd(zlib.crc32(self._anew, self._records.crc(0, self.cut))).write(builder)
+        data = builder.end()
+        start = self.cut + len(data)
+        groups: list[tuple[Opcode, int]] = []
+        for opcode, content in self._groups():
+            groups.append((opcode, len(content)))
+            builder.write(content)
+        at, offsets_at = start, start + builder.count
+        for opcode, size in groups:
+            SummaryOffset(opcode, at, size).write(builder)
+            at += size
+        summary = builder.end()
+        covered = summary + HEAD.pack(Opcode.FOOTER, FOOTER.size) + FOOTER.pack(start, offsets_at, 0)[: -U32.size]
+        Footer(start, offsets_at, zlib.crc32(covered)).write(builder)
+        return b"".join((data, summary, builder.end(), MAGIC))
+
+    def _groups(self) -> Iterator[tuple[Opcode, bytes]]:
+        """Yield the records of the summary, grouped by kind."""
+        yield Opcode.SCHEMA, b"".join(self._schemas.values())
+        yield Opcode.CHANNEL, b"".join(self._channels.values())
+        yield Opcode.STATISTICS, _written(self._statistics())
+        yield Opcode.CHUNK_INDEX, _written(*(chunk.index for chunk in self._chunks))
+        yield Opcode.ATTACHMENT_INDEX, _written(*self._attachments)
+        yield Opcode.METADATA_INDEX, _written(*self._metadata)
+
+    def _statistics(self) -> Statistics:
+        counts: dict[int, int] = {}
+        for chunk in self._chunks:
+            for number, count in chunk.counts.items():
+                counts[number] = counts.get(number, 0) + count
+        return Statistics(
+            attachment_count=len(self._attachments),
+            channel_count=len(self._channels),
+            channel_message_counts=counts,
+            chunk_count=len(self._chunks),
+            message_count=sum(counts.values()),
+            message_end_time=max((chunk.index.message_end_time for chunk in self._chunks), default=0),
+            message_start_time=min((chunk.index.message_start_time for chunk in self._chunks), default=0),
+            metadata_count=len(self._metadata),
+            schema_count=len(self._schemas),
+        )
+
+
+def _written(*records: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    return bytes(builder.end())
