@@ -18,7 +18,7 @@ from shmio import logs
 from shmio.cli.instance.detach import Configured, Failed, Started, StartMessage, headline, replay_keys
 from shmio.cli.run import say
 from shmio.cli.target import config_file
-from shmio.connectors.load import counted
+from shmio.connectors.request_count import counted
 from shmio.errors import ShmioError
 from shmio.logs import printable
 from shmio.plan.prepare import Prepared, peer, prepare

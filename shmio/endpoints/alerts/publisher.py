@@ -14,7 +14,7 @@ from shmio.endpoints.alerts.notice import Notice
 from shmio.endpoints.alerts.sender import MAX_WAITING
 from shmio.endpoints.mqtt.broker.directory import own_socket
 from shmio.endpoints.mqtt.connection.connection import BrokerConnection
-from shmio.endpoints.mqtt.connection.target import ReconnectPolicy, targets
+from shmio.endpoints.mqtt.connection.reconnect import ReconnectPolicy, targets
 from shmio.endpoints.mqtt.topics import Message
 from shmio.segment import Segment
 
