@@ -57,7 +57,7 @@ def bridge(made: Segment, address: Address, qos: int) -> Iterator[Bridge]:
     )
     try:
         while not running.connection.up or running.outbox.busy or running.connection.in_flight:
-            running.turn()
+            running.run_once()
         yield running
     finally:
         running.close()
@@ -89,11 +89,11 @@ def ours(running: Bridge, moving: Moving, duration_s: float) -> Callable[[], flo
         while time.perf_counter() - begun_s < duration_s:
             for _ in range(MAX_FRAMES_PER_TURN):  # as a bridge that is behind finds them: it has to wait for none
                 moving.publish()
-            running.turn()
+            running.run_once()
             while running.outbox.busy:
-                running.turn()
+                running.run_once()
         while running.connection.in_flight:
-            running.turn()
+            running.run_once()
         return (running.outbox.sent - before) / (time.perf_counter() - begun_s)
 
     return sample
@@ -151,7 +151,7 @@ def latencies(address: Address, qos: int, count: int) -> list[float]:
             publishing = threading.Thread(target=publish)
             publishing.start()
             while subscriber.poll() is None:
-                running.turn()
+                running.run_once()
             stop.set()
             publishing.join()
             return [float(line) for line in subscriber.stdout]
@@ -171,7 +171,7 @@ def share(address: Address, qos: int, duration_s: float) -> float:
             publishing.start()
             begun_s, used_s = time.perf_counter(), time.thread_time()
             while time.perf_counter() - begun_s < duration_s:
-                running.turn()
+                running.run_once()
             percent = 100 * (time.thread_time() - used_s) / (time.perf_counter() - begun_s)
             stop.set()
             publishing.join()

@@ -56,7 +56,7 @@ def cost(made: Segment, address: Address, count: int, way: str, duration_s: floa
     running = Bridge(made, made.processes.find("mqtt"), settings)
     links = 2 if "sparkplug" in WAYS[way] else 1
     while running.counters[6] < links or running.outbox.busy or running.connection.in_flight:
-        running.turn()
+        running.run_once()
     frames = 0
 
     def publish() -> None:
@@ -69,7 +69,7 @@ def cost(made: Segment, address: Address, count: int, way: str, duration_s: floa
     publishing.start()
     sent, begun_s, used_s = running.counters[0], time.perf_counter(), time.thread_time()
     while (passed_s := time.perf_counter() - begun_s) < duration_s:
-        running.turn()
+        running.run_once()
     sent, used_s = running.counters[0] - sent, time.thread_time() - used_s
     stop.set()
     publishing.join()

@@ -52,7 +52,7 @@ def record(folder: Path, period_ns: int, frames: int) -> Path:
                     struct.pack_into(">f", image, place, number * (at + 1) * 0.001)
                 writer.publish(image, cycle=number, at=Stamp(started_ns + clock_ns, clock_ns))
                 if number % 64 == 0:
-                    recorder.turn()
+                    recorder.run_once()
             recorder.close(PATIENCE_S)
         finally:
             segment.unlink()

@@ -346,7 +346,7 @@ class CommandProcessor:
         refuse_in = self._cannot or ("" if armed else _UNARMED)
         blocks = blocks or (lambda: {output.writer.block.source: output.writer.block})
         self._injections = InjectionProcessor(output, self._writable, refuse_in, owner_of, blocks)
-        self._turn = threading.Lock()
+        self._lock = threading.Lock()
         self._verdict = threading.Lock()  # held from the publication of acceptances until the items are in _items
         self._closed = "the source is not connected yet"
         self._items: list[Item] = []
@@ -360,7 +360,7 @@ class CommandProcessor:
 
         Call it once the device is connected and its data match the layout.
         """
-        with self._turn:
+        with self._lock:
             self._closed = ""
 
     def close(self, reason: str) -> None:
@@ -371,7 +371,7 @@ class CommandProcessor:
         if (lost := self._unconfirmed) is not None:
             self._unconfirmed = None
             self._end(lost.items, lost.ends([Lost.UNKNOWN] * len(lost.writes), reason))
-        with self._turn:
+        with self._lock:
             self._closed = f"the source is not connected: {reason}"
             items, self._items = self._items, []
         self._end(items, [(EventKind.EXPIRED, reason)] * len(items))
@@ -479,7 +479,7 @@ class CommandProcessor:
 
     def _take(self, which: Callable[[Item], bool]) -> list[Item]:
         """Remove and return the waiting items that ``which`` selects."""
-        with self._turn:
+        with self._lock:
             kinds = [(item, which(item)) for item in self._items]
             self._items = [item for item, wanted in kinds if not wanted]
         return [item for item, wanted in kinds if wanted]
@@ -491,7 +491,7 @@ class CommandProcessor:
 
     def _patience_ns(self) -> int:
         """Return how long :meth:`run` may wait for a command, in ns; negative: without limit."""
-        with self._turn:
+        with self._lock:
             deadlines = [item.command.deadline_ns for item in self._items]
         waits = [max(0, min(deadlines) - self._now_ns()) + 1_000_000] if deadlines else []
         waits += [wait_ns for wait_ns in (self._injections.patience_ns, self._output.patience_ns) if wait_ns >= 0]
@@ -564,10 +564,10 @@ class CommandProcessor:
         self._end(taken, [(EventKind.TAKEN, "")] * len(taken))  # _divert has published every DIVERTED event
         items = [item for item, _ in left]
         with self._verdict:
-            for item, source in left:  # not under _turn, which the loop's thread needs
+            for item, source in left:  # not under _lock, which the loop's thread needs
                 for part in pieces(EventKind.ACCEPTED, command, item.place, item.parts(), source):
                     self._writer.event(part)
-            with self._turn:
+            with self._lock:
                 closed = self._closed
                 if not closed:
                     self._items += items
@@ -584,7 +584,7 @@ class CommandProcessor:
         return bool(reason)
 
     def _has_room(self, command: Command) -> bool:
-        with self._turn:
+        with self._lock:
             items = list(self._items)
         if not items:
             return True
@@ -638,7 +638,7 @@ def _divert(
         if not output.injections.layers:
             left.append((Item(command, place), None))
             continue
-        with output.turn:
+        with output.lock:
             met, bits, data, by = output.injections.divert(write, above)
         for layer, parts in met:
             for record in pieces(EventKind.DIVERTED, command, place, parts, layer):

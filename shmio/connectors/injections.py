@@ -195,7 +195,7 @@ class DeclaredInjections:
         """
         if layer.activation.state is State.LIFTED:
             return f"the injection {layer.name} was lifted already"
-        with self._output.turn:
+        with self._output.lock:
             layer.activation.state = State.LIFTED
             self._publisher.publish()
             records = [*lost(layer, "the injection was lifted"), *self._publisher.computed(self._output.base)]
@@ -222,7 +222,7 @@ class DeclaredInjections:
 
     def settle(self) -> None:
         """Update the list of declared layers after layers were added or lifted."""
-        with self._output.turn:
+        with self._output.lock:
             self._settle()
 
     def _settle(self) -> None:
@@ -242,7 +242,7 @@ class DeclaredInjections:
             log.warning("injection %s: %s", declaration.name, reason)
 
     def _add(self, layer: DeclaredLayer, command: Command | None) -> str:
-        with self._output.turn:
+        with self._output.lock:
             if reason := self._publisher.add(layer):
                 return reason
             if self._output.advance is None:  # evaluate the injection from the next cycle on
@@ -285,7 +285,7 @@ class DeclaredInjections:
             except ConfigError as error:
                 log.warning("injection %s cannot start until the configuration is changed: %s", layer.name, error)
                 condition = NEVER
-            with self._output.turn:
+            with self._output.lock:
                 layer.program = replace(layer.program, condition=condition)
                 layer.memory.seen.clear()
 
@@ -294,7 +294,7 @@ class DeclaredInjections:
     def _advance(self, image: Image) -> list[Record]:
         """Evaluate all declared injections for the next image, and return events about the changes.
 
-        The caller holds the output's ``turn``. Only the first image of a cycle is evaluated: how
+        The caller holds the output's ``lock``. Only the first image of a cycle is evaluated: how
         many images follow it depends on timing, which must not influence the result.
         """
         looked = self._publisher.injections.now.cycle
@@ -326,13 +326,13 @@ class DeclaredInjections:
         if not any(layer.held for layer in self._layers):
             return []
         now = CycleImage(cycle, self._time_ns(cycle), b"")
-        with self._output.turn:
+        with self._output.lock:
             return [(layer, write) for layer in self._layers for write in layer.due(now)]
 
     def forget(self, reason: str) -> None:
         """Discard all delayed writes, because the connection to the device was lost."""
         if any(layer.held for layer in self._layers):
-            with self._output.turn:
+            with self._output.lock:
                 records = [record for layer in self._layers for record in lost(layer, reason)]
             for record in records:
                 self._output.writer.event(record)
@@ -467,7 +467,7 @@ class InjectionProcessor:
             cover = covering(self._writer.block.layout.size, command.writes)
         except ValueError as error:
             return str(error)
-        with self._output.turn:
+        with self._output.lock:
             layer = Layer(
                 command.id, command.direction, command.priority, command.keep, command.name, owner, cover, cover
             )
@@ -482,7 +482,7 @@ class InjectionProcessor:
     def _shadow(self, layer: Layer, command: Command) -> str:
         if isinstance(layer, DeclaredLayer):
             return f"the injection {layer.name} computes its values: clients cannot set them"
-        with self._output.turn:
+        with self._output.lock:
             if reason := shadow(layer, command.writes):
                 return reason
             diverted = [

@@ -58,7 +58,7 @@ class Image(NamedTuple):
 class Output:
     """Publishes images, and publishes the last image again when injections change.
 
-    Several threads may call it; the lock ``turn`` serialises them. If injections change more often
+    Several threads may call it; ``lock`` serialises them. If injections change more often
     than ``EXTRA_FRAMES`` times in a period, several changes share a frame. Events about a change
     are published after the frame that shows the change.
     """
@@ -68,9 +68,9 @@ class Output:
         self.injections = LayerStack(writer.block.layout.size)
         """The layers of this source.
 
-        Hold ``turn`` while you change them, then call :meth:`show`.
+        Hold ``lock`` while you change them, then call :meth:`show`.
         """
-        self.turn = threading.Lock()
+        self.lock = threading.Lock()
         self.advance: Callable[[Image], Iterable[Record]] | None = None
         """Called with each new image before the image is published.
 
@@ -135,7 +135,7 @@ class Output:
 
     def publish(self, image: Image) -> None:
         """Publish the next image."""
-        with self.turn:
+        with self.lock:
             self._last = image
             if self.advance is not None:
                 self._owed += self.advance(image)
@@ -143,11 +143,11 @@ class Output:
 
     def resume(self, image: Image) -> None:
         """Continue from an image that the source's previous process has published."""
-        with self.turn:
+        with self.lock:
             self._last = image
 
     def show(self, records: Iterable[Record]) -> None:
-        """Publish the present state of the injections, then ``records``. The caller holds ``turn``.
+        """Publish the present state of the injections, then ``records``. The caller holds ``lock``.
 
         If the last frame was published too recently, the changes wait for :meth:`flush`.
         """
@@ -158,7 +158,7 @@ class Output:
 
     def flush(self) -> None:
         """Publish the changes that wait, if it is time."""
-        with self.turn:
+        with self.lock:
             if self._changed and self._now_ns() >= self._next_ns:
                 self._publish()
 
@@ -213,7 +213,7 @@ class LayerPublisher:
     def add(self, layer: Layer) -> str:
         """Add a layer; return the reason why it was refused, or "".
 
-        The caller holds the output's ``turn``.
+        The caller holds the output's ``lock``.
         """
         if layer.direction is Direction.IN:
             if self._refuse_in:
@@ -237,13 +237,13 @@ class LayerPublisher:
 
     def lift(self, which: Callable[[Layer], bool], reason: str, command: Command | None = None) -> None:
         """Remove the layers that ``which`` selects, and publish the reason."""
-        with self.output.turn:
+        with self.output.lock:
             self.output.show(self.removed(which, reason, command))
 
     def removed(self, which: Callable[[Layer], bool], reason: str, command: Command | None = None) -> list[Record]:
         """Remove the layers that ``which`` selects, and return the events about this.
 
-        The caller holds the output's ``turn``.
+        The caller holds the output's ``lock``.
         """
         gone = [layer for layer in self.injections.layers if which(layer)]
         above = {other.id for layer in gone for other in self.injections.outer(layer)}
@@ -299,7 +299,7 @@ class LayerPublisher:
         return in_parts(end, msgspec.json.encode(how))
 
     def publish(self, growth: int = 0) -> None:
-        """Write the list of injections into the segment. The caller holds the output's ``turn``.
+        """Write the list of injections into the segment. The caller holds the output's ``lock``.
 
         Raises:
             ValueError: The list is too long, or would be too long if it grew by ``growth`` bytes.

@@ -65,7 +65,7 @@ class Attachment:
 
         The attachment must be ``writable`` to change them.
         """
-        self._turn = threading.Lock()
+        self._lock = threading.Lock()
         self._guest: int | None = None
         self._source_writers: dict[str, SourceWriter] = {}
         self._open: weakref.WeakSet[Following[Any]] = weakref.WeakSet()
@@ -558,7 +558,7 @@ class Attachment:
         """
         if not self._segment.shared.writable:
             raise CommandError("this attachment only reads: attach with writable=True")
-        with self._turn:
+        with self._lock:
             if self._guest is None:
                 self._guest = _take_guest_slot(self._segment)
             known = self._source_writers.get(block.source)
@@ -571,7 +571,7 @@ class Attachment:
 
         If another thread has just closed this attachment, end the iterator now.
         """
-        with self._turn:
+        with self._lock:
             detached = self._detached
             self._open.add(following)
         if detached:
@@ -583,7 +583,7 @@ class Attachment:
         Raises:
             TimeError: A step has failed while time was played.
         """
-        with self._turn:
+        with self._lock:
             self._detached = True
             following = list(self._open)
         for one in following:

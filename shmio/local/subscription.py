@@ -41,7 +41,7 @@ class Following(Generic[Item]):
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
-        self._turn = threading.Lock()  # locked while the mapped memory is read: close waits for it
+        self._lock = threading.Lock()  # locked while the mapped memory is read: close waits for it
         self._relays: dict[int, Relay] = {}  # by section of the block
         self._stop = weakref.finalize(self, _stop, self._relays)  # also if the program does not close it
         self._closed = False
@@ -54,7 +54,7 @@ class Following(Generic[Item]):
 
     def __next__(self) -> Item:
         while True:
-            with self._turn:
+            with self._lock:
                 if self._closed:
                     raise StopIteration
                 for relay in self._relays.values():
@@ -90,7 +90,7 @@ class Following(Generic[Item]):
     def end(self) -> None:
         """End the iteration, and wait until nothing reads the mapped memory."""
         self._closed = True
-        with self._turn:
+        with self._lock:
             self._stop()
 
     def close(self) -> None:

@@ -101,7 +101,7 @@ class Coordinator:
         self._soft_ns = round(soft_s * 1e9)
         self._hard_ns = round(hard_s * 1e9)
         self._deliver = deliver
-        self._turn = threading.RLock()
+        self._lock = threading.RLock()
         self._lock_byte = time_lock(segment.header)
         self._owns = False
 
@@ -119,7 +119,7 @@ class Coordinator:
         Raises:
             TimeError: Another living process owns time, and is playing or does not give it up.
         """
-        with self._turn:
+        with self._lock:
             if self._owns:
                 return
             self._check_writable()
@@ -149,7 +149,7 @@ class Coordinator:
         Raises:
             TimeError: Another living process owns time, or time was virtual from the start.
         """
-        with self._turn:
+        with self._lock:
             self.check_release()
             if not self._owns:
                 self._take_lock(time.monotonic_ns() + round(patience_s * 1e9))
@@ -183,7 +183,7 @@ class Coordinator:
             TimeError: Another process owns time.
         """
         check_step(dt_ns)
-        with self._turn:
+        with self._lock:
             self.take_over()
             self._write(self.read()._replace(step_size_ns=dt_ns))
 
@@ -196,7 +196,7 @@ class Coordinator:
         """
         if not 0 < rate <= MAX_RATE:
             raise ValueRangeError(f"the rate must be above 0 and at most {MAX_RATE:g}, not {rate:g}")
-        with self._turn:
+        with self._lock:
             self.take_over()
             self._write(self.read()._replace(playing=playing, rate=rate))
 
@@ -213,7 +213,7 @@ class Coordinator:
                 process did not answer within the hard time-out.
             ValueRangeError: The length is not within 1 us and 1 h.
         """
-        with self._turn, closing(self.stepping(dt_ns)) as stepping:
+        with self._lock, closing(self.stepping(dt_ns)) as stepping:
             while True:
                 try:
                     block, seen, rest_ns = next(stepping)
@@ -257,7 +257,7 @@ class Coordinator:
 
     def close(self) -> None:
         """Give up the ownership of time. Time stays stopped until another program takes it over."""
-        with self._turn:
+        with self._lock:
             if not self._owns or self._segment.closed:
                 return
             self._write(self.read()._replace(owner=0, playing=False))

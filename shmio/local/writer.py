@@ -60,7 +60,7 @@ class CommandSender:
     def __init__(self, block: Block, writer: int) -> None:
         self.block = block
         self.writer = writer
-        self._turn = threading.Lock()
+        self._lock = threading.Lock()
         self._pid = os.getpid()  # two processes on one queue would overwrite each other's commands
         # Random: the previous owner of the queue may have commands whose outcomes are still to come.
         self._next = secrets.randbits(62) + 1
@@ -91,7 +91,7 @@ class CommandSender:
         source = self.block.source
         if (len(writes) > 0) == (kind in EMPTY) or len(writes) > MAX_WRITES:
             raise CommandError(f"{source}: a command must have 1 to {MAX_WRITES} items, but this one has {len(writes)}")
-        with self._turn:
+        with self._lock:
             number, self._next = self._next, self._next + 1
             incarnation = self.block.incarnation
             command = Command(self.writer, number, incarnation, deadline_ns, tuple(writes), kind, injection, **options)

@@ -79,7 +79,7 @@ def _record(worker: Worker, series: RotatingRecorder | TriggeredRecorder) -> Non
     while not worker.stopping.is_set():
         if not more:
             seen = bell.wait(seen, round(series.tap.pause_s * 1e9))
-        more = series.turn()
+        more = series.run_once()
         if (done := series.tap.done) != clock.delivered(slot):
             clock.deliver(slot, done)
         if time.monotonic() - told_s < BEAT_S:

@@ -38,8 +38,8 @@ def create(directory: Path, instance: str, now: datetime | None = None) -> tuple
     stem = f"{instance}-{(now or datetime.now(UTC)).strftime('%Y%m%dT%H%M%SZ')}"
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        for turn in range(1, _NAMES):
-            path = directory / f"{stem}{f'_{turn}' if turn > 1 else ''}{SUFFIX}"
+        for number in range(1, _NAMES):
+            path = directory / f"{stem}{f'_{number}' if number > 1 else ''}{SUFFIX}"
             with suppress(FileExistsError):
                 return path, os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     except OSError as error:

@@ -194,7 +194,7 @@ class Counters:
 
 
 class Recorder:
-    """Records to one file. Call :meth:`turn` repeatedly, then :meth:`close`, from one thread."""
+    """Records to one file. Call :meth:`run_once` repeatedly, then :meth:`close`, from one thread."""
 
     def __init__(
         self,
@@ -264,7 +264,7 @@ class Recorder:
             "recording_ns": str(self.tap.log_time(time.monotonic_ns())),
         }
 
-    def turn(self) -> bool:
+    def run_once(self) -> bool:
         """Record new entries, and return whether there are more.
 
         Raises:
@@ -353,7 +353,7 @@ class Recorder:
 
         Return False if it is not safely on the disk.
         """
-        while self.turn():
+        while self.run_once():
             pass
         self.put(self.tap.rest())
         self.end()
@@ -513,13 +513,13 @@ class RotatingRecorder:
             attachments=self._attachments,
         )  # fmt: skip
 
-    def turn(self) -> bool:
+    def run_once(self) -> bool:
         """Record new entries, and return whether there are more.
 
         Raises:
             RecordingError: The file was removed.
         """
-        return self.recorder.turn()
+        return self.recorder.run_once()
 
     def put(self, entries: Iterable[BlockEntry | InstanceEntry]) -> None:
         """Record entries.

@@ -183,7 +183,7 @@ class TriggeredRecorder:
         if going:
             self._begin(tap.now())
 
-    def turn(self) -> bool:
+    def run_once(self) -> bool:
         """Read new entries, and record them if the trigger has fired.
 
         Return whether there are more.
@@ -293,7 +293,7 @@ class TriggeredRecorder:
 
         Return a message for each file that is incomplete.
         """
-        while self.turn():
+        while self.run_once():
             pass
         self._end(self.tap.rest())
         until_s = time.monotonic() + patience_s

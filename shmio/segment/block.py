@@ -435,7 +435,7 @@ class BlockWriter:
         """
         self.block = block
         self._clock_ns = clock_ns
-        self._turn = threading.Lock()  # so that frames and events are in one order
+        self._lock = threading.Lock()  # so that frames and events are in one order
         self.cycle = 0
         """The present cycle. Each event gets this number."""
         self.at_ns: int | None = None
@@ -483,7 +483,7 @@ class BlockWriter:
         Returns:
             The frame's number.
         """
-        with self._turn:
+        with self._lock:
             now_ns, clock_ns, _ = at or self._present()
             self._quality = quality
             return self.block.ring.publish(
@@ -517,7 +517,7 @@ class BlockWriter:
         Returns:
             The event's number.
         """
-        with self._turn:
+        with self._lock:
             now_ns, clock_ns, utc_ns = at or self._present()
             number = self.block.events.ring.publish(
                 record.pack(),

@@ -214,7 +214,7 @@ class Playhead:
         self._ask_at = offset + _ASK_AT
         self._lock_byte = lock_byte
         self._clock = clock
-        self._turn = threading.Lock()
+        self._lock = threading.Lock()
 
     # ---- for readers ---------------------------------------------------------------------------------------------
 
@@ -299,7 +299,7 @@ class Playhead:
         Raises:
             CommandError: Another program did not release the lock in time.
         """
-        with self._turn:
+        with self._lock:
             until_s = time.monotonic() + _LOCK_S
             while not self._shared.try_lock(self._lock_byte):
                 if time.monotonic() > until_s:

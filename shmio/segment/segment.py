@@ -320,7 +320,7 @@ class Segment:
         self.memory = memoryview(shared.map())
         self.header = Header.read(self.memory, shared.name)
         self.processes = ProcessTable(shared, self.memory, self.header)
-        self._turn = threading.RLock()
+        self._lock = threading.RLock()
         """Lock for changes of ``blocks``, because several threads may call :meth:`refresh`."""
         self.clock = _read_clock(shared, self.header, self._sections())
         self._known: dict[int, Block] = {}  # by index of the layout section
@@ -454,7 +454,7 @@ class Segment:
         Raises:
             FormatError: A block is inconsistent.
         """
-        with self._turn:
+        with self._lock:
             entries = enumerate(self._entries)
             layouts = [index for index, entry in entries if entry.kind == SectionKind.LAYOUT and entry.retired]
             return [self._found(index) for index in layouts]
@@ -492,7 +492,7 @@ class Segment:
         Raises:
             FormatError: A block is inconsistent.
         """
-        with self._turn:
+        with self._lock:
             if not self.outdated:
                 return False
             self.blocks = self._find_blocks()

@@ -296,8 +296,8 @@ def to_start(processes: Ranked) -> list[int]:
     ranks = {rank for rank, life in processes if not life.starts}
     if not ranks or any(life.starts == 1 and life.state is State.STARTING for _, life in processes):
         return []
-    turn = min(ranks)
-    return [index for index, (rank, life) in enumerate(processes) if rank == turn and not life.starts]
+    next_rank = min(ranks)
+    return [index for index, (rank, life) in enumerate(processes) if rank == next_rank and not life.starts]
 
 
 def to_stop(processes: Ranked) -> list[int]:
@@ -306,9 +306,9 @@ def to_stop(processes: Ranked) -> list[int]:
     Stuck processes do not delay the stop of others.
     """
     there = [rank for rank, life in processes if not (life.state is State.STOPPED or _past_stopping(life))]
-    turn = max(there, default=None)
+    next_rank = max(there, default=None)
     settled = (State.STOPPED, State.STOPPING)
-    return [index for index, (rank, life) in enumerate(processes) if rank == turn and life.state not in settled]
+    return [index for index, (rank, life) in enumerate(processes) if rank == next_rank and life.state not in settled]
 
 
 def _past_stopping(life: Life) -> bool:

@@ -63,7 +63,7 @@ class InstanceChange:
         if not self._stopped:
             self._stopped = self._stop()
             if self._stopped:
-                self._turn()
+                self._apply()
         if self._stopped:
             self._fleet.start_due()
         return self._stopped and all(self._has_come(job.name) for job in self._coming)
@@ -93,7 +93,7 @@ class InstanceChange:
             self._fleet.apply(leaving[index], Event.STOP)
         return policy.all_gone([(managed.rank, managed.life) for managed in leaving])
 
-    def _turn(self) -> None:
+    def _apply(self) -> None:
         """Change blocks and jobs, after the old processes have ended."""
         if self.changes.add or self.changes.retire:
             self._segment.change(self.changes.add, self.changes.retire)

@@ -374,7 +374,7 @@ class FaultProxy:
             self._cleanup.callback(self._close_all)
             while self._running:
                 self._links = [link for link in self._links if link.open]
-                self._turn()
+                self._run_once()
 
     def _close_all(self) -> None:
         for link in self._links:
@@ -383,7 +383,7 @@ class FaultProxy:
             if plain is not None:
                 plain.close()
 
-    def _turn(self) -> None:
+    def _run_once(self) -> None:
         """Wait for the next event, and handle it."""
         pipes = [] if self._frozen else [pipe for link in self._links for pipe in link.pipes]
         readers = {pipe.source: pipe for pipe in pipes if pipe.hungry}

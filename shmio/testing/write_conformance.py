@@ -112,8 +112,8 @@ class WriteConformance(ConnectorConformance):
 
     def test_a_value_written_is_in_the_next_frame(self, run: Run, writer: Writer, rig: WriteRig) -> None:
         """Every read that is requested after the confirmation returns the new value."""
-        for turn in range(1, 20):
-            value = bytes([turn]) * SPARE
+        for number in range(1, 20):
+            value = bytes([number]) * SPARE
             frame = writer.written(Write(rig.spare, 0, value))
             assert frame.raw[rig.spare : rig.spare + SPARE] == value
 
@@ -126,9 +126,9 @@ class WriteConformance(ConnectorConformance):
 
     def test_a_bit_is_written_without_its_neighbours(self, run: Run, writer: Writer, rig: WriteRig) -> None:
         """While the device counts in the other bits of the byte, writing one bit loses no count."""
-        for turn in range(50):
-            frame = writer.written(Write(rig.flags, 1, bytes([turn & 1])))
-            assert frame.raw[rig.flags] & 1 == turn & 1
+        for number in range(50):
+            frame = writer.written(Write(rig.flags, 1, bytes([number & 1])))
+            assert frame.raw[rig.flags] & 1 == number & 1
 
     def test_a_refused_item_among_good_ones(self, rig: WriteRig) -> None:
         """The device refuses one item, with a reason.
@@ -166,9 +166,9 @@ class WriteConformance(ConnectorConformance):
     @pytest.mark.parametrize("count", [1, 30])
     def test_lost_in_mid_write(self, run: Run, writer: Writer, rig: WriteRig, count: int) -> None:
         """If the connection breaks during a write, the reported outcome is true."""
-        for turn in range(1, 5):
-            rig.proxy.cut_after(count * turn)
-            value = bytes([turn]) * SPARE
+        for number in range(1, 5):
+            rig.proxy.cut_after(count * number)
+            value = bytes([number]) * SPARE
             end = writer.once_open(Write(rig.spare, 0, value))
             assert end.kind in {EventKind.WRITTEN, EventKind.EXPIRED, EventKind.UNKNOWN}
             rig.proxy.pass_all()

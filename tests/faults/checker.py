@@ -66,7 +66,7 @@ class Checker:
         self.sources = [open_source(fields) for fields in self.description.sources]
         self.stopping = threading.Event()
         self._counts: dict[str, Counts] = {}
-        self._turn = threading.Lock()
+        self._lock = threading.Lock()
         self._threads: list[threading.Thread] = []
         self._pulse = Pulse()
 
@@ -121,5 +121,5 @@ class Checker:
         self.stopping.set()
 
     def _tell(self, message: object) -> None:
-        with self._turn:
+        with self._lock:
             print(json.dumps(message), flush=True)

@@ -146,7 +146,7 @@ class Rig(Instance):
         compile_c(HERE / "clock.c", folder / "clock.so", "-shared", "-fPIC", "-ldl")
         compile_c(ROOT / "examples/reader.c", folder / "reader")
         self.devices: dict[str, Device] = {}
-        self._turn = threading.Lock()
+        self._lock = threading.Lock()
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -197,7 +197,7 @@ class Rig(Instance):
 
     def reload(self, change: Callable[[Configuration], None]) -> None:
         """Change the configuration, and reload the instance."""
-        with self._turn:
+        with self._lock:
             change(self.configuration)
             self.ask("reload")
 

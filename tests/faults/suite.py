@@ -72,13 +72,13 @@ class Run:
         self._folder = folder
         self._instance = instance
         self._say = say
-        self._turn = threading.Lock()
+        self._lock = threading.Lock()
         self._history: deque[str] = deque(maxlen=HISTORY)
         self._stopping = threading.Event()
 
     def complain(self, problem: str) -> None:
         """Record a violation with the evidence to find its cause, and end the run."""
-        with self._turn:
+        with self._lock:
             self.record.violated += 1
             if len(self.record.violations) < MOST_VIOLATIONS:
                 now = f"{time.monotonic_ns()} ({time.strftime('%H:%M:%S', time.gmtime())} UTC)"

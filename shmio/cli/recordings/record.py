@@ -84,7 +84,7 @@ def _record(
         rest_s = work.tap.pause_s if until_s is None else min(work.tap.pause_s, until_s - time.monotonic())
         if rest_s <= 0 or stopping.wait(0 if more else rest_s):
             return True
-        more = work.turn()
+        more = work.run_once()
         if work.file != file:
             file = work.file
             news.tell("file", f"recording to {file}" if file else "waiting for the next time", file=_name(file))

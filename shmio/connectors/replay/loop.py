@@ -422,7 +422,7 @@ class ReplayLoop:
         """Play until the clock tells the loop to stop, then publish a last, bad frame."""
         try:
             self._begin()
-            while not self._turn():
+            while not self._run_once():
                 pass
         finally:
             self.commands.stop()
@@ -450,7 +450,7 @@ class ReplayLoop:
 
     # ---- the loop ------------------------------------------------------------------------------------------------
 
-    def _turn(self) -> bool:
+    def _run_once(self) -> bool:
         """Play what is due, answer requests, then wait. Return whether the loop must stop."""
         asked = self._head.asks(self._play.asked)  # before the time is read, so that no request is in the future
         state = self._page.read()

@@ -38,7 +38,7 @@ class Settings(msgspec.Struct):
 
 
 class Alerts:
-    """Watches and notifies. Use it from one thread: call :meth:`turn` repeatedly, then :meth:`close`."""
+    """Watches and notifies. Use it from one thread: call :meth:`run_once` repeatedly, then :meth:`close`."""
 
     def __init__(self, worker: Worker, settings: Settings) -> None:
         segment = worker.segment
@@ -62,19 +62,19 @@ class Alerts:
         self._closed = False
 
     def wake(self) -> None:
-        """Wake :meth:`turn`. Any thread may call it."""
+        """Wake :meth:`run_once`. Any thread may call it."""
         if not self._closed:  # the thread of an action may outlive close()
             os.eventfd_write(self._wakeup, 1)
 
-    def turn(self) -> None:
+    def run_once(self) -> None:
         """Wait until something happens, and handle it."""
         for key, events in self._selector.select(self._rest_s):
             key.data(events)
-        notices, more = self._monitor.turn()
+        notices, more = self._monitor.run_once()
         for one, notice in notices:
             self._notices += 1
             self._dispatcher.put(one.alert, notice)
-        rest_s = self._dispatcher.turn()
+        rest_s = self._dispatcher.run_once()
         if self._monitor.changed or self._dispatcher.waiting_count != self._waiting:
             self._save()
         if (done := self._monitor.done) != self._clock.delivered(self._slot):
@@ -132,7 +132,7 @@ def run(worker: Worker) -> None:
         log.info("watching %d alerts", len(worker.config["alert"]))
         worker.running()
         while not worker.stopping.is_set():
-            alerts.turn()
+            alerts.run_once()
         alerts.close()
         alerts.report()
     finally:

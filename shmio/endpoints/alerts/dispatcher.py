@@ -40,7 +40,7 @@ class Dispatcher:
             mqtt: The section ``[mqtt]``; None if no alert publishes.
             segment: The instance's segment.
             selector: Selects the sockets that are ready.
-            wake: Called in any thread when :meth:`turn` must run, or the notices that wait have changed.
+            wake: Called in any thread when :meth:`run_once` must run, or the notices that wait have changed.
             waiting: Notices that an earlier process could not deliver.
 
         """
@@ -67,9 +67,9 @@ class Dispatcher:
         if self._publisher is not None and alert.mqtt_topic is not None:
             self._publisher.put(alert, notice)
 
-    def turn(self) -> float:
+    def run_once(self) -> float:
         """Do what is due, and return after how many seconds to call this again."""
-        return 1.0 if self._publisher is None else self._publisher.turn()
+        return 1.0 if self._publisher is None else self._publisher.run_once()
 
     @property
     def waiting(self) -> Waiting:

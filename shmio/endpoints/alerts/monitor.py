@@ -90,7 +90,7 @@ class Monitor:
         """Number of frames that were overwritten or skipped before they could be evaluated."""
         return self._missed + sum(follower.missed for follower in self._followers.values())
 
-    def turn(self) -> tuple[list[tuple[WatchedAlert, Notice]], bool]:
+    def run_once(self) -> tuple[list[tuple[WatchedAlert, Notice]], bool]:
         """Evaluate what is new. Return notices, and whether there are more frames."""
         clock = self._segment.clock.read()  # before the frames, so that those of a finished step are evaluated
         if self._segment.refresh() or self._blocks is not self._segment.blocks:

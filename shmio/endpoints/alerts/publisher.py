@@ -35,13 +35,13 @@ class Publisher:
     def __init__(
         self, settings: Mqtt, segment: Segment, selector: selectors.BaseSelector, wake: Callable[[], object]
     ) -> None:
-        """Prepare to connect; :meth:`turn` connects.
+        """Prepare to connect; :meth:`run_once` connects.
 
         Args:
             settings: The section ``[mqtt]``, without an own broker's passwords.
             segment: The instance's segment.
             selector: Selects the sockets that are ready.
-            wake: Called by a thread that needs :meth:`turn` to run.
+            wake: Called by a thread that needs :meth:`run_once` to run.
 
         """
         clean = msgspec.structs.replace(settings, session_expiry_s=0)
@@ -81,10 +81,10 @@ class Publisher:
         message = Message(alert.mqtt_topic or "", notice.json(), 1, alert.mqtt_retain)
         self._queue.append(_Entry(notice, message))
 
-    def turn(self) -> float:
+    def run_once(self) -> float:
         """Do what is due, and return after how many seconds to call this again."""
         connection = self._connection
-        rest_s = connection.turn()
+        rest_s = connection.run_once()
         while self._sent and not connection.is_unacknowledged(self._sent[0].message):
             self._sent.popleft()
         while self._queue and connection.room > 0:

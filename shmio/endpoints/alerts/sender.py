@@ -79,7 +79,7 @@ class Sender:
         """Number of notices that were dropped."""
         self._alert, self._action, self._on_change = alert, action, on_change
         self._turns, self._retry, self._give_up_s = turns or nullcontext(), retry, give_up_s
-        self._turn = threading.Condition()
+        self._condition = threading.Condition()
         self._waiting = deque(waiting, MAX_WAITING)
         self._stopping = False
         self._thread: threading.Thread | None = None
@@ -89,7 +89,7 @@ class Sender:
     @property
     def waiting(self) -> list[Notice]:
         """The notices that are not delivered yet, the oldest first."""
-        with self._turn:
+        with self._condition:
             return list(self._waiting)
 
     @property
@@ -99,12 +99,12 @@ class Sender:
 
     def put(self, notice: Notice) -> None:
         """Add a notice. It never blocks."""
-        with self._turn:
+        with self._condition:
             if len(self._waiting) == MAX_WAITING:
                 self._drop(f"more than {MAX_WAITING} notices wait; the oldest are dropped")
             self._waiting.append(notice)
             self._start()
-            self._turn.notify()
+            self._condition.notify()
 
     def _start(self) -> None:
         if self._thread is None:
@@ -113,9 +113,9 @@ class Sender:
 
     def stop(self) -> None:
         """Request the thread to end. The notices that it has not delivered stay in :attr:`waiting`."""
-        with self._turn:
+        with self._condition:
             self._stopping = True
-            self._turn.notify()
+            self._condition.notify()
         self._action.stop()
 
     def join(self, timeout_s: float) -> None:
@@ -145,13 +145,13 @@ class Sender:
 
     def _await(self) -> bool:
         """Wait for a notice. Return False if the thread is to end instead."""
-        with self._turn:
-            self._turn.wait_for(lambda: self._waiting or self._stopping)
+        with self._condition:
+            self._condition.wait_for(lambda: self._waiting or self._stopping)
             return not self._stopping
 
     def _begin(self) -> Notice | None:
         """Return the next notice; None: the thread is to end."""
-        with self._turn:
+        with self._condition:
             if self._stopping:
                 return None
             notice = self._waiting[0]
@@ -169,11 +169,11 @@ class Sender:
         return None
 
     def _rest(self, wait_s: float) -> None:
-        with self._turn:
-            self._turn.wait_for(lambda: self._stopping, wait_s)
+        with self._condition:
+            self._condition.wait_for(lambda: self._stopping, wait_s)
 
     def _succeed(self, notice: Notice) -> None:
-        with self._turn:
+        with self._condition:
             self._remove(notice)
             if self.problem:
                 log.info("alert %s: %s works again", self._alert, self._action.text)
@@ -183,7 +183,7 @@ class Sender:
 
     def _fail(self, notice: Notice, problem: str, *, again: bool) -> None:
         text = f"alert {self._alert}: {self._action.text}: {problem}"
-        with self._turn:
+        with self._condition:
             if not again:
                 self._remove(notice)
                 self.failed += 1

@@ -88,7 +88,7 @@ class StateWriter:
         self.problem = ""
         """Why the state could not be written; empty if it could."""
         self._file = file
-        self._turn = threading.Condition()
+        self._condition = threading.Condition()
         self._newest: bytes | None = None
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="alerts' state", daemon=True)
@@ -97,21 +97,21 @@ class StateWriter:
     def write(self, state: State) -> None:
         """Write this state soon."""
         data = msgspec.json.encode(state)
-        with self._turn:
+        with self._condition:
             self._newest = data
-            self._turn.notify()
+            self._condition.notify()
 
     def close(self, timeout_s: float) -> None:
         """Write the last state, and end the thread, waiting at most ``timeout_s``."""
-        with self._turn:
+        with self._condition:
             self._stopping = True
-            self._turn.notify()
+            self._condition.notify()
         self._thread.join(timeout_s)
 
     def _run(self) -> None:
         while True:
-            with self._turn:
-                self._turn.wait_for(lambda: self._newest is not None or self._stopping)
+            with self._condition:
+                self._condition.wait_for(lambda: self._newest is not None or self._stopping)
                 data, self._newest = self._newest, None
             if data is None:
                 return

@@ -155,9 +155,9 @@ def _settings(worker: Worker) -> tuple[Grpc, _Place]:
     return msgspec.convert(config, Grpc), place
 
 
-async def _take_anew(worker: Worker, file: Path, listeners: Listeners, server: Server, turn: asyncio.Lock) -> None:
+async def _take_anew(worker: Worker, file: Path, listeners: Listeners, server: Server, lock: asyncio.Lock) -> None:
     """Reload tokens and roles, and end the calls that they no longer allow."""
-    async with turn:  # one reload at a time: the last one must win
+    async with lock:  # one reload at a time: the last one must win
         try:
             config = await asyncio.to_thread(load, file)
             if config.grpc is None:

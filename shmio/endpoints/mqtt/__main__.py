@@ -42,7 +42,7 @@ def _run_bridge(worker: Worker) -> None:
     worker.running()
     reported_s = 0.0
     while not worker.stopping.is_set():
-        bridge.turn()
+        bridge.run_once()
         if time.monotonic() - reported_s >= BEAT_S:
             reported_s = time.monotonic()
             worker.report(bridge.counters, note=bridge.problem)

@@ -52,7 +52,7 @@ log = logging.getLogger("shmio.mqtt")
 class Bridge:
     """Connects a segment to a broker.
 
-    Use it from one thread: call :meth:`turn` repeatedly, then :meth:`close`.
+    Use it from one thread: call :meth:`run_once` repeatedly, then :meth:`close`.
     """
 
     def __init__(self, segment: Segment, slot: ProcessSlot, settings: Mqtt) -> None:
@@ -112,7 +112,7 @@ class Bridge:
         """Topics whose retained messages the bridge asked the broker for; None: not asked yet."""
         self._behind: set[Feed] = set()
         self._rest_s = 0.0
-        """How long :meth:`turn` may wait for events, in s."""
+        """How long :meth:`run_once` may wait for events, in s."""
         self._missed = 0
         """Number of frames that feeds had missed before they were removed."""
         self._generation = -1
@@ -151,12 +151,12 @@ class Bridge:
         )
 
     def wake(self) -> None:
-        """Wake :meth:`turn`. You may call this from any thread."""
+        """Wake :meth:`run_once`. You may call this from any thread."""
         os.eventfd_write(self._wakeup, 1)
 
-    # ---- a turn ------------------------------------------------------------------------------------------------------
+    # ---- the loop ----------------------------------------------------------------------------------------------------
 
-    def turn(self) -> None:
+    def run_once(self) -> None:
         """Wait up to ``TURN_S`` for events, and handle them."""
         for key, events in self._selector.select(self._rest_s):
             key.data(events)
@@ -168,9 +168,9 @@ class Bridge:
         due_s = [TURN_S, *self._mark_due()]
         self.outbox.flush()
         due_s.append(self._turn_connections())
-        due_s.append(self._guard.turn())
+        due_s.append(self._guard.run_once())
         if self._sparkplug is not None:
-            due_s.append(self._sparkplug.turn())
+            due_s.append(self._sparkplug.run_once())
         self._rest_s = 0.0 if self._behind or self.outbox.can_send else min(due_s)
 
     def _mark_due(self) -> Iterator[float]:
@@ -186,7 +186,7 @@ class Bridge:
     def _turn_connections(self) -> float:
         """Run both connections, and return after how many seconds to run them again."""
         connection = self.connection
-        rest_s = min(self.command_connection.turn(connection.at), connection.turn())
+        rest_s = min(self.command_connection.run_once(connection.at), connection.run_once())
         if connection.problem and not connection.up:
             self.outbox.keeping = True
         if connection.came_up:
@@ -386,5 +386,5 @@ class Bridge:
             for key, events in self._selector.select(min(rest_s, TURN_S)):
                 key.data(events)
             self.outbox.flush()
-            self.command_connection.turn(self.connection.at)
-            self.connection.turn()
+            self.command_connection.run_once(self.connection.at)
+            self.connection.run_once()

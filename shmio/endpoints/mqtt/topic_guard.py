@@ -93,7 +93,7 @@ class TopicGuard:
         else:
             self._waiting[topic] = None
 
-    def turn(self) -> float:
+    def run_once(self) -> float:
         """Correct what is due, and return after how many seconds to call this again."""
         now_s = self._now_s()
         if self._resting:

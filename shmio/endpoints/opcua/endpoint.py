@@ -69,7 +69,7 @@ class Endpoint:
         if self._reading is not None and self._reading.done():
             reading, self._reading = self._reading, None
             self._add(reading.result())
-        if self._stepping.turn.locked():
+        if self._stepping.lock.locked():
             return  # a step looks at the sources, too
         if self._reading is None and self._segment.generation != self._generation:
             known = {source.feed.block.section for source in self.sources.values()}

@@ -23,7 +23,7 @@ class Stepping:
     """Steps the instance's time for clients. Use it only in the event loop's thread."""
 
     def __init__(self, segment: Segment) -> None:
-        self.turn = asyncio.Lock()
+        self.lock = asyncio.Lock()
         """Held during a step."""
         self._segment = segment
         self._coordinator = Coordinator(segment)
@@ -38,7 +38,7 @@ class Stepping:
         """
         if not math.isfinite(length_ms) or length_ms < 0:
             raise ServiceError(ua.StatusCodes.BadOutOfRange)
-        async with self.turn:
+        async with self.lock:
             return await asyncio.to_thread(self._step, round(length_ms * 1e6) or None)
 
     def _step(self, length_ns: int | None) -> list[ua.Variant]:

@@ -321,13 +321,13 @@ class Exposition:
     def __init__(self, collector: Collector) -> None:
         self._registry = CollectorRegistry(auto_describe=False)
         self._registry.register(collector)
-        self._turn = threading.Lock()
+        self._lock = threading.Lock()
         self._answer = b""
         self._fresh_until_s = 0.0
 
     def answer(self) -> bytes:
         """Return all figures in the text format. They are at most ``FRESH_S`` old."""
-        with self._turn:
+        with self._lock:
             if time.monotonic() >= self._fresh_until_s:
                 self._answer = generate_latest(self._registry)
                 self._fresh_until_s = time.monotonic() + FRESH_S

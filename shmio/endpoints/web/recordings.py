@@ -128,7 +128,7 @@ class Work(Generic[T]):
         self._watch = _Watch() if opened is None else opened.watch
         self._lock = threading.Lock() if opened is None else opened.lock
         self._parts = work(self._watch)
-        self._turn = asyncio.Lock()
+        self._calls = asyncio.Lock()
         self.stopped = False
 
     async def next(self) -> T | None:
@@ -138,7 +138,7 @@ class Work(Generic[T]):
             RecordingError: The file cannot be read.
 
         """
-        async with self._turn:
+        async with self._calls:
             try:
                 return None if self.stopped else await self._recordings.in_thread(self._next)
             except _StoppedError:
@@ -211,9 +211,9 @@ class Recordings:
 
         """
         path = self.path(name)
-        turn = self._opening.setdefault(name, asyncio.Lock())
+        lock = self._opening.setdefault(name, asyncio.Lock())
         try:
-            async with turn:
+            async with lock:
                 state = await self.in_thread(lambda: _state(path))
                 known = self._opened.get(name)
                 if known is not None and _serves(known, state, since_s):
@@ -228,7 +228,7 @@ class Recordings:
                     await self.in_thread(known.close)
                 return opened
         finally:
-            if not turn.locked():
+            if not lock.locked():
                 self._opening.pop(name, None)
 
     async def of_run(self, instance: str, epoch: str, since_s: float) -> AsyncIterator[Opened]:

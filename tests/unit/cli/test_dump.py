@@ -60,10 +60,10 @@ def file(segment: Segment, tmp_path: Path) -> str:
     cell.event(Record(EventKind.WRITTEN, "", 4, 99, 0, 1, 0, 0, 2))
     cell.event(Record(EventKind.QUALITY, "cable out"), quality=Quality.BAD)
     cell.publish(b"\0\x08", cycle=9, quality=Quality.BAD, reason="cable out")
-    work.turn()
+    work.run_once()
     press = segment.writer("press")
     publish(press, 3 * RING)
-    work.turn()
+    work.run_once()
     segment.change(add=[spec("cell", OTHER)], retire=["cell"])
     segment.writer("cell").publish(b"\x40\x20\0\0\0\x05", cycle=10)
     assert work.close()
@@ -110,7 +110,7 @@ def test_info_folds_equal_lines(segment: Segment, tmp_path: Path, said: Output) 
     work = recorder(segment, tmp_path / "dumps")
     for turn in range(3):
         publish(segment.writer("cell"), 1, first=turn)
-        work.turn()
+        work.run_once()
         segment.change(add=[spec("cell")], retire=["cell"])
     assert work.close()
     assert main(["info", str(work.output.path)]) == 0
@@ -280,7 +280,7 @@ def damaged(segment: Segment, tmp_path: Path, file: str) -> tuple[str, str]:
     work = recorder(segment, tmp_path / "steady", selection=Selection(["press"]), start=StartPositions(first=False))
     for turn in range(3):
         publish(segment.writer("press"), 10, first=10 * turn)
-        work.turn()
+        work.run_once()
         work._writer.flush()
     assert work.close()
     content = bytearray(work.output.path.read_bytes())
@@ -355,7 +355,7 @@ def test_damaged_channel_description_affects_no_other_channel(segment: Segment, 
     for turn in range(3):
         for source in ("cell", "press"):
             publish(segment.writer(source), 10, first=10 * turn)
-        work.turn()
+        work.run_once()
         work._writer.flush()
     assert work.close()
     content = bytearray(work.output.path.read_bytes())

@@ -30,7 +30,7 @@ def recording(segment: Segment, tmp_path: Path) -> bytes:
         writer.event(Record(EventKind.QUALITY, "so so"))
         if turn == 1:
             publish(writer, 1200)
-        work.turn()
+        work.run_once()
         work._writer.flush()
     assert work.close()
     return work.output.path.read_bytes()

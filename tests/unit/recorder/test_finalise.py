@@ -32,7 +32,7 @@ def whole(segment: Segment, tmp_path: Path) -> Path:
         for source in ("cell", "press")[: 1 + turn % 2]:
             publish(segment.writer(source), 5, first=5 * turn)
             segment.writer(source).event(Record(EventKind.QUALITY, "so so"))
-        work.turn()
+        work.run_once()
         work._writer.flush()
     assert work.close()
     return work.output.path

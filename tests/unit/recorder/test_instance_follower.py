@@ -81,10 +81,10 @@ def test_a_recording_has_the_state_and_changes_of_processes(
     slot = segment.processes.find("cell")
     to(slot, Phase.RUNNING, 7)
     work = recorder(segment, tmp_path)
-    work.turn()
-    work.turn()
+    work.run_once()
+    work.run_once()
     to(slot, Phase.BACKOFF, 7, 0, "killed by SIGKILL")
-    work.turn()
+    work.run_once()
     assert work.close()
     found = changes(work.output.path)
     assert found == [
@@ -99,12 +99,12 @@ def test_changes_without_room_are_recorded_as_the_state_afterwards(
     monkeypatch.setattr(instance_follower, "TURN_S", 0.0)
     slot = segment.processes.find("cell")
     work = recorder(segment, tmp_path)
-    work.turn()
+    work.run_once()
     with monkeypatch.context() as full:
         full.setattr(type(work.output), "full", True)
         to(slot, Phase.RUNNING, 7)
-        work.turn()
-    work.turn()
+        work.run_once()
+    work.run_once()
     assert work.close()
     found = changes(work.output.path)
     assert found == [ProcessChange("cell", "source", 7, ProcessEvent.IS, "", 0)]
@@ -124,7 +124,7 @@ def test_a_configuration_that_changes_is_attached_again(
     work = recorder(segment, tmp_path, attachments=attachments)
     for text in texts:
         now[0] = text
-        work.turn()
+        work.run_once()
     now[0] = texts[-1]
     assert work.close()
     content = work.output.path.read_bytes()

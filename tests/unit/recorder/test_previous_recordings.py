@@ -27,7 +27,7 @@ def file(segment: Segment, tmp_path: Path) -> Path:
     for turn, sources in enumerate((("cell", "press"), ("cell", "press"), ("press",))):
         for source in sources:
             publish(segment.writer(source), 10, first=10 * turn)
-        work.turn()
+        work.run_once()
         work._writer.flush()
     assert work.close()
     return work.output.path

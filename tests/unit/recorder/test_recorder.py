@@ -48,7 +48,7 @@ def test_frames_and_events_of_busy_sources_are_in_order(segment: Segment, tmp_pa
     with ThreadPoolExecutor() as pool:
         work = [pool.submit(events, 0), pool.submit(events, 1), pool.submit(publish, writers[0], 300)]
         while not all(done.done() for done in work):
-            recording.turn()
+            recording.run_once()
     assert recording.close()
     messages = read(recording.output.path)
     assert numbers(recording.output.path) == list(range(1, 301))
@@ -71,9 +71,9 @@ def test_a_recorder_slower_than_the_ring_counts_missed_frames_exactly(segment: S
     recording = recorder(segment, tmp_path)
     writer = segment.writer("cell")
     publish(writer, 10)
-    recording.turn()
+    recording.run_once()
     publish(writer, 3 * RING)
-    recording.turn()
+    recording.run_once()
     publish(writer, 5)
     assert recording.close()
     found = numbers(recording.output.path)
@@ -88,7 +88,7 @@ def test_a_recorder_slower_than_the_ring_counts_missed_frames_exactly(segment: S
 def test_missed_events_are_counted_exactly(segment: Segment, tmp_path: Path) -> None:
     recording = recorder(segment, tmp_path)
     writer = segment.writer("press")
-    recording.turn()
+    recording.run_once()
     for item in range(3000):
         writer.event(Record(EventKind.WRITTEN, item=item))
     assert recording.close()
@@ -118,7 +118,7 @@ def test_only_chosen_sources_are_recorded(segment: Segment, tmp_path: Path) -> N
 def test_a_changed_layout_and_a_new_source_are_separate_blocks(segment: Segment, tmp_path: Path) -> None:
     recording = recorder(segment, tmp_path)
     publish(segment.writer("cell"), 3)
-    recording.turn()
+    recording.run_once()
     old = segment.blocks["cell"]
     publish_late = segment.writer("cell")  # keeps the old block's writer, whose last frames are recorded too
     publish(publish_late, 2)
@@ -179,7 +179,7 @@ def test_a_frame_is_in_the_file_within_a_second(
     begun_s, given = clock.s, recording.output.tell()
     while recording.output.tell() == given:
         clock.s += recording.tap.pause_s
-        recording.turn()
+        recording.run_once()
     assert clock.s - begun_s < 1.0
     recording.close()
 
@@ -231,7 +231,7 @@ def test_frames_lost_to_a_full_disk_are_gaps_and_it_continues(
     def turns(until: Callable[[], object]) -> None:
         while not until():
             publish(writer, 50, first=writer.block.ring.head())
-            recording.turn()
+            recording.run_once()
 
     full = OSError(28, "No space left on device")
     with monkeypatch.context() as broken:
@@ -253,8 +253,8 @@ def test_frames_lost_to_a_full_disk_are_gaps_and_it_continues(
 def test_a_removed_file_is_reported(segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "CHECK_S", 0.0)
     recording = recorder(segment, tmp_path)
-    recording.turn()
+    recording.run_once()
     recording.output.path.unlink()
     with pytest.raises(RecordingError, match="was removed while it was being written"):
-        recording.turn()
+        recording.run_once()
     recording.output.close(30)

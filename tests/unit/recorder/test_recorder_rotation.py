@@ -60,7 +60,7 @@ def test_rotation_neither_loses_nor_repeats_a_frame(segment: Segment, tmp_path: 
     for turn in range(60):
         publish(writer, 10, first=10 * turn)
         writer.event(Record(EventKind.QUALITY, "so so"))
-        work.turn()
+        work.run_once()
         tend(work)
     assert work.close() == []
     found = files(tmp_path)
@@ -84,7 +84,7 @@ def test_a_gap_at_the_end_of_a_file_is_in_that_file(segment: Segment, tmp_path: 
     """An example is a writer that died, so that no later frame shows which frames the ring lost."""
     work = series(segment, tmp_path, rotate_mb=0.001)
     publish(segment.writer("cell"), 100)
-    work.turn()
+    work.run_once()
     cell = work.tap.followers[0]
     gap = Gap("cell", cell.number, "frames", 101, 110, 10, Reason.OVERTAKEN, 0, 0)
     now_ns = work.tap.now()
@@ -103,7 +103,7 @@ def test_frames_lost_between_two_files_are_one_gap_in_the_second(segment: Segmen
     work = series(segment, tmp_path, rotate_mb=0.001)
     writer = segment.writer("cell")
     publish(writer, 100)
-    work.turn()
+    work.run_once()
     publish(writer, 3 * RING, first=100)
     work.recorder._writer.flush()
     work.tend()
@@ -135,7 +135,7 @@ def test_a_step_at_a_rotation_is_recorded_once(segment: Segment, tmp_path: Path)
     work = series(segment, tmp_path, rotate_mb=0.0001)
     for _ in range(6):
         coordinator.step(1_000_000)
-        work.turn()
+        work.run_once()
         tend(work)
     done = work.tap.done
     assert work.close() == []
@@ -158,7 +158,7 @@ def test_no_new_file_is_started_while_the_disk_fails(
 
         broken.setattr(Output, "_put", refuse)
         publish(segment.writer("cell"), 100)
-        work.turn()
+        work.run_once()
         work.recorder._writer.flush()
         until(lambda: bool(work.problem), "the problem")
         work.tend()
@@ -220,13 +220,13 @@ def test_rotation_writes_no_file_after_one_that_could_not_be_written(
 
     monkeypatch.setattr(Output, "_put", held)
     publish(segment.writer("cell"), 100)
-    work.turn()
+    work.run_once()
     work.recorder._writer.flush()
     work.tend()
     second = work.recorder.output
     assert second is not first
     publish(segment.writer("cell"), 1)
-    work.turn()
+    work.run_once()
     answered.set()
     assert len(work.close()) == 2
     assert second.path.read_bytes() == b""

@@ -88,7 +88,7 @@ def test_a_steps_mark_follows_all_its_frames(segment: Segment, tmp_path: Path) -
     coordinator = Coordinator(segment)
     for _ in range(3):
         coordinator.step(MS)
-        recording.turn()
+        recording.run_once()
     assert recording.tap.done == 3
     assert recording.close()
     items = [message.item for message in read(recording.output.path)]

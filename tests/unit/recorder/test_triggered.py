@@ -67,7 +67,7 @@ class Bench:
             self.writer.at_ns = self._begin_ns + self._next * S
             self.writer.publish(self._next.to_bytes(2, "big"), cycle=self._next, **options)  # type: ignore[arg-type]
             self._next += 1
-        self.work.turn()
+        self.work.run_once()
         self.work.tend()
 
     def writes(self) -> bool:
@@ -184,11 +184,11 @@ def test_frames_lost_before_the_files_time_are_not_a_gap(segment: Segment, tmp_p
 def test_a_reload_removes_the_triggers_register_and_restores_it(segment: Segment, tmp_path: Path) -> None:
     bench = Bench(segment, tmp_path, when="cell/count = 7", before_s=0, after_s=0)
     segment.change(add=[spec("cell2")], retire=["cell"])
-    bench.work.turn()
+    bench.work.run_once()
     segment.change(add=[spec("cell", OTHER)], retire=[])
     writer = segment.writer("cell")
     writer.publish(bytes(4) + b"\0\7", cycle=1)
-    bench.work.turn()
+    bench.work.run_once()
     assert bench.work.file
     assert bench.work.close() == []
 

@@ -217,11 +217,11 @@ def test_missing_numbers_outside_of_gaps_are_reported(
     work = recorder(segment, tmp_path)
     writer = segment.writer("cell")
     publish(writer, 5)
-    work.turn()
+    work.run_once()
     with monkeypatch.context() as broken:
         broken.setattr(instance_follower.BlockFollower, "_entries", lambda self, side: iter(_dropped(side)))
         publish(writer, 3)
-        work.turn()
+        work.run_once()
     publish(writer, 2)
     assert work.close()
     assert found_in(work.output.path).problems == [

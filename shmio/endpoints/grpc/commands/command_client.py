@@ -69,7 +69,7 @@ class CommandClient:
         self._preparing = asyncio.Lock()
         self._in_flight = InFlightTable(writer)
         self._silent = False
-        self._turn = asyncio.Lock()  # serves callers in order while they wait for room
+        self._lock = asyncio.Lock()  # serves callers in order while they wait for room
         self._freed: asyncio.Future[None] | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._events = block.events.cursor()
@@ -86,7 +86,7 @@ class CommandClient:
         return not (
             self._reader.alive
             or self._in_flight
-            or self._turn.locked()
+            or self._lock.locked()
             or self.write_subscriptions.busy
             or self.followers.busy
         )
@@ -109,7 +109,7 @@ class CommandClient:
 
     def ready(self, values: Mapping[str, object]) -> bool:
         """Return whether :meth:`send` and :meth:`give` would send these values without waiting."""
-        return self._prepared and not self._turn.locked() and self._has_room(self._cost(values))
+        return self._prepared and not self._lock.locked() and self._has_room(self._cost(values))
 
     async def writable(self, registers: Iterable[Register]) -> bool:
         """Return whether the configuration allows writing all of these registers."""
@@ -237,7 +237,7 @@ class CommandClient:
         *,
         until_accepted: bool = False,
     ) -> None:
-        async with self._turn:
+        async with self._lock:
             await self._prepare()
             while not self._has_room(cost):
                 self._freed = self._loop.create_future()

@@ -48,13 +48,13 @@ _KINDS: Final = {
 class DeclareCall:
     """A Declare call with its injections."""
 
-    def __init__(self, feeds: Mapping[str, Feed], request: wire.DeclareRequest, turn: asyncio.Lock) -> None:
+    def __init__(self, feeds: Mapping[str, Feed], request: wire.DeclareRequest, lock: asyncio.Lock) -> None:
         """Check the declarations.
 
         Args:
             feeds: The feeds of all sources, by name.
             request: The request of the call.
-            turn: Lock that lets only one call at a time check its declarations.
+            lock: Lock that lets only one call at a time check its declarations.
 
         Raises:
             ConfigError: A declaration is not valid.
@@ -73,7 +73,7 @@ class DeclareCall:
             for one in parse_campaign({"injection": tables})
         ]
         self._feeds = feeds
-        self._turn = turn
+        self._lock = lock
         self._keep = request.keep
         self._members: list[DeclaredInjection] = []
         self._waiting = SendQueue()  # serialised fields of a DeclareResponse
@@ -94,7 +94,7 @@ class DeclareCall:
 
         """
         feeds = dict(self._feeds)
-        async with self._turn:  # in a thread: a large layout takes seconds
+        async with self._lock:  # in a thread: a large layout takes seconds
             programs = await asyncio.to_thread(
                 _check,
                 self._declarations,

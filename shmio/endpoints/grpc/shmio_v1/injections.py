@@ -474,7 +474,7 @@ class InjectionCalls:
         self._selections = selections
         self._wake_ups = wake_ups
         self._open: set[InjectCall | DeclareCall] = set()
-        self._turn = asyncio.Lock()
+        self._lock = asyncio.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
@@ -576,7 +576,7 @@ class InjectionCalls:
         opening: asyncio.Task[bytes] | None = None
         try:
             self._check_room()
-            campaign = DeclareCall(self._feeds, request, self._turn)
+            campaign = DeclareCall(self._feeds, request, self._lock)
             self._open.add(campaign)
             opening = asyncio.get_running_loop().create_task(campaign.open())
             yield await asyncio.shield(opening)

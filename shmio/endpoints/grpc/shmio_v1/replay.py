@@ -25,7 +25,7 @@ class ReplayCalls:
 
     def __init__(self, segment: Segment) -> None:
         self._replays = Replays(segment)
-        self._turn = asyncio.Lock()
+        self._lock = asyncio.Lock()
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
         """Return the handler of the call, by name."""
@@ -55,7 +55,7 @@ class ReplayCalls:
 
     async def _change(self, wanted: ReplayRequest) -> list[ReplayStatus]:
         over = threading.Event()
-        async with self._turn:
+        async with self._lock:
             try:
                 return await asyncio.to_thread(self._replays.change, wanted, over.is_set)
             finally:

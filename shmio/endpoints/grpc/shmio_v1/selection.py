@@ -53,7 +53,7 @@ class Selections:
         self._numbers = itertools.count(1)
         self._known: WeakValueDictionary[_Key, View] = WeakValueDictionary()
         self._kept: OrderedDict[_Key, View] = OrderedDict()
-        self._turn = asyncio.Lock()
+        self._lock = asyncio.Lock()
 
     def resolve(self, patterns: Sequence[str], *, inward: bool = False) -> TopicsBySource:
         """Parse a call's patterns, and group them by source and direction.
@@ -135,7 +135,7 @@ class Selections:
         block = self._topics.feed(place.source).block
         key = block.section, place.inward, tuple(topic.path for topic in topics)
         if (view := self._known.get(key)) is None:
-            async with self._turn:  # one at a time, because a large layout takes seconds in a thread
+            async with self._lock:  # one at a time, because a large layout takes seconds in a thread
                 view = self._known.get(key)
                 if view is None:
                     view = self._known[key] = await self._make(block, topics, budget, inward=place.inward)

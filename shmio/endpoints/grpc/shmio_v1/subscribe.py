@@ -245,7 +245,7 @@ class SubscribeCall:
         self._inward: dict[SourceDirection, WriteFollower] = {}
         self._rings: dict[SourceDirection, Callback] = {}  # the callbacks of their wake-ups
         self._moved: dict[SourceDirection, None] = {}
-        self._turn = 0
+        self._rotation = 0
         self._wake = asyncio.Event()
         self._clock = asyncio.get_running_loop().time
 
@@ -345,8 +345,8 @@ class SubscribeCall:
                 size += len(written)
                 parts.append(field(UPDATES, written))
         waiting = deque(one for one in self._blocks.values() if self._may_send(one))
-        waiting.rotate(self._turn)
-        self._turn += 1  # otherwise a block with long updates would starve the others
+        waiting.rotate(self._rotation)
+        self._rotation += 1  # otherwise a block with long updates would starve the others
         most = len(parts) + BATCH_UPDATES
         while waiting and size < BATCH_BYTES and len(parts) < most:
             update = waiting[0].next(now_s)

@@ -206,7 +206,7 @@ class Stepper:
         self._loop = asyncio.get_running_loop()
         self._coordinator = Coordinator(segment)
         self._driver = StepDriver(self._coordinator, segment.clock, wake_ups)
-        self._turn = asyncio.Lock()  # only one task moves time
+        self._lock = asyncio.Lock()  # only one task moves time
         self._owns = False
         self._changing = asyncio.Lock()  # only one task starts or stops playing
         self._moving: asyncio.Task[Any] | None = None
@@ -353,7 +353,7 @@ class Stepper:
     @asynccontextmanager
     async def _moved(self) -> AsyncIterator[None]:
         """Take control of time. Meanwhile, no other client of this endpoint can move it."""
-        async with self._turn:
+        async with self._lock:
             self._moving, self.timeline.steered = asyncio.current_task(), True
             try:
                 if self._segment.outdated:
@@ -381,11 +381,11 @@ class Stepper:
         self._rest = None
         if self._loop.time() < self._rest_s:  # time was moved in between
             self._rest = self._loop.call_at(self._rest_s, self._give_up)
-        elif self._owns and not self._player.on and not self._turn.locked():
+        elif self._owns and not self._player.on and not self._lock.locked():
             self._spawn(self._release())
 
     async def _release(self) -> None:
-        async with self._turn:
+        async with self._lock:
             if not self._player.on:
                 self._own(False)
                 self._coordinator.close()
@@ -404,7 +404,7 @@ class Stepper:
         self._coordinator.check_release()
         async with self._changing:
             await self._player.end()
-            async with self._turn:
+            async with self._lock:
                 self._coordinator.release()
                 self._own(False)
                 self.timeline.ended = False

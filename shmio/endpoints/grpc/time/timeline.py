@@ -160,7 +160,7 @@ class _Delivery:
         self._virtual_time = virtual_time
         self._feeds = feeds
         self._outboxes = outboxes
-        self._turn = asyncio.Lock()
+        self._lock = asyncio.Lock()
         self.receivers: list[StepReceiver] = []
 
     def begin(self, moment: Moment) -> None:
@@ -191,7 +191,7 @@ class _Delivery:
             mark: Queues the step's marker.
 
         """
-        async with self._turn:
+        async with self._lock:
             if step.number <= self._virtual_time.moment.number:
                 return False
             self._show(step)
@@ -206,7 +206,7 @@ class _Delivery:
     @property
     def busy(self) -> bool:
         """True while a step is being delivered."""
-        return self._turn.locked()
+        return self._lock.locked()
 
     def pass_over(self, step: Step, mark: Callable[[], None]) -> None:
         """Deliver a step without waiting, because no stream is open.

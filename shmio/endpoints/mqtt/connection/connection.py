@@ -176,12 +176,12 @@ class BrokerConnection:
         will: Callable[[], Message | None],
         most: int,
     ) -> None:
-        """Prepare to connect. :meth:`turn` connects.
+        """Prepare to connect. :meth:`run_once` connects.
 
         Args:
             policy: Chooses the broker and the waits.
             selector: Selects the sockets that are ready.
-            wake: Called by a thread that needs :meth:`turn` to run.
+            wake: Called by a thread that needs :meth:`run_once` to run.
             will: Returns the will for each CONNECT.
             most: Maximum number of unacknowledged messages, in each direction.
 
@@ -241,9 +241,9 @@ class BrokerConnection:
         """Number of messages that the broker has not acknowledged."""
         return len(self._in_flight)
 
-    # ---- a turn ------------------------------------------------------------------------------------------------------
+    # ---- the loop ----------------------------------------------------------------------------------------------------
 
-    def turn(self) -> float:
+    def run_once(self) -> float:
         """Do what is due, and return after how many seconds to call this again."""
         now_s = time.monotonic()
         if self._attempt is not None and self._attempt.over:
@@ -270,7 +270,7 @@ class BrokerConnection:
             if now_s >= self._misc_s:
                 self._misc_s = now_s + 1.0
                 self._client.loop_misc()
-        return 1.0 if self._socket_io is None else self._socket_io.turn()
+        return 1.0 if self._socket_io is None else self._socket_io.run_once()
 
     def _take(self, attempt: ConnectAttempt) -> None:
         """Handle the end of an attempt."""
@@ -496,13 +496,13 @@ class CommandConnection:
         filters: Callable[[], Sequence[str]],
         answers: Callable[[], Sequence[str]],
     ) -> None:
-        """Create the connection. :meth:`turn` connects.
+        """Create the connection. :meth:`run_once` connects.
 
         Args:
             settings: The configuration's ``[mqtt]`` section.
             client_id: The client id of this connection.
             selector: Selects the sockets that are ready.
-            wake: Called by a thread that needs :meth:`turn` to run.
+            wake: Called by a thread that needs :meth:`run_once` to run.
             filters: Returns the topic filters to subscribe to for commands.
             answers: Returns the topic filters to subscribe to for the results of commands.
 
@@ -525,7 +525,7 @@ class CommandConnection:
         """Reason why no commands arrive or no results are sent; empty if there is no problem."""
         return f"commands: {self.connection.problem}" if self.connection.problem else ""
 
-    def turn(self, at: Target | None) -> float:
+    def run_once(self, at: Target | None) -> float:
         """Connect to the broker that receives the values, and do what is due.
 
         Args:
@@ -541,7 +541,7 @@ class CommandConnection:
             if at is not None:
                 self._policy.use_only(at)
                 self.connection.open()
-        rest_s = self.connection.turn()
+        rest_s = self.connection.run_once()
         if self.connection.came_up:
             self.connection.came_up = False
             self.subscribe()

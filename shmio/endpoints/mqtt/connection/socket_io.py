@@ -71,7 +71,7 @@ class SocketIo:
 
         return counted
 
-    def turn(self) -> float:
+    def run_once(self) -> float:
         """Read what the selector cannot see, and return the time in s until the next call."""
         if self._unseen():
             self._serve(selectors.EVENT_READ)

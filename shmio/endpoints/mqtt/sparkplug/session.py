@@ -94,7 +94,7 @@ class PrimaryHost:
 
 
 class Session:
-    """The Sparkplug session of an instance. Call :meth:`turn` in each turn of the bridge's thread.
+    """The Sparkplug session of an instance. Call :meth:`run_once` in each turn of the bridge's thread.
 
     While the broker is slow, changes are merged. While there is no broker, changes are kept, and
     sent later as historical values.
@@ -115,7 +115,7 @@ class Session:
             sparkplug: The configuration's ``[mqtt.sparkplug]`` section.
             segment: The instance's shared memory.
             selector: Selects the sockets that are ready.
-            wake: Called by a thread that needs :meth:`turn` to run.
+            wake: Called by a thread that needs :meth:`run_once` to run.
 
         Raises:
             PathError: A pattern is not valid.
@@ -196,7 +196,7 @@ class Session:
         if self.connection.up and self.node.alive:
             self._birth()
 
-    def turn(self) -> float:
+    def run_once(self) -> float:
         """Do what is due, and return after how many seconds to call this again."""
         if not self._defined:
             self._define()
@@ -219,7 +219,7 @@ class Session:
             for change in device.poll():
                 self._publish(name, device, change.kind, change.at)
         self._flush()
-        rest_s = self.connection.turn()  # after sending, because it returns when there is room for more
+        rest_s = self.connection.run_once()  # after sending, because it returns when there is room for more
         more = self._room <= 0 or self.connection.came_up or any(device.behind for device in self._devices.values())
         now_s = time.monotonic()
         due_s = [due_s for name, due_s in self._due_s.items() if due_s > now_s and self._waiting.get(name)]

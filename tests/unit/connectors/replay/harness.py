@@ -79,7 +79,7 @@ def recorded(folder: Path, instance: str, *sources: str, name: str = "") -> Iter
     origin = Origin(BEGIN_NS - S, 7_000 * S)
     with Segment.create(f"{instance}{name}-recorded", specs, [], origin=origin) as segment:
         taking = recorder(segment, folder)
-        yield [Recorded(segment, spec.source, taking.turn) for spec in specs]
+        yield [Recorded(segment, spec.source, taking.run_once) for spec in specs]
         taking.close()
         segment.unlink()
 

@@ -52,12 +52,12 @@ class Watched:
     def until(self, time_s: float) -> list[Notice]:
         """Set the clock, and return the notices that follow."""
         self.segment.clock.write(Clock(ClockMode.VIRTUAL, self.step, round(time_s * 1e9), done=self.step))
-        return self.turn()
+        return self.run_once()
 
-    def turn(self) -> list[Notice]:
-        found, more = self.monitor.turn()
+    def run_once(self) -> list[Notice]:
+        found, more = self.monitor.run_once()
         while more:
-            rest, more = self.monitor.turn()
+            rest, more = self.monitor.run_once()
             found += rest
         return [one for _, one in found]
 

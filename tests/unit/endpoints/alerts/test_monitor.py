@@ -119,7 +119,7 @@ def test_a_restarted_process_repeats_no_notice(instance: str) -> None:
         one.at(1, position=9)
         before = {"hot": one.monitor.alerts[0].lifecycle.progress}
         again = monitor.Monitor(one.segment, [HOT], before, one.selector)
-        assert again.turn()[0] == []
+        assert again.run_once()[0] == []
         one.publish(2, position=1)
-        assert [str(n.state) for _, n in again.turn()[0]] == ["resolved"]
+        assert [str(n.state) for _, n in again.run_once()[0]] == ["resolved"]
         again.close()

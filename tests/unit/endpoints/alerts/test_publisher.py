@@ -34,7 +34,7 @@ class Running:
 
     def until(self, condition: Any) -> None:
         while not condition():
-            rest_s = self.publisher.turn()
+            rest_s = self.publisher.run_once()
             for key, events in self.selector.select(min(rest_s, 0.1)):
                 key.data(events)
 

@@ -115,7 +115,7 @@ class Running:
 
     def _run(self) -> None:
         while not self._stopping:
-            self.bridge.turn()
+            self.bridge.run_once()
             with self._turned:
                 self._turned.notify_all()
         self.bridge.close()

@@ -289,16 +289,16 @@ def test_frames_that_the_bridge_missed_are_counted_and_reported(
     try:
         with listening(broker.address, f"{PREFIX}/#") as listener:
             while bridge.counters[6] < followers or bridge.outbox.busy:
-                bridge.turn()
+                bridge.run_once()
             assert listener.json("cell/status")["missed"] == 0
             burst(writer, range(3, 52))
             while listener.values("cell/step/out")[-1:] != ["51"]:
-                bridge.turn()
+                bridge.run_once()
                 listener.taken()
             assert bridge.counters[7] == 48 * followers
             burst(writer, range(52, 100))
             while listener.values("cell/step/out")[-1:] != ["99"]:
-                bridge.turn()
+                bridge.run_once()
                 listener.taken()
             assert bridge.counters[7] == 48 * followers
     finally:

@@ -219,14 +219,14 @@ def test_commands_are_taken_a_few_at_a_time(
     bridge = Bridge(segment, slot, Mqtt(broker="external", host=str(broker.address), prefix=PREFIX))
     try:
         while not bridge.connection.up or bridge.outbox.busy or bridge.connection.in_flight:
-            bridge.turn()
+            bridge.run_once()
         with listening(broker.address, "none") as flooder:
             for _ in range(1000):
                 flooder.client.publish(f"{PREFIX}/cell/nowhere/in", "1", qos)
             flooder.publish("cell/nowhere/in", "1")
         most = 0
         while (before := bridge.counters[1]) < 1001:
-            bridge.turn()
+            bridge.run_once()
             most = max(most, bridge.counters[1] - before)
         assert most <= bound
     finally:

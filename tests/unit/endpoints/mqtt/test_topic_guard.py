@@ -87,15 +87,15 @@ def test_corrections_become_rarer_while_the_forging_continues() -> None:
     for _ in range(100_000):
         owner.guard.report("status")
         owner.now_s += 0.001
-        owner.guard.turn()
+        owner.guard.run_once()
     assert 20 < len(owner.corrected) < 40
-    assert owner.guard.turn() <= PAUSE.most_s
+    assert owner.guard.run_once() <= PAUSE.most_s
     owner.now_s += PAUSE.most_s
-    owner.guard.turn()
+    owner.guard.run_once()
     owner.now_s += (CALM_PAUSES + 1) * PAUSE.most_s
     for _ in range(2):
         owner.guard.report("status")
-        owner.guard.turn()
+        owner.guard.run_once()
         owner.now_s += PAUSE.first_s
     assert owner.corrected[-2:] == ["status", "status"]
     assert len(owner.corrected) < 45
@@ -105,12 +105,12 @@ def test_many_topics_are_corrected_in_portions_and_too_many_by_resending_all() -
     owner = Owner()
     for number in range(AT_ONCE + 1):
         owner.guard.report(f"t{number}")
-    assert owner.guard.turn() == pytest.approx(PAUSE.first_s)
+    assert owner.guard.run_once() == pytest.approx(PAUSE.first_s)
     assert len(owner.corrected) == AT_ONCE
     for number in range(1500):
         owner.guard.report(f"t{number}")
     owner.now_s += PAUSE.first_s
-    owner.guard.turn()
+    owner.guard.run_once()
     assert (owner.all, len(owner.corrected)) == (1, AT_ONCE)
 
 
@@ -124,13 +124,13 @@ def test_during_a_flood_the_guard_stops_listening_and_then_resends_everything() 
         owner.guard.report("status")
         owner.guard.begin()
         assert owner.watching == 0, "a new connection does not end the pause"
-        rests.append(owner.guard.turn())
+        rests.append(owner.guard.run_once())
         owner.now_s += rests[-1]
         told = owner.all
-        owner.guard.turn()
+        owner.guard.run_once()
         assert owner.watching == 1
         owner.now_s += PAUSE.most_s
-        owner.guard.turn()
+        owner.guard.run_once()
         assert owner.all == told + 1
     assert rests == [REST.first_s, 2 * REST.first_s, 4 * REST.first_s]
     assert not owner.corrected

@@ -409,7 +409,7 @@ def test_a_call_cancelled_before_its_answer_leaves_no_injection(segment: Segment
 def test_a_value_published_to_the_shadow_before_the_injection_is_laid_counts(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         call: Any = served.stub.Publish(timeout=TIMEOUT_S)
-        with device.output.turn:  # delays the source's answer
+        with device.output.lock:  # delays the source's answer
             stream = inject(served, "cell/step/in", "s")
 
             async def named() -> bool:

@@ -37,7 +37,7 @@ def test_a_connection_made_after_the_end_is_closed(
         settings = Mqtt(broker="external", host=f"127.0.0.1:{server.getsockname()[1]}")
         policy = ReconnectPolicy(settings, "test", targets(settings, ""))
         connection = BrokerConnection(policy, selector, woken.set, lambda: Message("will", b"", 1, retain=True), 1)
-        connection.turn()
+        connection.run_once()
         assert asked.wait(TIMEOUT_S)
         connection.close()
         answered.set()
@@ -62,7 +62,7 @@ class Broker:
 
     def admit(self) -> None:
         """Accept a connection."""
-        self.connection.turn()
+        self.connection.run_once()
         self._socket, _ = self._server.accept()
         self._socket.settimeout(TIMEOUT_S)
         self.hear(0x10)
@@ -101,7 +101,7 @@ class Broker:
 
     def turn_until(self, until: Callable[[], bool]) -> None:
         while not until():
-            self.connection.turn()
+            self.connection.run_once()
             for key, events in self._selector.select(0.1):
                 key.data(events)
 

@@ -311,22 +311,22 @@ def test_the_backlog_is_sent_in_small_portions(
     assert slot.take()
     bridge = Bridge(segment, slot, Mqtt(broker="external", host=str(broker.address), topic=nothing, sparkplug=PLANT))
 
-    def turn(until: Callable[[], bool]) -> None:
+    def run_until(until: Callable[[], bool]) -> None:
         deadline_s = time.monotonic() + TIMEOUT_S
         while not until():
-            bridge.turn()
+            bridge.run_once()
             assert time.monotonic() < deadline_s
 
     def kept() -> int:
         return bridge.counters[4]
 
     try:
-        turn(lambda: bridge.counters[6] == 2)
+        run_until(lambda: bridge.counters[6] == 2)
         broker.kill()
-        turn(lambda: bool(bridge.problem))
+        run_until(lambda: bool(bridge.problem))
         for step in range(2, 42):
             writer.publish(image(step=step), cycle=step)
-        turn(lambda: kept() >= 40)
+        run_until(lambda: kept() >= 40)
         broker.start()
         before, most = kept(), 0
 
@@ -335,7 +335,7 @@ def test_the_backlog_is_sent_in_small_portions(
             most, before = max(most, before - kept()), kept()
             return not before
 
-        turn(less)
+        run_until(less)
         assert most <= 2
         assert bridge.counters[5] == 0
     finally:

@@ -211,7 +211,7 @@ def recorder(segment: Segment, folder: Path, start: StartPositions = FROM_THE_FI
 
 
 def flush(work: Recorder) -> None:
-    while work.turn():
+    while work.run_once():
         pass
     work._writer.flush()
     work.output.flush()
