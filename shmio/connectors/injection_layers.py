@@ -18,7 +18,8 @@ import numpy as np
 from shmio.config import Declaration
 from shmio.injection import Program
 from shmio.injection.activation import Activation, State
-from shmio.injection.condition import Memory, Number
+from shmio.injection.condition import Memory
+from shmio.injection.language import Number
 from shmio.injection.draw import SeededRandom
 from shmio.injection.operations import Delay, Drop, Operation, OperationContext
 from shmio.layout.values.write import Write, apply, merge

@@ -35,7 +35,7 @@ from shmio.connectors.output import Image, LayerPublisher, Output, in_parts, lay
 from shmio.errors import ConfigError, SegmentError
 from shmio.injection import Program, compile_program
 from shmio.injection.activation import State
-from shmio.injection.condition import Number
+from shmio.injection.language import Number
 from shmio.injection.program import NEVER, compile_condition
 from shmio.layout.values.write import Write, apply
 from shmio.model.injection import Running

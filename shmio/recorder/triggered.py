@@ -12,7 +12,8 @@ from typing import Final
 from shmio.config import Recorder as Settings
 from shmio.config import Trigger as TriggerSettings
 from shmio.errors import ConfigError, RecordingError
-from shmio.injection.condition import Memory, Number
+from shmio.injection.condition import Memory
+from shmio.injection.language import Number
 from shmio.injection.program import NEVER, compile_condition
 from shmio.layout.values.codec import RegisterCodec
 from shmio.recorder.instance_follower import TURN_S, BlockEntry, InstanceEntry, InstanceFollower

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmio.errors import ConfigError
-from shmio.injection.condition import MAX_DEPTH, MAX_LENGTH, MAX_NODES, Memory, Number, parse
+from shmio.injection.condition import Memory, parse
+from shmio.injection.language import MAX_DEPTH, MAX_LENGTH, MAX_NODES, Number
 
 VALUES: dict[str, Number] = {"a": 3, "b": -2.5, "on": True, "off": False, "cell/R 1/x": 7}
 
