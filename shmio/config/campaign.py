@@ -1,4 +1,4 @@
-"""Campaigns: files of declared injections for ``shmio inject --file``."""
+"""Campaigns: files of declared injections, and of what is expected of signals."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from shmio.config.declaration import check_declarations
+from shmio.config.expectation import expectation_faults
 from shmio.config.faults import named
-from shmio.config.model import Declaration, Section
+from shmio.config.model import Declaration, Expectation, Section
 from shmio.config.read import check_text, convert, read_tables
 from shmio.errors import ConfigError
 
@@ -15,7 +16,19 @@ from shmio.errors import ConfigError
 class Campaign(Section):
     """The contents of a campaign file."""
 
-    injection: list[Declaration]
+    injection: list[Declaration] = []
+    expect: list[Expectation] = []
+
+
+def load_campaign(file: Path) -> Campaign:
+    """Read a campaign file with expectations.
+
+    Raises:
+        ConfigError: The file is invalid, or has no expectation; the message names the file, the key
+            and the remedy.
+
+    """
+    return _read(file, "expect")
 
 
 def read_campaign(file: Path) -> list[Declaration]:
@@ -25,11 +38,7 @@ def read_campaign(file: Path) -> list[Declaration]:
         ConfigError: The file is invalid; the message names the file, the key and the remedy.
 
     """
-    tables = read_tables(file)
-    try:
-        return parse_campaign(tables)
-    except ConfigError as error:
-        raise ConfigError(f"{file}: {named(str(error), tables)}") from None
+    return _read(file, "injection").injection
 
 
 def parse_campaign(tables: dict[str, Any]) -> list[Declaration]:
@@ -39,9 +48,26 @@ def parse_campaign(tables: dict[str, Any]) -> list[Declaration]:
         ConfigError: A table is invalid; the message begins with its key.
 
     """
-    if isinstance(tables.get("injection"), dict):
-        raise ConfigError("injection: write [[injection]] with double brackets, because there can be several")
+    return _parse(tables, "injection").injection
+
+
+def _read(file: Path, needed: str) -> Campaign:
+    tables = read_tables(file)
+    try:
+        return _parse(tables, needed)
+    except ConfigError as error:
+        raise ConfigError(f"{file}: {named(str(error), tables)}") from None
+
+
+def _parse(tables: dict[str, Any], needed: str) -> Campaign:
+    for key in ("injection", "expect"):
+        if isinstance(tables.get(key), dict):
+            raise ConfigError(f"{key}: write [[{key}]] with double brackets, because there can be several")
+    if needed not in tables:
+        raise ConfigError(f"{needed}: this key is needed")
     check_text(tables, "")
     campaign = convert(tables, Campaign)
     check_declarations(campaign.injection)
-    return campaign.injection
+    for fault in expectation_faults(campaign.expect):
+        raise ConfigError(fault)
+    return campaign

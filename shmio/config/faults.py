@@ -49,7 +49,7 @@ TOKEN: Final = re.compile(
     re.DOTALL,
 )
 _KEY: Final = re.compile(r"[A-Za-z0-9_-]+(?:\[[0-9]+\]|\.[A-Za-z0-9_-]+)*(?=[:\s])")
-_PLACE: Final = re.compile(r"\b(source|emulator|injection|alert)\[([0-9]+)\]")
+_PLACE: Final = re.compile(r"\b(source|emulator|injection|expect|alert)\[([0-9]+)\]")
 _QUOTES: Final = "'"
 _DOUBLE: Final = ("Cannot overwrite", "Cannot declare", "Duplicate inline table key")
 _ESCAPE: Final = ("Unescaped", "Invalid hex", "Escaped character", "Illegal character")
@@ -287,8 +287,8 @@ def _slip(message: str, line: str, column: int) -> str:
 
 
 def named(message: str, tables: Mapping[str, Any]) -> str:
-    """Add the name of a source, emulator, injection or alert to a message that has only its number."""
-    key = re.match(r"(source|emulator|injection|alert)\[(\d+)\](?!\.name:)", message)
+    """Add the name of a source, emulator, injection, expectation or alert to a message that has only its number."""
+    key = re.match(r"(source|emulator|injection|expect|alert)\[(\d+)\](?!\.name:)", message)
     if key is None:
         return message
     try:

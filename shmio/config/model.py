@@ -244,6 +244,32 @@ class Declaration(Section, omit_defaults=True):
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] | None = None
 
 
+class Expectation(Section, omit_defaults=True):
+    """``[[expect]]``: what a campaign expects of signals.
+
+    docs/reference/expectations.md describes the keys. ``expectation.py`` has the rules for the keys
+    of each form.
+    """
+
+    name: Name
+    formula: Text | None = None
+    when: Text | None = None
+    within_s: Seconds | None = None
+    then: Text | None = None
+    never: Text | None = None
+    always: Text | None = None
+    stays: Text | None = None
+    for_s: Annotated[float, Meta(gt=0, le=1e6)] | None = None
+    signal: Text | Annotated[list[Text], Meta(min_length=1, max_length=64)] | None = None
+    max_rate: Annotated[float, Meta(ge=0, le=1e300)] | None = None
+    like: Text | None = None
+    tolerance: Annotated[float, Meta(ge=0, le=1e300)] | None = None
+    tolerance_s: Annotated[float, Meta(ge=0, le=1e6)] | None = None
+    severity: Severity = "warning"
+    text: Annotated[str, Meta(max_length=2000)] = ""
+    requirement: Annotated[str, Meta(max_length=200)] = ""
+
+
 class MqttTls(Section):
     """``[mqtt.tls]``: PEM files.
 

@@ -138,12 +138,24 @@ def compile_condition(text: str, layouts: Mapping[str, Layout]) -> Condition:
 
 
 def _read(path: str, layouts: Mapping[str, Layout]) -> tuple[str, RegisterCodec]:
+    source, register = number_register(path, layouts)
+    return source, trusted_codec(register, layouts[source])
+
+
+def number_register(path: str, layouts: Mapping[str, Layout]) -> tuple[str, Register]:
+    """Return the source and the register that a condition names, which has a number or a BOOL.
+
+    Raises:
+        PathError: There is no such register, or the path names an input.
+        ConfigError: The register has several values, or others.
+
+    """
     source, register = single(path, layouts)
     if register.dims:
         raise ConfigError(f"{path} is an array, but a condition reads single values: name one of its elements")
     if register.type != "BOOL" and not scalar_codec(register.element).plain:
         raise ConfigError(f"{path}: {register.type} is neither a number nor a BOOL")
-    return source, trusted_codec(register, layouts[source])
+    return source, register
 
 
 def _window(declaration: Declaration) -> Window:

@@ -1,0 +1,1 @@
+"""What expectations mean: formulas over signals, their verdicts and robustness."""

@@ -1,0 +1,290 @@
+"""Turns formulas into networks of operators; equal parts of several formulas share their nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Final
+
+import numpy as np
+
+from shmio.errors import ConfigError, PathError
+from shmio.injection.language import TEMPORAL, Constant, Operation, Reference, Tree, nodes
+from shmio.injection.program import number_register
+from shmio.judging.operators import (
+    COMPARISONS,
+    NUMBERS,
+    Arithmetic,
+    Difference,
+    Digit,
+    Edge,
+    Extremum,
+    History,
+    Node,
+    Not,
+    Truth,
+    Until,
+    Window,
+    from_bool,
+    from_number,
+)
+from shmio.judging.source import Signal
+from shmio.judging.verdict import All, Opposite, Outer, Start, UntilEnd, Whole
+from shmio.layout.model import Layout, Register
+
+MAX_HORIZON_S: Final = 1_000_000
+"""The longest time for which a formula may look ahead or back, with all its parts."""
+ASPECTS: Final = ("quality", "age", "raw")
+_LOGIC: Final = frozenset({"and", "or", "not", "implies"})
+_EDGES: Final = frozenset({"rise", "fall", "rising", "falling", "changed"})
+_TRUTH: Final = _LOGIC | _EDGES | TEMPORAL | COMPARISONS.keys()
+_NS: Final = 1_000_000_000
+
+
+class Registers:
+    """Finds the registers that formulas read."""
+
+    def __init__(self, layouts: Mapping[str, Layout]) -> None:
+        self._layouts = layouts
+        self.found: dict[Signal, Register] = {}
+        """The register of each signal."""
+
+    def signal(self, reference: Reference, aspect: str = "value") -> Signal:
+        """Return the signal of a register.
+
+        Raises:
+            ConfigError: There is no such register, or it is neither a number nor a BOOL.
+
+        """
+        try:
+            source, register = number_register(reference.path, self._layouts)
+        except PathError as error:
+            raise ConfigError(f"at character {reference.at}: {error}") from None
+        except ConfigError as error:
+            text = str(error).replace("a condition reads", "a formula reads")
+            raise ConfigError(f"at character {reference.at}: {text}") from None
+        signal = Signal(source, register.path, aspect)
+        self.found[signal] = register
+        return signal
+
+
+def check(tree: Tree) -> None:
+    """Check what the grammar does not.
+
+    Raises:
+        ConfigError: A part of the formula has no meaning, or needs bounds.
+
+    """
+    for node in nodes(tree):
+        if not isinstance(node, Operation):
+            continue
+        if node.name in ASPECTS and not isinstance(node.operands[0], Reference):
+            raise ConfigError(f"at character {node.at}: {node.name}( ) needs a register")
+        if node.name in _EDGES | {"rate"} and temporal(node.operands[0]):
+            raise ConfigError(
+                f"at character {node.at}: {node.name}( ) compares a frame with the one before, so it takes no temporal "
+                "operator"
+            )
+    _check_bounds(tree, outer=True)
+    if horizon_ns(tree) > MAX_HORIZON_S * _NS:
+        raise ConfigError(f"the formula's bounds add up to more than {MAX_HORIZON_S} s")
+
+
+def _check_bounds(tree: Tree, *, outer: bool) -> None:
+    """Refuse an operator without bounds within a temporal one, which would wait until the end each time."""
+    if not isinstance(tree, Operation):
+        return
+    if not outer and tree.name in ("always", "eventually", "until") and tree.bounds_ns is None:
+        raise ConfigError(
+            f"at character {tree.at}: {tree.name!r} within another operator needs bounds, such as {tree.name}[0, 10]"
+        )
+    for operand in tree.operands:
+        _check_bounds(operand, outer=outer and tree.name in _LOGIC)
+
+
+def temporal(tree: Tree) -> bool:
+    """Return whether a tree has a temporal operator."""
+    return any(isinstance(node, Operation) and node.name in TEMPORAL for node in nodes(tree))
+
+
+def horizon_ns(tree: Tree) -> int:
+    """Return how far a tree looks ahead or back, at most, in ns."""
+    if not isinstance(tree, Operation):
+        return 0
+    own = tree.bounds_ns[1] if tree.bounds_ns else 0
+    return own + max(map(horizon_ns, tree.operands))
+
+
+class Network:
+    """The nodes of several formulas, each after its operands."""
+
+    def __init__(self, registers: Registers, input_of: Callable[[Signal], Node]) -> None:
+        """Create an empty network.
+
+        Args:
+            registers: Finds registers.
+            input_of: Returns the node of a signal.
+        """
+        self._registers = registers
+        self._input_of = input_of
+        self._nodes: dict[tuple[object, ...], Node] = {}
+
+    def turn(self) -> None:
+        """Let each node take what has become known of its operands."""
+        for node in self._nodes.values():
+            node.turn()
+
+    def outer(self, tree: Tree) -> Outer:
+        """Return the outermost part of a formula, whose truth at the begin is the verdict."""
+        if not isinstance(tree, Operation) or tree.name not in {*_LOGIC, "always", "eventually", "until"}:
+            return Start(self.truth(tree))
+        if tree.name == "not":
+            return Opposite(self.outer(tree.operands[0]))
+        if tree.name in _LOGIC:
+            if not temporal(tree):
+                return Start(self.truth(tree))
+            first, second = map(self.outer, tree.operands)
+            if tree.name == "and":
+                return All((first, second))
+            first = first if tree.name == "implies" else Opposite(first)
+            return Opposite(All((first, Opposite(second))))
+        if tree.name == "until":
+            if tree.bounds_ns is not None:
+                return Start(self.truth(tree))
+            left, right = self._truths(tree)
+            return UntilEnd(left, right)
+        return Whole(_extremum(tree.name), self.truth(tree.operands[0]), tree.bounds_ns)
+
+    def truth(self, tree: Tree) -> Node:
+        """Return the node of a truth; a number is true if it is not 0."""
+        if isinstance(tree, Operation) and tree.name in _TRUTH:
+            return self._operation(tree)
+        number = self.number(tree)
+        if not isinstance(number, Node):
+            raise ConfigError("a formula must read a register")
+        function = from_bool if self._boolean(tree) else from_number
+        return self._shared(("truth", number), lambda: Truth(function, (number,)))
+
+    def number(self, tree: Tree) -> Node | float:
+        """Return the node of a number, or a constant; truth is 1 or 0."""
+        match tree:
+            case Constant(value):
+                return float(value)
+            case Reference():
+                return self._input_of(self._registers.signal(tree))
+            case Operation(name, (Reference() as reference,)) if name in ASPECTS:
+                return self._input_of(self._registers.signal(reference, name))
+            case Operation(name) if name in _TRUTH:
+                truth = self._operation(tree)
+                return self._shared(("digit", truth), lambda: Digit((truth,)))
+            case Operation("rate", (operand,)):
+                number = self.number(operand)
+                if not isinstance(number, Node):
+                    return 0.0
+                return self._shared(("rate", number), lambda: Difference(number, per_second=True))
+            case _:
+                operands = [self.number(operand) for operand in tree.operands]
+                function = NUMBERS[tree.name]
+                if not any(isinstance(operand, Node) for operand in operands):
+                    with np.errstate(all="ignore"):
+                        return float(function(*map(np.float64, operands)))  # type: ignore[arg-type]
+                return self._shared((tree.name, *operands), lambda: Arithmetic(function, operands))
+
+    def _boolean(self, tree: Tree) -> bool:
+        match tree:
+            case Reference() | Operation("raw", (Reference(),)):
+                reference = tree if isinstance(tree, Reference) else tree.operands[0]
+                assert isinstance(reference, Reference)  # noqa: S101
+                return self._registers.found[self._registers.signal(reference)].type == "BOOL"
+            case _:
+                return False
+
+    def _operation(self, tree: Operation) -> Node:
+        """Return the node of an operation that gives a truth."""
+        name = tree.name
+        if name in COMPARISONS:
+            operands = [self.number(operand) for operand in tree.operands]
+            if not any(isinstance(operand, Node) for operand in operands):
+                raise ConfigError(f"at character {tree.at}: a comparison must read a register")
+            return self._shared((name, *operands), lambda: Truth(COMPARISONS[name], operands))
+        if name == "changed":
+            return self._changed(tree)
+        if name in _EDGES:
+            operand = self.truth(tree.operands[0])
+            if name in ("fall", "falling"):
+                operand = self._not(operand)
+            return self._shared((name, operand), lambda: Edge(operand, first=name in ("rise", "fall")))
+        truths = self._truths(tree)
+        if name == "not":
+            return self._not(truths[0])
+        if name == "implies":
+            truths = [self._not(truths[0]), truths[1]]
+        if name in _LOGIC:
+            function = _extremum(name)
+            return self._shared((function, *truths), lambda: Extremum(function, truths))
+        begin_ns, end_ns = tree.bounds_ns or (0, 0)
+        if name == "until":
+            return self._shared(
+                (name, *truths, begin_ns, end_ns), lambda: Until(truths[0], truths[1], begin_ns, end_ns)
+            )
+        function, (operand,) = _extremum(name), truths
+        if name in ("once", "historically"):
+            if tree.bounds_ns is None:
+                return self._shared((name, operand), lambda: History(function, operand))
+            begin_ns, end_ns = -end_ns, -begin_ns
+        return self._shared((function, operand, begin_ns, end_ns), lambda: Window(function, operand, begin_ns, end_ns))
+
+    def _truths(self, tree: Operation) -> list[Node]:
+        """Return the nodes of truths. A constant gets the times of another one."""
+        found = [None if isinstance(operand, Constant) else self.truth(operand) for operand in tree.operands]
+        other = next((node for node in found if node is not None), None)
+        if other is None:
+            raise ConfigError(f"at character {tree.at}: {tree.name!r} must read a register")
+        truths: list[Node] = []
+        for operand, node in zip(tree.operands, found, strict=True):
+            if node is None:
+                assert isinstance(operand, Constant)  # noqa: S101
+                value = np.inf if operand.value else -np.inf
+                truths.append(Arithmetic(lambda low, value=value: np.full(len(low), value), (other,)))
+                self._nodes["constant", len(self._nodes)] = truths[-1]
+            else:
+                truths.append(node)
+        return truths
+
+    def _changed(self, tree: Operation) -> Node:
+        number = self.number(tree.operands[0])
+        if not isinstance(number, Node):
+            raise ConfigError(f"at character {tree.at}: changed( ) must read a register")
+        difference = self._shared(("difference", number), lambda: Difference(number, per_second=False))
+        return self._shared(("truth", difference), lambda: Truth(from_number, (difference,)))
+
+    def _not(self, operand: Node) -> Node:
+        return self._shared(("not", operand), lambda: Not((operand,)))
+
+    def _shared(self, key: tuple[object, ...], make: Callable[[], Node]) -> Node:
+        """Return the node with this meaning. Create it if there is none yet."""
+        if key not in self._nodes:
+            node = make()  # before it is stored, so that its operands come first
+            self._nodes[key] = node
+        return self._nodes[key]
+
+
+def _extremum(name: str) -> np.ufunc:
+    return np.minimum if name in ("and", "always", "historically") else np.maximum
+
+
+def signals(tree: Tree, registers: Registers) -> Iterator[Signal]:
+    """Iterate over the signals that a tree reads, once each.
+
+    Raises:
+        ConfigError: A register does not exist, or is neither a number nor a BOOL.
+
+    """
+    seen: dict[Signal, None] = {}
+    inner: set[int] = set()
+    for node in reversed(list(nodes(tree))):
+        if isinstance(node, Operation) and node.name in ASPECTS and isinstance(node.operands[0], Reference):
+            inner.add(id(node.operands[0]))
+            seen[registers.signal(node.operands[0], node.name)] = None
+        elif isinstance(node, Reference) and id(node) not in inner:
+            seen[registers.signal(node)] = None
+    yield from reversed(seen)

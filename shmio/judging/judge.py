@@ -1,0 +1,261 @@
+"""Judges: gives verdicts on expectations from the frames of the sources that they read."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import Final
+
+import numpy as np
+
+from shmio.config import Expectation
+from shmio.errors import ConfigError, PathError
+from shmio.injection.program import number_register
+from shmio.judging.expectation import Formula, read_expectations
+from shmio.judging.formula import Network
+from shmio.judging.operators import Node
+from shmio.judging.source import Frames, Rows, Signal, Source
+from shmio.judging.verdict import Outcome, Outer, Verdict, Whole
+from shmio.layout.model import Layout, Register
+
+AROUND: Final = 3
+"""Number of values before and after a moment that a verdict has."""
+
+
+class Judge:
+    """Judges expectations while frames arrive, or from a recording.
+
+    The judged time begins when each source that the expectations read has a frame, and ends with
+    the newest frame. Add frames in any portions, and call :meth:`turn` whenever you like: the
+    verdicts are the same.
+    """
+
+    def __init__(
+        self, expectations: Sequence[Expectation], layouts: Mapping[str, Layout], stale_ns: Mapping[str, int]
+    ) -> None:
+        """Read the expectations.
+
+        Args:
+            expectations: The expectations.
+            layouts: The layout of each source.
+            stale_ns: The age from which a frame of a source is stale, in ns.
+
+        Raises:
+            ConfigError: An expectation is invalid; the message starts as ``expect[0].formula: …``.
+
+        """
+        formulas, registers = read_expectations(expectations, layouts)
+        by_source: dict[str, dict[Signal, None]] = {}
+        for formula in formulas:
+            for signal in formula.signals:
+                by_source.setdefault(signal.source, {})[signal] = None
+        self._sources = {name: Source(name, tuple(found)) for name, found in by_source.items()}
+        inputs: dict[Signal, Node] = {
+            signal: node
+            for source in self._sources.values()
+            for signal, node in zip(source.signals, source.inputs, strict=True)
+        }
+        self.registers: Mapping[Signal, Register] = registers.found
+        """The register of each signal."""
+        self._network = Network(registers, inputs.__getitem__)
+        self._cases = [_Case(formula, self._network) for formula in formulas]
+        horizon_ns = max((formula.horizon_ns for formula in formulas), default=0)
+        self._histories = {name: _History(horizon_ns) for name in self._sources}
+        self._origin_ns: int | None = None
+        self.end_ns: int | None = None
+        """End of the judged time; None before :meth:`finish`."""
+        for name in self._sources:
+            self.follow(name, layouts[name], stale_ns[name])
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Names of the sources that the expectations read."""
+        return tuple(self._sources)
+
+    @property
+    def begin_ns(self) -> int | None:
+        """Begin of the judged time on the instance's clock; None while a source has no frame."""
+        return self._origin_ns
+
+    def needs_raw(self, source: str) -> bool:
+        """Return whether an expectation reads what a source delivered, without injections."""
+        return self._sources[source].needs_raw
+
+    def signals(self, source: str) -> tuple[Signal, ...]:
+        """Return the signals of a source that the expectations read."""
+        return self._sources[source].signals
+
+    def follow(self, name: str, layout: Layout, stale_ns: int) -> None:
+        """Set the block from which the next frames of a source come, such as after a reload.
+
+        Values of registers that it does not have are unknown.
+        """
+        source = self._sources[name]
+        found = {}
+        for signal in source.signals:
+            with suppress(PathError, ConfigError):
+                found[signal.path] = number_register(f"{name}/{signal.path}", {name: layout})[1]
+        source.follow(layout, found, stale_ns)
+
+    def add(self, source: str, frames: Frames) -> None:
+        """Add the frames of a source that follow."""
+        self._sources[source].add(frames)
+
+    def turn(self) -> dict[str, Rows]:
+        """Judge what the added frames make known, and return the values of the signals by source."""
+        return self._turn(None)
+
+    def finish(self) -> dict[str, Rows]:
+        """Judge what is left: no more frames follow. Return as :meth:`turn`."""
+        self.end_ns = max((source.newest_ns for source in self._sources.values()), default=0) + 1
+        for case in self._cases:
+            case.finish(self.end_ns)
+        return self._turn(self.end_ns)
+
+    def _turn(self, end_ns: int | None) -> dict[str, Rows]:
+        if self._origin_ns is None:
+            firsts = [source.origin_ns for source in self._sources.values()]
+            known = [first for first in firsts if first is not None]
+            if len(known) < len(firsts):
+                return {}
+            self._origin_ns = max(known, default=0)
+        rows = {}
+        for name, source in self._sources.items():
+            source.turn(self._origin_ns, end_ns)
+            if len(source.rows.time):
+                rows[name] = source.rows
+                self._histories[name].add(source.rows)
+        self._network.turn()
+        for case in self._cases:
+            case.turn()
+            if case.failed and case.around is None:
+                case.around = self._around(case, final=end_ns is not None)
+        return rows
+
+    def _around(self, case: _Case, *, final: bool) -> dict[str, list[tuple[int, float | None]]] | None:
+        """Return the values around the moment of a failure; None if some will follow."""
+        moment_ns = case.outer.decided_ns()
+        found: dict[str, list[tuple[int, float | None]]] = {}
+        for signal in case.formula.signals if moment_ns is not None else ():
+            source, history = self._sources[signal.source], self._histories[signal.source]
+            pairs = history.around(moment_ns or 0, source.signals.index(signal), final=final)
+            if pairs is None:
+                return None
+            found[signal.name] = pairs
+        return found
+
+    @property
+    def failed(self) -> bool:
+        """True if an expectation has failed, whatever follows."""
+        return any(case.failed for case in self._cases)
+
+    @property
+    def verdicts(self) -> list[Verdict]:
+        """The verdicts: before :meth:`finish`, with what is known up to now."""
+        return [self._verdict(case) for case in self._cases]
+
+    def _verdict(self, case: _Case) -> Verdict:
+        outer, formula = case.outer, case.formula
+        outcome, reason, moment_ns = Outcome.INCONCLUSIVE, "", None
+        if case.failed:
+            outcome, reason, moment_ns = Outcome.FAILED, formula.failure, outer.decided_ns()
+        elif outer.low > 0 and not case.idle:
+            outcome = Outcome.PASSED
+        elif outer.low > 0:
+            reason = f"{case.condition} never became true"
+        else:
+            reason = self._unknown(case)
+        return Verdict(
+            formula.expectation, outcome, reason, outer.low, outer.high, moment_ns, outer.extreme_ns, case.around or {}
+        )
+
+    def _unknown(self, case: _Case) -> str:
+        """Return why the truth of a formula is not known."""
+        names = dict.fromkeys(signal.source for signal in case.formula.signals)
+        for name in names:
+            if self._sources[name].origin_ns is None:
+                return f"there was no frame of {name}"
+        if self.end_ns is None:
+            return "the run is not over"
+        unknown_ns = case.outer.unknown_ns()
+        if unknown_ns is not None:
+            reach_ns = case.formula.horizon_ns
+            troubles = [
+                trouble
+                for name in names
+                for trouble in self._sources[name].troubles
+                if trouble.begin_ns <= unknown_ns + reach_ns and trouble.end_ns > unknown_ns - reach_ns
+            ]
+            if troubles:
+                first = min(troubles)
+                return f"{first.reason} from {first.begin_ns / 1e9:.3f} s to {first.end_ns / 1e9:.3f} s"
+            if unknown_ns + reach_ns < self.end_ns:
+                return f"a value was not a number at {unknown_ns / 1e9:.3f} s"
+        return f"the run ended at {(self.end_ns - 1) / 1e9:.3f} s, before it was decided"
+
+
+class _Case:
+    """The present state of an expectation."""
+
+    def __init__(self, formula: Formula, network: Network) -> None:
+        self.formula = formula
+        self.outer: Outer = network.outer(formula.tree)
+        self._trigger = None
+        if formula.trigger is not None:
+            self._trigger = Whole(np.maximum, network.truth(formula.trigger), None)
+        self.around: dict[str, list[tuple[int, float | None]]] | None = None
+
+    @property
+    def failed(self) -> bool:
+        """True if the expectation has failed, whatever follows."""
+        return self.outer.high < 0
+
+    @property
+    def idle(self) -> bool:
+        """True if its condition has never become true."""
+        return self._trigger is not None and self._trigger.high < 0
+
+    @property
+    def condition(self) -> str:
+        """The condition, as text."""
+        expectation = self.formula.expectation
+        return expectation.when or expectation.stays or "the condition before 'implies'"
+
+    def turn(self) -> None:
+        """Take what has become known."""
+        self.outer.turn()
+        if self._trigger is not None:
+            self._trigger.turn()
+
+    def finish(self, end_ns: int) -> None:
+        """Set the end of the judged time."""
+        self.outer.finish(end_ns)
+        if self._trigger is not None:
+            self._trigger.finish(end_ns)
+
+
+class _History:
+    """The last values of a source: as far back as a failure can be found, and a few more."""
+
+    def __init__(self, horizon_ns: int) -> None:
+        self._horizon_ns = horizon_ns
+        self._rows: deque[Rows] = deque()
+
+    def add(self, rows: Rows) -> None:
+        """Add values, and drop old ones."""
+        self._rows.append(rows)
+        old_ns = int(rows.time[0]) - self._horizon_ns
+        while len(self._rows) > 3 * AROUND and int(self._rows[3 * AROUND].time[-1]) < old_ns:
+            self._rows.popleft()
+
+    def around(self, moment_ns: int, index: int, *, final: bool) -> list[tuple[int, float | None]] | None:
+        """Return times and values of a signal around a moment; None if some will follow, unless it is final."""
+        time = np.concatenate([rows.time for rows in self._rows]) if self._rows else np.empty(0, np.int64)
+        at = int(time.searchsorted(moment_ns, "right"))
+        if at + AROUND > len(time) and not final:
+            return None
+        values = np.concatenate([rows.values[index] for rows in self._rows])
+        part = slice(max(0, at - AROUND), at + AROUND)
+        pairs = zip(time[part].tolist(), values[part].tolist(), strict=True)
+        return [(time_ns, None if value != value else value) for time_ns, value in pairs]  # noqa: PLR0124  NaN

@@ -1,0 +1,430 @@
+"""The operators of formulas, as nodes of a network through which the pieces of signals pass.
+
+Each node takes what has become known of its operands, and gives what is therefore known of itself.
+The result does not depend on how a signal is divided into pieces. So the same nodes serve a
+live cell, which brings a few frames at a time, and a recording, which brings thousands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import numpy as np
+
+from shmio.judging.pieces import FAR_NS, NOTHING, TINY, Alignment, Piece, Times, Values, cut, join
+
+Numeric = Callable[..., Values]
+"""Computes numbers from numbers: arrays, or constants."""
+
+
+class Node:
+    """A signal. ``out`` is what has become known of it in the present turn."""
+
+    out: Piece = NOTHING
+
+    def turn(self) -> None:
+        """Take what has become known of the operands, and set ``out``."""
+        raise NotImplementedError
+
+
+class Input(Node):
+    """A signal that frames bring. Its source sets ``out``."""
+
+    def turn(self) -> None:
+        """Leave ``out`` as it is."""
+
+
+# -- at each moment on its own -----------------------------------------------------------------------------------------
+
+
+class _Pointwise(Node):
+    """A signal that depends only on the present values of its operands."""
+
+    def __init__(self, operands: Sequence[Node]) -> None:
+        self._operands = operands
+        self._alignment = Alignment(len(operands))
+
+    def turn(self) -> None:
+        if len(self._operands) == 1:
+            pieces = [self._operands[0].out]
+        else:
+            pieces = self._alignment.align([operand.out for operand in self._operands])
+        self.out = self.combine(pieces) if len(pieces[0].time) else NOTHING
+
+    def combine(self, pieces: list[Piece]) -> Piece:
+        """Return the result for pieces with the same times."""
+        raise NotImplementedError
+
+
+class Arithmetic(_Pointwise):
+    """A number that is computed from numbers; NaN if one of them is unknown."""
+
+    def __init__(self, function: Numeric, operands: Sequence[Node | float]) -> None:
+        super().__init__([operand for operand in operands if isinstance(operand, Node)])
+        self._function = function
+        self._constants = [None if isinstance(operand, Node) else operand for operand in operands]
+
+    def combine(self, pieces: list[Piece]) -> Piece:
+        """Return the result; see the class."""
+        values = iter(pieces)
+        arguments = [next(values).low if constant is None else constant for constant in self._constants]
+        with np.errstate(all="ignore"):
+            found = self._function(*arguments)
+        return Piece(pieces[0].time, found, found, pieces[0].end)
+
+
+class Truth(Arithmetic):
+    """Turns numbers into truth: the function gives the distance, with the sign of the truth."""
+
+    def combine(self, pieces: list[Piece]) -> Piece:
+        """Return the result; see the class."""
+        time, distance, _, end = super().combine(pieces)
+        unknown = np.isnan(distance)
+        if not unknown.any():
+            return Piece(time, distance, distance, end)
+        return Piece(time, np.where(unknown, -np.inf, distance), np.where(unknown, np.inf, distance), end)
+
+
+class Digit(_Pointwise):
+    """Turns truth into a number: 1 is true, 0 is false, NaN is unknown."""
+
+    def combine(self, pieces: list[Piece]) -> Piece:
+        """Return the result; see the class."""
+        time, low, high, end = pieces[0]
+        found = np.where(low > 0, 1.0, np.where(high < 0, 0.0, np.nan))
+        return Piece(time, found, found, end)
+
+
+class Not(_Pointwise):
+    """The opposite of a signal."""
+
+    def combine(self, pieces: list[Piece]) -> Piece:
+        """Return the result; see the class."""
+        time, low, high, end = pieces[0]
+        opposite = -low
+        return Piece(time, opposite if high is low else -high, opposite, end)
+
+
+class Extremum(_Pointwise):
+    """The least of several signals (and), or the greatest (or)."""
+
+    def __init__(self, function: np.ufunc, operands: Sequence[Node]) -> None:
+        super().__init__(operands)
+        self._function = function
+
+    def combine(self, pieces: list[Piece]) -> Piece:
+        """Return the result; see the class."""
+        found = pieces[0]
+        for piece in pieces[1:]:
+            low = self._function(found.low, piece.low)
+            known = found.high is found.low and piece.high is piece.low
+            found = Piece(found.time, low, low if known else self._function(found.high, piece.high), found.end)
+        return found
+
+
+# -- between a frame and the one before --------------------------------------------------------------------------------
+
+
+class Edge(Node):
+    """True from a frame in which a signal has become true until the next frame.
+
+    Args:
+        operand: The signal.
+        first: Whether a signal that is true from the first frame on has become true there.
+    """
+
+    def __init__(self, operand: Node, *, first: bool) -> None:
+        self._operand = operand
+        self._before: tuple[float, float] = (-np.inf, -np.inf) if first else (np.inf, np.inf)
+
+    def turn(self) -> None:
+        """Compare each value with the one before."""
+        time, low, high, end = self._operand.out
+        if not len(time):
+            self.out = NOTHING
+            return
+        found = np.minimum(low, -_shifted(high, self._before[1]))
+        known = high is low and self._before[0] == self._before[1]
+        upper = found if known else np.minimum(high, -_shifted(low, self._before[0]))
+        self._before = float(low[-1]), float(high[-1])
+        self.out = Piece(time, found, upper, end)
+
+
+class Difference(Node):
+    """The difference between a number and the one in the frame before; 0 in the first frame.
+
+    With ``per_second``, the difference divided by the time between the frames.
+    """
+
+    def __init__(self, operand: Node, *, per_second: bool) -> None:
+        self._operand = operand
+        self._per_second = per_second
+        self._before: tuple[int, float] | None = None
+
+    def turn(self) -> None:
+        """Subtract from each value the one before."""
+        time, values, _, end = self._operand.out
+        if not len(time):
+            self.out = NOTHING
+            return
+        time_ns, value = self._before or (int(time[0]) - 1, float(values[0]))
+        with np.errstate(all="ignore"):
+            found = values - _shifted(values, value)
+            if self._per_second:
+                passed = np.empty(len(time))
+                passed[0], passed[1:] = time[0] - time_ns, np.diff(time)
+                found /= passed / 1e9
+        if self._before is None:
+            found[0] = 0.0
+        self._before = int(time[-1]), float(values[-1])
+        self.out = Piece(time, found, found, end)
+
+
+def _shifted(values: Values, before: float) -> Values:
+    shifted = np.empty_like(values)
+    shifted[0], shifted[1:] = before, values[:-1]
+    return shifted
+
+
+# -- over times --------------------------------------------------------------------------------------------------------
+
+
+class Window(Node):
+    """The greatest or the least value of a signal between ``t + begin`` and ``t + end``, at each t.
+
+    A window reaches into the future (``begin`` and ``end`` from 0 on: eventually, always) or into
+    the past (both up to 0: once, historically). In a window that ends before the judged time
+    begins, ``once`` is false, and ``historically`` is true.
+
+    It keeps only what can still decide a future result. For the greatest value that is, of the
+    values up to now, at each moment the greatest from then on, because each further window reaches
+    at least up to now.
+
+    Args:
+        function: ``np.maximum`` or ``np.minimum``.
+        operand: The signal.
+        begin_ns: Begin of the window relative to t.
+        end_ns: End of the window relative to t; it belongs to the window.
+    """
+
+    def __init__(self, function: np.ufunc, operand: Node, begin_ns: int, end_ns: int) -> None:
+        self._function = function
+        self._operand = operand
+        self._begin_ns, self._end_ns = begin_ns, end_ns
+        self._neutral = -np.inf if function is np.maximum else np.inf
+        self._kept = NOTHING
+        self._done_ns: int | None = None
+
+    def turn(self) -> None:
+        """Compute the windows that have become known completely."""
+        piece, kept = self._operand.out, self._kept
+        if not len(piece.time):
+            self.out = NOTHING
+            return
+        if self._done_ns is None:
+            self._done_ns = int(piece.time[0])
+        done, end = self._done_ns, max(self._done_ns, min(piece.end - self._end_ns, FAR_NS))
+        whole = join(kept, piece)
+        if end > done:
+            moments = self._moments(whole, done, end)
+            first = whole.time.searchsorted(moments + self._begin_ns, "right") - 1
+            last = whole.time.searchsorted(moments + self._end_ns, "right") - 1
+            np.maximum(first, 0, out=first)
+            low = self._extrema(whole.low, len(kept.time), first, last)
+            high = low if whole.high is whole.low else self._extrema(whole.high, len(kept.time), first, last)
+            self.out = Piece(moments, low, high, end)
+            self._done_ns = end
+            whole = cut(whole, max(end + self._begin_ns, int(whole.time[0])))
+        else:
+            self.out = NOTHING
+        self._kept = self._deciding(whole)
+
+    def _moments(self, whole: Piece, done: int, end: int) -> Times:
+        """Return the moments from ``done`` to ``end`` at which a value enters or leaves the window."""
+        changes = np.concatenate(([done], whole.time - self._end_ns, whole.time[1:] - self._begin_ns))
+        if self._begin_ns == self._end_ns:
+            changes = changes[: len(whole.time) + 1]
+        moments: Times = np.unique(changes[(changes >= done) & (changes < end)])
+        return moments
+
+    def _extrema(self, values: Values, kept: int, first: Times, last: Times) -> Values:
+        """Return the extremum of ``values[first : last + 1]`` for each pair.
+
+        The first ``kept`` values are already the extremum from their place up to the last of them.
+        """
+        fresh = values[kept:]
+        begin = np.maximum(first - kept, 0)
+        length = last - kept - begin + 1
+        found = np.full(len(first), self._neutral)
+        level, table = 0, fresh
+        longest = int(length.max())
+        while 1 << level <= longest:  # `table` has the extrema of 2**level values each
+            chosen = (length >> level) == 1
+            if chosen.any():
+                start = begin[chosen]
+                rest = last[chosen] - kept + 1 - (1 << level)
+                found[chosen] = self._function(table[start], table[rest])
+            level += 1
+            if 1 << level <= longest:
+                half = 1 << (level - 1)
+                table = self._function(table[:-half], table[half:])
+        if kept:
+            old = first < kept
+            found[old] = self._function(found[old], values[first[old]])
+        return found
+
+    def _deciding(self, whole: Piece) -> Piece:
+        """Return what can decide a future result; see the class."""
+        if len(whole.time) < 2:
+            return whole
+        low = self._function.accumulate(whole.low[::-1])[::-1]
+        changed = low[1:] != low[:-1]
+        if whole.high is whole.low:
+            keep = np.concatenate(([True], changed))
+            low = low[keep]
+            return Piece(whole.time[keep], low, low, whole.end)
+        high = self._function.accumulate(whole.high[::-1])[::-1]
+        keep = np.concatenate(([True], changed | (high[1:] != high[:-1])))
+        return Piece(whole.time[keep], low[keep], high[keep], whole.end)
+
+
+class History(Node):
+    """The greatest or the least value of a signal from the begin up to each moment."""
+
+    def __init__(self, function: np.ufunc, operand: Node) -> None:
+        self._function = function
+        self._operand = operand
+        self._neutral = -np.inf if function is np.maximum else np.inf
+        self._before: tuple[float, float] = (self._neutral, self._neutral)
+
+    def turn(self) -> None:
+        """Continue the extremum."""
+        time, low, high, end = self._operand.out
+        if not len(time):
+            self.out = NOTHING
+            return
+        known = high is low and self._before[0] == self._before[1]
+        low = self._function(self._function.accumulate(low), self._before[0])
+        high = low if known else self._function(self._function.accumulate(high), self._before[1])
+        self._before = float(low[-1]), float(high[-1])
+        self.out = Piece(time, low, high, end)
+
+
+class Until(Node):
+    """At each t: whether ``right`` is true at a moment in [t + begin, t + end], and ``left`` until then.
+
+    The value is the greatest, over these moments s, of the least of ``right`` at s and of ``left``
+    from t up to, but not at, s.
+    """
+
+    def __init__(self, left: Node, right: Node, begin_ns: int, end_ns: int) -> None:
+        self._operands = (left, right)
+        self._alignment = Alignment(2)
+        self._begin_ns, self._end_ns = begin_ns, end_ns
+        self._kept = (NOTHING, NOTHING)
+        self._done_ns: int | None = None
+
+    def turn(self) -> None:
+        """Compute the windows that have become known completely."""
+        left, right = self._alignment.align([operand.out for operand in self._operands])
+        if not len(left.time):
+            self.out = NOTHING
+            return
+        if self._done_ns is None:
+            self._done_ns = int(left.time[0])
+        left, right = join(self._kept[0], left), join(self._kept[1], right)
+        done, end = self._done_ns, max(self._done_ns, min(left.end - self._end_ns, FAR_NS))
+        self.out = NOTHING
+        if end > done:
+            changes = np.concatenate(([done], left.time, left.time - self._end_ns, left.time - self._begin_ns))
+            moments = np.unique(changes[(changes >= done) & (changes < end)])
+            here, first, last = (
+                left.time.searchsorted(moments + shift, "right") - 1 for shift in (0, self._begin_ns, self._end_ns)
+            )
+            inside = left.time[first] < moments + self._begin_ns  # `left` must also hold there, before the window
+            before = first + inside - here
+            low = _until(left.low, right.low, here, before, first, last)
+            known = left.high is left.low and right.high is right.low
+            high = low if known else _until(left.high, right.high, here, before, first, last)
+            self.out = Piece(moments, low, high, end)
+            self._done_ns = end
+            left, right = cut(left, end), cut(right, end)
+        self._kept = left, right
+
+
+def _until(left: Values, right: Values, here: Times, before: Times, first: Times, last: Times) -> Values:
+    """Return ``until`` for places of the present, and of the first and the last value of the window.
+
+    A value continues what follows it as x → max(p, min(q, x)); two such functions make one. So do
+    2**level of them, of which each window takes those that make up its length. ``before`` values
+    of ``left`` come before the window: there, p is minus infinity.
+    """
+    false = np.full(len(left), -np.inf)
+    found = np.full(len(here), -np.inf), np.full(len(here), np.inf)
+    _continue(found, false, left, here, before)
+    _continue(found, right, left, first, last - first + 1)
+    return found[0]
+
+
+def _continue(found: tuple[Values, Values], p: Values, q: Values, begin: Times, length: Times) -> None:
+    """Append to each function x → max(p, min(q, x)) in ``found`` the ``length`` functions from ``begin`` on."""
+    found_p, found_q = found
+    place, level = begin.copy(), 0
+    while (length >> level).any():
+        odd = (length >> level & 1).astype(bool)
+        next_p, next_q = p[place[odd]], q[place[odd]]
+        found_p[odd] = np.maximum(found_p[odd], np.minimum(found_q[odd], next_p))
+        found_q[odd] = np.minimum(found_q[odd], next_q)
+        half = 1 << level
+        place[odd] += half
+        p, q = np.maximum(p[:-half], np.minimum(q[:-half], p[half:])), np.minimum(q[:-half], q[half:])
+        level += 1
+
+
+# -- functions of numbers ----------------------------------------------------------------------------------------------
+
+
+def _strict(distance: Values) -> Values:
+    """Return distances of which 0 counts as false."""
+    return np.where(distance == 0, -TINY, distance)
+
+
+def _loose(distance: Values) -> Values:
+    """Return distances of which 0 counts as true."""
+    return np.where(distance == 0, TINY, distance)
+
+
+COMPARISONS: Final[dict[str, Numeric]] = {
+    "==": lambda left, right: _loose(-np.abs(np.subtract(left, right))),
+    "!=": lambda left, right: _strict(np.abs(np.subtract(left, right))),
+    "<": lambda left, right: _strict(np.subtract(right, left)),
+    "<=": lambda left, right: _loose(np.subtract(right, left)),
+    ">": lambda left, right: _strict(np.subtract(left, right)),
+    ">=": lambda left, right: _loose(np.subtract(left, right)),
+}
+
+
+def _quotient(left: Values, right: Values) -> Values:
+    return np.where(np.equal(right, 0), np.nan, np.divide(left, right))
+
+
+NUMBERS: Final[dict[str, Numeric]] = {
+    "+": np.add,
+    "-": np.subtract,
+    "*": np.multiply,
+    "/": _quotient,
+    "mod": np.mod,
+    "neg": np.negative,
+    "abs": np.abs,
+}
+
+
+def from_bool(values: Values) -> Values:
+    """Return the truth of BOOLs: 1 or -1."""
+    return 2.0 * values - 1.0
+
+
+def from_number(values: Values) -> Values:
+    """Return the truth of numbers, which are true if they are not 0."""
+    return _strict(np.abs(values))

@@ -1,0 +1,293 @@
+"""Verdicts: what the truth of a formula at the begin of the judged time says about an expectation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from math import isfinite
+
+import numpy as np
+
+from shmio.config import Expectation
+from shmio.judging.operators import Node
+from shmio.judging.pieces import NOTHING, Alignment, Piece, Values, cut, head
+
+
+class Outcome(StrEnum):
+    """What a verdict says."""
+
+    PASSED = "passed"
+    FAILED = "failed"
+    INCONCLUSIVE = "inconclusive"
+
+
+class Outer:
+    """An outermost part of a formula, which is evaluated only at the begin of the judged time.
+
+    ``low`` and ``high`` bound its truth, with what is known up to now.
+    """
+
+    low: float = -np.inf
+    high: float = np.inf
+    extreme_ns: int | None = None
+    """The moment of the value that is closest to deciding otherwise; None: unknown."""
+
+    def turn(self) -> None:
+        """Take what has become known of the operands."""
+        raise NotImplementedError
+
+    def finish(self, end_ns: int) -> None:
+        """Set the end of the judged time. One turn follows, with all that is left."""
+
+    def decided_ns(self) -> int | None:
+        """Return the moment at which the truth was decided, on the instance's clock; None if unknown."""
+        raise NotImplementedError
+
+    def unknown_ns(self) -> int | None:
+        """Return the first moment that keeps the truth from being known."""
+        raise NotImplementedError
+
+
+class Start(Outer):
+    """The truth of a signal at the begin."""
+
+    def __init__(self, operand: Node) -> None:
+        self._operand = operand
+        self._at_ns: int | None = None
+
+    def turn(self) -> None:
+        """Take the first value."""
+        piece = self._operand.out
+        if self._at_ns is None and len(piece.time):
+            self._at_ns = int(piece.time[0])
+            self.low, self.high = float(piece.low[0]), float(piece.high[0])
+
+    def decided_ns(self) -> int | None:
+        """Return the begin."""
+        return self._at_ns
+
+    def unknown_ns(self) -> int | None:
+        """Return the begin."""
+        return self._at_ns
+
+
+class Whole(Outer):
+    """The least or the greatest value of a signal over a time: always, or eventually.
+
+    Args:
+        function: ``np.minimum`` for always, ``np.maximum`` for eventually.
+        operand: The signal.
+        bounds_ns: The time, relative to the begin; None: up to the end.
+    """
+
+    def __init__(self, function: np.ufunc, operand: Node, bounds_ns: tuple[int, int] | None) -> None:
+        self._always = function is np.minimum
+        self._operand = operand
+        self._bounds_ns = bounds_ns
+        self._range: tuple[int, int | None] | None = None
+        self._end_ns: int | None = None
+        self._over = False
+        self._low, self._high = (np.inf, np.inf) if self._always else (-np.inf, -np.inf)
+        self._decided_ns: int | None = None
+        self._unknown_ns: int | None = None
+
+    def turn(self) -> None:
+        """Add the values that belong to the time."""
+        piece = self._operand.out
+        if self._over or not len(piece.time):
+            return
+        if self._range is None:
+            origin = int(piece.time[0])
+            first, last = self._bounds_ns or (0, None)
+            self._range = origin + first, None if last is None else origin + last + 1
+        begin, end = self._range
+        end = self._end_ns if end is None else end
+        self._over = end is not None and piece.end >= end
+        if piece.time[0] < begin:
+            piece = cut(piece, begin)
+        if end is not None:
+            piece = head(piece, end) if len(piece.time) and piece.time[0] < end else NOTHING
+        if len(piece.time):
+            self._add(piece)
+        self.low = self._low if self._over or not self._always else -np.inf
+        self.high = self._high if self._over or self._always else np.inf
+
+    def _add(self, piece: Piece) -> None:
+        time, low, high, _ = piece
+        if self._always:
+            place, best, decided = int(low.argmin()), float(low.min()), high < 0
+            better = best < self._low
+            self._low, self._high = min(self._low, best), min(self._high, float(high.min()))
+        else:
+            place, best, decided = int(high.argmax()), float(high.max()), low > 0
+            better = best > self._high
+            self._low, self._high = max(self._low, float(low.max())), max(self._high, best)
+        if better or self.extreme_ns is None:
+            self.extreme_ns = int(time[place])
+        if self._decided_ns is None and decided.any():
+            self._decided_ns = int(time[decided.argmax()])
+        if high is not low and self._unknown_ns is None:
+            unknown = (low < 0) & (high > 0)
+            if unknown.any():
+                self._unknown_ns = int(time[unknown.argmax()])
+
+    def finish(self, end_ns: int) -> None:
+        """Set the end of the time, if it has no bounds."""
+        self._end_ns = end_ns
+
+    def decided_ns(self) -> int | None:
+        """Return the first moment that decides the truth, or the end of the time."""
+        if self._decided_ns is not None:
+            return self._decided_ns
+        if self._range is None:
+            return None
+        end = self._range[1] if self._range[1] is not None else self._end_ns
+        return None if end is None else end - 1
+
+    def unknown_ns(self) -> int | None:
+        """Return the first moment at which the signal is unknown."""
+        return self._unknown_ns
+
+
+class UntilEnd(Outer):
+    """Whether ``left`` is true until ``right`` is, within the judged time."""
+
+    def __init__(self, left: Node, right: Node) -> None:
+        self._operands = (left, right)
+        self._alignment = Alignment(2)
+        self._left = [np.inf, np.inf]  # the least values up to now, of the bounds
+        self._found = [-np.inf, -np.inf]
+        self._end_ns: int | None = None
+        self._decided_ns: int | None = None
+        self._unknown_ns: int | None = None
+
+    def turn(self) -> None:
+        """Add the values that have become known."""
+        left, right = self._alignment.align([operand.out for operand in self._operands])
+        if self._end_ns is not None and len(left.time):
+            if left.time[0] >= self._end_ns:
+                left = right = NOTHING
+            else:
+                left, right = head(left, self._end_ns), head(right, self._end_ns)
+        if len(left.time):
+            bounds = [self._add(0, left.low, right.low), self._add(1, left.high, right.high)]
+            decided = (bounds[0] > 0) | (np.minimum.accumulate(left.high) < 0)
+            if self._decided_ns is None and decided.any():
+                self._decided_ns = int(left.time[decided.argmax()])
+            unknown = (bounds[0] < 0) & (bounds[1] > 0)
+            if self._unknown_ns is None and unknown.any():
+                self._unknown_ns = int(left.time[unknown.argmax()])
+        self.low = self._found[0]
+        self.high = self._found[1] if self._end_ns is not None else max(self._found[1], self._left[1])
+
+    def _add(self, which: int, left: Values, right: Values) -> Values:
+        before = np.minimum.accumulate(np.concatenate(([self._left[which]], left)))
+        found = np.maximum(np.maximum.accumulate(np.minimum(right, before[:-1])), self._found[which])
+        self._left[which], self._found[which] = float(before[-1]), float(found[-1])
+        return found
+
+    def finish(self, end_ns: int) -> None:
+        """Set the end of the judged time."""
+        self._end_ns = end_ns
+
+    def decided_ns(self) -> int | None:
+        """Return the first moment that decides the truth, or the end."""
+        return self._decided_ns if self._decided_ns is not None or self._end_ns is None else self._end_ns - 1
+
+    def unknown_ns(self) -> int | None:
+        """Return the first moment at which the truth is unknown."""
+        return self._unknown_ns
+
+
+class Opposite(Outer):
+    """The opposite of another part."""
+
+    def __init__(self, operand: Outer) -> None:
+        self._operand = operand
+
+    def turn(self) -> None:
+        """Take the opposite bounds."""
+        self._operand.turn()
+        self.low, self.high = -self._operand.high, -self._operand.low
+
+    def finish(self, end_ns: int) -> None:
+        """Pass on the end of the judged time."""
+        self._operand.finish(end_ns)
+
+    def decided_ns(self) -> int | None:
+        """Return the moment of the operand."""
+        return self._operand.decided_ns()
+
+    def unknown_ns(self) -> int | None:
+        """Return the moment of the operand."""
+        return self._operand.unknown_ns()
+
+
+class All(Outer):
+    """Whether several parts are all true."""
+
+    def __init__(self, operands: Sequence[Outer]) -> None:
+        self._operands = operands
+
+    def turn(self) -> None:
+        """Take the least bounds."""
+        for operand in self._operands:
+            operand.turn()
+        self.low = min(operand.low for operand in self._operands)
+        self.high = min(operand.high for operand in self._operands)
+
+    def finish(self, end_ns: int) -> None:
+        """Pass on the end of the judged time."""
+        for operand in self._operands:
+            operand.finish(end_ns)
+
+    def decided_ns(self) -> int | None:
+        """Return the first moment at which a part is false; the last moment if all are true."""
+        false = [operand.decided_ns() for operand in self._operands if operand.high < 0]
+        moments = [moment for moment in false or [one.decided_ns() for one in self._operands] if moment is not None]
+        if not moments:
+            return None
+        return min(moments) if false else max(moments)
+
+    def unknown_ns(self) -> int | None:
+        """Return the first moment that keeps a part from being known."""
+        moments = [one.unknown_ns() for one in self._operands if one.low < 0 < one.high]
+        return min((moment for moment in moments if moment is not None), default=None)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The verdict on an expectation. All times are on the instance's clock, in ns.
+
+    Attributes:
+        expectation: The expectation.
+        outcome: Passed, failed or inconclusive.
+        reason: Why it is not passed; empty if it is.
+        low: Lower bound of the robustness.
+        high: Upper bound of the robustness. It is the same if all that matters was known.
+        moment_ns: First moment at which the expectation was not met; None if there is none.
+        extreme_ns: Moment at which it was closest to failing, or furthest from being met; None: unknown.
+        around: Values before and after the moment, by signal: pairs of time and value, None if it
+            was unknown.
+    """
+
+    expectation: Expectation
+    outcome: Outcome
+    reason: str
+    low: float
+    high: float
+    moment_ns: int | None
+    extreme_ns: int | None
+    around: Mapping[str, Sequence[tuple[int, float | None]]]
+
+    @property
+    def robustness(self) -> float | None:
+        """The distance to failing: negative if failed, None if inconclusive or without a limit.
+
+        If it is not known exactly, it is the bound that is closer to 0.
+        """
+        if self.outcome is Outcome.INCONCLUSIVE:
+            return None
+        bound = self.low if self.outcome is Outcome.PASSED else self.high
+        return bound if isfinite(bound) else None
