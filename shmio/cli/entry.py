@@ -30,6 +30,11 @@ def shmio() -> int:
     return _run("shmio.cli.user")
 
 
+def shmio_campaign() -> int:
+    """Run the command ``shmio-campaign``."""
+    return _run("shmio.cli.campaign")
+
+
 def shmio_dump() -> int:
     """Run the command ``shmio-dump``."""
     return _run("shmio.cli.dump")

@@ -35,12 +35,18 @@ class PartlyDoneError(CommandError):
         self.found = found
 
 
-def run(program: str, command: Callable[[], int | None], options: argparse.Namespace) -> int:
+def run(
+    program: str,
+    command: Callable[[], int | None],
+    options: argparse.Namespace,
+    status_of: Callable[[Exception], int] = lambda _error: 1,
+) -> int:
     """Run a command and return its exit status.
 
     The status is 0 for success, 1 for a failure, with a line on standard error, and 128 + n after
     signal n, as in shells. argparse exits with 2 for wrong usage. With ``--json`` every command
-    also prints a failure on standard output, as ``{"error": "…"}``.
+    also prints a failure on standard output, as ``{"error": "…"}``. A command for which 1 has
+    another meaning passes ``status_of``, which returns the status for an error.
     """
     as_json = getattr(options, "json", False)
     if isinstance(sys.stdout, io.TextIOWrapper):
@@ -50,11 +56,11 @@ def run(program: str, command: Callable[[], int | None], options: argparse.Names
         sys.stdout.flush()
     except (ConfigError, ControlError, LayoutError) as error:  # a line for each problem
         _tell(str(error), as_json=as_json)
-        return 1
+        return status_of(error)
     except ShmioError as error:
         found = error.found if isinstance(error, PartlyDoneError) else {}
         _tell(str(error).replace("\n", "\\n"), found, as_json=as_json)
-        return 1
+        return status_of(error)
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
@@ -63,7 +69,7 @@ def run(program: str, command: Callable[[], int | None], options: argparse.Names
     except OSError as error:
         _tell(f"{error.filename or program}: {error.strerror}", as_json=as_json)
         _give_up_output()
-        return 1
+        return status_of(error)
     return status
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from msgspec import field
+
 from shmio.config.declaration import check_declarations
 from shmio.config.expectation import expectation_faults
 from shmio.config.faults import named
@@ -16,8 +18,8 @@ from shmio.errors import ConfigError
 class Campaign(Section):
     """The contents of a campaign file."""
 
-    injection: list[Declaration] = []
-    expect: list[Expectation] = []
+    injection: list[Declaration] = field(default_factory=list)
+    expect: list[Expectation] = field(default_factory=list)
 
 
 def load_campaign(file: Path) -> Campaign:

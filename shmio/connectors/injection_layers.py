@@ -19,8 +19,8 @@ from shmio.config import Declaration
 from shmio.injection import Program
 from shmio.injection.activation import Activation, State
 from shmio.injection.condition import Memory
-from shmio.injection.language import Number
 from shmio.injection.draw import SeededRandom
+from shmio.injection.language import Number
 from shmio.injection.operations import Delay, Drop, Operation, OperationContext
 from shmio.layout.values.write import Write, apply, merge
 from shmio.model.injection import Running

@@ -14,11 +14,13 @@ from shmio.judging.operators import (
     COMPARISONS,
     NUMBERS,
     Arithmetic,
+    Constantly,
     Difference,
     Digit,
     Edge,
     Extremum,
     History,
+    Moment,
     Node,
     Not,
     Truth,
@@ -77,6 +79,8 @@ def check(tree: Tree) -> None:
     for node in nodes(tree):
         if not isinstance(node, Operation):
             continue
+        if node.name in _TRUTH and constant(node):
+            raise ConfigError(f"at character {node.at}: {node.name!r} is always the same here, as it reads no register")
         if node.name in ASPECTS and not isinstance(node.operands[0], Reference):
             raise ConfigError(f"at character {node.at}: {node.name}( ) needs a register")
         if node.name in _EDGES | {"rate"} and temporal(node.operands[0]):
@@ -84,6 +88,8 @@ def check(tree: Tree) -> None:
                 f"at character {node.at}: {node.name}( ) compares a frame with the one before, so it takes no temporal "
                 "operator"
             )
+    if constant(tree):
+        raise ConfigError("it must read a register")
     _check_bounds(tree, outer=True)
     if horizon_ns(tree) > MAX_HORIZON_S * _NS:
         raise ConfigError(f"the formula's bounds add up to more than {MAX_HORIZON_S} s")
@@ -104,6 +110,11 @@ def _check_bounds(tree: Tree, *, outer: bool) -> None:
 def temporal(tree: Tree) -> bool:
     """Return whether a tree has a temporal operator."""
     return any(isinstance(node, Operation) and node.name in TEMPORAL for node in nodes(tree))
+
+
+def constant(tree: Tree) -> bool:
+    """Return whether a tree reads no register."""
+    return not any(isinstance(node, Reference) for node in nodes(tree))
 
 
 def horizon_ns(tree: Tree) -> int:
@@ -159,8 +170,7 @@ class Network:
         if isinstance(tree, Operation) and tree.name in _TRUTH:
             return self._operation(tree)
         number = self.number(tree)
-        if not isinstance(number, Node):
-            raise ConfigError("a formula must read a register")
+        assert isinstance(number, Node)  # noqa: S101  check() has refused a constant
         function = from_bool if self._boolean(tree) else from_number
         return self._shared(("truth", number), lambda: Truth(function, (number,)))
 
@@ -203,8 +213,6 @@ class Network:
         name = tree.name
         if name in COMPARISONS:
             operands = [self.number(operand) for operand in tree.operands]
-            if not any(isinstance(operand, Node) for operand in operands):
-                raise ConfigError(f"at character {tree.at}: a comparison must read a register")
             return self._shared((name, *operands), lambda: Truth(COMPARISONS[name], operands))
         if name == "changed":
             return self._changed(tree)
@@ -212,7 +220,8 @@ class Network:
             operand = self.truth(tree.operands[0])
             if name in ("fall", "falling"):
                 operand = self._not(operand)
-            return self._shared((name, operand), lambda: Edge(operand, first=name in ("rise", "fall")))
+            edge = self._shared(("edge", name, operand), lambda: Edge(operand, first=name in ("rise", "fall")))
+            return self._shared((name, operand), lambda: Moment(edge, operand))
         truths = self._truths(tree)
         if name == "not":
             return self._not(truths[0])
@@ -235,27 +244,20 @@ class Network:
 
     def _truths(self, tree: Operation) -> list[Node]:
         """Return the nodes of truths. A constant gets the times of another one."""
-        found = [None if isinstance(operand, Constant) else self.truth(operand) for operand in tree.operands]
-        other = next((node for node in found if node is not None), None)
-        if other is None:
-            raise ConfigError(f"at character {tree.at}: {tree.name!r} must read a register")
-        truths: list[Node] = []
-        for operand, node in zip(tree.operands, found, strict=True):
-            if node is None:
-                assert isinstance(operand, Constant)  # noqa: S101
-                value = np.inf if operand.value else -np.inf
-                truths.append(Arithmetic(lambda low, value=value: np.full(len(low), value), (other,)))
-                self._nodes["constant", len(self._nodes)] = truths[-1]
-            else:
-                truths.append(node)
-        return truths
+        truths = {at: self.truth(operand) for at, operand in enumerate(tree.operands) if not constant(operand)}
+        other = next(iter(truths.values()))
+        for at, operand in enumerate(tree.operands):
+            if at not in truths:
+                value = np.inf if self.number(operand) else -np.inf
+                truths[at] = self._shared(("constant", value, other), lambda value=value: Constantly(value, other))
+        return [truths[at] for at in range(len(tree.operands))]
 
     def _changed(self, tree: Operation) -> Node:
         number = self.number(tree.operands[0])
-        if not isinstance(number, Node):
-            raise ConfigError(f"at character {tree.at}: changed( ) must read a register")
+        assert isinstance(number, Node)  # noqa: S101  check() has refused a constant
         difference = self._shared(("difference", number), lambda: Difference(number, per_second=False))
-        return self._shared(("truth", difference), lambda: Truth(from_number, (difference,)))
+        edge = self._shared(("truth", difference), lambda: Truth(from_number, (difference,)))
+        return self._shared(("changed", number), lambda: Moment(edge, number))
 
     def _not(self, operand: Node) -> Node:
         return self._shared(("not", operand), lambda: Not((operand,)))

@@ -129,8 +129,10 @@ class Judge:
         self._network.turn()
         for case in self._cases:
             case.turn()
-            if case.failed and case.around is None:
-                case.around = self._around(case, final=end_ns is not None)
+            if case.failed and case.around_ns != case.outer.decided_ns():
+                found = self._around(case, final=end_ns is not None)
+                if found is not None:
+                    case.around, case.around_ns = found, case.outer.decided_ns()
         return rows
 
     def _around(self, case: _Case, *, final: bool) -> dict[str, list[tuple[int, float | None]]] | None:
@@ -167,7 +169,7 @@ class Judge:
         else:
             reason = self._unknown(case)
         return Verdict(
-            formula.expectation, outcome, reason, outer.low, outer.high, moment_ns, outer.extreme_ns, case.around or {}
+            formula.expectation, outcome, reason, outer.low, outer.high, moment_ns, outer.extreme_ns, case.around
         )
 
     def _unknown(self, case: _Case) -> str:
@@ -204,7 +206,8 @@ class _Case:
         self._trigger = None
         if formula.trigger is not None:
             self._trigger = Whole(np.maximum, network.truth(formula.trigger), None)
-        self.around: dict[str, list[tuple[int, float | None]]] | None = None
+        self.around: dict[str, list[tuple[int, float | None]]] = {}
+        self.around_ns: int | None = None  # the moment to which they belong
 
     @property
     def failed(self) -> bool:

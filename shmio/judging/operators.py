@@ -86,6 +86,19 @@ class Truth(Arithmetic):
         return Piece(time, np.where(unknown, -np.inf, distance), np.where(unknown, np.inf, distance), end)
 
 
+class Constantly(_Pointwise):
+    """A truth that is always the same, with the times of another signal."""
+
+    def __init__(self, value: float, other: Node) -> None:
+        super().__init__((other,))
+        self._value = value
+
+    def combine(self, pieces: list[Piece]) -> Piece:
+        """Return the value at each time."""
+        values = np.full(len(pieces[0].time), self._value)
+        return Piece(pieces[0].time, values, values, pieces[0].end)
+
+
 class Digit(_Pointwise):
     """Turns truth into a number: 1 is true, 0 is false, NaN is unknown."""
 
@@ -127,7 +140,7 @@ class Extremum(_Pointwise):
 
 
 class Edge(Node):
-    """True from a frame in which a signal has become true until the next frame.
+    """Whether a signal has become true since the frame before. :class:`Moment` makes it an event.
 
     Args:
         operand: The signal.
@@ -149,6 +162,37 @@ class Edge(Node):
         upper = found if known else np.minimum(high, -_shifted(low, self._before[0]))
         self._before = float(low[-1]), float(high[-1])
         self.out = Piece(time, found, upper, end)
+
+
+class Moment(Node):
+    """Makes an event of a comparison with the frame before: true at most at the moment of the frame.
+
+    Args:
+        edge: The comparison.
+        operand: What it compares. Where that is unknown, the event may come at any moment.
+    """
+
+    def __init__(self, edge: Node, operand: Node) -> None:
+        self._edge = edge
+        self._operand = operand
+
+    def turn(self) -> None:
+        """Put a false value behind each moment."""
+        time, low, high, end = self._edge.out
+        if not len(time):
+            self.out = NOTHING
+            return
+        _, operand, upper, _ = self._operand.out
+        after = time + 1
+        room = np.append(after[:-1] < time[1:], after[-1] < end)
+        open_ = np.isnan(operand) | ((operand < 0) & (upper > 0))
+        moments = np.stack((time, after), axis=1).reshape(-1)
+        kept = np.stack((np.ones(len(time), bool), room), axis=1).reshape(-1)
+        no = np.full(len(time), -np.inf)
+        found = np.stack((low, no), axis=1).reshape(-1)[kept]
+        known = high is low and not open_.any()
+        most = found if known else np.stack((high, np.where(open_, high, no)), axis=1).reshape(-1)[kept]
+        self.out = Piece(moments[kept], found, most, end)
 
 
 class Difference(Node):

@@ -163,6 +163,7 @@ class Source:
         """The node of each signal."""
         self.troubles: list[Trouble] = []
         """The first times in which values are unknown, and why."""
+        self._noted: dict[str, int] = {}  # the index of the last trouble for each reason
         self.origin_ns: int | None = None
         """The clock of the first frame; None before it."""
         self.newest_ns = 0
@@ -176,6 +177,7 @@ class Source:
         self._number: int | None = None
         self._left_out = False
         self._waiting: list[_Waiting] = []
+        self._held: _Waiting | None = None  # the last frame, until it is known how long it holds
         self._begun = False
         self._ages = np.array([signal.aspect == "age" for signal in signals])
         self._qualities = np.array([signal.aspect == "quality" for signal in signals])
@@ -224,35 +226,35 @@ class Source:
         if len(rows.time) and not self._begun:
             rows = _from(rows, origin_ns)
             self._begun = len(rows.time) > 0
-        self.rows = rows
+        self.rows = rows if end_ns is None else Rows(rows.time[:-1], rows.values[:, :-1], end_ns)
         for node, values in zip(self.inputs, rows.values, strict=True):
             node.out = Piece(rows.time, values, values, rows.end) if len(rows.time) else NOTHING
 
     def _known(self, end_ns: int | None) -> Rows:
         """Return the values up to the last frame, or up to the end and then unknown."""
-        if self._left_out and len(self._waiting) > 1:
-            self._waiting[1].missed[0] = True
-        waiting = None
         if self._waiting:
-            waiting, self._left_out = _ordered(_joined(self._waiting))
-        if waiting is None or (end_ns is None and len(waiting.time) < 2):
-            self._waiting = [] if waiting is None else [waiting]
+            self._waiting[0].missed[0] |= self._left_out
+            whole = _joined(self._waiting if self._held is None else [self._held, *self._waiting])
+            self._held, self._left_out = _ordered(whole)
+            self._waiting = []
+        held = self._held
+        if held is None or (end_ns is None and len(held.time) < 2):
             return _no_rows(len(self.signals))
         if end_ns is None:
-            time, following, values = waiting.time[:-1], waiting.time[1:], waiting.values[:, :-1]
-            self._waiting = [waiting.last]
+            time, following, values = held.time[:-1], held.time[1:], held.values[:, :-1]
+            self._held = held.last
         else:
-            time, following, values = waiting.time, np.append(waiting.time[1:], end_ns), waiting.values
-            self._waiting = []
+            time, following, values = held.time, np.append(held.time[1:], end_ns), held.values
+            self._held = None
         count, end = len(time), int(following[-1])
-        bad, fresh_ns = waiting.bad[:count], waiting.fresh_ns[:count]
+        bad, fresh_ns = held.bad[:count], held.fresh_ns[:count]
         lasted = following - time
         if self._ages.any():
             values = values.copy()
             values[self._ages] += lasted / 1e9
         if bad.any():
             self._note(time[bad], following[bad], f"the quality of {self.name} is bad")
-        missed = np.append(waiting.missed[1:], False)[:count]
+        missed = np.append(held.missed[1:], False)[:count]
         stale = ~missed & (lasted > fresh_ns)
         if missed.any() or stale.any():
             time, values = self._with_unknown(
@@ -288,10 +290,11 @@ class Source:
 
     def _note(self, begin: Times, end: Times, reason: str) -> None:
         for first, last in zip(begin[:MAX_TROUBLES].tolist(), end[:MAX_TROUBLES].tolist(), strict=True):
-            before = self.troubles[-1] if self.troubles else None
-            if before is not None and before.reason == reason and before.end_ns >= first:
-                self.troubles[-1] = Trouble(before.begin_ns, last, reason)
+            before = self._noted.get(reason)
+            if before is not None and self.troubles[before].end_ns >= first:
+                self.troubles[before] = self.troubles[before]._replace(end_ns=last)
             elif len(self.troubles) < MAX_TROUBLES:
+                self._noted[reason] = len(self.troubles)
                 self.troubles.append(Trouble(first, last, reason))
 
 
@@ -326,7 +329,9 @@ def _ordered(waiting: _Waiting) -> tuple[_Waiting, bool]:
         return waiting, False
     back = time < np.maximum.accumulate(time)
     forward = np.flatnonzero(~back)
-    kept = forward[np.append(time[forward[1:]] > time[forward[:-1]], True)]
-    missed = np.diff(np.cumsum(waiting.missed | back)[kept], prepend=0) > 0
+    new = time[forward[1:]] > time[forward[:-1]]
+    first, kept = forward[np.append(True, new)], forward[np.append(new, True)]  # of each time, the first and the last
+    lost = np.cumsum(waiting.missed | back)
+    missed = lost[first] > np.append(0, lost[kept[:-1]])
     found = _Waiting(time[kept], waiting.values[:, kept], waiting.bad[kept], missed, waiting.fresh_ns[kept])
     return found, bool(back[kept[-1] :].any())

@@ -11,7 +11,7 @@ import numpy as np
 
 from shmio.config import Expectation
 from shmio.judging.operators import Node
-from shmio.judging.pieces import NOTHING, Alignment, Piece, Values, cut, head
+from shmio.judging.pieces import NOTHING, TINY, Alignment, Piece, Values, cut, head
 
 
 class Outcome(StrEnum):
@@ -290,4 +290,11 @@ class Verdict:
         if self.outcome is Outcome.INCONCLUSIVE:
             return None
         bound = self.low if self.outcome is Outcome.PASSED else self.high
-        return bound if isfinite(bound) else None
+        return distance(bound)
+
+
+def distance(bound: float) -> float | None:
+    """Return a bound of the robustness for people: 0 for the least distance, None if it has no limit."""
+    if not isfinite(bound):
+        return None
+    return 0.0 if abs(bound) == TINY else bound

@@ -55,10 +55,24 @@ def formula(random: np.random.Generator, depth: int) -> str:
                 f"(once{bounds}{inner})",
                 f"(historically{bounds}{inner})",
                 f"({inner} until{bounds} {other})",
-                f"rise{predicate(random)}",
-                f"fall{predicate(random)}",
                 f"(once {inner})",
                 f"(historically {inner})",
+            ]
+        )
+    )
+
+
+def with_edge(random: np.random.Generator, inner: str) -> str:
+    """Return a formula about events, which are true at a sample but not between samples."""
+    edge = f"{random.choice(['rise', 'fall'])}{predicate(random)}"
+    return str(
+        random.choice(
+            [
+                f"always[0,5]({edge} implies {inner})",
+                f"historically[1,4]({edge} implies {inner})",
+                f"eventually[2,6]({edge} and {inner})",
+                f"once[0,9]({edge} and {inner})",
+                f"{edge}",
             ]
         )
     )
@@ -83,7 +97,8 @@ def with_shmio(text: str, values: npt.NDArray[np.float64], random: np.random.Gen
     network = Network(registers, inputs.__getitem__)
     node = network.truth(tree)
     source.follow(LAYOUT, {name: LAYOUT.registers[i] for i, name in enumerate(NAMES)}, STALE_NS)
-    whole, found = frames(values), {}
+    whole = frames(values)
+    found: dict[int, tuple[float, float]] = {}
     end_ns = SAMPLES * PERIOD_NS
     for part in [*portions(SAMPLES, random, most), None]:
         if part is not None:
@@ -105,6 +120,8 @@ def with_shmio(text: str, values: npt.NDArray[np.float64], random: np.random.Gen
 def test_robustness_is_that_of_rtamt(seed: int) -> None:
     random = np.random.default_rng(seed)
     text = formula(random, 1 + seed % 4)
+    if seed % 5 == 0:
+        text = with_edge(random, text)
     values = np.round(random.normal(0, 4, (SAMPLES, 3)), 1 if seed % 2 else 0)
     theirs = with_rtamt(text, values)
     for most in (1, 7, SAMPLES):

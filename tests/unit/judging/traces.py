@@ -51,7 +51,9 @@ def judge(*expectations: Expectation) -> Judge:
 
 def some(whole: Frames, part: slice) -> Frames:
     """Return a part of frames."""
-    return Frames(*(None if column is None else column[part] for column in whole))
+    raws = None if whole.raws is None else whole.raws[part]
+    number, clock_ns, quality, delay_us, images, _ = whole
+    return Frames(number[part], clock_ns[part], quality[part], delay_us[part], images[part], raws)
 
 
 def portions(count: int, random: np.random.Generator, most: int) -> Iterator[slice]:

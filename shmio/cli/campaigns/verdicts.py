@@ -1,0 +1,83 @@
+"""Prints verdicts, and turns them into an exit status."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import msgspec
+
+from shmio.cli.run import say, say_json
+from shmio.judging.judge import Judge
+from shmio.judging.verdict import Outcome, Verdict, distance
+
+STATUSES: Final = {Outcome.PASSED: 0, Outcome.FAILED: 1, Outcome.INCONCLUSIVE: 3}
+
+
+def exit_status(verdicts: Sequence[Verdict]) -> int:
+    """Return 0 if all passed, 1 if one failed, 3 if otherwise one is inconclusive."""
+    outcomes = {verdict.outcome for verdict in verdicts}
+    worst = (Outcome.FAILED, Outcome.INCONCLUSIVE, Outcome.PASSED)
+    return STATUSES[next((outcome for outcome in worst if outcome in outcomes), Outcome.PASSED)]
+
+
+def tell(judge: Judge, found: dict[str, Any], *, as_json: bool) -> int:
+    """Print all verdicts, and return the exit status. ``found`` are further keys of the JSON object."""
+    verdicts = judge.verdicts
+    if as_json:
+        begin, end = judge.begin_ns, judge.end_ns
+        times = {
+            "begin_s": None if begin is None else begin / 1e9,
+            "end_s": None if begin is None or end is None else (end - 1) / 1e9,
+        }
+        say_json({**found, **times, "verdicts": [as_table(verdict) for verdict in verdicts]})
+        return exit_status(verdicts)
+    width = max((len(verdict.expectation.name) for verdict in verdicts), default=0)
+    for verdict in verdicts:
+        for line in _lines(verdict, width):
+            say(line)
+    counts = [f"{sum(one.outcome is outcome for one in verdicts)} {outcome}" for outcome in Outcome]
+    say(", ".join(counts))
+    return exit_status(verdicts)
+
+
+def as_table(verdict: Verdict) -> dict[str, Any]:
+    """Return a verdict for JSON. Times are in s of the instance's clock."""
+    expectation = msgspec.to_builtins(verdict.expectation)
+    return {
+        "name": verdict.expectation.name,
+        "outcome": str(verdict.outcome),
+        "reason": verdict.reason,
+        "robustness": verdict.robustness,
+        "low": distance(verdict.low),
+        "high": distance(verdict.high),
+        "moment_s": _seconds(verdict.moment_ns),
+        "closest_s": _seconds(verdict.extreme_ns),
+        "around": {
+            name: [{"time_s": _seconds(time_ns), "value": value} for time_ns, value in pairs]
+            for name, pairs in verdict.around.items()
+        },
+        "severity": verdict.expectation.severity,
+        "requirement": verdict.expectation.requirement,
+        "text": verdict.expectation.text,
+        "expectation": expectation,
+    }
+
+
+def _lines(verdict: Verdict, width: int) -> list[str]:
+    expectation = verdict.expectation
+    of = f" [{expectation.requirement}]" if expectation.requirement else ""
+    robustness = "" if verdict.robustness is None else f"  robustness {verdict.robustness:.6g}"
+    at = "" if verdict.moment_ns is None else f" at {verdict.moment_ns / 1e9:.3f} s"
+    why = f"  {verdict.reason}{at}" if verdict.reason else ""
+    lines = [f"{verdict.outcome:<12}  {expectation.name:<{width}}{of}{robustness}{why}"]
+    for name, pairs in verdict.around.items():
+        values = "  ".join(
+            f"{time_ns / 1e9:.3f}: {'?' if value is None else f'{value:.9g}'}" for time_ns, value in pairs
+        )
+        lines.append(f"{'':<14}{name}  {values}")
+    return lines
+
+
+def _seconds(time_ns: int | None) -> float | None:
+    return None if time_ns is None else time_ns / 1e9
