@@ -13,7 +13,7 @@ from typing import Any, Final
 from shmio.errors import ShmioError
 from shmio.recording.libraries import library
 
-PROGRAMS: Final = ("shmio", "shmio-supervisor", "shmio-dump", "shmio-layout")
+PROGRAMS: Final = ("shmio", "shmio-supervisor", "shmio-dump", "shmio-layout", "shmio-campaign")
 SHELLS: Final = ("bash", "zsh", "fish")
 
 Completer = Callable[..., Iterable[str]]
@@ -41,6 +41,7 @@ def answer(parser: argparse.ArgumentParser) -> None:
     files = completers.FilesCompleter
 
     by_dest: dict[str, Completer] = {
+        "campaign": files(["toml"]),
         "config": files(["toml"]),
         "directory": completers.DirectoriesCompleter(),
         "instance": _instances,
@@ -53,7 +54,7 @@ def answer(parser: argparse.ArgumentParser) -> None:
         "sources": _sources,
         "value": _registers,
     }
-    if parser.prog == "shmio-dump":
+    if parser.prog in ("shmio-dump", "shmio-campaign"):
         by_dest |= dict.fromkeys(("file", "files"), files(["mem"]))
     for action in _actions(parser):
         if action.choices is None and action.nargs != 0:

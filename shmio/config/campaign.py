@@ -65,10 +65,10 @@ def _parse(tables: dict[str, Any], needed: str) -> Campaign:
     for key in ("injection", "expect"):
         if isinstance(tables.get(key), dict):
             raise ConfigError(f"{key}: write [[{key}]] with double brackets, because there can be several")
-    if needed not in tables:
-        raise ConfigError(f"{needed}: this key is needed")
     check_text(tables, "")
     campaign = convert(tables, Campaign)
+    if needed not in tables:
+        raise ConfigError(f"{needed}: this key is needed")
     check_declarations(campaign.injection)
     for fault in expectation_faults(campaign.expect):
         raise ConfigError(fault)

@@ -23,7 +23,7 @@ from shmio.cli import entry
 sys.argv[1:] = ["--version"]
 sys.exit(entry.{name}())
 """
-NAMES = ("shmio", "shmio_dump", "shmio_layout", "shmio_supervisor")
+NAMES = ("shmio", "shmio_campaign", "shmio_dump", "shmio_layout", "shmio_supervisor")
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -76,6 +76,7 @@ sys.exit(entry.{name}())
     [
         ("shmio", ["step", "--instance", "not-there"], "msgspec"),
         ("shmio", ["get", "--host", "unix:no.sock", "cell/a"], "grpc"),
+        ("shmio_campaign", ["judge", "no.mem", "-f", "no.toml"], "shmio.cli.campaigns.judge"),
         ("shmio_dump", ["info", "no.mem"], "shmio.cli.recordings.examine"),
         ("shmio_supervisor", ["status", "--instance", "not-there"], "shmio.cli.instance.status"),
         ("shmio_supervisor", ["up", "-c", "no.toml"], "shmio.cli.instance.up"),
