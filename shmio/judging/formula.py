@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -248,8 +249,8 @@ class Network:
         other = next(iter(truths.values()))
         for at, operand in enumerate(tree.operands):
             if at not in truths:
-                value = np.inf if self.number(operand) else -np.inf
-                truths[at] = self._shared(("constant", value, other), lambda value=value: Constantly(value, other))
+                make = partial(Constantly, np.inf if self.number(operand) else -np.inf, other)
+                truths[at] = self._shared((make.func, *make.args), make)
         return [truths[at] for at in range(len(tree.operands))]
 
     def _changed(self, tree: Operation) -> Node:

@@ -9,7 +9,8 @@ from typing import Final, NamedTuple, Protocol
 
 from shmio.config import Alert
 from shmio.errors import ConfigError
-from shmio.injection.condition import Memory, Number
+from shmio.injection.condition import Memory
+from shmio.injection.language import Number
 from shmio.injection.program import Condition, compile_condition
 from shmio.layout.glob import Glob
 from shmio.segment import Block, Frame, Phase, Quality, Segment

@@ -87,7 +87,7 @@ def test_two_sources_and_damage_of_values(capsys: pytest.CaptureFixture[str]) ->
         ('[[expect]]\nname = "e"\nstays = "on"\nfor_s = nan\n', "expect[0].for_s: expected"),
         (
             '[[expect]]\nname = "e"\nnever = "on"\nseverity = "huge"\n',
-            "severity: 'huge' is unknown; valid: minor, major",
+            "severity: 'huge' is unknown; valid: info, warning",
         ),
         ('[[expect]]\nname = "e"\nnever = "on"\n' * 2, "expect[1].name: 'e' is already the name of expect[0]"),
         ('[expect]\nname = "e"\n', "expect: write [[expect]] with double brackets"),

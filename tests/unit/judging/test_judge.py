@@ -201,7 +201,7 @@ def test_two_sources_at_their_own_rates() -> None:
     assert found.begin_ns == S // 2
 
 
-FORMULAS = [
+FORMULAS: list[dict[str, Any]] = [
     {"formula": "always(rise(x > 0) implies eventually[0, 2.5] y >= 0)"},
     {"formula": "always[1, 7](y < 3 or once[0.5, 3] rate(x) > 1)"},
     {"stays": "x > -1", "for_s": 1.5},
