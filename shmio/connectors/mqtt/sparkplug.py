@@ -298,6 +298,9 @@ class Node:
                 known = device.metrics.get(one.name) if device is not None else None
                 if device is not None and known is not None:
                     device.take(known, one, message, payload.timestamp)
+            elif not one.HasField("alias"):
+                self._lose("a metric has neither a name nor an alias")
+                return
             elif one.alias not in self._aliases:
                 self._lose(f"no birth has the alias {one.alias}")
                 return

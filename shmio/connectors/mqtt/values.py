@@ -204,7 +204,10 @@ def _parse_number(text: str) -> int | float:
     if _WHOLE.fullmatch(text):
         return int(text)
     if _NUMBER.fullmatch(text):
-        return float(text)
+        number = float(text)
+        if math.isinf(number):
+            raise ValueFaultError(BAD_OUT_OF_RANGE, f"{_show(text)} does not fit any register")
+        return number
     found = _NO_NUMBER.get(text.casefold())
     if found is None:
         raise ValueFaultError(BAD_DECODING_ERROR, f"{_show(text)} is no number")

@@ -20,6 +20,7 @@ from shmio.connectors.opcua import decode
 from shmio.connectors.opcua.decode import Extension, Sample
 from shmio.connectors.opcua.options import Credentials, OpcUaOptions
 from shmio.connectors.opcua.session import Session
+from shmio.layout.addresses.opcua import escaped_uri
 from shmio.layout.topic import shorten
 
 _OBJECTS: Final = ua.NodeId(85)
@@ -204,7 +205,7 @@ class _Search:
         if not number:
             return text
         uri = self._uris[number] if number < len(self._uris) else ""
-        return f"nsu={uri};{text}" if uri and ";" not in uri else f"ns={number};{text}"
+        return f"nsu={escaped_uri(uri)};{text}" if uri else f"ns={number};{text}"
 
 
 def _type(value: Sample, data_type: Sample) -> tuple[str, str]:

@@ -1,7 +1,7 @@
 """Addresses of nodes in tag tables: node ids and browse paths.
 
 A node id is ``ns=3;s=Speed`` or ``nsu=http://maker/device;i=1001``, as in OPC 10000-6, section
-5.3.1.10. The identifier types are ``i`` (number), ``s`` (text), ``g`` (GUID) and ``b`` (base64). A
+5.3.1.10; in a URI, ``%3B`` stands for a semicolon, and ``%25`` for ``%``. The identifier types are ``i`` (number), ``s`` (text), ``g`` (GUID) and ``b`` (base64). A
 browse path begins at the root: ``/Objects/2:Device/2:Speed``. Each step is a browse name, with the
 number of its namespace unless that is 0; ``&`` precedes one of the characters ``/ . < > : # ! &`` in
 a name (OPC 10000-4, annex A.2).
@@ -58,10 +58,20 @@ def parse(text: str) -> Address:
     found = _NODE.fullmatch(text)
     if found is None:
         raise ValueError(f"{text!r} is no address of OPC UA; {_EXAMPLE}/Objects/2:Device/2:Speed")
-    namespace: int | str = found["uri"] or int(found["index"] or 0)
+    namespace: int | str = unescaped_uri(found["uri"] or "") or int(found["index"] or 0)
     if isinstance(namespace, int) and namespace > 0xFFFF:
         raise ValueError(f"{text!r}: namespaces have numbers up to 65535")
     return NodeAddress(namespace, _identifier(text, found["kind"], found["identifier"]))
+
+
+def escaped_uri(uri: str) -> str:
+    """Return the URI of a namespace as an address has it."""
+    return uri.replace("%", "%25").replace(";", "%3B")
+
+
+def unescaped_uri(text: str) -> str:
+    """Return the URI that an address has; see :func:`escaped_uri`."""
+    return text.replace("%3B", ";").replace("%3b", ";").replace("%25", "%")
 
 
 def _identifier(text: str, kind: str, identifier: str) -> int | str | uuid.UUID | bytes:

@@ -7,17 +7,21 @@ from collections.abc import Mapping
 from typing import Final
 from xml.etree.ElementTree import Element
 
+from shmio.layout.addresses.opcua import escaped_uri
 from shmio.layout.importing.found import Found, ImportingError
 
 ROOT: Final = "UANodeSet"
 # Node ids of namespace 0, as the specification numbers them (OPC 10000-6, Annex A).
 _BUILT_IN: Final = {
     1: "BOOL", 2: "SINT", 3: "USINT", 4: "INT", 5: "UINT", 6: "DINT", 7: "UDINT", 8: "LINT", 9: "ULINT",
-    10: "REAL", 11: "LREAL", 12: "STRING", 29: "DINT", 290: "LREAL",
+    10: "REAL", 11: "LREAL", 12: "STRING", 13: "LDT", 14: "STRING", 16: "STRING", 17: "STRING", 18: "STRING",
+    19: "UDINT", 20: "STRING", 21: "STRING", 29: "DINT", 290: "LREAL", 294: "LDT",
 }  # fmt: skip
 _NAMES: Final = {
     "Boolean": 1, "SByte": 2, "Byte": 3, "Int16": 4, "UInt16": 5, "Int32": 6, "UInt32": 7, "Int64": 8, "UInt64": 9,
-    "Float": 10, "Double": 11, "String": 12, "Enumeration": 29, "Duration": 290,
+    "Float": 10, "Double": 11, "String": 12, "DateTime": 13, "Guid": 14, "XmlElement": 16, "NodeId": 17,
+    "ExpandedNodeId": 18, "StatusCode": 19, "QualifiedName": 20, "LocalizedText": 21, "Enumeration": 29,
+    "Duration": 290, "UtcTime": 294,
     "Organizes": 35, "HasSubtype": 45, "HasProperty": 46, "HasComponent": 47, "HasOrderedComponent": 49,
 }  # fmt: skip
 _PARENTS: Final = frozenset({"i=35", "i=46", "i=47", "i=49"})
@@ -84,8 +88,7 @@ class _Model:
         match = _NODE.fullmatch(key)
         if match is None or int(match[1]) >= len(self.uris):
             return key
-        uri = self.uris[int(match[1])].replace("%", "%25").replace(";", "%3B")
-        return f"nsu={uri};{match[2]}"
+        return f"nsu={escaped_uri(self.uris[int(match[1])])};{match[2]}"
 
 
 def read(root: Element) -> Found:

@@ -18,7 +18,7 @@ from shmio.connectors.mqtt.options import MqttOptions
 from shmio.connectors.mqtt.store import Store
 from shmio.connectors.mqtt.topic import time_ns
 from shmio.layout.values.codec import codec
-from shmio.model.statuses import StatusArea, quality_of
+from shmio.model.statuses import BAD_OUT_OF_RANGE, BAD_WAITING_FOR_INITIAL_DATA, GOOD, StatusArea, quality_of
 from shmio.model.values import Quality
 from shmio.wire import sparkplug_b_pb2 as wire
 from tests.unit.connectors.mqtt.peer import layout_of
@@ -99,6 +99,30 @@ SPARKPLUG: Final = {
     **{f"d/{kind[:5]}".replace("[", ""): (kind, f"sparkplug G/N/D metric m{at % 4}") for at, kind in enumerate(KINDS)},
     "array": ("ARRAY[1..3] OF INT", "sparkplug G/N/D metric m1"),
 }
+
+
+def test_a_number_beyond_all_registers_is_bad() -> None:
+    store = store_of({"number": ("LREAL", "t")})
+    area = StatusArea(store.layout)
+    for text, code in ((b"1e308", GOOD), (b"-1e309", BAD_OUT_OF_RANGE), (b"inf", GOOD)):
+        store.take("t", text, retained=False)
+        assert area.get(store.image(0), 0).code == code
+
+
+def test_a_metric_without_a_name_and_an_alias_is_no_value() -> None:
+    """Alias 0 is a metric of its own."""
+    store = store_of({"n": ("INT", "sparkplug G/N metric m0")})
+    register, area = store.layout.registers[0], StatusArea(store.layout)
+    born = [_metric("bdSeq", None, 4, 0, b"", 1, null=False), _metric("m0", 0, 3, 5, b"", 0, null=False)]
+    store.take("spBv1.0/G/NBIRTH/N", wire.Payload(seq=0, metrics=born).SerializeToString(), retained=False)
+    assert codec(register, store.layout.byte_order).decode(store.image(0)) == 5
+    for seq, alias, code in ((1, 0, GOOD), (2, None, BAD_WAITING_FOR_INITIAL_DATA)):
+        data = wire.Payload(seq=seq, metrics=[_metric(None, alias, 3, 6 + seq, b"", 0, null=False)])
+        store.take("spBv1.0/G/NDATA/N", data.SerializeToString(), retained=False)
+        image = store.image(0)
+        assert (codec(register, store.layout.byte_order).decode(image), area.get(image, 0).code) == (7, code)
+
+
 METRICS = st.builds(
     lambda name, alias, kind, number, data, how, null: _metric(name, alias, kind, number, data, how, null=null),
     st.none() | st.sampled_from(["m0", "m1", "m2", "bdSeq"]),

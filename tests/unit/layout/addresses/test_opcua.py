@@ -16,6 +16,7 @@ GUID = "72962b91-fa75-4ae6-8d28-b404dc7daf63"
         ("ns=3;s=Speed", NodeAddress(3, "Speed")),
         ('ns=3;s="DB201"."Axs1;=x"', NodeAddress(3, '"DB201"."Axs1;=x"')),
         ("nsu=http://maker/device;i=1001", NodeAddress("http://maker/device", 1001)),
+        ("nsu=http://maker%3B1/%25a%20b;i=1", NodeAddress("http://maker;1/%a%20b", 1)),
         (f"ns=2;g={GUID}", NodeAddress(2, uuid.UUID(GUID))),
         ("ns=2;b=AQI=", NodeAddress(2, b"\1\2")),
         ("/Objects/2:Device/2:Speed", BrowsePath(((0, "Objects"), (2, "Device"), (2, "Speed")))),
