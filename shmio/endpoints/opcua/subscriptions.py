@@ -127,7 +127,7 @@ class Item:
         if self.size > 1:
             self._keep()
         if self.mode == ua.MonitoringMode.Reporting:
-            self._subscription.dirty[self] = None
+            self._subscription.mark(self)
 
     def _matters(self) -> bool:
         """Return whether the filter lets the present value through, and note it."""
@@ -232,6 +232,8 @@ class Subscription:
         self._first = True
         self._timer: asyncio.TimerHandle | None = None
         self._due_s = 0.0
+        self._idle = False
+        """True if the last interval ended without changes: the next change is published at once."""
         self.revise(asked)
 
     def revise(self, asked: Any) -> None:
@@ -269,6 +271,30 @@ class Subscription:
             self.stop()
             self._on_end()
             return
+        self._publish()
+        self._idle = not self.dirty
+
+    def mark(self, item: Item) -> None:
+        """Note that an item has something to send.
+
+        If a source changes its values as often as the subscription publishes, some changes come just
+        after the end of an interval. With the wait for the next end, the newest values would replace
+        them.
+        """
+        self.dirty[item] = None
+        if self._idle:
+            self._idle = False
+            asyncio.get_running_loop().call_soon(self._publish_early)  # when all of the frame are marked
+
+    def _publish_early(self) -> None:
+        if self._timer is None:
+            return
+        self._timer.cancel()
+        self._due_s = asyncio.get_running_loop().time()
+        self._schedule()
+        self._publish()
+
+    def _publish(self) -> None:
         while self._wants() and self.can_send() and (request := self.pub_request_callback(self.id)) is not None:
             self._send(request)
 
@@ -373,7 +399,7 @@ class Subscription:
         elif before == ua.MonitoringMode.Disabled:
             item.changed()
         elif mode == ua.MonitoringMode.Reporting and item.queue:
-            self.dirty[item] = None
+            self.mark(item)
         elif mode == ua.MonitoringMode.Sampling:
             self.dirty.pop(item, None)
 

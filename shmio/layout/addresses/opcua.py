@@ -1,10 +1,11 @@
 """Addresses of nodes in tag tables: node ids and browse paths.
 
 A node id is ``ns=3;s=Speed`` or ``nsu=http://maker/device;i=1001``, as in OPC 10000-6, section
-5.3.1.10; in a URI, ``%3B`` stands for a semicolon, and ``%25`` for ``%``. The identifier types are ``i`` (number), ``s`` (text), ``g`` (GUID) and ``b`` (base64). A
-browse path begins at the root: ``/Objects/2:Device/2:Speed``. Each step is a browse name, with the
-number of its namespace unless that is 0; ``&`` precedes one of the characters ``/ . < > : # ! &`` in
-a name (OPC 10000-4, annex A.2).
+5.3.1.10; in a URI, ``%3B`` stands for a semicolon, and ``%25`` for ``%``. The identifier types are
+``i`` (number), ``s`` (text), ``g`` (GUID) and ``b`` (base64). A browse path begins at the root:
+``/Objects/2:Device/2:Speed``. Each step is a browse name, with the number of its namespace unless
+that is 0; ``&`` precedes one of the characters ``/ . < > : # ! &`` in a name (OPC 10000-4, annex
+A.2).
 """
 
 from __future__ import annotations
