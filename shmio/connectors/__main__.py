@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 SWITCH_S = 0.0005  # Python's default of 5 ms would delay the poll thread too long
 LAST_WORDS_S = 4.0  # less than the supervisor's grace period
 REPLAY_TIMEOUT_S = 1.0
-HANG_MARGIN_S = 30.0  # added to the time-out: a host name lookup has no time-out here
+HANG_MARGIN_S = 30.0  # added to the time-out, because asyncio's look-up of a host name has none of its own
 
 
 class _LoopHandle(NamedTuple):

@@ -3,21 +3,43 @@
 from __future__ import annotations
 
 import socket
+import threading
 import time
 from collections.abc import Sequence
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeoutError
 from typing import Any
 
 Place = tuple[socket.AddressFamily, socket.SocketKind, int, str, Any]
 
 
-def look_up(host: str, port: int) -> Sequence[Place]:
+def look_up(host: str, port: int, timeout_s: float) -> Sequence[Place]:
     """Return the addresses of a host, as ``socket.getaddrinfo`` does.
 
+    The system's own time-out may be half a minute if no name server answers. A look-up that takes
+    too long is abandoned in a thread of its own.
+
     Raises:
-        OSError: The host has no address.
+        OSError: The host has no address, or no name server has answered within ``timeout_s``.
 
     """
-    return socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    try:
+        return socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_NUMERICHOST)
+    except socket.gaierror:
+        pass  # it is a name
+    found: Future[Sequence[Place]] = Future()
+
+    def ask() -> None:
+        try:
+            found.set_result(socket.getaddrinfo(host, port, type=socket.SOCK_STREAM))
+        except Exception as error:  # noqa: BLE001  the caller raises it
+            found.set_exception(error)
+
+    threading.Thread(target=ask, name="look-up", daemon=True).start()
+    try:
+        return found.result(timeout_s)
+    except FutureTimeoutError:
+        raise socket.gaierror(socket.EAI_AGAIN, "no name server has answered in time") from None
 
 
 def connect(places: Sequence[Place], timeout_s: float) -> socket.socket:

@@ -81,7 +81,7 @@ class ModbusClient:
         return self._socket is not None
 
     def connect(self) -> None:
-        """Connect within the time-out, plus the name lookup.
+        """Connect within the time-out, after a look-up of the name within the time-out.
 
         Raises:
             ConnectorError: The device cannot be reached.
@@ -89,7 +89,8 @@ class ModbusClient:
         """
         self.close()
         try:
-            self._socket = tcp.connect(tcp.look_up(self._host, self._port), self._timeout_ms / 1000)
+            timeout_s = self._timeout_ms / 1000
+            self._socket = tcp.connect(tcp.look_up(self._host, self._port, timeout_s), timeout_s)
         except OSError as error:
             raise self._explained(error) from None
 

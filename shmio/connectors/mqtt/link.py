@@ -247,7 +247,7 @@ class Link:
     def _connected_socket(self, until_s: float) -> socket.socket:
         peer = self.peer
         try:
-            places = tcp.look_up(peer.host, peer.port)
+            places = tcp.look_up(peer.host, peer.port, max(0.001, self._soon(until_s) - time.monotonic()))
             opened = tcp.connect(places, max(0.001, self._soon(until_s) - time.monotonic()))
         except TimeoutError:
             raise ConnectorError(f"no answer within {self._options.timeout} ms from {peer}") from None

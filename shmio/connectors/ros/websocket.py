@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import msgspec
 
 from shmio.config import Address
+from shmio.connectors import tcp
 from shmio.errors import ConnectorError
 from shmio.logs import printable
 
@@ -88,14 +89,13 @@ class Link:
         self._pong: threading.Event | None = None
         self._pinged_ns = self.heard_ns = time.monotonic_ns()
         try:
-            channel = socket.create_connection((peer.host, peer.port), timeout_s)
+            channel = tcp.connect(tcp.look_up(peer.host, peer.port, timeout_s), timeout_s)
         except TimeoutError:
             raise ConnectorError(f"no answer within {timeout_s * 1000:.0f} ms from {peer}") from None
         except OSError as error:
             raise ConnectorError(f"cannot connect to {peer}: {error.strerror or error}") from None
         try:
             channel.settimeout(None)  # the thread waits for ever, and a send as long as the option below says
-            channel.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             whole, part = divmod(timeout_s, 1)
             channel.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _SEND_TIMEOUT.pack(int(whole), int(part * 1e6)))
             self._socket: Connection = self._stack.enter_context(connect(

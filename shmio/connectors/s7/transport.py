@@ -25,13 +25,13 @@ class Transport:
     """
 
     def __init__(self, host: str, port: int, timeout_ns: int) -> None:
-        """Connect within ``timeout_ns``, not counting the time to look up the host name.
+        """Connect within ``timeout_ns``, after a look-up of the host name within ``timeout_ns``.
 
         Raises:
             OSError: No connection could be opened.
 
         """
-        places = tcp.look_up(host, port)
+        places = tcp.look_up(host, port, timeout_ns / 1e9)
         self.deadline_ns = time.monotonic_ns() + timeout_ns
         """The end of ``timeout_ns``, in ns of CLOCK_MONOTONIC."""
         self._socket = tcp.connect(places, timeout_ns / 1e9)

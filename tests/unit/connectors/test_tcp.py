@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import threading
 from typing import Any
 
 import pytest
@@ -29,3 +30,21 @@ def test_the_error_of_the_last_address_is_raised() -> None:
     places: list[Any] = [(socket.AF_INET, socket.SOCK_STREAM, 6, "", place)] * 2
     with pytest.raises(ConnectionRefusedError):
         tcp.connect(places, 1.0)
+
+
+def test_a_name_server_that_does_not_answer_costs_no_more_than_the_time_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    real, answered = socket.getaddrinfo, threading.Event()
+
+    def silent(host: str, port: int, flags: int = 0, **named: Any) -> Any:
+        if not flags:
+            answered.wait()
+        return real(host, port, flags=flags, **named)
+
+    monkeypatch.setattr(socket, "getaddrinfo", silent)
+    assert tcp.look_up("127.0.0.1", 102, 0.01)[0][4] == ("127.0.0.1", 102)
+    try:
+        with pytest.raises(socket.gaierror, match="no name server has answered"):
+            tcp.look_up("plc.example", 102, 0.01)
+    finally:
+        answered.set()
+    assert tcp.look_up("localhost", 102, 10.0)

@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from typing import Final
 from urllib.parse import urlsplit
 
+from shmio.connectors import tcp
 from shmio.errors import ConnectorError
 from shmio_mtconnect.documents import MAX_DOCUMENT_BYTES, DevicesDocument, StreamsDocument
 
@@ -17,6 +18,10 @@ _CHUNK: Final = 1 << 16
 MAX_LINE: Final = 1 << 12
 """Longest line in the header of a part, in bytes."""
 MAX_LINES: Final = 32
+
+
+def _connected(address: tuple[str, int], timeout_s: float, _source: object) -> socket.socket:
+    return tcp.connect(tcp.look_up(*address, timeout_s), timeout_s)
 
 
 class Exchange:
@@ -32,6 +37,8 @@ class Exchange:
         self._timeout_ms = timeout_ms
         kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
         self._connection = kind(parts.hostname or "", parts.port, timeout=timeout_ms / 1000)
+        # As http.client opens its connections, but with a time-out for the look-up of the name.
+        self._connection._create_connection = _connected  # type: ignore[attr-defined]
         self._answer: http.client.HTTPResponse | None = None
         self._socket: socket.socket | None = None
         self._closed = False
