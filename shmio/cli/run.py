@@ -55,11 +55,11 @@ def run(
         status = command() or 0
         sys.stdout.flush()
     except (ConfigError, ControlError, LayoutError) as error:  # a line for each problem
-        _tell(str(error), as_json=as_json)
+        _print_error(str(error), as_json=as_json)
         return status_of(error)
     except ShmioError as error:
         found = error.found if isinstance(error, PartlyDoneError) else {}
-        _tell(str(error).replace("\n", "\\n"), found, as_json=as_json)
+        _print_error(str(error).replace("\n", "\\n"), found, as_json=as_json)
         return status_of(error)
     except KeyboardInterrupt:
         return 130
@@ -67,7 +67,7 @@ def run(
         _give_up_output()  # the reader has ended, as with `| head`
         return 141
     except OSError as error:
-        _tell(f"{error.filename or program}: {error.strerror}", as_json=as_json)
+        _print_error(f"{error.filename or program}: {error.strerror}", as_json=as_json)
         _give_up_output()
         return status_of(error)
     return status
@@ -105,7 +105,7 @@ def say_json(value: Any) -> None:
         print(dumps(value), flush=True)
 
 
-def _tell(error: str, found: Mapping[str, object] = MappingProxyType({}), *, as_json: bool) -> None:
+def _print_error(error: str, found: Mapping[str, object] = MappingProxyType({}), *, as_json: bool) -> None:
     sys.stderr.write("".join(f"{printable(line)}\n" for line in error.split("\n")))
     if as_json:
         say_json({**found, "error": error})

@@ -159,7 +159,7 @@ def _owner_of(segment: Segment, writer: int) -> Owner | None:
     None if no live process does.
     """
     segment.refresh()
-    for slot in (*segment.processes, *segment.processes.guests):
+    for slot in (*segment.processes, *segment.processes.external):
         if slot.writer == writer and slot.alive():
             return Owner(writer, slot.report.pid)
     return None

@@ -467,7 +467,7 @@ class CommandProcessor:
                 for writer in range(queues.writers):  # round robin
                     taken |= self._take_one(writer)
             self._expire(self._take(lambda item: self._now_ns() > item.command.deadline_ns))
-            self._injections.look()
+            self._injections.follow_changes()
             self._output.flush()
             if not self._stopped:
                 queues.wait(seen, self._patience_ns())

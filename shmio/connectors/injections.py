@@ -442,7 +442,7 @@ class InjectionProcessor:
         self.declared.settle()
         return ""
 
-    def look(self) -> None:
+    def follow_changes(self) -> None:
         """Apply changes of the configuration, and every ``LOOK_NS`` check owners and conditions.
 
         The check lifts each injection without ``keep`` whose client has ended. It compiles

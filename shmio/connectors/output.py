@@ -80,7 +80,7 @@ class Output:
         self._gap_ns = writer.block.period_ns // EXTRA_FRAMES
         self._next_ns = 0
         self._changed = False
-        self._owed: list[Record] = []
+        self._pending: list[Record] = []
         self._last = self._predecessors()
 
     def _predecessors(self) -> Image | None:
@@ -138,7 +138,7 @@ class Output:
         with self.lock:
             self._last = image
             if self.advance is not None:
-                self._owed += self.advance(image)
+                self._pending += self.advance(image)
             self._publish(image.at)
 
     def resume(self, image: Image) -> None:
@@ -151,7 +151,7 @@ class Output:
 
         If the last frame was published too recently, the changes wait for :meth:`flush`.
         """
-        self._owed += records
+        self._pending += records
         self._changed = True
         if self._now_ns() >= self._next_ns:
             self._publish()
@@ -177,8 +177,8 @@ class Output:
                 asked_ns=asked_ns,
                 at=at,
             )
-        owed, self._owed, self._changed = self._owed, [], False
-        for record in owed:
+        pending, self._pending, self._changed = self._pending, [], False
+        for record in pending:
             self.writer.event(record)
         self._next_ns = self._now_ns() + self._gap_ns
 

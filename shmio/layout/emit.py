@@ -46,7 +46,7 @@ class _Expansion:
         # Caches, so that each text is parsed once, however often its structure is expanded.
         self._split: dict[tuple[int, str], dict[str, str]] = {}
         self._listed: dict[tuple[int, str], list[str | None]] = {}
-        self._told: set[Position] = set()
+        self._reported: set[Position] = set()
 
     def registers(self, group: Group, prefix: str, base: int, layers: _Layers) -> Iterator[Register]:
         for key, field in group.fields.items():
@@ -82,8 +82,8 @@ class _Expansion:
             except ValueRangeError as error:
                 self._split[key] = {}
                 position = field.member.position
-                if position not in self._told:
-                    self._told.add(position)
+                if position not in self._reported:
+                    self._reported.add(position)
                     what = f"the initial value of the structure {field.member.name!r} is ignored: {error}"
                     self._report.add(position.warning(what))
         return self._split[key]

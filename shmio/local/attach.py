@@ -9,7 +9,7 @@ For example::
             print(view.cycle, view["Robot_800/Axs1_Pos"], view.missed)
 
 Attaching maps the shared memory read-only. The program takes no lock, does not register, and needs
-no server. A program that also writes occupies one of the process table's guest slots.
+no server. A program that also writes occupies one of the process table's external slots.
 """
 
 from __future__ import annotations
@@ -554,7 +554,7 @@ class Attachment:
     def _source_writer(self, block: Block) -> SourceWriter:
         """Return the writer for a block.
 
-        The first call takes a guest slot, until the program detaches.
+        The first call takes an external slot, until the program detaches.
         """
         if not self._segment.shared.writable:
             raise CommandError("this attachment only reads: attach with writable=True")
@@ -625,7 +625,7 @@ def attach(instance: str | None = None, *, writable: bool = False) -> Attachment
 
 
 def _take_guest_slot(segment: Segment) -> int:
-    """Take a free guest slot of the process table for as long as the segment is open.
+    """Take a free external slot of the process table for as long as the segment is open.
 
     Returns:
         The number of the slot's command queue.
@@ -633,7 +633,7 @@ def _take_guest_slot(segment: Segment) -> int:
     Raises:
         SegmentError: No slot is free.
     """
-    places = segment.processes.guests
+    places = segment.processes.external
     for slot in places:
         if slot.writer is not None and slot.take():
             slot.report = Report(os.getpid(), Activity.RUNNING, time.monotonic_ns())

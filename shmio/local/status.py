@@ -175,10 +175,10 @@ def supervisor_silence(segment: Segment) -> str | None:
     )
 
 
-def _state(told: InstanceState, processes: list[SourceStatus | ProcessStatus], note: str) -> InstanceState:
+def _state(state: InstanceState, processes: list[SourceStatus | ProcessStatus], note: str) -> InstanceState:
     """Return the supervisor's state while it starts or stops, else that of its processes."""
-    if told not in (InstanceState.RUNNING, InstanceState.DEGRADED):
-        return told
+    if state not in (InstanceState.RUNNING, InstanceState.DEGRADED):
+        return state
     running = [p.state == str(Phase.RUNNING) and not complaint(p.kind, p.note) for p in processes]
     return assess(running, [Quality[p.quality.upper()] for p in processes if isinstance(p, SourceStatus)], note)
 
@@ -211,20 +211,20 @@ def assess(running: Sequence[bool], qualities: Sequence[Quality | None], note: s
 def _process(
     segment: Segment, slot: ProcessSlot, alive: bool, supervised: bool, now_ns: int
 ) -> SourceStatus | ProcessStatus:
-    told, report = slot.supervised, slot.report
-    phase, note = told.phase, told.note
+    state, report = slot.supervised, slot.report
+    phase, note = state.phase, state.note
     if not supervised:
         phase = Phase.RUNNING if alive else Phase.STOPPED
     elif phase is Phase.RUNNING and not alive:  # the supervisor has not noticed the death yet
         phase, note = Phase.STOPPED, "dead"
     counters = slot.counters
-    current = alive and report.pid != 0 and report.started_ns >= told.spawned_ns  # else that of the previous process
+    current = alive and report.pid != 0 and report.started_ns >= state.spawned_ns  # else that of the previous process
     values = ProcessStatus(
         name=slot.name,
         kind=slot.kind,
         pid=report.pid if current else None,
         state=str(phase),
-        restarts=told.restarts,
+        restarts=state.restarts,
         uptime_s=_seconds(now_ns - report.started_ns) if current else 0.0,
         note=note or (report.note if current else ""),
         counters={name: value for name, value in counters.items() if name != "rate_mhz"},

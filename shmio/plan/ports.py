@@ -53,9 +53,9 @@ def check_listening(config: Config) -> None:
             hosts = _hosts(address)
         except ConfigError as error:
             raise ConfigError(f"{key}: {error}") from None
-        for other, told, port, others in seen:
+        for other, seen_text, port, others in seen:
             if port == address.port != 0 and _share(hosts, others):
-                raise ConfigError(f"{key}: {text} is already the port of {other} ({told}); choose another port")
+                raise ConfigError(f"{key}: {text} is already the port of {other} ({seen_text}); choose another port")
         seen.append((key, text, address.port, hosts))
 
 

@@ -70,12 +70,12 @@ class Housekeeper:
     def _run(self) -> None:
         while not self._stop.is_set():
             try:
-                self.look()
+                self.check_folder()
             except Exception:  # an error here must not end the recording
                 log.exception("cleaning up earlier recordings failed")
             self._stop.wait(LOOK_S)
 
-    def look(self) -> None:
+    def check_folder(self) -> None:
         """Check the folder once: close recordings that were left unclosed, and delete old ones."""
         present = self._present()
         files = [_file(path) for path in own_files(Path(self._settings.directory), self._instance)]

@@ -171,7 +171,7 @@ class ProcessWatch:
         self._segment = segment
         self._known = self._now()
 
-    def look(self) -> list[ProcessChange]:
+    def check(self) -> list[ProcessChange]:
         """Return the changes since the last check, or since the watch was created."""
         before, self._known = self._known, self._now()
         changes = []
@@ -196,8 +196,8 @@ class ProcessWatch:
 
 
 def _state(slot: ProcessSlot) -> _ProcessState:
-    told = slot.supervised
-    return _ProcessState(slot.kind, told.phase, slot.report.pid, told.restarts, told.note)
+    supervised = slot.supervised
+    return _ProcessState(slot.kind, supervised.phase, slot.report.pid, supervised.restarts, supervised.note)
 
 
 def _change(name: str, state: _ProcessState, what: ProcessEvent) -> ProcessChange:
@@ -323,7 +323,7 @@ class InstanceFollower:
         now_s = time.monotonic()
         if now_s - self._watched_s >= TURN_S:
             self._watched_s = now_s
-            entries += self._asides(self._watch.look())
+            entries += self._asides(self._watch.check())
         return entries, more
 
     def present(self) -> list[InstanceEntry]:

@@ -73,7 +73,7 @@ class ConfigFiles:
 
     def __init__(self, file: Path) -> None:
         self._file = file
-        self._told: set[str] = set()
+        self._logged: set[str] = set()
 
     def __call__(self, source: str | None, block: int) -> list[AttachedFile]:
         """Return the files of a source's layout.
@@ -85,7 +85,7 @@ class ConfigFiles:
         try:
             config = load(self._file)
         except ConfigError as error:
-            self._tell(f"the layout files of source {source} are not attached to the recording: {error}")
+            self._log_once(f"the layout files of source {source} are not attached to the recording: {error}")
             return []
         layouts = [section.layout for section in config.source if section.name == source and section.layout]
         names = [name for layout in layouts for name in ([layout] if isinstance(layout, str) else layout)]
@@ -99,18 +99,18 @@ class ConfigFiles:
                     data = stream.read(MAX_FILE_BYTES + 1)
                 changed_ns = file.stat().st_mtime_ns
             except OSError as error:
-                self._tell(f"{file} is not attached to the recording: {error.strerror}")
+                self._log_once(f"{file} is not attached to the recording: {error.strerror}")
                 continue
             if len(data) > MAX_FILE_BYTES:
-                self._tell(f"{file} is not attached to the recording: it is larger than {MAX_FILE_BYTES} bytes")
+                self._log_once(f"{file} is not attached to the recording: it is larger than {MAX_FILE_BYTES} bytes")
                 continue
             found.append(AttachedFile(f"{folder}/{file.name}", media_type, data, max(0, changed_ns)))
         return found
 
-    def _tell(self, why: str) -> None:
+    def _log_once(self, why: str) -> None:
         """Log a message, unless it was logged before: the files are read again and again."""
-        if why not in self._told:
-            self._told.add(why)
+        if why not in self._logged:
+            self._logged.add(why)
             log.warning("%s", why)
 
 
@@ -305,7 +305,7 @@ class Recorder:
             self.output.check()
         if now_s - self._looked_s >= CONFIG_S:
             self._looked_s = now_s
-            self._look()
+            self._attach_changed_files()
 
     def _confirm(self) -> None:
         """Copy the stored positions to :attr:`confirmed` if an fsync has covered their data.
@@ -380,7 +380,7 @@ class Recorder:
             self._attach(self._attachments(block.source, follower.number))
         return followed
 
-    def _look(self) -> None:
+    def _attach_changed_files(self) -> None:
         """Attach the configuration file again if it has changed."""
         now = self._attachments(None, 0)
         if now and [(one.name, one.data) for one in now] != [(one.name, one.data) for one in self._config]:

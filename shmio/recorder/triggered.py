@@ -92,7 +92,7 @@ class PreTriggerBuffer:
         self._limit = limit_bytes
         self._entries: deque[BlockEntry | InstanceEntry] = deque()
         self._size = 0
-        self._told = False
+        self._logged = False
         self.places = dict(places)
         """Positions after which the buffer starts now, by section of the block."""
 
@@ -105,8 +105,8 @@ class PreTriggerBuffer:
         self._entries.append(entry)
         self._size += _size(entry)
         self._trim(entry.log_ns)
-        if self._size > self._limit and not self._told:
-            self._told = True
+        if self._size > self._limit and not self._logged:
+            self._logged = True
             kept_s = (entry.log_ns - self._entries[0].log_ns) / 1e9
             log.warning(
                 "only the last %.1f s before a trigger fit in memory: raise recorder.trigger.before_mb to keep more",

@@ -407,11 +407,11 @@ def _events(dump: Dump, source: str, writer: Writer, from_ns: int, to_ns: int) -
         if block is None:
             continue
         explained = explainers.setdefault(block, Explainer(source, block.layout)).explain(event)
-        told = {"kind": kind_of(event), "quality": str(event.quality), "number": event.number}
+        what = {"kind": kind_of(event), "quality": str(event.quality), "number": event.number}
         about = object_of(event, explained)
         about["laid"] = about["laid"] or {}
-        told_in_numbers = {"frame": event.frame, "cycle": event.cycle}
-        yield _Row(log_ns, channel, log_ns, msgspec.json.encode(told | told_in_numbers | about))
+        numbers = {"frame": event.frame, "cycle": event.cycle}
+        yield _Row(log_ns, channel, log_ns, msgspec.json.encode(what | numbers | about))
 
 
 def _property(kind: str) -> dict[str, Any]:

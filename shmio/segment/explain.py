@@ -19,7 +19,7 @@ from shmio.layout.values.write import Write, bits_of, paths_of
 from shmio.layout.values.write import apply as write_to
 from shmio.model.injection import Injection
 from shmio.segment.events import EVENT_DATA_SIZE, NO_WRITER, Event, EventKind
-from shmio.segment.processes import GUEST_SLOTS, WRITERS
+from shmio.segment.processes import EXTERNAL_SLOTS, WRITERS
 
 MAX_REMEMBERED: Final = 4096
 """An explainer remembers at most this many unfinished commands and this many injections."""
@@ -268,7 +268,7 @@ def by(writer: int) -> str:
     """Name the owner of a command queue: an endpoint or a program; empty if there is no owner."""
     if writer == NO_WRITER:
         return ""
-    return _ROLES.get(writer, f"program {writer + 1}" if writer < GUEST_SLOTS else f"writer {writer}")
+    return _ROLES.get(writer, f"program {writer + 1}" if writer < EXTERNAL_SLOTS else f"writer {writer}")
 
 
 ABOUT: Final = ("path", "value", "direction", "by")

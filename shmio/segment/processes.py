@@ -48,8 +48,8 @@ COUNTERS: Final[Mapping[str, tuple[str, ...]]] = {
 """
 
 
-GUEST_SLOTS: Final = 4
-"""Number of guest slots: slots for programs that write but are not part of the instance.
+EXTERNAL_SLOTS: Final = 4
+"""Number of external slots: slots for programs that write but are not part of the instance.
 
 They are the last slots of the table, and have the first command queues.
 """
@@ -211,31 +211,31 @@ class ProcessSlot:
 class ProcessTable(Sequence[ProcessSlot]):
     """The slots of the instance's processes, in order.
 
-    ``guests`` are the slots for other programs.
+    ``external`` are the slots for other programs.
     """
 
     def __init__(self, shared: SharedObject, memory: memoryview, header: Header) -> None:
         self._shared, self._memory, self._header = shared, memory, header
         named = [slot for slot in map(self._slot, range(header.process_capacity)) if slot.name]
         self._slots = [slot for slot in named if slot.kind != "guest"]
-        self.guests = [slot for slot in named if slot.kind == "guest"]
+        self.external = [slot for slot in named if slot.kind == "guest"]
 
     def _slot(self, index: int) -> ProcessSlot:
         return ProcessSlot(self._shared, self._memory, index, self._header.processes_offset + index * SLOT_SIZE)
 
     @staticmethod
     def write(memory: memoryview, header: Header, specs: Sequence[ProcessSpec]) -> None:
-        """Write the names of a new segment's slots, including the guest slots."""
-        first = header.process_capacity - GUEST_SLOTS
+        """Write the names of a new segment's slots, including the external slots."""
+        first = header.process_capacity - EXTERNAL_SLOTS
         slots = [(index, spec.name, spec.kind, spec.writer) for index, spec in enumerate(specs)]
-        slots += [(first + guest, f"guest-{guest + 1}", "guest", guest) for guest in range(GUEST_SLOTS)]
+        slots += [(first + guest, f"guest-{guest + 1}", "guest", guest) for guest in range(EXTERNAL_SLOTS)]
         for index, name, kind, writer in slots:
             at = header.processes_offset + index * SLOT_SIZE
             _FIXED.pack_into(memory, at, name.encode(), kind.encode(), 0 if writer is None else writer + 1)
 
     def require(self, count: int) -> None:
         """Raise SegmentError unless ``count`` processes can be added."""
-        vacant = self._header.process_capacity - len(self.guests) - len(self._slots)
+        vacant = self._header.process_capacity - len(self.external) - len(self._slots)
         if count > vacant:
             raise SegmentError(
                 f"segment {self._shared.name} has room for {vacant} more processes, not for {count}: "
@@ -251,7 +251,7 @@ class ProcessTable(Sequence[ProcessSlot]):
             SegmentError: No slot is vacant.
         """
         self.require(1)
-        taken = {slot.index for slot in (*self._slots, *self.guests)}
+        taken = {slot.index for slot in (*self._slots, *self.external)}
         index = next(i for i in range(self._header.process_capacity) if i not in taken)
         at = self._header.processes_offset + index * SLOT_SIZE
         writer = spec.writer

@@ -35,7 +35,7 @@ from shmio.segment.header import HEADER_SIZE, SECTION_SIZE, SLOT_SIZE, Header, S
 from shmio.segment.injection_list import CELL_SIZE, declared_cell, injection_list_cell
 from shmio.segment.model_channel import ModelChannel
 from shmio.segment.playhead import PLAYHEAD_SIZE, Playhead
-from shmio.segment.processes import GUEST_SLOTS, SUPERVISOR_LOCK, ProcessSpec, ProcessTable, supervisor_beat
+from shmio.segment.processes import EXTERNAL_SLOTS, SUPERVISOR_LOCK, ProcessSpec, ProcessTable, supervisor_beat
 from shmio.segment.shm import SharedObject
 from shmio.version import __version__
 
@@ -53,7 +53,7 @@ _RING_SECONDS = 8
 _SECTIONS_PER_BLOCK = 8  # of a block with every kind of section
 _SPARE_SECTIONS = 40 * _SECTIONS_PER_BLOCK
 _OWN_SECTIONS = 1  # sections of no block: the clock page
-_SPARE_PROCESSES = 16 + GUEST_SLOTS
+_SPARE_PROCESSES = 16 + EXTERNAL_SLOTS
 _EVENT_STRIDE = _align(_atomics.RAW_OFFSET + EVENT_SIZE, 64)
 _FIRST_LINK = 2
 """Used to compute the lock byte of a block's model channel or playhead.

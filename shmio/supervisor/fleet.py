@@ -80,12 +80,12 @@ class ManagedProcess:
             True if the process was signalled, and has rules or had some.
 
         """
-        told = self.rereads(job)
+        reported = self.rereads(job)
         blind = self._job is None and job.rules is not None
         self._job = job
-        if self.child is not None and (told or blind):
+        if self.child is not None and (reported or blind):
             self.child.reread()
-        return told
+        return reported
 
     def rereads(self, job: Job) -> bool:
         """Return whether :meth:`keep` would signal the process, and it has rules or had some."""
@@ -264,7 +264,7 @@ class Fleet:
         for index in indices:
             self.apply(managed[index], event)
 
-    def look(self, now_ns: int) -> None:
+    def check(self, now_ns: int) -> None:
         """Check all heartbeats and time limits."""
         # A pause of the supervisor (host suspended, container paused) is one of all processes: it does
         # not count.

@@ -49,12 +49,12 @@ class LogFolder:
             return f"log_dir: {self._folder}: the disk does not answer" if waited_s > SILENT_S else self._found
         if self._begun_ns is None or waited_s >= LOOK_S:
             self._begun_ns = now_ns
-            self._looking = threading.Thread(target=self._look, name="log folder", daemon=True)
+            self._looking = threading.Thread(target=self._check_folder, name="log folder", daemon=True)
             with suppress(RuntimeError):  # no thread can be started now: try again later
                 self._looking.start()
         return self._found
 
-    def _look(self) -> None:
+    def _check_folder(self) -> None:
         obstacle = unwritable(self._folder)
         self._found = f"log_dir: {obstacle.reason}; log lines are lost until that is fixed" if obstacle else ""
 
@@ -136,7 +136,7 @@ class Health:
         self._qualities: list[Quality | None] = []
         self._qualities_ns = 0
 
-    def look(self) -> list[Quality | None]:
+    def qualities(self) -> list[Quality | None]:
         """Return the present quality of each source; None for a source without a frame."""
         qualities: list[Quality | None] = []
         for block in self._segment.blocks.values():
@@ -168,7 +168,7 @@ class Health:
 
     def _assess(self, now_ns: int, note: str) -> InstanceState:
         if now_ns - self._qualities_ns >= QUALITY_S * 1e9 or len(self._qualities) != len(self._segment.blocks):
-            self._qualities, self._qualities_ns = self.look(), now_ns
+            self._qualities, self._qualities_ns = self.qualities(), now_ns
             for managed in self._fleet:
                 managed.listen()
         well = [m.life.state is State.RUNNING and not m.complaint for m in self._fleet]

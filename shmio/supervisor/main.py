@@ -227,7 +227,7 @@ class Supervisor:
     def _tick(self) -> bool:
         """Check everything once; return True when all processes have stopped."""
         now_ns = time.monotonic_ns()
-        self._fleet.look(now_ns)
+        self._fleet.check(now_ns)
         self._control.expire()
         if not self._stopping and now_ns - self._found_ns >= NAME_S * 1e9:
             self._found_ns = now_ns
@@ -275,7 +275,7 @@ class Supervisor:
                 return
         self._fleet.start_due()
         since_ns = max((m.life.ready_ns or 0 for m in self._fleet), default=0)
-        self._started = policy.start_over(self._fleet.ranked, self._health.look(), since_ns, now_ns, self._limits)
+        self._started = policy.start_over(self._fleet.ranked, self._health.qualities(), since_ns, now_ns, self._limits)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from shmio.config import Address
 from shmio.endpoints.mqtt.broker.program import find_mosquitto
 
 PATIENCE_S = 20.0
-TETHER = ("setpriv", "--pdeathsig", "KILL") if shutil.which("setpriv") else ()
+KILL_WITH_PARENT = ("setpriv", "--pdeathsig", "KILL") if shutil.which("setpriv") else ()
 """Prefix of the broker's command: it kills the broker when the thread that started it ends."""
 
 
@@ -50,7 +50,7 @@ class Mosquitto:
         """Start the broker. Return when it listens."""
         program = find_mosquitto() or "mosquitto"
         with (self.folder / "mosquitto.log").open("ab") as log:
-            self._process = subprocess.Popen([*TETHER, program, "-c", self._file], stdout=log, stderr=log)
+            self._process = subprocess.Popen([*KILL_WITH_PARENT, program, "-c", self._file], stdout=log, stderr=log)
         until_s = time.monotonic() + PATIENCE_S
         while True:
             try:

@@ -98,8 +98,8 @@ def reload(arguments: argparse.Namespace) -> int:
         answer = ask_supervisor(segment, control.Reload(), RELOAD_S)
     status = 1 if answer["problems"] else 0
     if arguments.json:
-        told = {key: answer[key] for key in ("done", "kept", "warnings", "problems")}
-        print(dumps({"instance": segment.instance, **told}, indent=2))
+        answered = {key: answer[key] for key in ("done", "kept", "warnings", "problems")}
+        print(dumps({"instance": segment.instance, **answered}, indent=2))
         return status
     for line in answer["warnings"]:
         print(printable(line), file=sys.stderr)
@@ -118,8 +118,8 @@ def _preview(arguments: argparse.Namespace) -> int:
     faults, warnings = answer["faults"], answer["warnings"]
     kinds = [kind for kind in PREVIEWED if kind in answer]
     if arguments.json:
-        told = {kind: answer[kind] for kind in kinds}
-        print(dumps({"instance": segment.instance, "faults": faults, "warnings": warnings, **told}, indent=2))
+        answered = {kind: answer[kind] for kind in kinds}
+        print(dumps({"instance": segment.instance, "faults": faults, "warnings": warnings, **answered}, indent=2))
         return 1 if faults else 0
     for line in [*faults, *warnings]:
         print(printable(line), file=sys.stderr)

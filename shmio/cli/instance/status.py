@@ -132,7 +132,7 @@ class Listed(msgspec.Struct):
 
 def list_instances(arguments: argparse.Namespace) -> int:
     """Print a line for each instance of this host."""
-    found = [one for name in instances() if (one := _look(name))]
+    found = [one for name in instances() if (one := _listed(name))]
     if arguments.json:
         print(msgspec.json.format(msgspec.json.encode(found), indent=2).decode())
     elif found:
@@ -142,7 +142,7 @@ def list_instances(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _look(name: str) -> Listed | None:
+def _listed(name: str) -> Listed | None:
     """Return what this user can find out about an instance; None if the instance has just ended."""
     try:
         with Segment.open(name) as segment:

@@ -65,29 +65,29 @@ def _detached(file: Path, mode: str, keys: Mapping[str, Any], report: int) -> in
 
     Send the result of the start to the descriptor ``report``.
     """
-    told = False
+    finished = False
 
-    def tell(message: StartMessage) -> None:
-        nonlocal told
-        if told:
+    def send(message: StartMessage) -> None:
+        nonlocal finished
+        if finished:
             return
-        told = not isinstance(message, Configured)
+        finished = not isinstance(message, Configured)
         with suppress(OSError):  # the waiting process has given up
             os.write(report, msgspec.json.encode(message) + b"\n")
-        if told:
+        if finished:
             os.close(report)
 
     try:
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
         prepared = prepare(file, mode, keys)
         plan = prepared.plan
-        tell(Configured(printable(str(_log_file(plan))), tuple(map(printable, plan.warnings))))
+        send(Configured(printable(str(_log_file(plan))), tuple(map(printable, plan.warnings))))
         check_startable(plan)
 
         def on_state(state: State) -> None:
             if state is not State.STOPPING:
                 history, processes = ([*map(printable, lines)] for lines in (supervisor.history, _processes(prepared)))
-                tell(Started(plan.instance, history, processes))
+                send(Started(plan.instance, history, processes))
 
         with hold_log_folder(plan.log_dir, plan.instance):
             logs.setup(_log_file(plan), "supervisor", streams=True)
@@ -97,12 +97,12 @@ def _detached(file: Path, mode: str, keys: Mapping[str, Any], report: int) -> in
             supervisor = Supervisor(plan, replan=_replan(plan, keys), on_state=on_state)
             supervisor.run()
     except ShmioError as error:
-        tell(Failed("\n".join(map(printable, str(error).split("\n")))))
+        send(Failed("\n".join(map(printable, str(error).split("\n")))))
         return 1
     except OSError as error:
-        tell(Failed(printable(f"{error.filename}: {error.strerror}" if error.filename else str(error))))
+        send(Failed(printable(f"{error.filename}: {error.strerror}" if error.filename else str(error))))
         return 1
-    tell(Failed("it was stopped while it started"))
+    send(Failed("it was stopped while it started"))
     return 0
 
 

@@ -37,11 +37,11 @@ def record(arguments: argparse.Namespace) -> int:
         for missing in selection.nothing({name: block.layout for name, block in segment.blocks.items()}):
             raise PathError(missing)
         tap = InstanceFollower(segment, StartPositions(first=False), selection)
-        news = Reporter(as_json=arguments.json)
-        work = _work(arguments, tap, _attachments(segment, news))
+        reporter = Reporter(as_json=arguments.json)
+        work = _work(arguments, tap, _attachments(segment, reporter))
         chosen = list(sources or segment.blocks)
         place = work.file or f"{arguments.directory} whenever {arguments.when}"
-        news.tell(
+        reporter.report(
             "recording",
             f"recording {', '.join(chosen)} of {segment.instance} to {place}; Ctrl-C ends it",
             instance=segment.instance,
@@ -49,11 +49,11 @@ def record(arguments: argparse.Namespace) -> int:
             file=_name(work.file),
         )
         try:
-            whole = _record(segment, work, stopping, arguments.duration_s, news)
+            whole = _record(segment, work, stopping, arguments.duration_s, reporter)
         finally:
             file = work.file
             unclosed = work.close()
-        _sum_up(work, file, arguments.directory, news, whole=whole and not unclosed)
+        _sum_up(work, file, arguments.directory, reporter, whole=whole and not unclosed)
         for text in unclosed:
             raise RecordingError(text)
         return 0 if whole else 1
@@ -75,7 +75,7 @@ def _record(
     work: RotatingRecorder | TriggeredRecorder,
     stopping: threading.Event,
     duration_s: float | None,
-    news: Reporter,
+    reporter: Reporter,
 ) -> bool:
     """Record; return False if the instance ended before the requested time."""
     until_s = None if duration_s is None else time.monotonic() + duration_s
@@ -87,37 +87,37 @@ def _record(
         more = work.run_once()
         if work.file != file:
             file = work.file
-            news.tell("file", f"recording to {file}" if file else "waiting for the next time", file=_name(file))
+            reporter.report("file", f"recording to {file}" if file else "waiting for the next time", file=_name(file))
         if time.monotonic() - look_s < LOOK_S:
             continue
         look_s = time.monotonic()
         work.tend()
         before, problem = problem, work.problem
         if bool(problem) != bool(before):
-            news.tell("problem", problem or f"{file} is being written again", text=problem or None)
+            reporter.report("problem", problem or f"{file} is being written again", text=problem or None)
         if not segment.shared.current():
-            news.tell("stopped", f"instance {segment.instance!r} has stopped")
+            reporter.report("stopped", f"instance {segment.instance!r} has stopped")
             return until_s is None
 
 
-def _attachments(segment: Segment, news: Reporter) -> AttachedFiles:
+def _attachments(segment: Segment, reporter: Reporter) -> AttachedFiles:
     """Return a function that attaches the files of the configuration, if its path is known."""
     try:
         return ConfigFiles(Path(control.request(segment.header.control, control.Where(), WHERE_S)["config"]))
     except (ControlError, KeyError) as error:
         text = f"the configuration is not attached: {error}"
-        news.tell("problem", text, text=text)
+        reporter.report("problem", text, text=text)
         return no_attachments
 
 
 def _sum_up(
-    work: RotatingRecorder | TriggeredRecorder, file: Path | None, directory: Path, news: Reporter, *, whole: bool
+    work: RotatingRecorder | TriggeredRecorder, file: Path | None, directory: Path, reporter: Reporter, *, whole: bool
 ) -> None:
     counters = work.counters
     counts = {"frames": counters.frames, "events": counters.events, "missed": counters.missed}
     size = f", {work.written / 1e6:.2f} MB" if work.written else ""
     line = f"{file or directory}: {', '.join(f'{count} {what}' for what, count in counts.items())}{size}"
-    news.tell("ended", line, file=_name(file), **counts, bytes=work.written, whole=whole)
+    reporter.report("ended", line, file=_name(file), **counts, bytes=work.written, whole=whole)
 
 
 def _name(file: Path | None) -> str | None:
@@ -130,7 +130,7 @@ class Reporter:
     def __init__(self, *, as_json: bool) -> None:
         self._as_json = as_json
 
-    def tell(self, what: str, line: str, **fields: Any) -> None:
+    def report(self, what: str, line: str, **fields: Any) -> None:
         """Report an event; a closed terminal does not end the recording."""
         if self._as_json:
             say_json({"what": what, **fields})

@@ -461,8 +461,8 @@ class Link:
             missing = "TLS there (mqtts://)" if self._context is None else "a client certificate (certificate, key)"
             older = ", or MQTT 3.1.1 (version)" if self.version == MQTTv5 else ""
             return f"{self.peer} closed the connection before it accepted the login: it may expect {missing}{older}"
-        twin = f"; does another client connect as {self._client_id} (client_id)?" if self._options.client_id else ""
-        return f"the connection to {self.peer} was lost{twin}"
+        hint = f"; does another client connect as {self._client_id} (client_id)?" if self._options.client_id else ""
+        return f"the connection to {self.peer} was lost{hint}"
 
     def _fail(self, why: str) -> None:
         with self._condition:

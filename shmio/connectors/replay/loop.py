@@ -188,7 +188,7 @@ class Player:
             output.raw, max(0, output.cycle), output.source_ns, Quality.BAD, Provenance.REPLAYED, reason,
             shown=None if output.base is output.raw else output.base, at=stamp,
         )  # fmt: skip
-        self._tell(Quality.BAD, reason, stamp)
+        self._change_quality(Quality.BAD, reason, stamp)
         self._missing = True
         self._show(image)
 
@@ -202,7 +202,7 @@ class Player:
             if self._missing:
                 self._missing = False
                 if item.quality is not Quality.BAD:
-                    self._tell(item.quality, GOES_ON, at)
+                    self._change_quality(item.quality, GOES_ON, at)
             self._show(self._image(item, at))
         elif isinstance(item, Event):
             self._happen(item, stamp(position_ns, item.clock_ns))
@@ -235,7 +235,7 @@ class Player:
         self._writer.cycle = event.cycle
         self._writer.event(record, quality=event.quality, at=at._replace(utc_ns=event.utc_ns))
 
-    def _tell(self, quality: Quality, reason: str, at: Stamp) -> None:
+    def _change_quality(self, quality: Quality, reason: str, at: Stamp) -> None:
         self._writer.event(Record(EventKind.QUALITY, reason), quality=quality, at=at)
         log.info("quality %s: %s", quality, reason)
 

@@ -123,14 +123,14 @@ class CpuValues:
         self._tags = tags
         self._mode = mode
         self._mode_seen = -1
-        self._news: dict[int, tuple[Value, int, int]] = {}  # by index: value, status, UTC time of the answer
+        self._changes: dict[int, tuple[Value, int, int]] = {}  # by index: value, status, UTC time of the answer
         self._bad: set[int] = set()
         self.queries: list[Query] = []
         for szl in (_MODULES, _COMPONENTS):
             if wanted := [tag for tag in tags if tag.name in _TEXTS and _TEXTS[tag.name].szl == szl]:
-                self.queries.append(_TextsQuery(szl, wanted, self._tell))
+                self.queries.append(_TextsQuery(szl, wanted, self._note))
         if clocks := [tag for tag in tags if tag.name == _CLOCK]:
-            self.queries.append(_ClockQuery(clocks, self._tell))
+            self.queries.append(_ClockQuery(clocks, self._note))
         self._states = [tag for tag in tags if tag.name == _STATE]
 
     def begin(self) -> None:
@@ -138,18 +138,18 @@ class CpuValues:
         self._mode_seen = -1
         for tag in self._tags:
             if tag.place not in self._bad:  # of a bad one, its status says more
-                self._news[tag.place] = None, BAD_WAITING_FOR_INITIAL_DATA, 0
+                self._changes[tag.place] = None, BAD_WAITING_FOR_INITIAL_DATA, 0
 
     def store(self, image: RegisterImage) -> None:
         """Put all values that have changed since the last call into the image."""
         if self._states:
             self._look_at_mode()
-        for index, (value, status, source_ns) in self._news.items():
+        for index, (value, status, source_ns) in self._changes.items():
             if value is None:
                 image.fail(index, status, source_ns)
             else:
                 image.put(index, value, source_ns)
-        self._news.clear()
+        self._changes.clear()
 
     def _look_at_mode(self) -> None:
         mode = self._mode
@@ -157,10 +157,10 @@ class CpuValues:
             if self._mode_seen:
                 self._mode_seen = 0
                 why = "the controller does not report its operating mode"
-                self._tell(self._states, lambda _: None, BAD_NOT_SUPPORTED, why)
+                self._note(self._states, lambda _: None, BAD_NOT_SUPPORTED, why)
         elif mode.mode is not None and mode.answered_ns != self._mode_seen:
             self._mode_seen = mode.answered_ns
-            self._tell(self._states, self._state, BAD_NO_DATA, f"mode {mode.mode} is unknown")
+            self._note(self._states, self._state, BAD_NO_DATA, f"mode {mode.mode} is unknown")
 
     def _state(self, tag: CpuTag) -> Value:
         base, mode = tag.register.element.base, self._mode
@@ -168,7 +168,7 @@ class CpuValues:
             return mode.runs
         return mode.mode if base in INTEGERS else MODES.get(mode.mode or 0)
 
-    def _tell(self, tags: Iterable[CpuTag], value_of: Callable[[CpuTag], Value], status: int, why: str) -> None:
+    def _note(self, tags: Iterable[CpuTag], value_of: Callable[[CpuTag], Value], status: int, why: str) -> None:
         """Note new values of registers.
 
         A register without a value gets ``status``; ``why`` is for the log.
@@ -177,7 +177,7 @@ class CpuValues:
         good, bad = [], []
         for tag in tags:
             value = value_of(tag)
-            self._news[tag.place] = value, GOOD if value is not None else status, now_ns
+            self._changes[tag.place] = value, GOOD if value is not None else status, now_ns
             if (value is None) == (tag.place in self._bad):
                 continue
             name = f"{tag.register.path} ({CPU}{tag.name})"
@@ -193,32 +193,32 @@ class CpuValues:
             log.info("%s: good again", names_of(good))
 
 
-_Tell = Callable[[Iterable[CpuTag], Callable[[CpuTag], Value], int, str], None]
+_Note = Callable[[Iterable[CpuTag], Callable[[CpuTag], Value], int, str], None]
 
 
 class _CpuQuery(Query):
     """A question whose answer gives registers their values; they are bad if there is no answer."""
 
-    def __init__(self, service: Service, interval_ns: int | None, tags: Sequence[CpuTag], tell: _Tell) -> None:
+    def __init__(self, service: Service, interval_ns: int | None, tags: Sequence[CpuTag], note: _Note) -> None:
         super().__init__(service, interval_ns)
-        self.tags, self.tell = tags, tell
+        self.tags, self.note = tags, note
 
     def refused(self, refusal: RefusedError) -> None:
         """Turn the registers bad, and ask again in the next session."""
         self.rest()
         status = BAD_USER_ACCESS_DENIED if refusal.code == ACCESS_DENIED else BAD_NOT_SUPPORTED
-        self.tell(self.tags, lambda _: None, status, str(refusal))
+        self.note(self.tags, lambda _: None, status, str(refusal))
 
     def given_up(self, why: str) -> None:
         """Turn the registers bad; the question is never asked again."""
-        self.tell(self.tags, lambda _: None, BAD_NOT_SUPPORTED, f"the controller {why}; shmio does not ask again")
+        self.note(self.tags, lambda _: None, BAD_NOT_SUPPORTED, f"the controller {why}; shmio does not ask again")
 
 
 class _TextsQuery(_CpuQuery):
     """The question for the texts of one list, asked once in each session."""
 
-    def __init__(self, szl: int, tags: Sequence[CpuTag], tell: _Tell) -> None:
-        super().__init__(READ_SZL, None, tags, tell)
+    def __init__(self, szl: int, tags: Sequence[CpuTag], note: _Note) -> None:
+        super().__init__(READ_SZL, None, tags, note)
         self._szl = szl
 
     def data(self) -> bytes:
@@ -230,7 +230,7 @@ class _TextsQuery(_CpuQuery):
         records: dict[int, bytes] = {}
         for record in szl_records(data, self._szl):
             records.setdefault(int.from_bytes(record[:2], "big"), record)
-        self.tell(
+        self.note(
             self.tags,
             lambda tag: _text(tag.name, records),
             BAD_NO_DATA,
@@ -254,8 +254,8 @@ def _text(name: str, records: Mapping[int, bytes]) -> str | None:
 class _ClockQuery(_CpuQuery):
     """The question for the time of the CPU's clock, asked once a second."""
 
-    def __init__(self, tags: Sequence[CpuTag], tell: _Tell) -> None:
-        super().__init__(READ_CLOCK, CLOCK_INTERVAL_NS, tags, tell)
+    def __init__(self, tags: Sequence[CpuTag], note: _Note) -> None:
+        super().__init__(READ_CLOCK, CLOCK_INTERVAL_NS, tags, note)
 
     def data(self) -> bytes:
         """Return the data of the request, which are empty."""
@@ -265,4 +265,4 @@ class _ClockQuery(_CpuQuery):
         """Give the registers the time."""
         clock = parse_clock(data)
         text = None if clock is None else clock.isoformat(timespec="milliseconds")
-        self.tell(self.tags, lambda _: text, BAD_NO_DATA, "the CPU's clock has no valid time: set the clock")
+        self.note(self.tags, lambda _: text, BAD_NO_DATA, "the CPU's clock has no valid time: set the clock")

@@ -103,7 +103,7 @@ class Monitor:
         for source, follower in self._followers.items():
             if follower.became_stale():
                 notices += self._evaluate(self._concerned(source), self._now_ns)
-        notices += self._look()
+        notices += self._check_processes()
         if not more:
             self.done = clock.done
             for one in self.alerts:
@@ -188,7 +188,7 @@ class Monitor:
     def _concerned(self, source: str) -> list[WatchedAlert]:
         return [one for one in self.alerts if source in one.watch.sources]
 
-    def _look(self) -> list[tuple[WatchedAlert, Notice]]:
+    def _check_processes(self) -> list[tuple[WatchedAlert, Notice]]:
         """Check the process table, and sources that have no frame yet."""
         now_s = time.monotonic()
         if now_s < self._looked_s + LOOK_S:
@@ -207,7 +207,7 @@ class Monitor:
 
     def _evaluate(self, alerts: Iterable[WatchedAlert], now_ns: int) -> Iterator[tuple[WatchedAlert, Notice]]:
         for one in alerts:
-            finding = one.watch.look(self._followers)
+            finding = one.watch.evaluate(self._followers)
             if finding.holds is not None:
                 one.finding = finding
             yield from self._notices(one, one.lifecycle.observe(finding.holds, now_ns), now_ns)

@@ -44,7 +44,7 @@ class Watch(Protocol):
     sources: Collection[str]
     """The sources whose frames matter."""
 
-    def look(self, followers: Followers) -> Finding:
+    def evaluate(self, followers: Followers) -> Finding:
         """Evaluate the present state. For a condition, call it once for each frame of its sources."""
 
 
@@ -63,7 +63,7 @@ class RegisterWatch:
         self.sources: Collection[str] = {source for source, _ in self._condition.reads} if self._condition else ()
         self._memory = Memory()
 
-    def look(self, followers: Followers) -> Finding:
+    def evaluate(self, followers: Followers) -> Finding:
         """Evaluate the condition."""
         if self._condition is None:
             return UNKNOWN
@@ -98,18 +98,18 @@ class QualityWatch:
         self.sources: Collection[str] = [name for name in blocks if any(glob.matches(name) for glob in globs)]
         self._qualities = qualities
 
-    def look(self, followers: Followers) -> Finding:
+    def evaluate(self, followers: Followers) -> Finding:
         """Compare the present qualities."""
         if not self.sources:
             return UNKNOWN
         present = {name: followers[name] for name in self.sources}
         met = [one for one in present.items() if str(one[1].quality) in self._qualities]
-        told = [
+        texts = [
             f"{name} is {one.quality}{f': {one.reason}' if one.reason else ''}" for name, one in met or present.items()
         ]
         frames = [one.frame for _, one in met or present.items() if one.frame is not None]
         kinds = sorted({str(frame.provenance) for frame in frames})
-        return Finding(bool(met), "; ".join(told), {}, injected=False, provenance=", ".join(kinds))
+        return Finding(bool(met), "; ".join(texts), {}, injected=False, provenance=", ".join(kinds))
 
 
 class ProcessWatch:
@@ -125,14 +125,14 @@ class ProcessWatch:
         self._states = states
         self._segment = segment
 
-    def look(self, _followers: Followers) -> Finding:
+    def evaluate(self, _followers: Followers) -> Finding:
         """Compare the present states."""
         supervised = self._segment.supervised
         states: dict[str, tuple[str, str]] = {}
         for slot in self._segment.processes:
             if slot.kind != "alerts" and any(glob.matches(slot.name) for glob in self._globs):
-                told = slot.supervised
-                phase, note = told.phase, told.note
+                state = slot.supervised
+                phase, note = state.phase, state.note
                 if not supervised:
                     phase, note = (Phase.RUNNING, "") if slot.alive() else (Phase.STOPPED, "dead, as is the supervisor")
                 elif phase is Phase.STARTING and note and note != RESTARTING:

@@ -31,14 +31,14 @@ FOREIGN_LOGGERS: Final = ("asyncio", "grpc._cython.cygrpc")
 def run(worker: Worker) -> None:
     """Serve clients until the worker is stopped."""
     limits.limit_arenas()
-    rations = {name: LogRateLimit(one_kind=name != "shmio.grpc") for name in ("shmio.grpc", *FOREIGN_LOGGERS)}
-    for name, ration in rations.items():
-        logging.getLogger(name).addFilter(ration)
+    rate_limits = {name: LogRateLimit(one_kind=name != "shmio.grpc") for name in ("shmio.grpc", *FOREIGN_LOGGERS)}
+    for name, rate_limit in rate_limits.items():
+        logging.getLogger(name).addFilter(rate_limit)
     try:
         asyncio.run(_serve(worker))
     finally:
-        for name, ration in rations.items():
-            logging.getLogger(name).removeFilter(ration)
+        for name, rate_limit in rate_limits.items():
+            logging.getLogger(name).removeFilter(rate_limit)
 
 
 async def _serve(worker: Worker) -> None:
@@ -98,8 +98,8 @@ async def _serve(worker: Worker) -> None:
             _end_now(worker)
         if not (feeds.alive and services.stepper.alive):
             raise RuntimeError("a task ended unexpectedly; the endpoint restarts")
-        trimmer.look(server.unknown)
-        services.stepper.timeline.look()
+        trimmer.trim(server.unknown)
+        services.stepper.timeline.update()
         streams, dropped, published, refused = services.counters
         worker.report((streams, feeds.messages + services.updates, dropped, published, refused))
         try:

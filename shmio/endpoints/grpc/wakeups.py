@@ -191,20 +191,20 @@ class BatchReader:
     def start(self) -> None:
         """Start following the block."""
         self.alive = True
-        self._wake_ups.join(self._block, self.look, patient=self._patient)
+        self._wake_ups.join(self._block, self.read_batch, patient=self._patient)
 
     def stop(self) -> None:
         """Stop following the block."""
         if self.alive:
             self.alive = False
-            self._wake_ups.leave(self._block, self.look)
+            self._wake_ups.leave(self._block, self.read_batch)
 
-    def look(self) -> None:
+    def read_batch(self) -> None:
         """Read a batch, unless ``passes`` says to read nothing now."""
         if not self.alive:
             return  # stopped during the wake-up
         if self._passes is not None and self._passes():
-            self._wake_ups.rest(self._block, self.look)
+            self._wake_ups.rest(self._block, self.read_batch)
         else:
             self.read()
 
@@ -222,8 +222,8 @@ class BatchReader:
 
     def resume(self) -> None:
         """Make the reader read at each wake-up again, because it is no longer patient."""
-        self._wake_ups.resume(self._block, self.look)
+        self._wake_ups.resume(self._block, self.read_batch)
 
     def _look_again(self) -> None:
         self._again = False
-        self.look()
+        self.read_batch()

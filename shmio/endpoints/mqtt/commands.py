@@ -90,7 +90,7 @@ class CommandClient:
             raise CommandError(f"{self.block.source}: too many commands are under way: wait for their results")
         if self.block.retired:
             raise CommandError(RETIRED)
-        self._pending.add(self._source_writer.submit({register.path: value}), cost, partial(_tell, done))
+        self._pending.add(self._source_writer.submit({register.path: value}), cost, partial(_report, done))
 
     def poll(self) -> None:
         """Read new events, and end the commands whose outcome is known or overdue."""
@@ -103,7 +103,7 @@ class CommandClient:
             self._pending.end(REPLACED)
 
 
-def _tell(done: Done, ends: Sequence[End]) -> None:
+def _report(done: Done, ends: Sequence[End]) -> None:
     kind, reason = worst(ends)
     done(kind, "" if kind in DONE else reason)
 
@@ -169,19 +169,19 @@ class CommandReceiver:
         if len(topic.encode()) > MAX_TOPIC_BYTES:
             self.refused += 1
             return
-        tell = _Reply(self._prefix, topic, message, self._answer)
+        reply = _Reply(self._prefix, topic, message, self._answer)
         if message.retain:  # its age is unknown: the broker may have stored it before we connected
             self.refused += 1
-            tell(EventKind.REJECTED, RETAINED)
+            reply(EventKind.REJECTED, RETAINED)
             return
         try:
             client, register = self._find(topic.removeprefix(f"{self._prefix}/"))
             client.check(register)  # before decoding, because no value would be accepted
             json = self._rules.of(client.block.source, register.path).payload != "text"
-            client.send(register, _value(bytes(message.payload), register, json=json), tell)
+            client.send(register, _value(bytes(message.payload), register, json=json), reply)
         except (CommandError, PathError, ValueRangeError) as error:
             self.refused += 1
-            tell(EventKind.REJECTED, str(error))
+            reply(EventKind.REJECTED, str(error))
 
     def _find(self, text: str) -> tuple[CommandClient, Register]:
         topic = parse_topic(text, self._clients, None)

@@ -241,8 +241,8 @@ def _provenance(node: RegisterNode, name: str) -> Property:
     def get() -> ua.Variant:
         frame = node.feed.follower.frame
         over = frame is not None and injected(node.feed.block, (node.register,), frame)
-        told = Provenance.INJECTED if over else Provenance.LIVE if frame is None else frame.provenance
-        return ua.Variant(str(told), _Types.String)
+        provenance = Provenance.INJECTED if over else Provenance.LIVE if frame is None else frame.provenance
+        return ua.Variant(str(provenance), _Types.String)
 
     return Property(node, name, ua.ObjectIds.String, get, node.feed.watch_detail)
 

@@ -177,7 +177,7 @@ class Recordings:
         self._opened: dict[str, Opened] = {}
         self._opening: dict[str, asyncio.Lock] = {}
         self._details: dict[str, tuple[_State, float, Mapping[str, Any]]] = {}
-        self._looking: asyncio.Task[None] | None = None
+        self._examining: asyncio.Task[None] | None = None
 
     async def in_thread(self, function: Callable[[], T]) -> T:
         """Run a function in one of the threads that read recordings."""
@@ -292,11 +292,11 @@ class Recordings:
                 unknown.append((name, state))
             details: Mapping[str, Any] = {} if known is None or known[0].inode != state.inode else known[2]
             rows.append({"name": name, "size": state.size, "writing": written, "known": bool(details), **details})
-        if unknown and (self._looking is None or self._looking.done()):
-            self._looking = asyncio.get_running_loop().create_task(self._look(unknown))
+        if unknown and (self._examining is None or self._examining.done()):
+            self._examining = asyncio.get_running_loop().create_task(self._examine(unknown))
         return rows
 
-    async def _look(self, files: list[tuple[str, _State]]) -> None:
+    async def _examine(self, files: list[tuple[str, _State]]) -> None:
         """Find the details of some files, one after the other. The next list asks for more."""
         for name, state in files[:LOOKS]:
             opened: Opened | None = None

@@ -346,8 +346,8 @@ class DamageLog:
     readable chunk and at the end of the file. Call :meth:`after` after each readable chunk.
     """
 
-    def __init__(self, tell: Callable[[Damage], object]) -> None:
-        self._tell = tell
+    def __init__(self, report: Callable[[Damage], object]) -> None:
+        self._report = report
         self._after_ns = 0
         self._found: Damage | None = None
 
@@ -369,7 +369,7 @@ class DamageLog:
         ``before_ns``: log time of the next entry; 0: none.
         """
         if self._found is not None:
-            self._tell(self._found._replace(before_ns=before_ns))
+            self._report(self._found._replace(before_ns=before_ns))
             self._found = None
 
 

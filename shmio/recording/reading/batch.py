@@ -38,7 +38,7 @@ HEAD: Final = np.dtype(
 
 _RECORD: Final = struct.Struct("<BQH")  # opcode, size; then, in a message, the channel
 _MESSAGE: Final = struct.Struct("<BQHIQQ")  # opcode, size, channel, sequence, log time, publish time
-_TOLD: Final = np.dtype(
+_MESSAGE_HEAD: Final = np.dtype(
     [
         ("opcode", "u1"),
         ("size", "<u8"),
@@ -219,15 +219,15 @@ def _cut(array: _Bytes, begin: int, period: int, count: int, size: int) -> _Byte
 
 def _restored(run: _Bytes) -> _Bytes:
     """Convert all messages from FRAME_V2 to FRAME, like ``restore`` in ``encoding.py``."""
-    told = run[:, : _MESSAGE.size].view(_TOLD)[:, 0]
+    head_fields = run[:, : _MESSAGE.size].view(_MESSAGE_HEAD)[:, 0]
     frames = run[:, _MESSAGE.size :].copy()
     if frames.shape[1] >= HEAD.itemsize:
         head = frames[:, : HEAD.itemsize].view(HEAD)[:, 0]
-        head["number"] += told["sequence"]
+        head["number"] += head_fields["sequence"]
         head["cycle"] += head["number"]
-        head["clock_ns"] += told["log_ns"]
+        head["clock_ns"] += head_fields["log_ns"]
         head["publish_ns"] += head["clock_ns"]
-        head["source_ns"] += told["publish_ns"]
+        head["source_ns"] += head_fields["publish_ns"]
     return frames
 
 

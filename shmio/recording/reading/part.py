@@ -190,7 +190,7 @@ class Part:
     def messages(self, channels: Collection[int], from_ns: int, to_ns: int) -> Iterator[Message]:
         """Yield the messages of some channels in a range of log times, in file order."""
         records = (record for record, _, _ in self._chunks(from_ns, to_ns, channels))
-        damaged = self._tell if self._damaged else None
+        damaged = self._report if self._damaged else None
         yield from self.reader.messages(
             lambda channel: channel.number in channels, max(from_ns, 0), to_ns, damaged, records
         )
@@ -201,7 +201,7 @@ class Part:
         The messages of a chunk are in file order.
         """
         for record, _, _ in self.found.chunks.before(time_ns, self._sure(channels)):
-            damaged = self._tell if self._damaged else None
+            damaged = self._report if self._damaged else None
             wanted = lambda channel: channel.number in channels  # noqa: E731
             yield list(self.reader.messages(wanted, 0, time_ns, damaged, [record]))
 
@@ -222,7 +222,7 @@ class Part:
 
     def _each(self, channel: int, from_ns: int, to_ns: int, decode: Callable[[bytes], T]) -> Iterator[T]:
         """Decode each chunk that may have messages of a channel in a range of log times."""
-        log = DamageLog(self._tell)
+        log = DamageLog(self._report)
         for record, first_ns, last_ns in self._chunks(from_ns, to_ns, [channel]):
             try:
                 found = self._decoded(record, decode)
@@ -256,7 +256,7 @@ class Part:
         """
         return channels if self._indexed else None
 
-    def _tell(self, damage: Damage) -> None:
+    def _report(self, damage: Damage) -> None:
         if self._damaged:
             self._damaged(self.file, damage)
 

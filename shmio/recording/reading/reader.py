@@ -147,11 +147,11 @@ class Reader:
             records: The records to read; None for the whole file.
         """
 
-        def tell(damage: Damage) -> None:
+        def report(damage: Damage) -> None:
             if damaged and damage.after_ns <= to_ns and not 0 < damage.before_ns < from_ns:
                 damaged(damage)
 
-        log = DamageLog(tell)
+        log = DamageLog(report)
         for record in self.records.walk() if records is None else records:
             try:
                 if record.opcode == Opcode.CHUNK:

@@ -24,7 +24,7 @@ def to(slot: ProcessSlot, phase: Phase, pid: int, restarts: int = 0, why: str = 
 
 
 def told(watch: ProcessWatch) -> list[tuple[str, str, int, str]]:
-    return [(change.name, change.what, change.pid, change.why) for change in watch.look()]
+    return [(change.name, change.what, change.pid, change.why) for change in watch.check()]
 
 
 def test_each_start_and_end_of_a_process_is_reported(segment: Segment) -> None:

@@ -250,7 +250,7 @@ def keep(segment: Segment, folder: Path, present: Path | None = None, **settings
     """Clean up the folder; return the remaining files."""
     writing = {present} if present else set()
     keeper = Housekeeper(segment.instance, Settings(directory=str(folder), **settings), "supervised", lambda: writing)
-    keeper.look()
+    keeper.check_folder()
     return set(folder.iterdir())
 
 
@@ -288,10 +288,10 @@ def test_a_file_that_was_in_use_is_closed_later(segment: Segment, tmp_path: Path
     killed.write_bytes(whole.read_bytes()[:-100])
     keeper = Housekeeper(segment.instance, Settings(directory=str(tmp_path)), "supervised", set)
     with Recording([killed]):
-        keeper.look()
+        keeper.check_folder()
         with Reader(killed) as reader:
             assert reader.records.footer() is None
-    keeper.look()
+    keeper.check_folder()
     with Reader(killed) as reader:
         assert reader.records.footer() is not None
 
@@ -334,10 +334,10 @@ def test_a_file_that_cannot_be_deleted_is_reported_once(
 
     with monkeypatch.context() as readonly:
         readonly.setattr(Path, "unlink", refuse)
-        keeper.look()
-        keeper.look()
+        keeper.check_folder()
+        keeper.check_folder()
     assert caplog.text.count(f"{old} cannot be deleted: Permission denied; it is 9.0 days old") == 1
-    keeper.look()
+    keeper.check_folder()
     assert not old.exists()
 
 

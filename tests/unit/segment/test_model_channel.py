@@ -66,13 +66,13 @@ def test_only_a_block_with_outputs_has_a_channel(segment: Segment) -> None:
 
 
 def test_a_model_connects_while_every_process_slot_is_taken(segment: Segment) -> None:
-    slots = [slot.index for slot in (*segment.processes, *segment.processes.guests)]
+    slots = [slot.index for slot in (*segment.processes, *segment.processes.external)]
     assert slots[-1] == segment.header.process_capacity - 1
     with (
         Segment.open(segment.instance, writable=True) as others,
         Segment.open(segment.instance, writable=True) as other,
     ):
-        assert all(slot.take() for slot in (*others.processes, *others.processes.guests))
+        assert all(slot.take() for slot in (*others.processes, *others.processes.external))
         assert link_of(other).join("belt")
 
 

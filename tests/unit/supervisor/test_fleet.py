@@ -49,7 +49,7 @@ def test_only_an_unknown_process_is_evicted_from_a_slot(
             managed.child = AdoptedProcess(child.pid, os.pidfd_open(child.pid))
             managed.life = Life(State.STARTING)
             managed.slot.report = Report(1, Activity.STOPPING, 0, (), "")  # report of the previous process
-            fleet.look(time.monotonic_ns())
+            fleet.check(time.monotonic_ns())
             assert bool(killed) is not holder_is_child
             os.close(managed.child.pidfd)
         finally:

@@ -104,7 +104,7 @@ def test_a_source_is_removed_and_its_place_is_used_again(launch: Launch) -> None
         assert segment.processes.find("robot").index not in places.values()
         assert segment.processes.find("robot").index == max(places.values()) + 1
         assert segment.processes.find("robot").supervised.restarts == 0
-    assert [slot.name for slot in segment.processes.guests] == ["guest-1", "guest-2", "guest-3", "guest-4"]
+    assert [slot.name for slot in segment.processes.external] == ["guest-1", "guest-2", "guest-3", "guest-4"]
 
 
 def test_a_process_with_a_changed_configuration_is_replaced(launch: Launch) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from shmio.testing.mosquitto import TETHER, missing
+from shmio.testing.mosquitto import KILL_WITH_PARENT, missing
 
 TIMEOUT_MS = 30_000
 PROGRAM = """
@@ -27,7 +27,7 @@ with reserved_port() as address:
 
 
 @pytest.mark.skipif(bool(missing()), reason=missing())
-@pytest.mark.skipif(not TETHER, reason="setpriv is not installed: it is in util-linux")
+@pytest.mark.skipif(not KILL_WITH_PARENT, reason="setpriv is not installed: it is in util-linux")
 def test_it_ends_with_a_killed_test_run(tmp_path: Path) -> None:
     command = [sys.executable, "-c", PROGRAM, str(tmp_path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as run:

@@ -60,13 +60,13 @@ class Health(health_pb2_grpc.HealthServicer):
         changed = asyncio.Event()
         watchers = self._watchers.setdefault(request.service, set())
         watchers.add(changed)
-        told = None
+        sent = None
         try:
             while True:
                 changed.clear()
                 status = self._status(request.service)
-                if status != told:
-                    told = status
+                if status != sent:
+                    sent = status
                     yield status
                 await changed.wait()
         finally:

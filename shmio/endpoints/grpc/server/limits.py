@@ -79,7 +79,7 @@ class Trimmer:
         self._seen = 0
         self._due_s = self._until_s = 0.0
 
-    def look(self, refused: int) -> None:
+    def trim(self, refused: int) -> None:
         """Return free memory to the kernel if it is time.
 
         Args:

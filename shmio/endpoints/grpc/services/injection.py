@@ -330,7 +330,7 @@ class Shadows:
         self._topics = topics
         self._named: dict[str, Shadow] = {}
         self._holders: dict[Injection, set[object]] = {}
-        self._looking: asyncio.Task[None] | None = None
+        self._releasing: asyncio.Task[None] | None = None
 
     def find(self, path: str) -> Shadow | None:
         """Return the shadow topic that a path names, or None."""
@@ -386,8 +386,8 @@ class Shadows:
             seen = None
         client = _Client(seen, time.monotonic() + UNSEEN_S)
         injection = await self.create(target, shape, kinds, client, peer)
-        if self._looking is None:
-            self._looking = asyncio.get_running_loop().create_task(self._look())
+        if self._releasing is None:
+            self._releasing = asyncio.get_running_loop().create_task(self._release_abandoned())
         return injection
 
     def hold(self, injection: Injection, stream: object) -> None:
@@ -435,7 +435,7 @@ class Shadows:
         del self._holders[injection]
         self._named = {name: shadow for name, shadow in self._named.items() if shadow.injection is not injection}
 
-    async def _look(self) -> None:
+    async def _release_abandoned(self) -> None:
         """Release the injections of disconnected clients that had no stream."""
         while clients := self._clients():
             await asyncio.sleep(LOOK_S)
@@ -444,7 +444,7 @@ class Shadows:
                 gone = time.monotonic() > client.until_s if client.peer is None else client.peer not in there
                 if gone:
                     self.release(injection, client)
-        self._looking = None
+        self._releasing = None
 
     def _clients(self) -> list[tuple[Injection, _Client]]:
         return [

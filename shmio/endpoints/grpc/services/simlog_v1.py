@@ -408,7 +408,7 @@ class SimlogV1:
                 yield moment
             return
         topic, found = await self._resolve(request.path, context)
-        told = False
+        reported = False
         with self._outboxes.opened() as outbox:
             lane: Lane = StateLane(outbox)
             if topic.direction == "in":
@@ -422,9 +422,9 @@ class SimlogV1:
                     joined.callback(lane.join(feed, Subject("v1", found.path, found.registers, encode)))
                     outbox.on_failure = joined.close  # at once, because a client that does not read delays the end
                     try:
-                        if not told:
+                        if not reported:
                             await context.send_initial_metadata(())  # the client misses nothing from then on
-                            told = True
+                            reported = True
                         while (message := await outbox.pop()) is not None:
                             yield message
                     finally:

@@ -30,7 +30,7 @@ class SimServer:
         self._stepper = stepper
         self._outboxes = outboxes
         self._lanes: dict[StateLane, None] = {}  # of the subscribers to the status
-        stepper.timeline.watch(self._tell)
+        stepper.timeline.watch(self._send)
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
         """Return the handlers of the service's calls."""
@@ -99,7 +99,7 @@ class SimServer:
         except ShmioError as error:
             await refuse(context, error)
 
-    def _tell(self, status: TimeStatus) -> None:
+    def _send(self, status: TimeStatus) -> None:
         if self._lanes:
             message = _wire(status).SerializeToString()
             for lane in self._lanes:

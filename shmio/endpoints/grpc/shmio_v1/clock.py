@@ -90,7 +90,7 @@ class TimeCalls:
         self._segment = segment
         self._stepper = stepper
         self._watchers: set[asyncio.Event] = set()
-        stepper.timeline.watch(self._tell)
+        stepper.timeline.watch(self._wake_watchers)
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
         """Return the handlers of these calls, by name."""
@@ -180,15 +180,15 @@ class TimeCalls:
         """
         if len(self._watchers) >= MAX_WATCHERS:
             await refuse(context, EndpointError(f"{MAX_WATCHERS} calls of WatchClock are open, the maximum"))
-        news = asyncio.Event()
-        self._watchers.add(news)
+        change = asyncio.Event()
+        self._watchers.add(change)
         try:
             while True:
-                news.clear()
+                change.clear()
                 yield clock(self._segment.clock.read())
-                await news.wait()
+                await change.wait()
         finally:
-            self._watchers.discard(news)
+            self._watchers.discard(change)
 
     async def _do(self, work: Awaitable[object], context: Context) -> wire.Clock:
         try:
@@ -197,9 +197,9 @@ class TimeCalls:
             await refuse(context, error)
         return clock(self._segment.clock.read())
 
-    def _tell(self, _: TimeStatus) -> None:
-        for news in self._watchers:
-            news.set()
+    def _wake_watchers(self, _: TimeStatus) -> None:
+        for event in self._watchers:
+            event.set()
 
 
 def clock(state: Clock) -> wire.Clock:

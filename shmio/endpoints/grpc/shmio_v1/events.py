@@ -81,7 +81,7 @@ class EventLog:
     def start(self) -> None:
         """Start following the block."""
         self._batches.start()
-        self._batches.look()
+        self._batches.read_batch()
 
     def stop(self) -> None:
         """Stop following the block."""

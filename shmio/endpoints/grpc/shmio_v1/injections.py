@@ -357,7 +357,7 @@ class InjectCall(InjectionFollower):
 
     def _answer(self, shadow: wire.Shadow, end: End) -> None:
         answer = wire.Answer(sequence=shadow.sequence, outcome=outcome(*end))
-        self._tell(field(_ANSWERS, answer.SerializeToString()))
+        self._queue(field(_ANSWERS, answer.SerializeToString()))
 
     async def _values(self, shadow: wire.Shadow) -> tuple[Mapping[str, object], Sequence[Write]]:
         values = packed(shadow.values, self._view) if shadow.HasField("values") else {}
@@ -416,9 +416,9 @@ class InjectCall(InjectionFollower):
             columns = self._view.columns
             values = pack_slots(columns.decode(image), columns.of_bits(changed))
             body = (field(VALUES, values) if values else b"") + self._ranges.pieces(image, changed)
-            self._tell(field(_ORIGINALS, head_of(self._view.number, diverted.event) + body))
+            self._queue(field(_ORIGINALS, head_of(self._view.number, diverted.event) + body))
 
-    def _tell(self, message: bytes) -> None:
+    def _queue(self, message: bytes) -> None:
         if not self.over and (reason := self._waiting.add(message)):
             self._give_up(reason)
         self._wake.set()

@@ -41,7 +41,7 @@ class VirtualTime:
 
     def __init__(self) -> None:
         self.on = False
-        self.look: Callable[[], object] = lambda: None
+        self.update: Callable[[], object] = lambda: None
         """Function that adopts the steps that other programs have made. The timeline sets it."""
         self.moment = Moment(0, 0)
 
@@ -158,7 +158,7 @@ class Feed:
         self._free: list[int] = []  # unused slots
         self._table = _ChannelTable.of((), 0)
         self._outdated = False
-        self._owed: dict[Listener, _Channel] = {}  # listeners that wait for a good value
+        self._awaiting_value: dict[Listener, _Channel] = {}  # listeners that wait for a good value
         _ = block.layout.members("")  # builds the index of paths before the first client needs it
         self._follower = FrameFollower(block, notice_gaps=True)
         self._reader = BatchReader(block, wake_ups, self._read, passes=self._passes)
@@ -196,12 +196,12 @@ class Feed:
         channel.listeners[listener] = None
         self._back_pressure.join(listener.stream)
         listener.since = 0
-        self._owed[listener] = channel
+        self._awaiting_value[listener] = channel
         self._settle()
 
     def leave(self, subject: Subject, listener: Listener) -> None:
         """Remove a listener. The last listener's removal ends the channel."""
-        self._owed.pop(listener, None)
+        self._awaiting_value.pop(listener, None)
         channel = self._channels[subject]
         del channel.listeners[listener]
         self._back_pressure.leave(listener.stream)
@@ -215,7 +215,7 @@ class Feed:
     def tell_again(self, subject: Subject) -> None:
         """Deliver the value of a subject again, because it has changed without a new frame."""
         if channel := self._channels.get(subject):
-            self._owed |= dict.fromkeys(channel.listeners, channel)
+            self._awaiting_value |= dict.fromkeys(channel.listeners, channel)
             self._settle()
 
     def hold(self) -> None:
@@ -231,7 +231,7 @@ class Feed:
             return
         self._held = self._stepped = False
         self._follower.restart()
-        self._reader.look()
+        self._reader.read_batch()
         self._settle()
 
     def step(self) -> None:
@@ -259,7 +259,7 @@ class Feed:
         if message is not None:
             self.messages += 1
             for listener in listeners:
-                self._owed.pop(listener, None)
+                self._awaiting_value.pop(listener, None)
                 listener.keep(message)
 
     def _adopt(self, frame: Frame | None) -> None:
@@ -272,26 +272,26 @@ class Feed:
         """Deliver the current value, if it is good, to the listeners that wait for a value."""
         if self._held:
             if self._shown is not None:
-                for listener, channel in list(self._owed.items()):
+                for listener, channel in list(self._awaiting_value.items()):
                     self._keep([listener], channel.encode(self._shown))
-                self._owed.clear()
+                self._awaiting_value.clear()
             return
-        frame = self.block.latest() if self._owed else None
+        frame = self.block.latest() if self._awaiting_value else None
         if frame is None or self.block.assess(frame)[0] is Quality.BAD:
             return
-        for listener, channel in self._owed.items():
+        for listener, channel in self._awaiting_value.items():
             listener.since = frame.number
             message = channel.encode(frame)
             if message is not None:
                 listener.deliver(message, frame.publish_ns / 1e9)
-        self._owed.clear()
+        self._awaiting_value.clear()
 
     def _turn_bad(self, frame: int) -> None:
         """Drop listeners' values older than ``frame``, because its quality is bad."""
         self._shown = None
         for channel in self._channels.values():
             self._lose(channel, frame)
-        self._tell(good=False)
+        self._report_quality(good=False)
 
     def _lose(self, channel: _Channel, frame: int) -> None:
         """Drop a channel's waiting values older than ``frame``. They are no longer valid."""
@@ -345,16 +345,16 @@ class Feed:
             self._turn_bad(frame.number)
         if not bad:
             if not self._good:
-                self._tell(good=True)
+                self._report_quality(good=True)
             self._show(self._shown, frame)
             self._shown = frame
 
     def _regard(self, frame: Frame) -> None:
         """Report a change of quality at once, although the values wait for a step."""
-        self._tell(good=frame.quality is not Quality.BAD)
+        self._report_quality(good=frame.quality is not Quality.BAD)
         self._adopt(frame)
 
-    def _tell(self, *, good: bool) -> None:
+    def _report_quality(self, *, good: bool) -> None:
         if good != self._good:
             self._good = good
             self._on_quality(self.block.source, good)
@@ -372,9 +372,9 @@ class Feed:
             self.messages += 1
             for listener in channel.listeners:
                 if frame.number > listener.since:
-                    self._owed.pop(listener, None)
+                    self._awaiting_value.pop(listener, None)
                     listener.deliver(message, frame.publish_ns / 1e9)
-        if self._owed:
+        if self._awaiting_value:
             self._settle()
 
     def _changes(self, shown: Frame | DeliveredImage | None, frame: Frame) -> list[_Channel]:
@@ -388,7 +388,7 @@ class Feed:
     def present(self) -> Frame | DeliveredImage | None:
         """Return the image that a new listener would get, or None if the quality is not good."""
         if self._held:
-            self._virtual_time.look()
+            self._virtual_time.update()
             return self._shown
         frame = self.block.latest()
         return None if frame is None or self.block.assess(frame)[0] is Quality.BAD else frame

@@ -51,9 +51,9 @@ class Outbox:
         self._next = 0
         self._waiter: asyncio.Future[None] | None = None
         self._ended = False
-        self._owed = 0  # taken() waits for the messages before this number
+        self._required = 0  # delivered() waits for the messages before this number
         self._taken = 0  # messages before this number were sent or dropped
-        self._told: asyncio.Future[None] | None = None
+        self._delivery: asyncio.Future[None] | None = None
         self._asked = False  # whether the reader waits
         self.losses = LossMonitor()
         self.refills: dict[Callable[[], object], None] = {}
@@ -111,8 +111,8 @@ class Outbox:
         for lane, message, _ in self._waiting.values():
             lane.load.remove(message)
         self._waiting.clear()
-        self._owed = 0
-        self._tell()
+        self._required = 0
+        self._report_delivery()
 
     def end(self) -> None:
         """End the reader after the messages that wait now."""
@@ -124,32 +124,32 @@ class Outbox:
         failed, self.failure = self.failure, self.failure or reason
         self.clear()
         self.end()
-        self._tell()
+        self._report_delivery()
         if self.on_failure and not failed:
             asyncio.get_running_loop().call_soon(self.on_failure)  # later, as the caller may iterate over listeners
 
-    def owe(self) -> None:
-        """Make :meth:`taken` wait for all messages that have been added so far."""
-        self._owed = self._next
+    def require_delivery(self) -> None:
+        """Make :meth:`delivered` wait for all messages that have been added so far."""
+        self._required = self._next
 
     @property
-    def owing(self) -> bool:
-        """True if the client has not yet taken all messages that :meth:`taken` waits for."""
-        return self._taken < self._owed and not self.failure
+    def delivery_pending(self) -> bool:
+        """True if the client has not yet taken all messages that :meth:`delivered` waits for."""
+        return self._taken < self._required and not self.failure
 
-    async def taken(self) -> None:
-        """Wait until the client has taken all messages up to :meth:`owe`, or until the stream ends."""
-        while self.owing:
-            self._told = asyncio.get_running_loop().create_future()
+    async def delivered(self) -> None:
+        """Wait until the client has taken all messages up to :meth:`require_delivery`, or until the stream ends."""
+        while self.delivery_pending:
+            self._delivery = asyncio.get_running_loop().create_future()
             try:
-                await self._told
+                await self._delivery
             finally:
-                self._told = None
+                self._delivery = None
 
-    def _tell(self) -> None:
-        """Wake :meth:`taken` if the client has taken all messages that it waits for."""
-        if self._told is not None and not self._told.done() and not self.owing:
-            self._told.set_result(None)
+    def _report_delivery(self) -> None:
+        """Wake :meth:`delivered` if the client has taken all messages that it waits for."""
+        if self._delivery is not None and not self._delivery.done() and not self.delivery_pending:
+            self._delivery.set_result(None)
 
     async def pop(self) -> bytes | None:
         """Wait for the oldest message, and return it. After :meth:`end`, return None.
@@ -159,8 +159,8 @@ class Outbox:
         """
         waiting = self._waiting
         self._taken = next(iter(waiting)) if waiting else self._next
-        if self._told is not None:
-            self._tell()
+        if self._delivery is not None:
+            self._report_delivery()
         self._asked = True
         while not waiting:
             if self._ended:
@@ -215,7 +215,7 @@ class _Lane:
                 f"{self.load.count} values are waiting: too many values change in one step for this stream"
             )
         self._add(message)
-        self._outbox.owe()
+        self._outbox.require_delivery()
 
     def _add(self, message: Sized, at_s: float = 0.0) -> None:
         if self._outbox.failure:
@@ -373,21 +373,21 @@ class Outboxes:
             self._dropped += outbox.dropped
             outbox.close()
 
-    async def taken(self, patience_s: float) -> None:
-        """Wait until all clients have taken the messages marked by :meth:`Outbox.owe`.
+    async def delivered(self, patience_s: float) -> None:
+        """Wait until all clients have taken the messages marked by :meth:`Outbox.require_delivery`.
 
         Streams whose clients have not done so within ``patience_s`` fail.
         """
-        owing = [outbox for outbox in self._open if outbox.owing]
-        if not owing:
+        late = [outbox for outbox in self._open if outbox.delivery_pending]
+        if not late:
             return
         try:
             async with asyncio.timeout(patience_s):
-                for outbox in owing:
-                    await outbox.taken()
+                for outbox in late:
+                    await outbox.delivered()
         except TimeoutError:
-            for outbox in owing:
-                if outbox.owing:
+            for outbox in late:
+                if outbox.delivery_pending:
                     outbox.fail(f"the client has not taken the values of a step within {patience_s:g} s")
 
 

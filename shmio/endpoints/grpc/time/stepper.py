@@ -267,7 +267,7 @@ class Stepper:
 
         """
         done: asyncio.Future[Step] = self._loop.create_future()
-        task = self._spawn(_tell(self._step(dt_ns, peer), done))
+        task = self._spawn(_complete(self._step(dt_ns, peer), done))
         try:
             return await done
         finally:
@@ -361,11 +361,11 @@ class Stepper:
                 if not self._owns:
                     self._coordinator.take_over()
                     self._own(True)
-                    self.timeline.look()
+                    self.timeline.update()
                 yield
             finally:
                 self._moving, self.timeline.steered = None, False
-                self.timeline.look()
+                self.timeline.update()
                 self._set_rest()
 
     def _own(self, owns: bool) -> None:
@@ -417,7 +417,7 @@ class Stepper:
         return self.timeline.status
 
 
-async def _tell(work: Coroutine[Any, Any, _Result], done: asyncio.Future[_Result]) -> None:
+async def _complete(work: Coroutine[Any, Any, _Result], done: asyncio.Future[_Result]) -> None:
     """Await ``work``, and pass its result or error to ``done``, unless ``done`` is cancelled."""
     try:
         result = await work

@@ -98,7 +98,7 @@ class TimeTopics:
         if not listeners:
             del self._listeners[topic, encode]
 
-    def tell(self) -> None:
+    def publish_step(self) -> None:
         """Send the number and time of the step that was delivered."""
         for (topic, encode), listeners in self._listeners.items():
             message = encode(topic, self._virtual_time.moment)
@@ -196,11 +196,11 @@ class _Delivery:
                 return False
             self._show(step)
             if len(self._outboxes) + sum(receiver.streams for receiver in self.receivers) > 1:
-                await self._outboxes.taken(PATIENCE_S)
+                await self._outboxes.delivered(PATIENCE_S)
             for receiver in self.receivers:
                 await receiver.deliver(step)
             mark()
-            await self._outboxes.taken(PATIENCE_S)
+            await self._outboxes.delivered(PATIENCE_S)
             return True
 
     @property
@@ -279,17 +279,17 @@ class Timeline:
         state = self._clock.read()
         if state.virtual:
             self._delivery.begin(Moment(state.done, state.present_ns))
-        self._told = self._status(state)[1:]
+        self._reported = self._status(state)[1:]
         self._delivered = state.done
         self._awaited = False  # whether steps wait for this process's delivery
         open_streams.changed = self._attend
-        virtual_time.look = self.look
+        virtual_time.update = self.update
         self._attend()
 
     def start(self) -> None:
         """Start following time."""
         self._page = WakeUp(self._clock.bell, "clock")
-        self._page.listeners[self.look] = None
+        self._page.listeners[self.update] = None
 
     async def stop(self) -> None:
         """Stop following time, and cancel the deliveries that have not ended."""
@@ -327,7 +327,7 @@ class Timeline:
     @property
     def status(self) -> TimeStatus:
         """The present state of time."""
-        return self._status(self.look())
+        return self._status(self.update())
 
     async def deliver(self, step: Step) -> None:
         """Deliver a step's values and marker to all streams, unless that has been done already."""
@@ -336,7 +336,7 @@ class Timeline:
             if self._awaited:
                 self._clock.deliver(self._slot.index, step.number)
 
-    def look(self) -> Clock:
+    def update(self) -> Clock:
         """Read the clock page, and act on changes.
 
         It is also called periodically, because no wake-up tells that a playing program has died.
@@ -355,20 +355,20 @@ class Timeline:
             else:
                 self._delivered = step.number
                 self._delivery.pass_over(step, partial(self._mark, step))
-        elif (status := self._status(state))[1:] != self._told:
-            self._tell(status, state)
+        elif (status := self._status(state))[1:] != self._reported:
+            self._report(status, state)
         return state
 
     def _end(self, state: Clock) -> None:
         """Handle the return to real time."""
         self._delivery.end()
         self.time_topics.resume()
-        self._tell(self._status(state), state)
+        self._report(self._status(state), state)
 
     def _attend(self) -> None:
         """Make steps wait for this process while it has open streams, and only then."""
         if self._open_streams:
-            self.look()  # delivers the steps so far; the next step will wait for this process
+            self.update()  # delivers the steps so far; the next step will wait for this process
             self._awaited = True
             self._clock.deliver(self._slot.index, self._delivered)
         else:
@@ -377,16 +377,16 @@ class Timeline:
 
     def _mark(self, step: Step) -> None:
         self.ended = False
-        self.time_topics.tell()
+        self.time_topics.publish_step()
         state = self._clock.read()
-        self._tell(TimeStatus(step.time_ns, step.dt_ns, True, state.playing), state)
+        self._report(TimeStatus(step.time_ns, step.dt_ns, True, state.playing), state)
 
     def _status(self, state: Clock) -> TimeStatus:
         dt_ns = (self._play_dt_ns() if state.playing else None) or state.step_size_ns
         return TimeStatus(self._now().clock_ns, dt_ns, not self.ended, state.playing)
 
-    def _tell(self, status: TimeStatus, state: Clock) -> None:
-        self._told = self._status(state)[1:]
+    def _report(self, status: TimeStatus, state: Clock) -> None:
+        self._reported = self._status(state)[1:]
         for watcher in self._watchers:
             watcher(status)
 

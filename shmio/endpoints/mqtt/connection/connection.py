@@ -311,9 +311,9 @@ class BrokerConnection:
     ) -> None:
         if self._client is None or client is not self._client:
             return
-        tls, told = self._policy.settings.tls is not None, flags.is_disconnect_packet_from_server
+        tls, by_broker = self._policy.settings.tls is not None, flags.is_disconnect_packet_from_server
         why = ended(self._client.tls_error, up=self.at is not None, tls=tls)
-        self.drop(refusal(code, self._policy) if told else why)
+        self.drop(refusal(code, self._policy) if by_broker else why)
 
     def _acknowledged(
         self, client: Client, _data: Any, mid: int, code: ReasonCode, _properties: Properties | None

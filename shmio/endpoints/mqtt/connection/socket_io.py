@@ -65,9 +65,9 @@ class SocketIo:
     def counting(self, callback: Callable[..., None]) -> Callable[..., None]:
         """Wrap a callback of the client, so that its calls are counted."""
 
-        def counted(*told: object) -> None:
+        def counted(*arguments: object) -> None:
             self._packets += 1
-            callback(*told)
+            callback(*arguments)
 
         return counted
 

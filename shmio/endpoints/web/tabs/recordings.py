@@ -164,15 +164,15 @@ class RecordingsTab(Tab):
 
         def work(beat: Callable[[], None]) -> Iterator[dict[str, Any]]:
             with Reader(path, own=True, beat=beat) as reader:
-                size, told, steps = reader.records.size, 0, check_by_record(reader)
+                size, reported_at, steps = reader.records.size, 0, check_by_record(reader)
                 while True:
                     try:
                         at = next(steps)
                     except StopIteration as end:
                         found = end.value
                         break
-                    if at - told >= CHECKED_BYTES:
-                        told = at
+                    if at - reported_at >= CHECKED_BYTES:
+                        reported_at = at
                         yield {"share": at / size}
                 result = {"chunks": found.chunks, "messages": found.messages, "damage": found.texts()[:MAX_SHOWN]}
                 yield {"share": 1.0, "closed": reader.records.closed, "end": reader.records.damage, **result}

@@ -118,7 +118,7 @@ def test_recorded_injections_are_kept_or_left_out(tmp_path: Path, instance: str,
         [frame] = playing.frames()
         assert (frame.raw, frame.image) == (image(1), image(99) if kept else image(1))
         assert [event.kind for event in playing.happened()] == [EventKind.INJECTED] * kept + [EventKind.QUALITY]
-        segment.processes.guests[0].take()
+        segment.processes.external[0].take()
         number = source_writer.inject(["other"])
         source_writer.shadow(number, {"other": 7})
         shown = playing.next(lambda frame: frame.image[2:] == b"\0\7")

@@ -513,7 +513,7 @@ def test_the_death_of_a_program_that_plays_is_reported(instance: str) -> None:
         with Segment.open(instance, writable=True) as dying:  # without releasing control of time
             Coordinator(dying).set_playing(True)
             assert (await asyncio.wait_for(statuses.read(), TIMEOUT_S)).playing
-        served.service.stepper.timeline.look()
+        served.service.stepper.timeline.update()
         assert not (await asyncio.wait_for(statuses.read(), TIMEOUT_S)).playing
         assert await step(served) == 0, "any client may step again"
 

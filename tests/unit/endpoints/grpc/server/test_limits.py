@@ -60,12 +60,12 @@ def test_a_shortage_of_connections_is_reported(monkeypatch: pytest.MonkeyPatch) 
 def test_free_memory_is_returned_repeatedly_after_a_flood() -> None:
     now_s, trims = 100.0, []
     trimmer = Trimmer(lambda: now_s, lambda _: trims.append(now_s))
-    trimmer.look(FLOOD_CALLS - 1)
+    trimmer.trim(FLOOD_CALLS - 1)
     assert trims == [], "a few calls do not count as a flood"
-    trimmer.look(FLOOD_CALLS)
+    trimmer.trim(FLOOD_CALLS)
     for _ in range(200):
         now_s += EVERY_S / 2
-        trimmer.look(FLOOD_CALLS)
+        trimmer.trim(FLOOD_CALLS)
     assert trims == [100.0 + EVERY_S * number for number in range(round(AFTER_S / EVERY_S))]
 
 

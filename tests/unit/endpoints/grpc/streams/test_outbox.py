@@ -240,7 +240,7 @@ def test_all_values_of_a_step_are_queued_or_the_stream_ends(monkeypatch: pytest.
             outbox.failure
             == f"{TOPIC_BOUND + 5} values are waiting: too many values change in one step for this stream"
         )
-        assert not outbox.owing
+        assert not outbox.delivery_pending
 
     asyncio.run(test())
 
@@ -269,15 +269,15 @@ def test_a_message_counts_as_taken_when_the_reader_asks_for_the_next() -> None:
         lane.deliver(b"before")
         lane.keep(b"a")
         lane.deliver(b"after")
-        taken = asyncio.ensure_future(outbox.taken())
+        taken = asyncio.ensure_future(outbox.delivered())
         for expected in (b"before", b"a"):
             assert await outbox.pop() == expected
             await asyncio.sleep(0)
-            assert outbox.owing
+            assert outbox.delivery_pending
             assert not taken.done()
         assert await outbox.pop() == b"after"
         await taken
-        assert not outbox.owing
+        assert not outbox.delivery_pending
 
     asyncio.run(test())
 
@@ -290,7 +290,7 @@ def test_streams_that_take_nothing_end_and_others_continue() -> None:
             for outbox in (idle, reader, gone):
                 StateLane(outbox).keep(b"x")
             StateLane(none).deliver(b"of a device")
-            waiting = asyncio.ensure_future(outboxes.taken(0.05))
+            waiting = asyncio.ensure_future(outboxes.delivered(0.05))
             await asyncio.sleep(0)
             assert await reader.pop() == b"x"
             popping = asyncio.ensure_future(reader.pop())
@@ -298,7 +298,7 @@ def test_streams_that_take_nothing_end_and_others_continue() -> None:
             await waiting
             assert idle.failure == "the client has not taken the values of a step within 0.05 s"
             assert (reader.failure, gone.failure, none.failure) == ("", "", "")
-            await outboxes.taken(60)  # no outbox owes a value
+            await outboxes.delivered(60)  # no delivery is pending
             popping.cancel()
 
     asyncio.run(test())
