@@ -95,7 +95,9 @@ def _parser() -> argparse.ArgumentParser:
     _add_browse(verb("browse", "list what a device offers, as a tree or as a tag table"))
     text = "write a package with a connector of your own, which works and has tests; change its protocol"
     new = verb("new-connector", text, command="new_connector:new_connector")
-    new.add_argument("connector", metavar="NAME", help='what connector = "NAME" in a configuration will be')
+    new.add_argument(
+        "connector", metavar="NAME", help='name of the connector: you write connector = "NAME" in supervisor.toml'
+    )
     new.add_argument("-o", dest="directory", type=Path, metavar="FOLDER", help="a new folder (default: shmio-NAME)")
     return parser
 

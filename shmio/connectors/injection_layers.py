@@ -156,7 +156,7 @@ class LayerStack:
         return image
 
     def before(self, raw: bytes, layer: Layer) -> Bits:
-        """Return a copy of ``raw`` with the active layers inside ``layer`` applied."""
+        """Return a copy of ``raw`` as ``layer`` receives it: with all active inner layers applied."""
         return self.seen(raw, self.inner(layer))
 
     def inner(self, layer: Layer) -> list[Layer]:

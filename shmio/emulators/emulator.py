@@ -20,7 +20,9 @@ from shmio.layout.s7.address import Area
 
 
 class Emulator:
-    """Runs a program on a data block or tag table, and serves it and others over S7. Start it once.
+    """Runs a program on one data block or tag table, and serves it over S7 with further blocks.
+
+    The further blocks have no program. You can start an emulator only once.
 
     Clients read and write between cycles, never within one. A client that stops the emulated CPU
     stops the program and its time, but not the server, as with a real controller.

@@ -66,7 +66,7 @@ class Attachment:
         The attachment must be ``writable`` to change them.
         """
         self._lock = threading.Lock()
-        self._guest: int | None = None
+        self._slot: int | None = None
         self._source_writers: dict[str, SourceWriter] = {}
         self._open: weakref.WeakSet[Following[Any]] = weakref.WeakSet()
         self._detached = False
@@ -559,11 +559,11 @@ class Attachment:
         if not self._segment.shared.writable:
             raise CommandError("this attachment only reads: attach with writable=True")
         with self._lock:
-            if self._guest is None:
-                self._guest = _take_guest_slot(self._segment)
+            if self._slot is None:
+                self._slot = _take_external_slot(self._segment)
             known = self._source_writers.get(block.source)
             if known is None or known.block is not block:
-                known = self._source_writers[block.source] = SourceWriter(block, self._guest)
+                known = self._source_writers[block.source] = SourceWriter(block, self._slot)
             return known
 
     def _end_with_this(self, following: Following[Any]) -> None:
@@ -624,7 +624,7 @@ def attach(instance: str | None = None, *, writable: bool = False) -> Attachment
     return Attachment(Segment.open(instance, writable=writable))
 
 
-def _take_guest_slot(segment: Segment) -> int:
+def _take_external_slot(segment: Segment) -> int:
     """Take a free external slot of the process table for as long as the segment is open.
 
     Returns:

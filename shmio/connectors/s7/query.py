@@ -148,7 +148,7 @@ class Query(ABC):
 
     @abstractmethod
     def refused(self, refusal: RefusedError) -> None:
-        """Process a refusal."""
+        """Handle the controller's refusal to answer this query."""
 
     @abstractmethod
     def given_up(self, why: str) -> None:

@@ -229,14 +229,14 @@ class Bridge:
 
     def correct(self, topic: str) -> None:
         """Publish the bridge's value on a topic again, or delete what another client published."""
-        log.warning(
-            "another client publishes on %s, a topic of this instance, which now publishes its own value again: let no "
-            "other account publish there, and no other bridge use this prefix",
-            shorten(topic),
-        )
+        remedy = "let no other account publish there, and no other bridge use this prefix"
         if (channel := self._channels.get(topic)) is not None:
+            log.warning(
+                "another client published on %s; the bridge publishes its own value again: %s", shorten(topic), remedy
+            )
             self.outbox.mark(channel)
         elif self.outbox.waiting < MOST_WAITING:
+            log.warning("another client left a message on %s; the bridge deletes it: %s", shorten(topic), remedy)
             self.outbox.mark(ClearedTopic(topic))
 
     def correct_all(self) -> None:

@@ -144,7 +144,11 @@ class DeclareCall:
         )
 
     async def messages(self) -> AsyncIterator[bytes]:
-        """Yield serialised DeclareResponses until all injections have ended."""
+        """Yield serialised DeclareResponses.
+
+        The iteration ends when all injections have ended, or when the client is too slow
+        (:meth:`end`).
+        """
         while True:
             self._wake.clear()  # before the checks, so that no wake-up is lost
             if self._waiting:
