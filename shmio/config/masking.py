@@ -125,9 +125,9 @@ class _Masker:
         self._hidden: int | None = None
         """Depth at which a secret value began; None outside of one."""
         self._awaited = False
-        """Whether a secret value has not begun yet. It may be in the next line, although TOML has it in the same."""
+        """True if a secret value has not begun yet. It may be in the next line, although TOML has it in the same."""
         self._plain_key = False
-        """Whether this value belongs to a key named ``key``, whose paths are shown."""
+        """True if this value belongs to a key named ``key``, whose paths are shown."""
         self._table_hidden = False
         self._header = False
         self._start = True

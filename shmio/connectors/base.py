@@ -66,20 +66,20 @@ class Connector(ABC):
     """The connector's own keys of ``[[source]]``. The struct must refuse unknown keys."""
 
     can_write: ClassVar[bool] = False
-    """Whether the connector can write."""
+    """True if the connector can write."""
 
     provenance: ClassVar[Provenance] = Provenance.LIVE
     """Where the values come from; each frame of the source states it."""
 
     register_quality: ClassVar[bool] = False
-    """Whether the device gives each register its own status and time.
+    """True if the device gives each register its own status and time.
 
     If it does, the layout has a status area, and the connector makes its images with
     :class:`shmio.connectors.register_image.RegisterImage`.
     """
 
     reads_optimized: ClassVar[bool] = False
-    """Whether the connector can read S7 data blocks with optimized access.
+    """True if the connector can read S7 data blocks with optimized access.
 
     The values of these blocks have names but no addresses.
     """
@@ -277,7 +277,7 @@ class Computed(ABC):
     """The source's own keys of ``[[source]]``. The struct must refuse unknown keys."""
 
     prompt: ClassVar[bool] = False
-    """Whether the loop publishes written values at once, without waiting for a cycle."""
+    """True if the loop publishes written values at once, without waiting for a cycle."""
 
     timeout_s: float = 1.0
     """The longest time that a step may take, in s."""

@@ -15,7 +15,7 @@ from shmio.layout.s7.address import Area, is_of_cpu, parse
 from shmio.layout.s7.conversion import Conversion
 
 Place = tuple[Area, int]
-"""An area, with the number of a data block; 0 for the others."""
+"""An area, and the number of the data block; 0 for other areas."""
 
 AREAS: Final[Mapping[Area, SrvArea]] = {
     Area.INPUT: SrvArea.PE,
@@ -27,11 +27,11 @@ AREAS: Final[Mapping[Area, SrvArea]] = {
 """The areas that are not data blocks, with python-snap7's names."""
 _LETTERS: Final = {Area.INPUT: "%I", Area.OUTPUT: "%Q", Area.MARKER: "%M", Area.TIMER: "%T", Area.COUNTER: "%C"}
 _LEAST: Final = dict.fromkeys(AREAS, 1024) | {Area.TIMER: 512, Area.COUNTER: 512}
-"""Bytes that these areas have at least, about as many as those of an S7-300."""
+"""Minimum size of these areas in bytes, about that of an S7-300."""
 
 
 def is_table(layout: Layout) -> bool:
-    """Return whether a layout is a tag table with addresses, and not that of a data block."""
+    """Return whether a layout is a tag table with addresses, rather than a data block."""
     return any(register.address for register in layout.registers)
 
 
@@ -44,7 +44,7 @@ class TableMemory:
     """The registers of a tag table in the controller's memory."""
 
     def __init__(self, layout: Layout) -> None:
-        """Find the place of each register; those of the CPU itself have none.
+        """Find the place of each register. Values of the CPU itself have no place.
 
         Raises:
             ConfigError: An address is wrong.
@@ -62,7 +62,7 @@ class TableMemory:
 
     @property
     def needs(self) -> dict[Place, int]:
-        """The areas that the registers need, with the bytes of each; even, as in a controller."""
+        """The areas that the registers need, with the size of each in bytes; an even number."""
         sizes: dict[Place, int] = {}
         for one in self._conversions:
             place = _place(one)
@@ -70,22 +70,22 @@ class TableMemory:
         return sizes
 
     def fill(self, memory: Mapping[Place, bytearray], present: frozenset[Place] = frozenset()) -> None:
-        """Store the initial values, those that the table gives after those of the types.
+        """Store the initial values. Those of the tag table override the defaults of the types.
 
         Args:
             memory: The areas.
-            present: Areas that have values already: there, only the values of the table are stored.
+            present: Areas that already have values: only the values of the tag table are stored there.
 
         """
         frame, _ = initial_frame(self.layout)
         for given in (False, True):
             for one in self._conversions:
                 if given is (one.register.initial is not None) and (given or _place(one) not in present):
-                    with suppress(ValueError, ValueRangeError):  # such as 0 with a scale that cannot give it
+                    with suppress(ValueError, ValueRangeError):  # for example, the scale has no raw value for 0
                         _store(one, frame, memory)
 
     def load(self, frame: bytearray, memory: Mapping[Place, bytearray]) -> None:
-        """Put the registers' values into an image; what is no value leaves the image as it is."""
+        """Copy the registers' values to an image. Invalid values leave the image unchanged."""
         for one in self._conversions:
             found = one.image_bytes(bytes(memory[_place(one)][one.start : one.stop]))
             if found is not None:
@@ -93,7 +93,7 @@ class TableMemory:
                 frame[offset : offset + len(found)] = found
 
     def store(self, before: bytes, frame: bytearray, memory: Mapping[Place, bytearray]) -> None:
-        """Put the registers of an image that have changed into the memory, if it can hold their values."""
+        """Copy the changed registers of an image to the memory, if it can hold their values."""
         for one in self._changed(before, frame):
             with suppress(ValueError, ValueRangeError):
                 _store(one, frame, memory)

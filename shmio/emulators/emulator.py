@@ -103,7 +103,7 @@ class Emulator:
         self.stop()
 
     def _serve(self, layout: Layout, number: int | None = None) -> bytearray:
-        """Serve a block with its initial values, under ``number`` or its own."""
+        """Serve a block with its initial values, under ``number`` or the block's own number."""
         number = layout.number if number is None else number
         if number is None:
             raise ConfigError(f"dbNumber: the layout {layout.name!r} names no number; give one")

@@ -1,7 +1,7 @@
 """An emulated Modbus device, with pymodbus's server.
 
-pymodbus decodes requests and makes the answers. The tables are ours: those of the library are meant
-for values that nobody else changes.
+pymodbus decodes requests and encodes the answers. The tables are shmio's own, because those of the
+library do not allow that the program also changes values.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 EXTRA: Final = "kind: the emulator modbus needs another library: pip install 'shmio[modbus]'"
 MAX_CLIENTS: Final = 16
 LEAST: Final = 100
-"""Number of entries that each table of a unit has at least."""
+"""Minimum number of entries in each table of a unit."""
 _ILLEGAL_FUNCTION, _ILLEGAL_ADDRESS = 1, 2
 _READS: Final = {1: Table.COIL, 2: Table.DISCRETE, 3: Table.HOLDING, 4: Table.INPUT}
 _TABLES: Final = _READS | {5: Table.COIL, 15: Table.COIL} | dict.fromkeys((6, 16, 22, 23), Table.HOLDING)
-"""The table of each function, for reading and for writing."""
+"""The table that each function reads or writes."""
 
 Words = dict[tuple[int, Table], list[int]]
 """The entries of each unit's tables: bits as 0 and 1, and words."""
@@ -55,7 +55,7 @@ class _Place:
 
     @property
     def stop(self) -> int:
-        """Number of the entry behind the last one of the register."""
+        """Number of the entry after the register's last entry."""
         return self.address.number + self.register.count * self.width
 
     def read(self, entries: Sequence[int]) -> Any:
@@ -69,7 +69,7 @@ class _Place:
         return nest(flat, self.register.shape) if self.register.dims else flat[0]
 
     def write(self, entries: list[int], value: Any) -> None:
-        """Store a value of the register; ValueError: the device's type cannot hold it."""
+        """Store a value of the register. ValueError: the device's type cannot hold it."""
         register = self.register
         flat = flatten(value, register.shape, register.path) if register.dims else (value,)
         for at, one in zip(self._starts, flat, strict=True):
@@ -103,30 +103,33 @@ class _TableImage:
         self._codecs = [codec(register, layout.byte_order) for register in layout.registers]
 
     def fill(self, words: Words) -> None:
-        """Store the initial values; those that the table gives last."""
+        """Store the initial values. Those of the tag table override the others."""
         frame, _ = initial_frame(self.layout)
         for given in (False, True):
             self._store(words, frame, [place.register.initial is not None for place in self.places], given)
 
     def load(self, frame: bytearray, words: Words) -> None:
-        """Put the values of the device into an image."""
+        """Copy the values of the device to an image."""
         for place, own in zip(self.places, self._codecs, strict=True):
             with suppress(ValueRangeError):
                 own.encode_into(place.read(words[place.where]), frame)
 
     def store(self, before: bytes, frame: bytearray, words: Words) -> None:
-        """Put the values of an image that have changed into the device."""
+        """Copy the changed values of an image to the device."""
         self._store(words, frame, [before[start:stop] != frame[start:stop] for start, stop in self._spans])
 
     def _store(self, words: Words, frame: bytearray, chosen: Sequence[bool], wanted: bool = True) -> None:
         for place, own, one in zip(self.places, self._codecs, chosen, strict=True):
             if one is wanted:
-                with suppress(ValueError, ValueRangeError):  # such as 0 with a scale that cannot give it
+                with suppress(ValueError, ValueRangeError):  # for example, the scale has no raw value for 0
                     place.write(words[place.where], own.decode(frame))
 
 
 class ModbusEmulator:
-    """Runs a program on a tag table, and serves the table's addresses, and those of others. Start it once."""
+    """Runs a program on one tag table, and serves the addresses of this and further tables.
+
+    You can start an emulator only once.
+    """
 
     def __init__(self, served: Sequence[Served], program_name: str, listen: Address) -> None:
         """Prepare the emulator.
@@ -181,7 +184,7 @@ class ModbusEmulator:
         from pymodbus.server import ModbusTcpServer  # noqa: PLC0415  it needs the extra
         from pymodbus.simulator import DataType, SimData, SimDevice  # noqa: PLC0415
 
-        logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # it logs what clients do wrong
+        logging.getLogger("pymodbus").setLevel(logging.CRITICAL)  # the library logs errors of clients
         nothing = SimDevice(0, simdata=[SimData(0, datatype=DataType.REGISTERS)])
         server: Any = ModbusTcpServer(nothing, address=(self.address.host, self.address.port))
         server.context = self._store
@@ -212,12 +215,12 @@ class ModbusEmulator:
 
 
 class _Store:
-    """What pymodbus's server asks for the values of its tables; zero-based numbers."""
+    """The tables, in the form that pymodbus's server needs. Numbers begin at 0."""
 
     def __init__(self, words: Mapping[tuple[int, Table], list[int]], lock: threading.Lock) -> None:
         self._words, self._lock = words, lock
         self.written = True
-        """Whether the tables may differ from the image of the program: initially, and after a client has written."""
+        """True if the tables may differ from the program's image: at first, and after a client has written."""
         self._units = {unit for unit, _ in words}
 
     def device_ids(self) -> list[int]:
@@ -227,7 +230,7 @@ class _Store:
     async def async_getValues(  # noqa: N802
         self, unit: int, function: int, address: int, count: int = 1
     ) -> list[int] | list[bool] | Any:
-        """Return entries of a function's table, or the code of an exception."""
+        """Return entries of a function's table, or an exception code."""
         entries = self._entries(unit, function, address, count)
         if not isinstance(entries, list):
             return entries
@@ -236,7 +239,7 @@ class _Store:
         return [bool(one) for one in found] if _TABLES[function].of_bits else found
 
     async def async_setValues(self, unit: int, function: int, address: int, values: Sequence[int]) -> Any:  # noqa: N802
-        """Store entries of a function's table; return the code of an exception, or None."""
+        """Store entries of a function's table. Return None or an exception code."""
         entries = self._entries(unit, function, address, len(values))
         if not isinstance(entries, list):
             return entries

@@ -1,4 +1,4 @@
-"""An emulated OPC UA server, with asyncua's: the nodes that a tag table or the data block of an S7-1500 names."""
+"""An emulated OPC UA server: serves the nodes of a tag table, or of an S7-1500 data block, with asyncua."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 EXTRA: Final = "kind: the emulator opcua needs another library: pip install 'shmio[opcua]'"
 MAX_CLIENTS: Final = 16
 MAX_NAMESPACE: Final = 100
-"""Highest number of a namespace that the emulator makes."""
+"""Highest namespace number that the emulator creates."""
 _TYPES: Final[Mapping[str, str]] = {
     "BOOL": "Boolean", "BYTE": "Byte", "USINT": "Byte", "SINT": "SByte", "WORD": "UInt16", "UINT": "UInt16",
     "INT": "Int16", "DWORD": "UInt32", "UDINT": "UInt32", "DINT": "Int32", "LWORD": "UInt64", "ULINT": "UInt64",
@@ -43,7 +43,7 @@ class _Variable:
     """A register, and the values of its node."""
 
     def __init__(self, register: Register, address: NodeAddress | BrowsePath, byte_order: Any) -> None:
-        """Choose the type of the node; ValueError: there is none for the register."""
+        """Choose the type of the node. ValueError: no type fits the register."""
         base = register.element.base
         if base not in _TYPES:
             raise ValueError(f"the emulator has no nodes for a {register.type}")
@@ -55,14 +55,14 @@ class _Variable:
         self.node: Any = None
 
     def there(self, frame: bytearray) -> Any:
-        """Return the register's value in an image as the node has it."""
+        """Return the register's value in an image, in the node's type."""
         register, value = self.register, self.codec.decode(frame)
         if not register.dims:
             return self._element(value)
         return nest([self._element(one) for one in flatten(value, register.shape, register.path)], register.shape)
 
     def here(self, value: Any, frame: bytearray) -> None:
-        """Put a value of the node into an image; ValueRangeError: the register cannot hold it."""
+        """Store a value of the node in an image. ValueRangeError: the register cannot hold it."""
         register = self.register
         if not register.dims:
             self.codec.encode_into(self._back(value), frame)
@@ -91,9 +91,9 @@ class _Variable:
 
 
 class OpcUaEmulator:
-    """Runs a program on a layout, and serves its nodes, and those of others. Start it once.
+    """Runs a program on one layout, and serves its nodes and those of further layouts.
 
-    Clients may write all nodes.
+    Clients may write all nodes. You can start an emulator only once.
     """
 
     def __init__(self, served: Sequence[Served], program_name: str, listen: Address) -> None:
@@ -140,7 +140,7 @@ class OpcUaEmulator:
     async def _serve(self) -> None:
         from asyncua import Server, ua  # noqa: PLC0415  it needs the extra
 
-        logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # it logs what clients do wrong
+        logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # the library logs errors of clients
         server = Server()
         await server.init()
         host = f"[{self.address.host}]" if ":" in self.address.host else self.address.host
@@ -165,7 +165,7 @@ class OpcUaEmulator:
             self._loop.run(self._in_loop, time_s)
 
     async def _in_loop(self, time_s: float) -> None:
-        """Read the nodes, run a cycle, and write what has changed; clients do nothing meanwhile."""
+        """Read the nodes, run a cycle, and write the changed nodes. Clients have to wait meanwhile."""
         from asyncua import ua  # noqa: PLC0415  it needs the extra
 
         frame, variables = self._frames[0], self._tables[0]
@@ -183,7 +183,7 @@ class OpcUaEmulator:
 
 
 class _Nodes:
-    """Makes the nodes of registers, and the objects and namespaces that they need."""
+    """Creates the nodes of registers, and the objects and namespaces that they need."""
 
     def __init__(self, server: Server) -> None:
         self._server = server
@@ -191,7 +191,7 @@ class _Nodes:
         self._known: dict[NodeAddress | BrowsePath, Any] = {}
 
     async def variable(self, variable: _Variable, value: ua.Variant) -> Any:
-        """Return the node of a register; registers with the same address share it."""
+        """Return the node of a register. Registers with the same address share a node."""
         from asyncua import ua  # noqa: PLC0415  it needs the extra
 
         address = variable.address
@@ -214,7 +214,7 @@ class _Nodes:
         return node
 
     async def _object(self, steps: tuple[tuple[int, str], ...]) -> Any:
-        """Return the object at a browse path, and make what is missing."""
+        """Return the object at a browse path. Create missing objects."""
         from asyncua import ua  # noqa: PLC0415  it needs the extra
 
         if not steps:
@@ -230,7 +230,7 @@ class _Nodes:
         return self._objects[steps]
 
     async def _namespace(self, wanted: int | str) -> int:
-        """Return the number of a namespace, and make it if it is missing."""
+        """Return the number of a namespace. Create the namespace if it is missing."""
         if isinstance(wanted, str):
             return int(await self._server.register_namespace(wanted))
         known = await self._server.get_namespace_array()
@@ -249,7 +249,7 @@ def _variables(served: Served) -> Iterator[_Variable]:
                 address = parse(register.address)
             if isinstance(address, NodeAddress) and isinstance(address.namespace, int):
                 if address.namespace == 0:
-                    raise ValueError(f"{register.address!r}: namespace 0 has the nodes of the standard alone")
+                    raise ValueError(f"{register.address!r}: namespace 0 has only the nodes of the standard")
                 if address.namespace > MAX_NAMESPACE:
                     raise ValueError(f"{register.address!r}: the emulator has namespaces up to {MAX_NAMESPACE}")
             yield _Variable(register, address, layout.byte_order)

@@ -24,7 +24,7 @@ class A50:
     period_ms = 10
 
     def __init__(self, layout: Layout) -> None:
-        """Find the registers; raise ConfigError with one that is missing or of another type."""
+        """Find the registers. ConfigError: a register is missing or has another type."""
         # A DB201 from print has spaces in place of some underscores.
         named = tuple(
             msgspec.structs.replace(register, path=register.path.replace(" ", "_")) for register in layout.registers
@@ -36,7 +36,7 @@ class A50:
 
     def step(self, time_s: float, frame: bytearray) -> None:
         """Write the axes, inputs and outputs at this time into the frame."""
-        self._runner.resume(bytes(frame))  # clients may have written any register, outputs included
+        self._runner.resume(bytes(frame))  # clients may have written any register, also outputs
         frame[:] = self._runner.step(round(time_s * 1e9), self.period_ms * 1_000_000)
 
 
@@ -48,7 +48,7 @@ _STRIDE = 0x9E37_79B9_7F4A_7C15
 class Counter:
     """Fills the block with big-endian 64-bit words: the cycle number mixed with the place.
 
-    If fewer than eight bytes remain at the end, they are the first bytes of their word.
+    If fewer than eight bytes remain at the end, they contain the first bytes of a word.
     """
 
     period_ms = 1
@@ -90,15 +90,15 @@ def _word(generation: int, place: int) -> bytes:
 class Wave:
     """Moves all registers that commands cannot write: numbers swing from 0 to 100, and bits blink.
 
-    Each register has a phase of its own. Texts and times keep their values, and so do the registers
-    that a tag table makes writable.
+    Each register has its own phase. The program does not change texts, times, or registers that a tag
+    table makes writable.
     """
 
     period_ms = 50
     swing_s = 10.0
 
     def __init__(self, layout: Layout) -> None:
-        """Find the registers; raise ConfigError if there is none."""
+        """Find the registers. ConfigError: there are none."""
         moved = [one for one in layout.registers if not one.writable and (one.type in NUMBERS or one.type == "BOOL")]
         if not moved:
             raise ConfigError("program wave: the layout has no number or BOOL that commands cannot write")

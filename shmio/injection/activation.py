@@ -39,7 +39,7 @@ class Window:
 
 @dataclass(slots=True)
 class Activation:
-    """Whether an injection is active, and how often it has been.
+    """Says whether an injection is active, and how often it has been active.
 
     ``runs`` is the number of activations so far. ``cycle`` and ``time_ns`` are the cycle and the
     instance's clock at which the last activation began.

@@ -136,7 +136,7 @@ class Plan:
     warnings: tuple[str, ...] = ()
     """Warnings about the configuration, one line each."""
     stepped: bool = False
-    """Whether the instance's clock stands still from the start, and moves only by steps."""
+    """True if the instance's clock stands still from the start, and moves only by steps."""
     origin: Origin | None = None
     """The instance time at which the clock starts, if a recording is replayed; else None."""
 

@@ -42,9 +42,13 @@ class Sources(NamedTuple):
 
 
 def check_sources(config: Config, files: LayoutFiles, recordings: Recordings, faults: Faults) -> Sources:
-    """Check all sources with their connectors, and add faults.
+    """Check each source with its connector, and add the problems to ``faults``.
 
-    Afterwards, ``options`` of each source contains all keys, and their values have the right types.
+    The function also completes ``options`` of each source: it then contains all keys, with values of
+    the right types.
+
+    Returns:
+        The layouts and the kinds of the sources.
     """
     found = Sources({}, [], [], {})
     inputs: dict[int, tuple[str, ...]] = {}

@@ -49,7 +49,7 @@ class Decimator:
         self._width_ns = max(1, (end_ns - begin_ns) // max(1, columns))
         self._rest = NO_SAMPLES
         self.reduced = False
-        """Whether samples were left out so far."""
+        """True if samples were left out so far."""
 
     def add(self, samples: Samples) -> Samples:
         """Add later samples; return what remains of the columns before the last one."""

@@ -354,10 +354,13 @@ def test_a_take_over_keeps_the_time_unless_the_configured_clock_changed(
     taken_over = step(line)["step"]
     assert "took over belt" in up_again(), "its configuration has the wall clock, though time is virtual"
     assert step(line)["step"] == taken_over + 1
-    assert f"{line.instance} was started with instance.clock wall, not stepped: it starts anew" in up_again("stepped")
+    assert (
+        f"{line.instance} was started with instance.clock wall, not stepped: the old processes are stopped"
+        in up_again("stepped")
+    )
     assert line.status()["clock"]["step"] == 0
     assert step(line, "--count", "3")["step"] == 3
     assert "took over belt" in up_again()
     assert step(line)["step"] == 4
-    assert "with instance.clock stepped, not wall: it starts anew" in up_again("wall")
+    assert "with instance.clock stepped, not wall: the old processes are stopped" in up_again("wall")
     assert line.status()["clock"]["mode"] == "wall"

@@ -1,11 +1,10 @@
-"""A Modbus TCP client: one request at a time, and no doubt about its answer.
+"""A Modbus TCP client that sends one request at a time and checks its answer strictly.
 
-Each answer must have the transaction, unit and function of the request, and exactly the length that
-the request asks for. Anything else ends the connection, and so does a time-out: a late answer can
-never be taken for the next one. There is one exception: a caller may stop waiting for one read. The
-client remembers its transaction, and discards its answer if it comes late. That is why this is not
-pymodbus's client, which skips all answers that it does not expect, and repeats writes after a
-time-out.
+Each answer must have the transaction, unit and function of the request, and exactly the requested
+length. Any other answer ends the connection, and so does a time-out, so that the client never mistakes
+a late answer for the next one. There is one exception: the caller may stop waiting for a read. Then
+the client remembers the transaction, and discards the answer if it comes late. shmio does not use
+pymodbus's client, because it skips all unexpected answers, and repeats writes after a time-out.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ class RefusedError(ConnectorError):
 
 
 class SilentError(ConnectorError):
-    """The unit did not answer in the time that the caller gave it. The connection stays open."""
+    """The unit did not answer before ``until_ns``. The connection stays open."""
 
 
 class ModbusClient:
@@ -64,7 +63,7 @@ class ModbusClient:
         self._received = bytearray()  # the beginning of an answer that is not complete yet
         self._abandoned: dict[int, tuple[int, int]] = {}  # by transaction: unit and function; the oldest first
         self.sent = False
-        """Whether any byte of the last request may have left this host."""
+        """True if any byte of the last request may have left this host."""
 
     def begin(self) -> None:
         """Start the time-out of the requests that follow."""
@@ -81,7 +80,7 @@ class ModbusClient:
         return self._socket is not None
 
     def connect(self) -> None:
-        """Connect within the time-out, after a look-up of the name within the time-out.
+        """Look up the name and connect. Each of the two has the time-out.
 
         Raises:
             ConnectorError: The device cannot be reached.
@@ -110,7 +109,7 @@ class ModbusClient:
             table: The table.
             start: First entry.
             count: Number of entries.
-            until_ns: When to stop waiting without ending the connection, in ns of CLOCK_MONOTONIC.
+            until_ns: Time at which to stop waiting and keep the connection, in ns of CLOCK_MONOTONIC.
 
         Raises:
             RefusedError: The device refuses the request. The connection stays open.
@@ -183,7 +182,7 @@ class ModbusClient:
         return found
 
     def _receive(self, size: int, until_ns: int | None) -> None:
-        """Receive until this many bytes of an answer are there; never more, so that none is taken for the next."""
+        """Receive this many bytes of an answer, and never a byte of the next answer."""
         while len(self._received) < size:
             if self._socket is None:
                 raise ConnectionResetError
@@ -192,7 +191,7 @@ class ModbusClient:
             try:
                 part = self._socket.recv(size - len(self._received))
             except TimeoutError:
-                self._left_s(until_ns)  # raises SilentError if the caller's time is over
+                self._left_s(until_ns)  # raises SilentError after until_ns
                 raise
             if not part:
                 raise ConnectionResetError

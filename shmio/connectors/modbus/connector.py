@@ -34,11 +34,11 @@ from shmio.model.statuses import (
 )
 
 GATEWAY_RETRY_NS: Final = 1_000_000_000
-"""How long a unit that does not answer is left alone at first; the time doubles with each further attempt."""
+"""First pause before a silent unit is asked again; it doubles with each further attempt."""
 MAX_UNIT_RETRY_NS: Final = 10_000_000_000
-"""Longest time that a unit that does not answer is left alone."""
+"""Longest pause before a silent unit is asked again."""
 MAX_COPIES: Final = 10_000
-"""Maximum number of requests of which is remembered where their bytes go."""
+"""Maximum number of requests for which the places of their bytes are cached."""
 _STATUS: Final = {
     client.ILLEGAL_FUNCTION: BAD_NOT_SUPPORTED,
     client.ILLEGAL_ADDRESS: BAD_OUT_OF_RANGE,
@@ -53,7 +53,7 @@ _STATUS: Final = {
 _OF_ADDRESSES: Final = frozenset(
     {client.ILLEGAL_FUNCTION, client.ILLEGAL_ADDRESS, client.ILLEGAL_VALUE, client.DEVICE_FAILURE, client.PARITY}
 )
-"""Exceptions that may be due to some of the addresses of a request."""
+"""Exceptions that a device may send because it refuses some addresses of a request."""
 _OF_UNITS: Final = frozenset({client.NO_PATH, client.NO_ANSWER})
 _TABLE_NAMES: Final = {
     Table.HOLDING: "holding register", Table.INPUT: "input register", Table.COIL: "coil",
@@ -65,33 +65,33 @@ log = logging.getLogger("shmio.source")
 
 
 class ModbusOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
-    """Address of the device, and what it can do."""
+    """Address of the device, and its limits."""
 
     host: Annotated[str, msgspec.Meta(min_length=1, max_length=253)]
     port: Annotated[int, msgspec.Meta(ge=1, le=65535)] = 502
     timeout: Annotated[int, msgspec.Meta(ge=1, le=600_000)] = 2000
     """Time-out in ms for connecting, for reading all registers, and for the writes of a cycle."""
     unit: Annotated[int, msgspec.Meta(ge=0, le=255)] = 1
-    """Unit id of addresses that name none."""
+    """Unit id of addresses without a unit."""
     word_order: Order = "big"
-    """Which word of a number of several words comes first: ``big`` is the highest."""
+    """The first word of a number of several words; ``big``: the highest word."""
     byte_order: Order = "big"
-    """Order of the bytes within a word; that of the protocol is ``big``."""
+    """Order of the bytes within a word. The protocol specifies ``big``."""
     max_registers: Annotated[int, msgspec.Meta(ge=1, le=125)] = 125
-    """Most words in one request."""
+    """Maximum number of words in a request."""
     max_bits: Annotated[int, msgspec.Meta(ge=1, le=2000)] = 2000
-    """Most coils or discrete inputs in one request."""
+    """Maximum number of coils or discrete inputs in a request."""
     max_gap: Annotated[int, msgspec.Meta(ge=0, le=124)] = 16
-    """Most unused words, or bits, that a request reads to save another request."""
+    """Maximum number of unused words, or bits, that a request reads to save another request."""
 
 
 class _Silence(NamedTuple):
     """A unit that does not answer."""
 
     until_ns: int
-    """When to ask it again, in ns of CLOCK_MONOTONIC."""
+    """Time of the next attempt, in ns of CLOCK_MONOTONIC."""
     pause_ns: int
-    """How long it is left alone this time."""
+    """Length of the present pause."""
     status: int
     mute: bool
     """False if the gateway said that the unit does not answer: then the connection is alive."""
@@ -108,9 +108,9 @@ class _Register:
             self.codec = WordCodec(address, register, options.word_order, options.byte_order)
 
     def byte_places(self, byte_order: str) -> list[int] | None:
-        """Return for each byte of the register in the image its place in the device's words.
+        """Return the place in the device's words of each byte of the register in the image.
 
-        None: the value must be converted.
+        None if the value must be converted.
         """
         register, size = self.register, self.register.size
         if self.codec is None or register.dims or register.scale or self.address.kind is not register.element:
@@ -126,7 +126,7 @@ class _Register:
         return Element(self.unit, address.table, start, address.width, self.index, place)
 
     def value(self, data: bytes, at: int) -> Any:
-        """Return an element's value; it begins at entry ``at`` of a request's bytes."""
+        """Decode an element that begins at entry ``at`` of a request's bytes."""
         if self.address.table.of_bits:
             return bool(data[at // 8] >> at % 8 & 1)
         if self.codec is None:
@@ -137,9 +137,10 @@ class _Register:
 class ModbusConnector(Connector):
     """Reads all registers of a layout in each cycle.
 
-    Addresses that the device refuses are bad by themselves: a refused request is split until they
-    are found, and they are tried again every 10 s, also after the connection was lost. A unit that
-    does not answer costs its share of the time-out; then it is left alone for 1 s and up to 10 s.
+    If the device refuses a request, the connector splits it until it finds the refused addresses.
+    Only these are bad. The connector tries them again every 10 s, also on a new connection. A unit
+    that does not answer takes its share of the time-out; then the connector pauses for 1 s, and later
+    up to 10 s, before it asks the unit again.
     """
 
     Options = ModbusOptions
@@ -172,7 +173,7 @@ class ModbusConnector(Connector):
         self._copies: dict[ReadRequest, Copy] = {}
         self._units = sorted({one.unit for one in self._registers})
         self._silent: dict[int, _Silence] = {}
-        self._probes = 0  # that this cycle may still send
+        self._probes = 0  # number of probes that this cycle may still send
         self._no_masks: set[int] = set()  # units that do not know function 22
 
     @property
@@ -240,15 +241,15 @@ class ModbusConnector(Connector):
         return bytes(self._image)
 
     def _asked(self, units: Collection[int], now_ns: int) -> list[int]:
-        """Return the units that this cycle asks: those that answer, and then at most one that was silent."""
+        """Return the units to ask in this cycle: those that answer, then at most one silent unit."""
         due = [unit for unit in self._silent if unit in units and self._silent[unit].until_ns <= now_ns]
         due.sort(key=lambda unit: self._silent[unit].until_ns)
         return [unit for unit in units if unit not in self._silent] + due[:1]
 
     def _until_ns(self, units: int) -> int | None:
-        """Return until when the first of so many units may answer, in ns of CLOCK_MONOTONIC.
+        """Return the deadline for the next of ``units`` units, in ns of CLOCK_MONOTONIC.
 
-        None: until the time-out. A source of one unit has no other unit to protect.
+        None: the time-out, because a source with one unit has no other unit to protect.
         """
         if len(self._units) == 1:
             return None
@@ -256,7 +257,7 @@ class ModbusConnector(Connector):
         return time.monotonic_ns() + min(share_ns, self._options.timeout * 1_000_000 // len(self._units))
 
     def _fell_silent(self, unit: int, status: int, error: ConnectorError, *, mute: bool) -> None:
-        """Leave a unit alone, and longer after each further attempt."""
+        """Pause before the next request to a unit. The pause grows with each attempt."""
         before = self._silent.get(unit)
         if before is None:
             log.warning("unit %d: %s; its registers are bad until it answers", unit, error)
@@ -276,10 +277,10 @@ class ModbusConnector(Connector):
         failed: dict[int, int],
         image: RegisterImage,
     ) -> None:
-        """Read a request's elements; if the device refuses it, search for the addresses that it refuses.
+        """Read a request's elements. If the device refuses the request, search for the refused addresses.
 
-        The search goes on in the next cycles if it needs more than ``MAX_PROBES`` requests, or more
-        than half of the time-out.
+        If the search needs more than ``MAX_PROBES`` requests, or more than half of the time-out, it
+        continues in the next cycles.
         """
         silence = self._silent.get(request.unit)
         if silence is not None and silence.until_ns > now_ns:
@@ -309,10 +310,10 @@ class ModbusConnector(Connector):
                     for part in parts:
                         self._fetch(part, now_ns, until_ns, values, failed, image)
                     return
-                news = len(parts) == 1 and self._refusals.refuse(request, status, now_ns)
+                first = len(parts) == 1 and self._refusals.refuse(request, status, now_ns)
             else:
-                news = True
-            if news:
+                first = True
+            if first:
                 log.warning("%s: %s", self._named(request), error)
             failed.update((one.register, status) for one in request.elements)
             return
@@ -332,7 +333,7 @@ class ModbusConnector(Connector):
             found[one.place] = register.value(data, one.start - request.start)
 
     def _copy_of(self, request: ReadRequest) -> Copy:
-        """Return which bytes of the answer to a request are those of registers in the image."""
+        """Return which bytes of an answer go to which bytes of the image."""
         sources: list[int] = []
         targets: list[int] = []
         indices = []
@@ -345,12 +346,12 @@ class ModbusConnector(Connector):
         return Copy(np.array(sources, np.intp), np.array(targets, np.intp), frozenset(indices))
 
     def _may_probe(self, now_ns: int) -> bool:
-        """Return whether this cycle may send more requests than it needs."""
+        """Return whether this cycle may send probes in addition to its requests."""
         used_ns = time.monotonic_ns() - now_ns
         return self._probes > 0 and used_ns < self._options.timeout * 500_000
 
     def _try_again(self, request: ReadRequest, now_ns: int) -> None:
-        """Read a refused address alone; from the next cycle on, with the others if the device answers."""
+        """Read a refused address alone. If the device answers, the next cycles read it with the others."""
         if request.unit in self._silent or not self._may_probe(now_ns):
             return
         self._probes -= 1
@@ -374,7 +375,8 @@ class ModbusConnector(Connector):
     def write(self, writes: Sequence[Write]) -> list[str]:
         """Write to the device, one write after the other: see :meth:`Connector.write`.
 
-        Writes that only together contain a whole value are written as one, in place of the last of them.
+        If several writes together make up a whole value, the connector joins them to one write, in
+        place of the last of them.
         """
         if not self._client.connected:
             raise WriteLostError(f"not connected to {self._client.peer}", [Lost.UNSENT] * len(writes))
@@ -399,10 +401,10 @@ class ModbusConnector(Connector):
         return [str(outcome) for outcome in outcomes]
 
     def _joined(self, writes: Sequence[Write]) -> list[list[int]]:
-        """Return the indices of the writes that are written as one, in the order in which to write them.
+        """Group the indices of the writes that are joined to one write, in the order of writing.
 
-        Such are the writes of a word and of one of its bits by two commands: the first write then
-        lacks the bit. The writes of a value are joined only if together they contain all its bits.
+        For example, two commands write a word and one of its bits: then the write of the word lacks
+        the bit. Writes of a value are joined only if together they contain all its bits.
         """
         group = list(range(len(writes)))  # for each write, the last write of its group
         for one in self._registers:
@@ -435,7 +437,10 @@ class ModbusConnector(Connector):
                 if function != client.MASK_WORD or error.code != client.ILLEGAL_FUNCTION:
                     raise
                 self._no_masks.add(unit)
-                log.warning("unit %d cannot write single bits (function 22): words are read and written back", unit)
+                log.warning(
+                    "unit %d cannot write single bits (function 22): shmio reads the word and writes it back instead",
+                    unit,
+                )
             else:
                 return
         start, keep, put = (int.from_bytes(data[at : at + 2], "big") for at in (0, 2, 4))
@@ -443,7 +448,7 @@ class ModbusConnector(Connector):
         self._client.write(unit, client.WRITE_WORD, data[:2] + (word & keep | put).to_bytes(2, "big"))
 
     def _steps(self, writes: Sequence[Write]) -> Iterator[tuple[int, int, bytes]]:
-        """Yield the requests (unit, function, data) of writes that are written as one.
+        """Yield the requests (unit, function, data) of joined writes.
 
         Raises:
             ValueError: The device cannot hold the value, or a write names nothing that can be written.
@@ -463,10 +468,10 @@ class ModbusConnector(Connector):
             else:
                 yield from self._values(one, parts)
         if not found:
-            raise ValueError("no register of the tag table is there")
+            raise ValueError("the tag table has no register at the written bytes")
 
     def _bit_of_word(self, one: _Register, write: Write) -> tuple[int, int, bytes]:
-        """Return the request that writes one bit of an integer, and leaves the others alone (function 22)."""
+        """Return the request that writes one bit of an integer and no other bit (function 22)."""
         register, address = one.register, one.address
         options = self._options
         if register.scale is not None or address.kind is not register.element or address.kind.base == "STRING":
@@ -484,7 +489,7 @@ class ModbusConnector(Connector):
         return one.unit, client.MASK_WORD, b"".join(number.to_bytes(2, "big") for number in (start, keep, put))
 
     def _values(self, one: _Register, writes: Sequence[Write]) -> Iterator[tuple[int, int, bytes]]:
-        """Yield the requests that write the elements of a register that writes cover together."""
+        """Yield the requests for the elements of a register that the writes cover together."""
         register, address = one.register, one.address
         image = bytearray(self._layout.size)
         covered = bytearray(self._layout.size)
@@ -548,7 +553,7 @@ class ModbusConnector(Connector):
 
 
 def _places(register: Register) -> Iterator[tuple[int, int, int]]:
-    """Yield for each element its first byte, its size, and the bits of each byte that are its own."""
+    """Yield the first byte, the size and the own bits of each element."""
     if register.type == "BOOL":
         for byte, bit in bit_positions(register):
             yield register.offset + byte, 1, 1 << bit
@@ -566,7 +571,7 @@ def _touches(write: Write, register: Register) -> bool:
 
 
 def _cut(write: Write, register: Register) -> Iterator[int]:
-    """Yield the offsets of the elements of which a write contains a part only."""
+    """Yield the offsets of the elements that a write contains only in part."""
     offset, mask, data = write
     stride, size = register.element.stride, register.element.size
     for byte in (offset, offset + len(data) - 1):  # those in between are whole
@@ -576,7 +581,7 @@ def _cut(write: Write, register: Register) -> Iterator[int]:
 
 
 def _share(write: Write, at: int, size: int) -> bytes:
-    """Return for each byte of an element which bits of it a write contains."""
+    """Return the bits of each byte of an element that a write contains."""
     offset, mask, data = write
     return bytes((mask or 0xFF) if offset <= place < offset + len(data) else 0 for place in range(at, at + size))
 

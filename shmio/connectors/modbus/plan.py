@@ -11,7 +11,7 @@ from shmio.layout.addresses.modbus import Table
 
 
 class Element(NamedTuple):
-    """One element of a register: what must be read in one request.
+    """One element of a register, which must be read in one request.
 
     Attributes:
         unit: Unit id.
@@ -33,7 +33,7 @@ class Element(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ReadRequest:
-    """A request that reads consecutive entries of a table, with the elements that lie in them."""
+    """A request that reads consecutive entries of a table, and the elements in these entries."""
 
     unit: int
     table: Table
@@ -42,7 +42,7 @@ class ReadRequest:
     elements: tuple[Element, ...]
 
     def halves(self) -> list[ReadRequest]:
-        """Return two requests that together read the same elements; only itself if it has but one address."""
+        """Return two requests that together read the same elements, or only this one if it has one address."""
         addresses = sorted({(one.start, one.size) for one in self.elements})
         if len(addresses) == 1:
             return [self]
@@ -55,20 +55,20 @@ class ReadRequest:
 
 
 RETRY_NS: Final = 10_000_000_000
-"""How long a refused address is left alone."""
+"""Pause before a refused address is tried again."""
 MAX_PROBES: Final = 20
-"""Most additional requests of a cycle that search for refused addresses or try them again."""
+"""Maximum number of additional requests of a cycle that search for refused addresses or retry them."""
 Place = tuple[int, Table, int]
 """An entry of a device: unit id, table, and number in the table."""
 
 
 class Limits(NamedTuple):
-    """What one request may read."""
+    """Limits of a request."""
 
     words: int
     bits: int
     gap: int
-    """Most unused entries between two elements of a request."""
+    """Maximum number of unused entries between two elements of a request."""
 
 
 def plan(elements: Iterable[Element], limits: Limits, refused: Collection[Place] = ()) -> list[ReadRequest]:
@@ -76,8 +76,8 @@ def plan(elements: Iterable[Element], limits: Limits, refused: Collection[Place]
 
     Args:
         elements: The elements.
-        limits: What one request may read.
-        refused: Places that the device refuses; no request reads over them.
+        limits: Limits of a request.
+        refused: Places that the device refuses. No request includes them.
 
     Raises:
         ValueError: An element is longer than a request may be.
@@ -113,14 +113,14 @@ def _request(elements: Sequence[Element]) -> ReadRequest:
 
 @dataclass
 class Refusals:
-    """What is known of the addresses that a device refuses; it outlives the connection."""
+    """The addresses that a device refuses. The object is kept across connections."""
 
     elements: Sequence[Element]
     limits: Limits
     requests: list[ReadRequest] = field(init=False)
     """The requests of a cycle, without refused addresses."""
     refused: dict[Element, tuple[int, int]] = field(default_factory=dict)
-    """The refused elements: when to try each again, in ns of CLOCK_MONOTONIC, and its status."""
+    """The refused elements, each with the time to try it again (ns of CLOCK_MONOTONIC) and its status."""
     suspects: dict[ReadRequest, int] = field(default_factory=dict)
     """Halves of refused requests that have not been answered yet, with the status of the refusal."""
 
@@ -128,7 +128,10 @@ class Refusals:
         self.requests = plan(self.elements, self.limits)
 
     def split(self, request: ReadRequest, status: int) -> list[ReadRequest]:
-        """From now on, read a refused request in two halves; return them, or only itself if it has one address."""
+        """Replace a refused request by its two halves, and return them.
+
+        If the request has only one address, return the request itself.
+        """
         halves = request.halves()
         self.suspects.pop(request, None)
         if len(halves) > 1:
@@ -138,15 +141,18 @@ class Refusals:
         return halves
 
     def refuse(self, request: ReadRequest, status: int, now_ns: int) -> bool:
-        """Leave the one address of a request alone for ``RETRY_NS``; return whether this is news."""
-        news = request.elements[0] not in self.refused
+        """Exclude the only address of a request for ``RETRY_NS``.
+
+        Return True if the address was not refused before.
+        """
+        first = request.elements[0] not in self.refused
         self.refused.update((one, (now_ns + RETRY_NS, status)) for one in request.elements)
         if request in self.requests:
             self.requests.remove(request)
-        return news
+        return first
 
     def due(self, now_ns: int, most: int) -> list[ReadRequest]:
-        """Return requests for at most this many refused addresses that are due for another attempt."""
+        """Return requests that retry refused addresses, at most this many."""
         found: dict[tuple[Place, int], list[Element]] = {}
         for one, (retry_ns, _) in self.refused.items():
             if retry_ns <= now_ns:

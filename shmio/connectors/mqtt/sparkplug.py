@@ -186,7 +186,7 @@ class Node:
 
     @property
     def born(self) -> bool:
-        """Whether the node has sent a birth, and no message since then is missing."""
+        """True if the node has sent a birth, and no message since then is missing."""
         return self._born
 
     def device(self, name: str) -> Device:
@@ -358,7 +358,7 @@ class Host:
 
     @property
     def complete(self) -> bool:
-        """Whether all nodes and devices have sent their births."""
+        """True if all nodes and devices have sent their births."""
         return all(node.born and all(device.born for device in node.devices.values()) for node in self._nodes.values())
 
     def take(self, message: Message, topic: str) -> None:

@@ -324,7 +324,7 @@ class Store:
 
     @property
     def complete(self) -> bool:
-        """Whether all topics, wills and Sparkplug devices have sent a first message."""
+        """True if all topics, wills and Sparkplug devices have sent a first message."""
         return (
             all(one.message is not None or one.refused for one in self._topics.values())
             and all(watch.there is not None for watch in self._watches)

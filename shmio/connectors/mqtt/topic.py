@@ -26,7 +26,7 @@ class Message(NamedTuple):
 
     payload: bytes
     retained: bool
-    """Whether the broker had retained it, so that the time of its publication is unknown."""
+    """True if the broker had retained it, so that the time of its publication is unknown."""
     order: int
     monotonic_ns: int
     utc_ns: int
@@ -39,7 +39,7 @@ class Found(NamedTuple):
     source_ns: int
     code: int = GOOD
     text: bool = False
-    """Whether ``value`` is the payload itself, which is text."""
+    """True if ``value`` is the payload itself, which is text."""
 
 
 class Origin(ABC):
@@ -92,7 +92,7 @@ class Topic(Origin):
         self.places: dict[int, Steps | None] = {}
         """By register index, the path of its value in JSON; None: the payload is the value as text."""
         self.refused = False
-        """Whether the broker refuses the subscription."""
+        """True if the broker refuses the subscription."""
         self._time, self._max_bytes = time, max_bytes
         self._document: Any = None
         self._decoded: Message | None = None

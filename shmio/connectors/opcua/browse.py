@@ -1,7 +1,7 @@
 """Lists the variables of an OPC UA server, with the types and addresses that a tag table needs.
 
-It follows the hierarchical references from the folder Objects, level by level, and looks at each node
-once, so that loops of references end. Of a variable that fits a register it does not list the parts.
+It follows the hierarchical references from the folder Objects, level by level. It visits each node
+once, so loops of references end. It does not list the parts of a variable that fits a register.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ _LEFT_OUT: Final = frozenset({ua.NodeId(2253), ua.NodeId(23470), ua.NodeId(31915
 """The objects Server, Aliases and Locations, which each server has."""
 _HAS_PROPERTY: Final = ua.NodeId(46)
 _NODES_AT_ONCE: Final = 20
-"""Nodes in a request to browse; more would keep the event loop from noticing that the server is alive."""
+"""Maximum number of nodes in a browse request. More would block the event loop for too long."""
 _VALUES_AT_ONCE: Final = 100
 REFERENCES_PER_NODE: Final = 30
-"""Most references for each node of the limit. Some lead to properties, and to nodes that are known."""
+"""Maximum number of references per node of the limit. Some lead to properties or known nodes."""
 MAX_CHARACTERS: Final = 1 << 26
-"""Most characters of all names, identifiers and comments together."""
+"""Maximum number of characters of all names, identifiers and comments together."""
 _MAX_COMMENT: Final = 1000
 _WRITE: Final = 2
 """The bit of CurrentWrite in an access level."""
@@ -81,7 +81,7 @@ class _Node:
     unit: Any = None
     """Node id of its EngineeringUnits."""
     is_whole: bool = False
-    """Whether it is a register, so that its parts are none."""
+    """True if the node is a register. Then its parts are not listed."""
     children: list[_Node] = field(default_factory=list)
 
 
@@ -112,7 +112,7 @@ class _Search:
 
     @property
     def _room(self) -> int:
-        """How many more references the search may look at; 0 or less if it must find no more nodes."""
+        """Number of references that the search may still visit; 0 or less: the search must end."""
         if len(self._seen) >= self._wanted.nodes or self._characters > MAX_CHARACTERS:
             return 0
         left = self._wanted.nodes * REFERENCES_PER_NODE - self._references
@@ -162,7 +162,7 @@ class _Search:
         parent.children.append(_Node(key, names, reference.NodeClass == ua.NodeClass.Variable))
 
     def _count(self, *texts: object) -> None:
-        """Count the characters of texts that are kept."""
+        """Count the characters of stored texts."""
         self._characters += sum(len(one) for one in texts if isinstance(one, str | bytes))
 
     async def _list(self, nodes: Sequence[_Node]) -> None:
@@ -209,7 +209,7 @@ class _Search:
 
 
 def _type(value: Sample, data_type: Sample) -> tuple[str, str]:
-    """Return the register type of a variable, and if there is none, why."""
+    """Return the register type of a variable, or the reason why there is none."""
     kind, dims = value.kind, value.dims
     if not kind:
         text = str(data_type.value) if data_type.kind == decode.NODE_ID else ""
@@ -227,11 +227,11 @@ def _type(value: Sample, data_type: Sample) -> tuple[str, str]:
 
 
 def _unit(sample: Sample) -> str:
-    """Return the text of an EUInformation, or an empty one."""
+    """Return the text of an EUInformation; empty if it has none."""
     if sample.kind != decode.EXTENSION or not isinstance(sample.value, Extension):
         return ""
     try:
         found = ua_binary.struct_from_binary(ua.EUInformation, Buffer(sample.value.body))
-    except Exception:  # noqa: BLE001  a unit is not worth a failure
+    except Exception:  # noqa: BLE001  a wrong unit must not end the search
         return ""
     return str(found.DisplayName.Text or "")

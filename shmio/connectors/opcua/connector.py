@@ -46,10 +46,10 @@ if TYPE_CHECKING:
 
 EXTRA: Final = "connector: opcua needs another library: pip install 'shmio[opcua]'"
 CONNECT_TIMEOUTS: Final = 3
-"""How many time-outs the whole of a connection may take."""
+"""Maximum time for connecting, as a multiple of the time-out."""
 CLOSE_S: Final = 0.5
 MAX_REPORTED: Final = 20
-"""Registers of a connection that are reported by name."""
+"""Maximum number of faulty registers that the log names per connection."""
 
 _Result = TypeVar("_Result")
 
@@ -60,7 +60,7 @@ class _NodeWrite(NamedTuple):
     """A write of a node: a whole value, or the elements of an index range."""
 
     write: int
-    """Which of the writes needs it."""
+    """Index of the write that this node's write belongs to."""
     item: Item
     elements: str | None
     sample: Sample
@@ -107,11 +107,11 @@ class OpcUaConnector(Connector):
 
     @property
     def doubt(self) -> str:
-        """Why values may not change although they can be read; empty if there is no reason."""
+        """Why values may stop changing although they can be read; empty if there is no reason."""
         return self._link.doubt if self._link is not None else ""
 
     def describe(self) -> str:
-        """Return the peer and how it is read, for the log."""
+        """Return the peer and the mode of reading, as a text for logs."""
         options = self._options
         how = f"{options.security}, {options.policy}" if options.security != "None" else "no security"
         sessions = self._link.sessions if self._link is not None else []
@@ -161,7 +161,7 @@ class OpcUaConnector(Connector):
             raise
 
     def read(self) -> bytes:
-        """Return the present image, if all sessions are certainly alive.
+        """Return the present image, if all sessions are alive.
 
         Raises:
             ConnectorError: A session is lost, or may be.
@@ -216,14 +216,14 @@ class OpcUaConnector(Connector):
             image.fail(index, BAD_OUT_OF_RANGE, sample.source_ns)
 
     def _report(self, index: int, what: str) -> None:
-        """Log a fault of a register once for each connection, the first ones by name."""
+        """Log a fault of a register once per connection. The log names only the first registers."""
         if (index, what) in self._reported:
             return
         self._reported.add((index, what))
         if len(self._reported) <= MAX_REPORTED:
             log.warning("%s: %s", self._layout.registers[index].path, what)
         elif len(self._reported) == MAX_REPORTED + 1:
-            log.warning("more registers are bad: shmio get shows all")
+            log.warning("more registers are bad: use shmio get to see all of them")
 
     # -- writing -------------------------------------------------------------------------------------------------------
 
@@ -282,7 +282,7 @@ class OpcUaConnector(Connector):
 
     @staticmethod
     def _mark_lost(outcomes: list[str | Lost], steps: Sequence[_NodeWrite], begun: int, link: _Link) -> None:
-        """Mark the writes without an answer: those begun may have been carried out."""
+        """Mark the writes without an answer. Those that were sent may have been carried out."""
         for step in steps[link.confirmed : begun]:
             if outcomes[step.write] == "":
                 outcomes[step.write] = Lost.UNKNOWN
@@ -292,7 +292,7 @@ class OpcUaConnector(Connector):
                 outcomes[step.write] = Lost.UNKNOWN if step.write in done else Lost.UNSENT
 
     def _steps(self, link: _Link, number: int, write: Write) -> Iterator[_NodeWrite]:
-        """Yield the nodes' writes for a write; ValueError if it cannot be done."""
+        """Yield the writes of nodes for a write of bytes. ValueError: the write is impossible."""
         layout, found = self._layout, False
         covered, image = bytearray(layout.size), bytearray(layout.size)
         apply(Write(write.offset, write.mask, b"\xff" * len(write.data)), covered)
@@ -322,7 +322,7 @@ class OpcUaConnector(Connector):
             last = first + count - 1
             yield _NodeWrite(number, item, f"{first}:{last}" if last > first else str(first), sample)
         if not found:
-            raise ValueError("no register of the layout is there")
+            raise ValueError("the layout has no register at the written bytes")
 
 
 def _need_library() -> None:
@@ -331,7 +331,7 @@ def _need_library() -> None:
 
 
 def _address(options: OpcUaOptions, layout: Layout, register: Register) -> Address:
-    """Return the node of a register; ConfigError."""
+    """Return the node of a register. ConfigError: its address is wrong."""
     try:
         if options.nodes == "siemens" and not register.address:
             return siemens.node_address(layout, register)
@@ -341,7 +341,7 @@ def _address(options: OpcUaOptions, layout: Layout, register: Register) -> Addre
 
 
 def _credentials(options: OpcUaOptions) -> Credentials:
-    """Read the files that the keys name; ConfigError."""
+    """Read the files that the keys name. ConfigError: a file is unusable."""
     password = read_password(options.password_file, "password_file") if options.password_file else ""
     if options.certificate is None or options.key is None:
         return Credentials(password=password)
@@ -365,7 +365,11 @@ def _overlapping(layout: Layout, write: Write) -> range:
 
 
 def _elements(register: Register, share: bytes) -> tuple[int, int]:
-    """Return (first, count) of the elements that these bits are; ValueError if they are not whole elements in a row."""
+    """Return the first element and the number of elements of these bits.
+
+    Raises:
+        ValueError: They are not consecutive whole elements.
+    """
     if not register.dims:
         raise ValueError("OPC UA cannot write a part of a value: write the whole register")
     if len(register.dims) > 1:
@@ -387,7 +391,7 @@ def _elements(register: Register, share: bytes) -> tuple[int, int]:
 
 
 def _batches(steps: Sequence[_NodeWrite], most: int) -> Iterator[list[_NodeWrite]]:
-    """Yield the steps in requests: in order, of one session each, and with no node twice in a request."""
+    """Group steps into requests, in order. A request belongs to one session, and writes no node twice."""
     batch: list[_NodeWrite] = []
     for step in steps:
         full = len(batch) >= most or any(one.item is step.item for one in batch)
@@ -427,17 +431,17 @@ class _Link(threading.Thread):
 
     @property
     def ready(self) -> bool:
-        """Whether all sessions are open, as far as is known."""
+        """True if all sessions are open, as far as the client knows."""
         return self._failure is None and bool(self.sessions) and all(one.ready for one in self.sessions)
 
     @property
     def per_write(self) -> int:
-        """How many values a request may write."""
+        """Maximum number of values that a request may write."""
         return min(one.per_write for one in self.sessions)
 
     @property
     def doubt(self) -> str:
-        """Why values may not change."""
+        """Why values may stop changing; empty if there is no reason."""
         from shmio.connectors.opcua.session import STATES  # noqa: PLC0415
 
         for one in self.sessions:
@@ -452,7 +456,7 @@ class _Link(threading.Thread):
             raise self._failure
         for one in self.sessions:
             if reason := one.check():
-                self._failure = ConnectorError(reason)  # no goodbye to a server that does not answer
+                self._failure = ConnectorError(reason)  # do not send CloseSession to a server that does not answer
                 raise self._failure
 
     def call(self, work: Callable[[], Coroutine[Any, Any, _Result]], deadline_ns: int | None = None) -> _Result:
@@ -486,7 +490,7 @@ class _Link(threading.Thread):
             raise self._failure or ConnectorError(f"the connection to {self._options.peer} was closed") from None
 
     def close(self) -> None:
-        """End the thread; wait shortly if the sessions are in order, so that the server frees them."""
+        """End the thread. If the sessions are alive, first give the server a moment to free them."""
         self._closed = True
         healthy = self.ready
         with suppress(RuntimeError):  # the loop may have just ended
@@ -546,7 +550,7 @@ class _Link(threading.Thread):
             await asyncio.gather(*rest, return_exceptions=True)
 
     async def _first_values(self, sessions: Sequence[Session], lost: Sequence[asyncio.Future[Any]]) -> None:
-        """Wait until each node has shown a value, or as long as an answer may take."""
+        """Wait for the first value of each node, at most for the time-out."""
         if self._options.mode == "poll":
             await self._guarded(self.poll)
             return
@@ -574,19 +578,19 @@ class _Link(threading.Thread):
         await asyncio.gather(*(one.poll() for one in self.sessions))
 
     async def write(self, batch: Sequence[_NodeWrite]) -> list[int]:
-        """Write a batch, which is of one session; return the status codes."""
+        """Write a batch of one session, and return the status codes."""
         session = self.sessions[batch[0].item.session]
         codes = await session.write([(step.item, step.elements, step.sample) for step in batch])
         self.confirmed += len(batch)
         return codes
 
     async def has_ranges(self, step: _NodeWrite) -> bool:
-        """Whether the server knows the elements of a write."""
+        """Return whether the server can write the single elements of a write."""
         assert step.elements is not None  # noqa: S101 - for the type checker
         return await self.sessions[step.item.session].has_ranges(step.item, step.elements, len(step.sample.value))
 
     async def read_back(self, items: Sequence[Item]) -> None:
-        """Read nodes that were written."""
+        """Read nodes that were just written."""
         for number, session in enumerate(self.sessions):
             if own := [item for item in items if item.session == number]:
                 await session.read_back(own)

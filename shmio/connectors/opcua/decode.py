@@ -1,8 +1,8 @@
 """Reads values from the answers of a server: read responses and publish responses.
 
 The library's own decoding builds an object for each field, which is too slow for thousands of values
-a cycle, and it does not bound what a short message can ask for. This one reads what a source needs,
-and checks each length against the bytes that are there. Encoding: OPC 10000-6, section 5.2.
+a cycle, and sets no limit to the memory that a short message can demand. This decoder reads only what
+a source needs, and checks each length against the received bytes. Encoding: OPC 10000-6, section 5.2.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _DATA_CHANGE, _STATUS_CHANGE = 811, 820
 
 
 class MalformedError(ConnectorError):
-    """A message is not what it should be."""
+    """A message does not follow the protocol."""
 
     def __init__(self, what: str = "the server's answer is malformed") -> None:
         super().__init__(what)
@@ -80,7 +80,7 @@ class Sample(NamedTuple):
 
 
 class Publication(NamedTuple):
-    """What a publish response holds.
+    """Content of a publish response.
 
     ``values`` has the number of each monitored item with its sample; ``closed`` is the status code
     with which the server ended the subscription, or 0. Without notifications it is a keep-alive.
@@ -94,19 +94,19 @@ class Publication(NamedTuple):
 
 
 def check_fault(data: bytes) -> None:
-    """Raise FaultError if any response says that the server refuses the request; MalformedError."""
+    """Raise FaultError if the server refuses the request, MalformedError if the response is malformed."""
     _Reader(data).header(None)
 
 
 def read_response(data: bytes) -> list[Sample]:
-    """Return the values of a read response; FaultError, MalformedError."""
+    """Return the values of a read response. Raise FaultError or MalformedError."""
     reader = _Reader(data)
     reader.header(_READ_RESPONSE)
     return [reader.data_value(0) for _ in range(reader.count())]
 
 
 def publish_response(data: bytes) -> Publication:
-    """Return the content of a publish response; FaultError, MalformedError."""
+    """Return the content of a publish response. Raise FaultError or MalformedError."""
     reader = _Reader(data)
     reader.header(_PUBLISH_RESPONSE)
     subscription = reader.u32()
@@ -128,7 +128,7 @@ def publish_response(data: bytes) -> Publication:
 
 
 class _Reader:
-    """Reads one message from its beginning on; each method reads what its name says."""
+    """Reads a message from its beginning. Each method reads the item that its name says."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
@@ -167,7 +167,7 @@ class _Reader:
         return int(_UINT.unpack_from(self._data, self._at - 4)[0])
 
     def count(self, least: int = 1) -> int:
-        """Return the length of an array whose elements take at least so many bytes each; 0 for none."""
+        """Return the length of an array whose elements take at least this many bytes; 0: no array."""
         self.skip(4)
         count = int(_INT.unpack_from(self._data, self._at - 4)[0])
         if count <= 0:
@@ -298,7 +298,7 @@ class _Reader:
         return kind, values, dims
 
     def scalar(self, kind: int, depth: int) -> Any:
-        """Read a value whose size its type does not tell."""
+        """Read a value of a type that has no fixed size."""
         if kind in (STRING, XML):
             return self.text()
         if kind == DATE_TIME:

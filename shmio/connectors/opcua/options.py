@@ -15,11 +15,15 @@ _Count = Annotated[int, msgspec.Meta(ge=1, le=100_000)]
 
 
 class OpcUaOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
-    """Address of the server, and how to read it; ValueError for a wrong URL and for keys that contradict."""
+    """Address of the server, and how to read it.
+
+    Raises:
+        ValueError: The URL is wrong, or keys contradict each other.
+    """
 
     url: Annotated[str, msgspec.Meta(min_length=1, max_length=1000)]
     timeout: Annotated[int, msgspec.Meta(ge=10, le=600_000)] = 4000
-    """Milliseconds for each answer of the server, and for its silence."""
+    """Time-out in ms for each answer, and for the time without any message of the server."""
     mode: Literal["subscribe", "poll"] = "subscribe"
     nodes: Literal["addresses", "siemens"] = "addresses"
     """Where node ids come from: the layout's addresses, or the names of a data block of an S7-1500."""
@@ -29,9 +33,9 @@ class OpcUaOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_o
     queue: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 1
     """Samples of a node that the server keeps between two publications."""
     max_items: _Count = 1000
-    """Most nodes of a subscription."""
+    """Maximum number of nodes of a subscription."""
     session_items: _Count = 10_000
-    """Most nodes of a session."""
+    """Maximum number of nodes of a session."""
     security: Literal["None", "Sign", "SignAndEncrypt"] = "None"
     policy: Literal["Basic256Sha256", "Aes128Sha256RsaOaep", "Aes256Sha256RsaPss"] = "Basic256Sha256"
     certificate: str | None = None
@@ -84,7 +88,7 @@ class OpcUaOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_o
 
 @dataclass(frozen=True)
 class Credentials:
-    """What a client identifies itself with.
+    """Certificate and password of a client.
 
     Attributes:
         application_uri: The client's URI, which is also in its certificate.

@@ -1,8 +1,8 @@
 """One session of an OPC UA server, with the nodes that it reads and the subscriptions for them.
 
-It uses asyncua for the channel, the security and the requests, but not its client's supervision: the
-session is lost with the first doubt, and never repaired. Then another session begins with objects of
-its own, so that nothing of the old one can be taken for the new one.
+It uses asyncua for the channel, the security and the requests, but not the supervision of asyncua's
+client. At the first error, the session ends, and the connector opens a new session with new objects.
+So nothing of the old session can be mistaken for an answer in the new one.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ from shmio.model.statuses import BAD_NODE_ID_UNKNOWN, BAD_WAITING_FOR_INITIAL_DA
 MAX_CHUNK_BYTES: Final = 65_535
 MAX_MESSAGE_BYTES: Final = 64 << 20
 MAX_PER_CALL: Final = 1_000
-"""Most nodes in a request; the server's own limit counts if it is lower."""
+"""Maximum number of nodes in a request; the server may have a lower limit."""
 MAX_PUBLISH_REQUESTS: Final = 20
 RETRY_S: Final = 10.0
-"""How often nodes that the server does not know are asked for again."""
+"""Interval in s at which the session requests nodes again that the server did not know."""
 SESSION_TIMEOUT_MS: Final = 30_000
 PROBES: Final = 0.25
-"""How often the server is asked for a sign of life, in time-outs."""
+"""Interval between requests that check whether the server answers, as a fraction of the time-out."""
 CLOSE_S: Final = 1.0
 _CHANNEL_LIFETIME_MS: Final = 3_600_000
 _NAMESPACES, _STATE = 2255, 2259
 _LIMITS: Final = (11705, 11707, 11712, 11714)
-"""The server's limits of a call: nodes of a read, of a write, of browse paths, and monitored items."""
+"""Nodes with the server's limits for a request: nodes to read, nodes to write, browse paths, monitored items."""
 _HIERARCHICAL: Final = 33
 _CLASSES: Final = 1 | 2
 """The classes of objects and variables."""
@@ -77,16 +77,16 @@ log = logging.getLogger("shmio.source")
 
 @dataclass(eq=False)
 class Item:
-    """A node that is read, and what is known of it."""
+    """A node that the source reads, and its state."""
 
     index: int
     address: Address
     deadband: float
-    """Of the node's own numbers; 0: none."""
+    """Dead-band in the numbers of the node, before scaling; 0: none."""
     session: int
-    """Which of the sessions reads it."""
+    """Index of the session that reads the node."""
     node: Any = None
-    """The node id; None if it is not resolved."""
+    """The node id; None if the server has not resolved the address yet."""
     code: int = BAD_WAITING_FOR_INITIAL_DATA
     """Status code if the node cannot be read, or waits for its first value."""
     subscription: Subscription | None = None
@@ -97,21 +97,21 @@ class Item:
     last: Sample | None = None
     """The last sample with a value."""
     settles_ns: int = 0
-    """Until when samples from before the last write may come."""
+    """Until this time, samples from before the last write may come."""
     written_ns: int = 0
     """Source time of the value that was read after the last write."""
     skipped: bool = False
-    """Whether a sample was skipped because it may be from before the last write."""
+    """True if a sample was skipped because it may be from before the last write."""
 
 
 @dataclass(eq=False)
 class Subscription:
-    """A subscription as the server made it."""
+    """A subscription, with the parameters that the server chose."""
 
     number: int
     publishing_s: float
     silent_s: float
-    """How long it may be silent."""
+    """Time after which the subscription is lost if the server sends nothing, in s."""
     alive_ns: int
     sequence: int = 0
     items: list[Item] = field(default_factory=list)
@@ -130,9 +130,9 @@ class Session:
 
         Args:
             options: The source's keys.
-            credentials: What the client identifies itself with.
-            items: What it reads.
-            deliver: Takes samples. A failed item has one without a value.
+            credentials: The certificate or password of the client.
+            items: The nodes to read.
+            deliver: Called with new samples. The sample of a failed item has no value.
 
         """
         self._options, self._credentials, self._items, self._deliver = options, credentials, items, deliver
@@ -148,7 +148,7 @@ class Session:
         self._per_read = self._per_write = self._per_path = self._per_items = MAX_PER_CALL
         self._answered_ns = time.monotonic_ns()
         self.failure = asyncio.get_running_loop().create_future()
-        """Gets the reason if the session is lost."""
+        """The future gets the reason if the session is lost."""
         self.state = _RUNNING
         """The server's state."""
 
@@ -158,7 +158,7 @@ class Session:
         """Connect, resolve the nodes, and subscribe to them.
 
         Raises:
-            ConnectorError: The server cannot be reached, or refuses it.
+            ConnectorError: The server cannot be reached, or refuses the session.
 
         """
         try:
@@ -268,7 +268,7 @@ class Session:
             self.failure.set_result(error)
 
     async def close(self, *, polite: bool) -> None:
-        """End the session; if ``polite``, tell the server."""
+        """End the session. If ``polite``, first send CloseSession to the server."""
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -311,7 +311,9 @@ class Session:
             closed = isinstance(error, ConnectionError)
             return ConnectorError(f"{peer} closed the connection" if closed else f"{peer} cannot be reached: {error}")
         if isinstance(error, ua.UaError | ValueError | struct.error | TypeError | AttributeError | LookupError):
-            return ConnectorError(f"{peer} sent what is not OPC UA, or not what was asked for: {str(error)[:200]}")
+            return ConnectorError(
+                f"{peer} sent data that is not OPC UA, or not the requested answer: {str(error)[:200]}"
+            )
         return ConnectorError(f"{peer}: {type(error).__name__}: {str(error)[:200]}")
 
     # -- requests ------------------------------------------------------------------------------------------------------
@@ -332,7 +334,7 @@ class Session:
         return ua_binary.struct_from_binary(kind, Buffer(body))
 
     async def _samples(self, nodes: Sequence[Any], attribute: Any = ua.AttributeIds.Value) -> list[Sample]:
-        """Read the values of nodes, or another attribute; each request has as many as the server takes."""
+        """Read the values of nodes, or another attribute, in requests of the size that the server accepts."""
         parts = [nodes[at : at + self._per_read] for at in range(0, len(nodes), self._per_read)]
 
         async def read(part: Sequence[Any]) -> list[Sample]:
@@ -354,7 +356,7 @@ class Session:
         return [sample for found in await asyncio.gather(*map(read, parts)) for sample in found]
 
     async def _ask_limits(self) -> None:
-        """Learn how many nodes the server takes in a call."""
+        """Read how many nodes the server accepts in a request."""
         found = await self._samples([ua.NodeId(one) for one in _LIMITS])
         limits = [
             min(one.value, MAX_PER_CALL)
@@ -471,7 +473,7 @@ class Session:
         self._deliver(list(zip(items, await self._samples([item.node for item in items]), strict=True)))
 
     async def read_back(self, items: Sequence[Item]) -> None:
-        """Read nodes after they were written, and deliver their samples before any other."""
+        """Read nodes that were just written, and deliver these samples before any others."""
         found = await self._samples([item.node for item in items])
         now_ns = time.monotonic_ns()
         for item, sample in zip(items, found, strict=True):
@@ -480,7 +482,7 @@ class Session:
         self._deliver(list(zip(items, found, strict=True)))
 
     async def has_ranges(self, item: Item, elements: str, count: int) -> bool:
-        """Whether the server reads just these elements of an array.
+        """Return whether the server can read single elements of an array.
 
         A server that does not know index ranges may ignore them, and replace the whole array.
         """
@@ -491,7 +493,7 @@ class Session:
         return found.code >> 30 == 0 and found.dims == (count,)
 
     async def write(self, values: Sequence[tuple[Item, str | None, Sample]]) -> list[int]:
-        """Write values, or with an index range elements of arrays; return the server's status code of each.
+        """Write values, or with an index range elements of arrays. Return the status code of each.
 
         At most :attr:`per_write` of them, and no node twice.
         """
@@ -506,17 +508,17 @@ class Session:
 
     @property
     def per_write(self) -> int:
-        """How many values a request may write."""
+        """Maximum number of values that a request may write."""
         return self._per_write
 
     @property
     def ready(self) -> bool:
-        """Whether the connection is open, as far as is known."""
+        """True if the connection is open, as far as is known."""
         return self._protocol is not None and self._protocol.transport is not None and not self.failure.done()
 
     @property
     def waiting(self) -> bool:
-        """Whether a node has shown no value yet."""
+        """True if a node has shown no value yet."""
         return any(item.code == BAD_WAITING_FOR_INITIAL_DATA for item in self._items)
 
     @property
@@ -539,7 +541,7 @@ class Session:
     # -- subscriptions -------------------------------------------------------------------------------------------------
 
     async def _subscribe(self, items: Sequence[Item]) -> None:
-        """Monitor items, in as many subscriptions as the keys and the server's limits need."""
+        """Monitor items, in as many subscriptions as the limits of keys and server require."""
         left = deque(items)
         most = self._options.max_items
         while left:
@@ -555,7 +557,7 @@ class Session:
                 await self._drop(one)
 
     async def _drop(self, subscription: Subscription) -> None:
-        """End a subscription without items; there is always another one for publish requests to wait for."""
+        """End a subscription without items. Another subscription remains, for which publish requests can wait."""
         del self._subscriptions[subscription.number]
         request = ua.DeleteSubscriptionsRequest()
         request.Parameters = ua.DeleteSubscriptionsParameters([subscription.number])
@@ -591,7 +593,7 @@ class Session:
         return one
 
     async def _fill(self, subscription: Subscription, items: Sequence[Item], *, filters: bool = True) -> None:
-        """Create monitored items; those that the server refuses have its status code."""
+        """Create monitored items. An item that the server refuses gets the status code of the refusal."""
         unfiltered: list[Item] = []
         at = 0
         while part := items[at : at + self._per_items]:
@@ -637,7 +639,7 @@ class Session:
         )
 
     def _publish(self) -> None:
-        """Keep as many publish requests with the server as are wanted."""
+        """Send publish requests until the wanted number is waiting at the server."""
         while self._publishing < self._wanted and self.ready:
             request = ua.PublishRequest()
             request.Parameters.SubscriptionAcknowledgements, self._acknowledge = self._acknowledge, []
@@ -647,7 +649,7 @@ class Session:
 
     def _published(self, future: asyncio.Future[Any]) -> None:
         self._publishing -= 1
-        lost = not future.cancelled() and future.exception() is not None  # asking keeps asyncio from complaining
+        lost = not future.cancelled() and future.exception() is not None  # reading it stops a warning of asyncio
         if future.cancelled() or self.failure.done():
             return
         if lost and not self.ready:
@@ -661,7 +663,7 @@ class Session:
             elif error.code != _BAD_TIMEOUT:
                 self.fail(self.explained(error))
                 return
-        except Exception as error:  # noqa: BLE001  what a server sends must end nothing but its session
+        except Exception as error:  # noqa: BLE001  an error in a message ends only the session
             self.fail(self.explained(error))
             return
         try:
@@ -695,7 +697,7 @@ class Session:
             self._deliver(taken)
 
     def _is_from_before(self, item: Item, sample: Sample) -> bool:
-        """Whether a sample may be from before the item's last write."""
+        """Return whether a sample may be older than the item's last write."""
         if time.monotonic_ns() > item.settles_ns:
             return False
         if sample.source_ns and item.written_ns:
@@ -705,7 +707,7 @@ class Session:
     # -- supervision ---------------------------------------------------------------------------------------------------
 
     async def _probe(self) -> None:
-        """Ask for the server's state, so that its silence is noticed and the session does not expire."""
+        """Read the server's state at intervals, to notice a dead server and to keep the session alive."""
         while True:
             try:
                 (found,) = await self._samples([ua.NodeId(_STATE)])
@@ -717,7 +719,7 @@ class Session:
             await asyncio.sleep(min(PROBES * self._timeout_s, max(0.1, self._client.session_timeout / 3000)))
 
     async def _watch(self) -> None:
-        """Notice silence, and read again what was written when its older samples have come."""
+        """Check for silence. Read written nodes again when no older samples can come any more."""
         while True:
             await asyncio.sleep(min(0.05, self._timeout_s / 8))
             if reason := self.check():
@@ -736,7 +738,7 @@ class Session:
                     return
 
     async def _retry(self) -> None:
-        """Ask again for nodes that the server did not know, or refused to monitor."""
+        """Request nodes again that the server did not know, or refused to monitor."""
         while True:
             await asyncio.sleep(RETRY_S)
             subscribes = self._options.mode == "subscribe"
@@ -758,10 +760,10 @@ class Session:
                 return
 
     async def _find_dead(self, items: Sequence[Item]) -> list[Item]:
-        """Return the monitored items of which the server sends no more changes, although their values differ.
+        """Return the monitored items for which the server has stopped sending changes.
 
-        Some servers keep silent about nodes that were removed, even after they were added again.
-        Items whose nodes do not exist turn bad.
+        Some servers send nothing more for a node that was removed, even after it was added again. A
+        read shows that the values differ. Make items bad whose nodes do not exist.
         """
         items = [item for item in items if item.code & 0xFFFF0000 not in _AGAIN]
         found = await self._samples([item.node for item in items]) if items else []
@@ -776,7 +778,7 @@ class Session:
         return [item for item, one in zip(silent, again, strict=True) if _differs(item, one)]
 
     def _settle_s(self, item: Item) -> float:
-        """Return how long samples may be on their way, in s."""
+        """Return for how long samples may be in flight, in s."""
         publishing_s = item.subscription.publishing_s if item.subscription is not None else 0.0
         return 2 * (publishing_s + max(0, self._options.sampling_ms) / 1000) + 0.2
 
@@ -808,10 +810,10 @@ class Session:
 
 
 class _Protocol(UASocketProtocol):
-    """Receives what the server sends, and bounds it."""
+    """Receives messages of the server, and limits their size."""
 
     reason = ""
-    """Why it closed the connection."""
+    """Why this client closed the connection."""
 
     def data_received(self, data: bytes) -> None:
         """Take bytes; close the connection if a message is too large."""
@@ -819,12 +821,12 @@ class _Protocol(UASocketProtocol):
         left = self.receive_buffer
         too_long = left is not None and len(left) >= 8 and int.from_bytes(left[4:8], "little") > MAX_CHUNK_BYTES + 64
         if (too_long or self._connection._incoming_size > MAX_MESSAGE_BYTES) and self.transport is not None:
-            self.reason = "the server sent what is not OPC UA, or a message that is too large"
+            self.reason = "the server sent data that is not OPC UA, or a message that is too large"
             self.transport.abort()
 
 
 def _differs(item: Item, found: Sample) -> bool:
-    """Whether the server should have sent another sample than the last one, because a read found this one."""
+    """Return whether a read found another value than the last sample, so that a sample is missing."""
     seen = item.seen
     if seen is None or (seen.code ^ found.code) & 0xFFFF0000:
         return True
@@ -837,12 +839,12 @@ def _differs(item: Item, found: Sample) -> bool:
 
 
 def _asked_too_much(code: int) -> bool:
-    """Whether a server refuses a request only because of its size, or that of its answer."""
+    """Return whether a status code means that the request or its answer was too large."""
     return code & 0xFFFF0000 in (0x80100000, 0x80080000, 0x80B80000, 0x80B90000)
 
 
 def _variant(sample: Sample) -> Any:
-    """Return a sample as the library writes it."""
+    """Convert a sample to a variant of the library."""
     kind = ua.VariantType(sample.kind)
 
     def there(value: Any) -> Any:
@@ -878,11 +880,11 @@ def _explained_code(code: int, options: OpcUaOptions) -> str:
         return f"the server has no more room ({name}): close other clients, or read less"
     if code & 0xFFFF0000 in (0x80540000, 0x80550000):
         return f"the server refuses security {options.security} ({name}): set security and policy to what it offers"
-    return f"the server refuses it: {name}"
+    return f"the server refuses the request: {name}"
 
 
 def bound_decoding() -> None:
-    """Make the library refuse arrays of nothing, which could be of any length in a short message."""
+    """Make the library refuse arrays of nulls: a short message could declare any number of them."""
     original = ua_binary.unpack_uatype_array
 
     def unpack(vtype: Any, data: Any) -> Any:

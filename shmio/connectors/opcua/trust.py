@@ -1,8 +1,8 @@
-"""Certificates: the client's own, and which servers it trusts.
+"""Reads the client's certificate, and checks whether a server is trusted.
 
-``trusted`` is a folder with certificates (PEM or DER) of servers, or of authorities that sign those.
-An unknown server's certificate is stored in the folder ``rejected`` beside it, where somebody can
-look at it and move it.
+``trusted`` is a folder with certificates (PEM or DER) of servers, or of authorities that sign them.
+The certificate of an unknown server is stored in the folder ``rejected`` beside it, so that the user
+can check it and move it to ``trusted``.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def check_server(data: bytes, trusted: Path, host: str) -> x509.Certificate:
     try:
         certificate = x509.load_der_x509_certificate(data[:size])
     except ValueError:
-        raise ConnectorError("the server shows no valid certificate") from None
+        raise ConnectorError("the server has no valid certificate") from None
     known = _folder(trusted)
     if certificate not in known:
         issuer = next((one for one in known if _has_signed(one, certificate)), None)

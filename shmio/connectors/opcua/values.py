@@ -1,8 +1,8 @@
-"""Fits values of OPC UA nodes to registers, and values of registers to nodes.
+"""Converts values of OPC UA nodes to values of registers, and back.
 
-A node's type decides how its value is read, so that the nodes of an S7-1500 (a DATE is a UInt16, a
-DATE_AND_TIME eight bytes, a DTL a structure), those of shmio's own server (dates are texts) and those
-of other servers all fit. Siemens' mapping: "Communication" function manual, table "SIMATIC and OPC UA
+The conversion depends on the node's type. So it works for the nodes of an S7-1500 (a DATE is a UInt16,
+a DATE_AND_TIME eight bytes, a DTL a structure), of shmio's own server (dates are texts) and of other
+servers. Siemens' mapping: "Communication" function manual, table "SIMATIC and OPC UA
 data types".
 """
 
@@ -29,7 +29,7 @@ _TEXTS: Final = frozenset({
     ua.STRING, ua.XML, ua.GUID, ua.NODE_ID, ua.EXPANDED_NODE_ID, ua.QUALIFIED_NAME, ua.LOCALIZED_TEXT
 })  # fmt: skip
 _OF_BYTES: Final = {"DATE_AND_TIME": 8, "POINTER": 6, "ANY": 10}
-"""Types that a server without them has as arrays of bytes, with their sizes."""
+"""Types that some servers represent as arrays of bytes, with their sizes."""
 _CHARACTERS: Final = frozenset({"BYTE", "USINT", "CHAR"})
 _DTL: Final = struct.Struct("<HBBBBBBI")
 _DTL_THERE: Final = struct.Struct(">HBBBBBBI")
@@ -39,7 +39,7 @@ _DEFAULTS: Final = {
     "LINT": ua.INT64, "REAL": ua.FLOAT, "LREAL": ua.DOUBLE, "TIME": ua.INT32, "LTIME": ua.INT64,
     "TIME_OF_DAY": ua.UINT32, "LTOD": ua.UINT64, "STRING": ua.STRING, "WSTRING": ua.STRING, "LDT": ua.DATE_TIME,
 }  # fmt: skip
-"""The type of a node that has shown no value yet; none where servers differ."""
+"""The type to expect of a node without a value; types for which servers differ are missing."""
 
 
 class MismatchError(ValueError):
@@ -97,11 +97,11 @@ class Fitting:
         return self._decoded(data)
 
     def _decoded(self, data: bytes) -> Scalar:
-        """Return the value of an element's bytes as a controller has them."""
+        """Decode the bytes of an element in the controller's own format."""
         assert self._raw is not None  # noqa: S101 - for the type checker
         value = self._raw.decode(data, 0)
         if value is None:
-            raise ValueRangeError(f"{self._base}: {data.hex()} is no valid value")
+            raise ValueRangeError(f"{self._base}: {data.hex()} is not a valid value")
         return value
 
     def _converter(self, kind: int) -> Callable[[Any], Scalar] | None:
@@ -156,11 +156,11 @@ class Fitting:
     # -- writing -------------------------------------------------------------------------------------------------------
 
     def sample(self, value: Value, like: Sample | None) -> Sample:
-        """Return a whole value of the register as the node takes it.
+        """Convert a whole value of the register to the node's type.
 
         Args:
             value: The value.
-            like: The last value that the node has shown; None if there is none.
+            like: The last value of the node; None if there is none.
 
         Raises:
             ValueError: The node cannot hold the value, or its type is unknown.
@@ -170,7 +170,7 @@ class Fitting:
         flat: list[Any] = list(flatten(value, register.shape, register.path)) if register.dims else [value]
         kind = like.kind if like is not None and like.kind else _DEFAULTS.get(self._base, 0)
         if not kind:
-            raise ValueError(f"the node has shown no value yet, so that its type for a {register.type} is unknown")
+            raise ValueError(f"the node has no value yet, so its type for a {register.type} is unknown")
         if self._base in _OF_BYTES and kind in (ua.BYTE, ua.BYTE_STRING):
             data = b"".join(self._encoded(one) for one in flat)
             dims = None if kind == ua.BYTE_STRING else (len(data),) if not register.dims else (*register.shape, 8)
@@ -181,7 +181,7 @@ class Fitting:
         return Sample(kind, there if register.dims else there[0], register.shape if register.dims else None, 0, 0)
 
     def elements(self, values: list[Any], like: Sample | None) -> Sample:
-        """Return consecutive elements of an array as the node takes them; ValueError."""
+        """Convert consecutive elements of an array to the node's type. ValueError: this is impossible."""
         kind = like.kind if like is not None and like.kind else _DEFAULTS.get(self._base, 0)
         if not kind or kind == ua.BYTE_STRING or self._base in _OF_BYTES:
             raise ValueError("the node has no single elements: write the whole array")
@@ -192,7 +192,7 @@ class Fitting:
         return self._raw.encode(value)
 
     def _there(self, value: Any, kind: int, like: Sample | None) -> Any:
-        """Return an element as a node of this type takes it."""
+        """Convert an element to a node's type."""
         base, scale = self._base, self._register.scale
         if kind == ua.BOOLEAN and base == "BOOL":
             return bool(value)
@@ -223,7 +223,7 @@ def _same(value: Any) -> Scalar:
 
 def _rounded(number: float) -> Scalar:
     if not math.isfinite(number):
-        raise ValueRangeError(f"{number} is no whole number")
+        raise ValueRangeError(f"{number} is not a whole number")
     return round(number)
 
 

@@ -49,7 +49,7 @@ class Step(NamedTuple):
 
     @property
     def whole(self) -> bool:
-        """Whether the step selects no element."""
+        """True if the step selects no element."""
         return self.place is None and self.key is None
 
 
@@ -102,7 +102,8 @@ def _steps(field: str) -> tuple[Step, ...]:
         steps.append(Step(found["name"], index, (found["key"], found["value"]) if found["key"] else None))
         at = found.end()
     if not 1 <= len(steps) <= MAX_STEPS:
-        raise ValueError(f"{field[:40]!r}…: expected 1 to {MAX_STEPS} names in a field")
+        what = f"has at most {MAX_STEPS} names, not {len(steps)}" if steps else "has at least one name"
+        raise ValueError(f"{field[:40]!r}{'…' * (len(field) > 40)}: the path of a field {what}")
     return tuple(steps)
 
 

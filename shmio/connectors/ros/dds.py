@@ -116,8 +116,8 @@ class Ros2Connector(Connector):
             if time.monotonic() > end_s:
                 self.close()
                 raise ConnectorError(
-                    f"no answer within {options.timeout} ms: none of the topics has a publisher or subscriber in DDS "
-                    f"{self._where}; compare ROS_DOMAIN_ID, names and types"
+                    f"found no publisher or subscriber of any topic in DDS {self._where} within {options.timeout} ms: "
+                    "check that ROS_DOMAIN_ID, topic names and types are those of the robot"
                 )
             time.sleep(POLL_S)
 

@@ -37,7 +37,7 @@ class Described(NamedTuple):
     ends: Sequence[tuple[int, str]]
     """For each register, in the order of addresses: the offset after its last byte, and its name."""
     whole: bool
-    """Whether all of the block is described, and not only some addresses."""
+    """True if all of the block is described, and not only some addresses."""
 
     def beyond(self, size: int) -> list[str]:
         """Return the names of the registers that do not fit in a block of ``size`` bytes."""

@@ -60,12 +60,12 @@ class ModeQuery(Query):
         self.answered_ns = 0
         """UTC time of the last answer, in ns since 1970."""
         self.unknown = False
-        """Whether the controller does not report its mode in this session."""
+        """True if the controller does not report its mode in this session."""
         self._logged = False
 
     @property
     def runs(self) -> bool:
-        """Whether the mode is known, and the program runs in this mode."""
+        """True if the mode is known, and the program runs in this mode."""
         return self.mode in MODES and self.mode not in _DOUBTS
 
     def data(self) -> bytes:

@@ -44,7 +44,7 @@ class Range:
         self.start = min(one.start for one in fields)
         self.stop = max(one.stop for one in fields)
         self.alone = False
-        """Whether the range needs its own job, because the controller refused it in a shared job."""
+        """True if the range needs its own job, because the controller refused it in a shared job."""
         self.last = b""
         """The bytes of the range that were stored last."""
 

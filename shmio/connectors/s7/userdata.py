@@ -56,7 +56,7 @@ class Part(NamedTuple):
     sequence: int
     """The number that a request for the next part must contain."""
     more: bool
-    """Whether another part follows."""
+    """True if another part follows."""
 
 
 def request(reference: int, service: Service, data: bytes = b"") -> bytes:

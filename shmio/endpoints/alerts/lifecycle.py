@@ -48,7 +48,7 @@ class Lifecycle:
     for_ns: int
     every_ns: int
     resolved: bool
-    """Whether the end of an announced activation gives a notice, too."""
+    """True if the end of an announced activation gives a notice, too."""
     progress: Progress
     held_ns: int | None = None
     """Since when the condition has been true; None if it is not, or the alert is active."""

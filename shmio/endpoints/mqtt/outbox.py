@@ -175,9 +175,11 @@ class Outbox:
         return self._backlog.dropped + self._dropped_results
 
     def mark(self, channel: Channel) -> None:
-        """Mark a topic as changed. A topic that already waits keeps its place.
+        """Mark a topic as changed.
 
-        Until the backlog has been sent, changes are appended to the backlog, if it has room.
+        While the backlog is being sent, or during an outage (``keeping``), the change goes to the
+        backlog, if it has room. Otherwise the topic waits; a topic that already waits keeps its
+        place.
         """
         if self._connection.up and not (self._catching_up and self._backlog.bytes < self._catch_up_bytes):
             self._waiting[channel] = None

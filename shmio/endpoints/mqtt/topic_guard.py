@@ -21,16 +21,16 @@ PAUSE: Final = Backoff(0.1, 5.0)
 CALM_PAUSES: Final = 4
 """Number of pauses without a correction after which the pauses are short again."""
 CALM_S: Final = 60.0
-"""Time without a rest, in s, after which the rests are short again."""
+"""Time in s after which a break is short again."""
 MOST_WAITING: Final = 1000
 """Maximum number of topics to correct. If there are more, all topics are published again."""
-MOST_HEARD: Final = 2000
+MAX_FOREIGN_MESSAGES: Final = 2000
 """Maximum number of other clients' messages in one second.
 
-If there are more, the guard rests: for a time, it corrects nothing.
+If there are more, the guard takes a break: for a time, it corrects nothing.
 """
-REST: Final = Backoff(10.0, 320.0)
-"""Durations of the rests. They grow while others publish on the bridge's topics."""
+BREAK: Final = Backoff(10.0, 320.0)
+"""Durations of the breaks. They grow while others publish on the bridge's topics."""
 
 log = logging.getLogger("shmio.mqtt")
 
@@ -58,36 +58,36 @@ class TopicGuard:
         self._owner, self._now_s = owner, now_s
         self._waiting: dict[str, None] = {}
         self._everything = False
-        self._pauses = self._rests = 0
-        """Numbers of consecutive pauses and rests. Each is longer than the previous."""
+        self._pauses = self._breaks = 0
+        """Numbers of consecutive pauses and breaks. Each is longer than the previous."""
         self._due_s = self._until_s = self._second_s = 0.0
         self._count = 0
-        self._resting = False
+        self._on_break = False
 
     def begin(self) -> None:
         """Begin after a connect. All topics are published then, so there is nothing to correct."""
-        if not self._resting:
+        if not self._on_break:
             self._waiting.clear()
             self._everything = False
             self._owner.watch()
 
     def report(self, topic: str) -> None:
         """Note that another client has published a wrong value on a topic."""
-        if self._resting:  # sent before we unsubscribed
+        if self._on_break:  # sent before we unsubscribed
             return
         now_s = self._now_s()
         if now_s - self._second_s >= 1.0:
             self._second_s, self._count = now_s, 0
         self._count += 1
-        if self._count > MOST_HEARD:
+        if self._count > MAX_FOREIGN_MESSAGES:
             self._owner.unwatch()
             self._waiting.clear()
             if now_s >= self._until_s + CALM_S:
-                self._rests = 0
-            rest_s = REST.wait_s(self._rests)
-            self._rests += 1
-            self._resting, self._everything, self._until_s = True, True, now_s + rest_s
-            log.warning("other clients publish too much on this instance's topics: no corrections for %g s", rest_s)
+                self._breaks = 0
+            break_s = BREAK.wait_s(self._breaks)
+            self._breaks += 1
+            self._on_break, self._everything, self._until_s = True, True, now_s + break_s
+            log.warning("other clients publish too much on this instance's topics: no corrections for %g s", break_s)
         elif topic not in self._waiting and len(self._waiting) >= MOST_WAITING:
             self._everything = True
         else:
@@ -96,10 +96,10 @@ class TopicGuard:
     def run_once(self) -> float:
         """Correct what is due, and return after how many seconds to call this again."""
         now_s = self._now_s()
-        if self._resting:
+        if self._on_break:
             if now_s < self._until_s:
                 return self._until_s - now_s
-            self._resting = False
+            self._on_break = False
             self._owner.watch()
         if not (self._waiting or self._everything):
             return CALM_S

@@ -22,14 +22,14 @@ MAX_PASSWORD = 1024
 
 @dataclass(frozen=True)
 class User:
-    """A client that has identified itself, or an anonymous one; ``name`` is for messages."""
+    """A client that has logged in, or an anonymous client. ``name`` is for messages."""
 
     name: str
     roles: frozenset[str]
 
 
 class Access:
-    """Decides who a client is, and what it may do."""
+    """Identifies clients, and decides which roles they have."""
 
     def __init__(self, config: OpcUa) -> None:
         """Read accounts and trusted certificates.
@@ -50,8 +50,8 @@ class Access:
         """Return the user with these credentials, or None if they are wrong or give no role.
 
         Args:
-            name: Name of the account; None: anonymous, or by certificate.
-            password: Its password.
+            name: Name of the account; None: an anonymous client, or one with a certificate.
+            password: Password of the account.
             certificate: The certificate of the user or of the client, as DER.
 
         """
@@ -70,7 +70,7 @@ class Access:
         return User(who, frozenset(roles)) if roles else None
 
     def _account(self, name: str, password: str) -> Secret | None:
-        """Return the account with this name and password; the time it takes depends on neither."""
+        """Return the account with this name and password, in a time that depends on neither."""
         shown = digest(password[:MAX_PASSWORD].encode())
         found = None
         for account in self._accounts:

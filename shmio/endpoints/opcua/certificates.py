@@ -17,7 +17,7 @@ MIN_KEY_BITS: Final = 2048
 
 
 def read_certificates(key: str, file: Path) -> list[x509.Certificate]:
-    """Return the certificates of a PEM or DER file; ConfigError."""
+    """Return the certificates of a PEM or DER file. ConfigError: the file is unusable."""
     data = _read(key, file)
     try:
         if b"-----BEGIN" in data:

@@ -15,7 +15,7 @@ from shmio.segment import Block
 from shmio.segment.commands import End, worst
 
 ROOM_S: Final = 2.0
-"""How long a write waits for room among the commands that are under way."""
+"""Maximum time for which a write waits until fewer commands are in flight."""
 
 
 class CommandClient:
@@ -35,7 +35,7 @@ class CommandClient:
         return self._source_writer.is_writable(register)
 
     async def write(self, register: Register, value: object) -> End:
-        """Write a value, and wait until the device or an injection has taken it, or not.
+        """Write a value, and wait for the outcome.
 
         Raises:
             CommandError: The command was not sent.
@@ -59,7 +59,7 @@ class CommandClient:
                     self._room.clear()
                     await self._room.wait()
         except TimeoutError:
-            raise CommandError(f"{self.block.source}: too many commands are under way") from None
+            raise CommandError(f"{self.block.source}: too many commands are in flight") from None
         if self.block.retired:
             raise CommandError(RETIRED)
 

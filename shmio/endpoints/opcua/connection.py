@@ -20,9 +20,9 @@ MAX_SESSIONS: Final = 100
 MAX_CHUNK_BYTES: Final = 65_535
 MAX_MESSAGE_BYTES: Final = 4 << 20
 MAX_WAITING: Final = 32
-"""Number of messages that wait from which on a connection is not read."""
+"""Maximum number of waiting messages. Beyond it, the endpoint does not read from the connection."""
 MAX_UNSENT_BYTES: Final = 1 << 20
-"""Bytes that wait for a client from which on its requests are not processed."""
+"""Maximum number of bytes that wait for a client. Beyond it, its requests are not processed."""
 STUCK_S: Final = 30.0
 """Time after which a client that does not read is disconnected."""
 ACTIVATION_S: Final = 10.0
@@ -51,7 +51,7 @@ _SERVED: Final = frozenset({
     _IDS.DeleteMonitoredItemsRequest_Encoding_DefaultBinary,
     _IDS.PublishRequest_Encoding_DefaultBinary, _IDS.RepublishRequest_Encoding_DefaultBinary,
 })  # fmt: skip
-"""The services that a session has; all others, which could change the address space, are refused."""
+"""The services that a session may use. The endpoint refuses all others, which could change the address space."""
 
 log = logging.getLogger("shmio.opcua")
 
@@ -70,11 +70,11 @@ class Processor(UaProcessor):
         self._pass.set()
 
     def can_send(self) -> bool:
-        """Return whether the client reads what it is sent."""
+        """True if the client reads its messages."""
         return self._pass.is_set() and not self._transport.is_closing()
 
     def hold(self) -> None:
-        """Process no requests until :meth:`release`."""
+        """Stop processing requests until :meth:`release`."""
         self._pass.clear()
 
     def release(self) -> None:
@@ -82,18 +82,18 @@ class Processor(UaProcessor):
         self._pass.set()
 
     async def proceed(self) -> None:
-        """Wait until the client reads what it is sent."""
+        """Wait until the client reads its messages."""
         await self._pass.wait()
 
     def publish(self, result: ua.PublishResult, request: Any) -> None:
-        """Send a publication as the answer to a request for one."""
+        """Send a publication as the answer to a Publish request."""
         response = ua.PublishResponse()
         response.Parameters = result
         result.Results = request.results
         self.send_response(request.requesthdr.RequestHandle, request.seqhdr, response)
 
     def open_secure_channel(self, algohdr: Any, seqhdr: Any, body: Any) -> None:
-        """Open or renew a channel; the client's certificate must be trusted, if the configuration says so."""
+        """Open or renew a channel. If the configuration requires it, check the client's certificate."""
         access = self.iserver.access
         certificate = self._connection.security_policy.peer_certificate
         if self.encrypted and access.asks_certificates and not (certificate and access.trusts(certificate)):
@@ -102,7 +102,7 @@ class Processor(UaProcessor):
 
     @property
     def encrypted(self) -> bool:
-        """Whether nobody else can read the channel."""
+        """True if the channel is encrypted."""
         return bool(self._connection.security_policy.Mode == ua.MessageSecurityMode.SignAndEncrypt)
 
     async def _process_message(self, typeid: Any, requesthdr: Any, seqhdr: Any, body: Any) -> bool:
@@ -120,13 +120,13 @@ class Processor(UaProcessor):
     async def _serve(self, typeid: Any, requesthdr: Any, seqhdr: Any, body: Any) -> bool:
         kind = typeid.Identifier if typeid.NamespaceIndex == 0 else None
         if kind not in _WITHOUT_SESSION:
-            # Everybody may open a channel without security, to ask which ones there are. It is for nothing else.
+            # A channel without security is always allowed, but only to read which endpoints there are.
             if not self.encrypted and not self.iserver.plain_text:
                 raise ServiceError(Fault.BadSecurityPolicyRejected)
             if kind not in _SESSIONS and kind not in _SERVED:
                 raise ServiceError(Fault.BadServiceUnsupported)
         if kind == _IDS.CreateSessionRequest_Encoding_DefaultBinary and self.session is not None:
-            await self.session.close_session()  # asyncua would keep it for ever
+            await self.session.close_session()  # asyncua would never remove it
             self.session = None
         elif kind == _IDS.ActivateSessionRequest_Encoding_DefaultBinary:
             return await self._activate(typeid, requesthdr, seqhdr, body)
@@ -170,7 +170,7 @@ class Processor(UaProcessor):
 
 
 class Protocol(OPCUAProtocol):
-    """Receives messages: it bounds their size and number, and disconnects a client that sends anything else."""
+    """Receives messages, limits their size and number, and disconnects clients that break the protocol."""
 
     iserver: Any  # InternalServer of the module server, which imports this one
 
@@ -213,13 +213,13 @@ class Protocol(OPCUAProtocol):
             self.processor.release()
 
     def data_received(self, data: bytes) -> None:
-        """Split what comes into messages."""
+        """Split received bytes into messages."""
         self._received += data
         while len(self._received) >= 8:
             kind, chunk, size = struct.unpack_from("<3scI", self._received)
             known = kind in _KINDS and chunk in (b"F", b"C", b"A") and (kind == b"HEL") != self._greeted
             if not known or not (12 if self._greeted else 8) < size <= MAX_CHUNK_BYTES:
-                self._drop("it sends what is not OPC UA")
+                self._drop("it sent data that is not OPC UA")
                 return
             if len(self._received) < size:
                 return
@@ -246,7 +246,7 @@ class Protocol(OPCUAProtocol):
             except ua.uaerrors.UaStatusCodeError as error:
                 self._fail(error.code)
                 break
-            except Exception as error:  # noqa: BLE001  what a client sends must not end anything but its connection
+            except Exception as error:  # noqa: BLE001  an error in a message ends only its connection
                 log.warning(
                     "a client was disconnected: its message cannot be processed: %s",
                     type(error).__name__, extra=fields(peer=str(self.peer_name)),
@@ -258,7 +258,7 @@ class Protocol(OPCUAProtocol):
             self.transport.close()
 
     def _fail(self, code: int) -> None:
-        """Tell the client why it is disconnected."""
+        """Send the client the reason for the disconnection."""
         if self.transport is not None and not self.transport.is_closing():
             self.transport.write(uatcp_to_binary(ua.MessageType.Error, ua.ErrorMessage(ua.StatusCode(code), "")))
 

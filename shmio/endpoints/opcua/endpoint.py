@@ -1,4 +1,4 @@
-"""The endpoint: follows all sources, serves their nodes, and adopts what a reload changes."""
+"""The endpoint: follows all sources, serves their nodes, and applies changes of a reload."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Endpoint:
             reading, self._reading = self._reading, None
             self._add(reading.result())
         if self._stepping.lock.locked():
-            return  # a step looks at the sources, too
+            return  # a step uses the sources, too
         if self._reading is None and self._segment.generation != self._generation:
             known = {source.feed.block.section for source in self.sources.values()}
             self._reading = asyncio.get_running_loop().create_task(asyncio.to_thread(self._read, known))
@@ -83,7 +83,7 @@ class Endpoint:
                 log.info("source %s was removed", source.name)
 
     def _read(self, known: Container[int]) -> list[SourceNode]:
-        self._generation = self._segment.generation  # first, so that the next look notices a change meanwhile
+        self._generation = self._segment.generation  # first, so that the next check notices a change meanwhile
         self._segment.refresh()
         root, namespace = self.server.iserver.space.root, self.server.namespace
         blocks = [block for block in self._segment.blocks.values() if block.section not in known]

@@ -20,18 +20,18 @@ from shmio.segment.doorbell import TURN_NS
 log = logging.getLogger("shmio.opcua")
 
 MAX_FRAMES_PER_TURN: Final = 8
-"""Maximum number of frames that are read before the endpoint does other work."""
+"""Maximum number of frames to read before the endpoint does other work."""
 CATCH_UP_S: Final = 3.0
-"""An endpoint that is further behind than this, or than half the ring, skips to the newest frame."""
+"""If the endpoint is further behind than this, or than half of the ring, it skips to the newest frame."""
 
 
 class Listener(Protocol):
     """A monitored item."""
 
     every: bool
-    """True if it also wants frames in which only the time has changed."""
+    """True if the item also reports frames in which only the time has changed."""
     queues: bool
-    """True if it keeps more values than the newest one."""
+    """True if the item queues more values than the newest."""
 
     def changed(self) -> None:
         """Note that the value has changed."""
@@ -40,7 +40,7 @@ class Listener(Protocol):
 class Watch:
     """The changes of one variable, for all clients that monitor it.
 
-    The value is encoded when the first of them needs it, once for all.
+    The value is encoded once for all clients, when the first of them needs it.
     """
 
     __slots__ = ("_encoded", "_get", "_value", "feed", "gone", "key", "listeners")
@@ -55,35 +55,35 @@ class Watch:
         self._encoded: bytes | None = None
 
     def add(self, listener: Listener) -> None:
-        """Tell a listener about changes."""
+        """Notify a listener of changes from now on."""
         self.listeners[listener] = None
         self.feed.count()
 
     def remove(self, listener: Listener) -> None:
-        """Tell a listener about changes no longer; the watch ends with its last one."""
+        """Remove a listener. The watch ends with its last listener."""
         self.listeners.pop(listener, None)
         if not self.listeners:
             self.feed.release(self)
         self.feed.count()
 
     def renew(self, get: Callable[[], ua.DataValue] | None) -> None:
-        """Get values from another function after a reload; None: the variable no longer exists."""
+        """Use another function for values after a reload; None: the variable no longer exists."""
         self.gone = get is None
         self._get = _unknown if get is None else get
         self.changed()
 
     def changed(self) -> None:
-        """Note that the value has changed, and tell the listeners."""
+        """Record that the value has changed, and notify the listeners."""
         self.forget()
         for listener in self.listeners:
             listener.changed()
 
     def forget(self) -> None:
-        """Make the value and its encoding anew when they are needed again."""
+        """Discard the value and its encoding. They are computed again when needed."""
         self._value = self._encoded = None
 
     def fetch(self) -> bytes:
-        """Return the present value, encoded, whether a change was noted or not."""
+        """Read the present value again, and return it encoded."""
         return struct_to_binary(self._get())
 
     @property
@@ -121,7 +121,7 @@ class Feed:
         self.follower = FrameFollower(block, catch_up_s=CATCH_UP_S)
         self.commands = CommandClient(block, writer)
         self.turn_ns = min(TURN_NS, block.stale_ns)
-        """How often to look at least, in ns: a frame that turns stale rings no doorbell."""
+        """Interval for checks without a doorbell, in ns: a frame that becomes stale rings no doorbell."""
         self._scan = _scan(block)
         self._index = {register.path: index for index, register in enumerate(block.layout.registers)}
         self._by_register: dict[int, dict[str, Watch]] = {}
@@ -130,10 +130,10 @@ class Feed:
         self._injected: Sequence[Any] = ()
         self._injection_sequence = -1
         self._shown_sequence = -1
-        """Sequence number of the list of injections that the last frame was read with."""
+        """Sequence number of the list of injections at the last frame."""
         self._counted = True
         self._patient = True
-        """True if all clients want the newest values only."""
+        """True if all clients need only the newest values."""
         self._timed: list[tuple[Watch, Listener]] = []
 
     @property
@@ -222,7 +222,7 @@ class Feed:
                     del self._by_register[index]
 
     def count(self) -> None:
-        """Note that listeners came or went."""
+        """Record that listeners were added or removed."""
         self._counted = False
 
     def _count(self) -> None:

@@ -16,7 +16,7 @@ from shmio.local.time_control import Coordinator
 from shmio.segment import EventKind, Segment
 
 PATIENCE_S: Final = 2.0
-"""How long a step waits until another program gives up the time."""
+"""Maximum time for which a step waits until another program releases the time."""
 
 
 class Stepping:
@@ -24,7 +24,7 @@ class Stepping:
 
     def __init__(self, segment: Segment) -> None:
         self.lock = asyncio.Lock()
-        """Held during a step."""
+        """Locked during a step."""
         self._segment = segment
         self._coordinator = Coordinator(segment)
 
@@ -43,7 +43,7 @@ class Stepping:
 
     def _step(self, length_ns: int | None) -> list[ua.Variant]:
         if not self._segment.clock.read().virtual:
-            raise TimeError("time is real: it can be stepped when a program has stopped it, as shmio step does")
+            raise TimeError("time is real: first take control of it, for example with shmio step")
         try:
             self._coordinator.take_over(PATIENCE_S, steps=True)
             done = self._coordinator.step(length_ns)
@@ -88,7 +88,7 @@ def add_injections(source: SourceNode) -> None:
     one = Method(source, "Lift", "inject", "Lifts an injection of any program", lift)
     one.inputs = [_argument("Number", ua.ObjectIds.UInt64, "as in Injections")]
     every = Method(source, "LiftAll", "inject", "Lifts all injections of this source, of all programs", lift_all)
-    every.outputs = [_argument("Lifted", ua.ObjectIds.UInt32, "how many there were")]
+    every.outputs = [_argument("Lifted", ua.ObjectIds.UInt32, "number of injections")]
     listed = Property(
         source,
         "Injections",

@@ -1,7 +1,7 @@
 """The instance's nodes: objects by path, a variable for each register, properties and methods.
 
-A node makes its attributes and references when a client asks for them. So a large cell starts fast,
-and a value is always read from the newest frame.
+A node computes its attributes and references when a client requests them. So a large cell starts
+fast, and a value always comes from the newest frame.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Node:
 
     @property
     def comment(self) -> str:
-        """What the node is."""
+        """Description of the node."""
         return ""
 
     def _own(self, attribute: int, _roles: Roles) -> ua.Variant | ua.DataValue | None:
@@ -173,7 +173,7 @@ class RegisterNode(VariableNode):
 
     @property
     def writable(self) -> bool:  # type: ignore[override]
-        """Whether the configuration allows writing it."""
+        """True if clients may write the register."""
         return self.feed.commands.is_writable(self.register)
 
     @property
@@ -278,7 +278,7 @@ class Method(Node):
 
     @property
     def comment(self) -> str:
-        """What the method does."""
+        """Description of the method."""
         return self._comment
 
     def all_children(self) -> Iterator[Node]:
@@ -342,7 +342,7 @@ class SourceNode(Node):
 
     @property
     def comment(self) -> str:
-        """Which block the source reads, and how."""
+        """Description of the source's block and connector."""
         return f"{self.feed.block.attributes.connector}: {self.feed.block.layout.name}"
 
     def _add(self, register: Register) -> None:
@@ -372,5 +372,5 @@ def child_id(owner: Node, name: str) -> ua.NodeId:
 
 
 def bad(code: int) -> ua.DataValue:
-    """Return a value that has only a bad status."""
+    """Return a value without content, with a bad status."""
     return ua.DataValue(StatusCode=ua.StatusCode(code))

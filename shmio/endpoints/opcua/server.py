@@ -46,7 +46,7 @@ _OAEP: Final[dict[str, Callable[[Any, bytes], bytes]]] = {
     "http://www.w3.org/2001/04/xmlenc#rsa-oaep": uacrypto.decrypt_rsa_oaep,
     "http://opcfoundation.org/UA/security/rsa-oaep-sha2-256": uacrypto.decrypt_rsa_oaep_sha256,
 }
-"""Encryptions of passwords that are accepted; that of PKCS 1.5 tells an attacker too much."""
+"""Accepted encryptions of passwords. PKCS 1.5 is missing, because it is vulnerable to padding attacks."""
 _SHA1: Final = "http://www.w3.org/2000/09/xmldsig#rsa-sha1"
 _LIMITS: Final = {
     "MaxNodesPerRead": MAX_NODES, "MaxNodesPerWrite": MAX_WRITES, "MaxNodesPerMethodCall": MAX_CALLS,
@@ -66,7 +66,7 @@ class Counters:
 
 
 class InternalServer(LibraryInternalServer):
-    """What all connections share."""
+    """The state that all connections share."""
 
     time_task: Any
 
@@ -79,7 +79,7 @@ class InternalServer(LibraryInternalServer):
         """True if clients may use channels without security."""
         self.space: Space
         self.catch_up: Callable[[], object] = lambda: None
-        """Reads all new frames, so that clients read the newest values."""
+        """Function that reads all new frames, so that clients get the newest values."""
         super().__init__(user_manager=self)
         self.instance = instance
         self.allow_remote_admin = False
@@ -93,7 +93,7 @@ class InternalServer(LibraryInternalServer):
         self.space = Space(self.instance, self.aspace)
 
     async def stop(self) -> None:
-        """Stop at once; the library would wait for its clock."""
+        """Stop at once. The library's own method would wait for its clock."""
         if self.time_task is not None:
             self.time_task.cancel()
             await asyncio.wait((self.time_task,))
@@ -123,7 +123,7 @@ class InternalServer(LibraryInternalServer):
         name, secret = token.UserName or "", token.Password or b""
         if not token.EncryptionAlgorithm:
             if not isession.trusted_channel:
-                log.warning("a client sent its password where others can read it: have it replaced")
+                log.warning("a client sent its password without encryption: replace the password")
                 raise ServiceError(ua.StatusCodes.BadIdentityTokenRejected)
             return name, secret.decode() if isinstance(secret, bytes) else str(secret)
         decrypt = _OAEP.get(token.EncryptionAlgorithm)
@@ -132,7 +132,9 @@ class InternalServer(LibraryInternalServer):
         plain = decrypt(self.private_key, secret)
         (length,) = struct.unpack_from("<I", plain)
         nonce = plain[4 + length - len(isession.nonce) : 4 + length]
-        if length < len(isession.nonce) or nonce != isession.nonce:  # recorded earlier, and sent again
+        if (
+            length < len(isession.nonce) or nonce != isession.nonce
+        ):  # an attacker has recorded the message and sent it again
             raise ServiceError(ua.StatusCodes.BadIdentityTokenInvalid)
         return name, plain[4 : 4 + length - len(isession.nonce)].decode()
 
@@ -226,15 +228,15 @@ class Server(Library):
 
     @property
     def port(self) -> int:
-        """The port on which it listens."""
+        """The port on which the server listens."""
         return self.bserver.port if self.bserver is not None else 0
 
 
 def bound_decoding() -> None:
-    """Make the library refuse arrays of nothing.
+    """Make the library refuse arrays of nulls.
 
-    Each element of such an array takes no byte of the message, so that a short message could fill
-    the memory.
+    The elements of such an array take no bytes in the message, so a short message could fill the
+    memory.
     """
     original = ua_binary.unpack_uatype_array
 

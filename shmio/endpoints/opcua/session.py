@@ -1,4 +1,4 @@
-"""A client's session: its services, each with the role that it needs and with limits."""
+"""A client's session: its services, with the role and the limits of each."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ MAX_NODES: Final = 10_000
 MAX_WRITES: Final = 1_000
 MAX_CALLS: Final = 10
 MAX_RESPONSE_BYTES: Final = 8 << 20
-"""Maximum size of the values in a response to Read, roughly."""
+"""Approximate maximum size of the values in a response to Read."""
 MAX_REFERENCES: Final = 20_000
 """Maximum number of references in a response to Browse; BrowseNext returns the rest."""
 MAX_CONTINUATIONS: Final = 20
 """Maximum number of continuation points of a session."""
 TURN: Final = 500
-"""Number of nodes after which a request lets others proceed."""
+"""Number of nodes after which a request yields to other tasks."""
 
 _OUTCOMES: Final = {
     EventKind.REJECTED: ua.StatusCodes.BadRequestNotAllowed,
@@ -41,7 +41,7 @@ _OUTCOMES: Final = {
     EventKind.EXPIRED: ua.StatusCodes.BadNoCommunication,
     EventKind.UNKNOWN: ua.StatusCodes.BadTimeout,
 }
-"""The status of a write that was not done, by its outcome."""
+"""The status code of a failed write, by its outcome."""
 
 log = logging.getLogger("shmio.opcua")
 
@@ -56,17 +56,17 @@ class Session(InternalSession):
 
     def __init__(self, *given: Any, **named: Any) -> None:
         super().__init__(*given, **named)
-        if self.external:  # asyncua counts tokens up, so that a client could guess another one's
+        if self.external:  # asyncua numbers tokens, so a client could guess those of other clients
             self.iserver.unregister_external_session(self)
             self.auth_token = ua.NodeId(secrets.token_bytes(32), 0, ua.NodeIdType.ByteString)
             self.iserver.register_external_session(self)
         self.trusted_channel = False
-        """True if nobody else can read what the client sends: it may send a password as it is."""
+        """True if the channel is encrypted, so that the client may send a password as plain text."""
         self._continuations: dict[bytes, Any] = {}
 
     @property
     def roles(self) -> frozenset[str]:
-        """What the client may do."""
+        """Roles of the client."""
         return self.user.roles if isinstance(self.user, User) else frozenset()
 
     def need(self, role: str) -> None:
@@ -78,7 +78,7 @@ class Session(InternalSession):
     def activate_session(
         self, params: ua.ActivateSessionParameters, peer_certificate: bytes | None
     ) -> ua.ActivateSessionResult:
-        """Identify the client. One that takes a session over must be the same user."""
+        """Identify the client. A client that takes over a session must be the same user."""
         before = self.user if self.is_activated() else None
         result = super().activate_session(params, peer_certificate)
         if before is not None and before.name != self.user.name:
@@ -87,7 +87,7 @@ class Session(InternalSession):
         return result
 
     async def close_session(self, delete_subs: bool = True) -> None:  # noqa: ARG002  it always ends them
-        """End the session and its subscriptions, which no other session could take over."""
+        """End the session and its subscriptions. No other session can take these over."""
         self._continuations.clear()
         if self.external:
             self.iserver.subscriptions.delete(self.iserver.subscriptions.of(self))
@@ -142,7 +142,7 @@ class Session(InternalSession):
         return results
 
     def browse_more(self, params: ua.BrowseNextParameters) -> list[ua.BrowseResult]:
-        """Return further references, or forget them if the client releases the continuation points."""
+        """Return further references, or discard them if the client releases the continuation points."""
         self.need("read")
         _bound(params.ContinuationPoints, MAX_NODES)
         room, results = MAX_REFERENCES, []
@@ -158,7 +158,7 @@ class Session(InternalSession):
         return results
 
     def _portion(self, references: Any, most: int, room: int) -> ua.BrowseResult:
-        """Return as many references as there is room for; a continuation point has the rest."""
+        """Return as many references as fit. A continuation point keeps the rest."""
         found = list(islice(references, min(most, room)))
         result = ua.BrowseResult(ua.StatusCode(), None, found)
         following = next(references, None)
@@ -194,7 +194,7 @@ class Session(InternalSession):
     # ---- writing and calling -----------------------------------------------------------------------------------------
 
     async def write(self, params: ua.WriteParameters) -> list[ua.StatusCode]:
-        """Write registers: each is a command to its source, and its status is the command's outcome."""
+        """Write registers. Each write is a command to its source; its status is the outcome of the command."""
         if not self.external:
             return await super().write(params)
         self.need("write")
@@ -281,7 +281,7 @@ class Session(InternalSession):
         return ua.CreateSubscriptionResult(found.id, found.interval_ms, found.lifetime, found.keep_alive)
 
     def attach(self, found: Subscription, callback: Any, request_callback: Any) -> None:
-        """Let a subscription publish by a connection."""
+        """Make a subscription publish through a connection."""
         found.pub_result_callback, found.pub_request_callback = callback, request_callback
         found.can_send = callback.__self__.can_send
 
@@ -317,12 +317,12 @@ class Session(InternalSession):
         params: ua.TransferSubscriptionsParameters,
         callback: Callable[..., Any],  # noqa: ARG002
     ) -> list[ua.TransferResult]:
-        """Refuse: no session may take over another one's subscriptions."""
+        """Refuse, because no session may take over the subscriptions of another."""
         _bound(params.SubscriptionIds, MAX_NODES)
         return [ua.TransferResult(ua.StatusCode(Fault.BadSubscriptionIdInvalid)) for _ in params.SubscriptionIds]
 
     def publish(self, acks: Iterable[ua.SubscriptionAcknowledgement] | None = None) -> tuple[int, list[ua.StatusCode]]:
-        """Take a client's acknowledgements."""
+        """Process a client's acknowledgements."""
         own = self.iserver.subscriptions
         mine = own.of(self)
         if not mine:
@@ -338,7 +338,7 @@ class Session(InternalSession):
         return len(mine), results
 
     def republish(self, params: ua.RepublishParameters) -> ua.NotificationMessage:
-        """Return a message again."""
+        """Send a message again."""
         return self.iserver.subscriptions.find(params.SubscriptionId, self).republish(params.RetransmitSequenceNumber)
 
     async def create_monitored_items(self, params: ua.CreateMonitoredItemsParameters) -> list[Any]:
@@ -397,7 +397,7 @@ MAX_ITEMS_PER_REQUEST: Final = 50_000
 
 
 def _bound(asked: list[Any] | None, most: int) -> None:
-    """Raise ServiceError if a request asks for nothing, or for too much."""
+    """Raise ServiceError if a request has no items, or too many."""
     if not asked:
         raise ServiceError(Fault.BadNothingToDo)
     if len(asked) > most:
@@ -418,7 +418,7 @@ def _joined(first: Any, rest: Any) -> Any:
 
 
 def _size(value: ua.DataValue) -> int:
-    """Return about how many bytes a value has."""
+    """Return the approximate size of a value in bytes."""
     held = None if value.Value is None else value.Value.Value
     if not isinstance(held, list | str | bytes):
         return 32
@@ -436,7 +436,7 @@ def _length(held: Any, element: int) -> int:
 
 
 def _plain(given: ua.Variant | None, register: Register) -> Any:
-    """Return the value of a variant, or None if it is not of the register's type."""
+    """Return the value of a variant, or None if its type does not fit the register."""
     if given is None or given.Value is None:
         return None
     if register.dims and given.VariantType == ua.VariantType.ByteString and data_type(register) == ua.VariantType.Byte:

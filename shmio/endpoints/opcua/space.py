@@ -25,7 +25,7 @@ from shmio.errors import PathError
 from shmio.layout.topic import find
 
 MAX_IDENTIFIER: Final = 4096
-"""Maximum number of characters of a node id that is looked up."""
+"""Maximum length of a node id, in characters."""
 _ANY: Final = ua.NodeId()
 
 Reference = Any  # ua.ReferenceDescription
@@ -43,14 +43,14 @@ class Space:
         standard[OBJECTS].references.append(self.root.description())
 
     def add(self, source: SourceNode) -> None:
-        """Add a source; it continues the watches of one with the same name."""
+        """Add a source. It continues the watches of a previous source with the same name."""
         before = self.sources.get(source.name)
         self.sources[source.name] = self.root.children[source.name] = source
         if before is not None:
             self._move(before.feed, source)
 
     def remove(self, name: str) -> None:
-        """Remove a source. Clients that monitor its variables see that they are unknown."""
+        """Remove a source. Clients that monitor its variables get the status that they are unknown."""
         source = self.sources.pop(name)
         del self.root.children[name]
         for watch in source.feed.watches:
@@ -67,7 +67,7 @@ class Space:
     # ---- look up -----------------------------------------------------------------------------------------------------
 
     def find(self, node_id: ua.NodeId) -> Node | None:
-        """Return a node of the instance by its id; elements, slices and bits of registers, too."""
+        """Return the node of the instance with an id, also for elements, slices and bits of registers."""
         if node_id.NamespaceIndex != NAMESPACE:
             return None
         if node_id == ROOT:
@@ -93,7 +93,7 @@ class Space:
         return None if source is None else source.by_path.get(rest) or self._part(source, rest)
 
     def _part(self, source: SourceNode, path: str) -> Node | None:
-        """Return the node of an element, a slice or a bit, which clients can use but do not browse."""
+        """Return the node of an element, a slice or a bit. Clients can use such nodes but not browse to them."""
         try:
             register = find(source.feed.block.layout, path)
         except PathError:
@@ -130,7 +130,7 @@ class Space:
         return None if found is None else iter(found.references)
 
     def browse(self, asked: ua.BrowseDescription) -> Iterator[Reference] | None:
-        """Return the references of a node that a client asks for, or None if there is no such node."""
+        """Return the references that a browse description selects; None: there is no such node."""
         found = self.references(asked.NodeId)
         return None if found is None else (one for one in found if self._suits(asked, one))
 
@@ -149,7 +149,7 @@ class Space:
         return subtypes and asked in self._above(reference)
 
     def _above(self, reference: ua.NodeId) -> frozenset[ua.NodeId]:
-        """Return the types of which a reference type is a subtype."""
+        """Return the supertypes of a reference type."""
         if reference not in self._supertypes:
             above, at = set[ua.NodeId](), reference
             while (data := self._standard.get(at)) is not None:
@@ -222,7 +222,7 @@ class Space:
 
 
 class StaticWatch(Watch):
-    """The changes of an attribute of one of the standard's nodes, or of one that never changes."""
+    """Watch of an attribute of a standard node, or of an attribute that never changes."""
 
     __slots__ = ("_handle", "_node", "_space", "_standard")
 
@@ -233,7 +233,7 @@ class StaticWatch(Watch):
         standard: AddressSpace | None,
         get: Callable[[], ua.DataValue],
     ) -> None:
-        super().__init__(_Unfollowed(), str(node), get)  # type: ignore[arg-type]  # it has what a watch needs of a feed
+        super().__init__(_Unfollowed(), str(node), get)  # type: ignore[arg-type]  # it has the methods of a feed that a watch calls
         self._space, self._node, self._standard = space, node, standard
         self._handle = 0
         if standard is not None:
@@ -243,7 +243,7 @@ class StaticWatch(Watch):
         self.changed()
 
     def remove(self, listener: Any) -> None:
-        """Tell a listener about changes no longer; the watch ends with its last one."""
+        """Remove a listener. The watch ends with its last listener."""
         self.listeners.pop(listener, None)
         if not self.listeners:
             if self._standard is not None:
@@ -252,7 +252,7 @@ class StaticWatch(Watch):
 
 
 class _Unfollowed:
-    """Takes the place of a feed, for watches of attributes that no source changes."""
+    """Substitute for a feed, for watches of attributes that no source changes."""
 
     def count(self) -> None:
         """Do nothing."""

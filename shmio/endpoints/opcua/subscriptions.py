@@ -1,8 +1,8 @@
 """Subscriptions and their monitored items, with limits.
 
-They replace those of asyncua, whose items keep a copy of each value, and whose clients may use each
-other's subscriptions. Here a value is encoded once for all clients, and an item with a queue of one
-keeps nothing: it sends what is newest when its subscription publishes.
+They replace the subscriptions of asyncua, where items keep a copy of each value, and clients can use
+each other's subscriptions. Here, a value is encoded once for all clients. An item with a queue of one
+stores no value: it sends the newest value when its subscription publishes.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ MAX_ITEMS_PER_SESSION: Final = 50_000
 MAX_QUEUE: Final = 100
 """Maximum length of an item's queue."""
 MAX_QUEUED_BYTES: Final = 4 << 20
-"""Maximum bytes that the queues of a subscription hold; beyond it an item keeps its newest value only."""
+"""Maximum size of a subscription's queues, in bytes. Beyond it, an item keeps only its newest value."""
 MAX_MESSAGE_BYTES: Final = 1 << 20
-"""Size from which a message ends, and the rest follows in another one."""
+"""Size in bytes at which a message ends; further values go into the next message."""
 MAX_UNACKNOWLEDGED: Final = 8
-"""Maximum number of messages that are kept for a client that has not acknowledged them."""
+"""Maximum number of unacknowledged messages that a subscription keeps."""
 MAX_UNACKNOWLEDGED_BYTES: Final = 4 << 20
 MAX_NOTIFICATIONS: Final = 10_000
 """Maximum number of values in a message."""
@@ -54,7 +54,7 @@ Fault = ua.StatusCodes
 
 
 class Item:
-    """A monitored item: one client's interest in one variable."""
+    """A monitored item: a variable that a client monitors."""
 
     __slots__ = (
         "_at_s", "_deadband", "_sampling_s", "_sent", "_status_only", "_subscription", "every", "handle", "id",
@@ -72,11 +72,11 @@ class Item:
         self._sent: ua.DataValue | None = None
 
     def revise(self, asked: ua.MonitoringParameters, slowest_ms: float, fastest_ms: float) -> tuple[float, int]:
-        """Adopt what a client asks for.
+        """Apply the parameters that the client requested, within the limits.
 
         Args:
-            asked: What the client asks for.
-            slowest_ms: The publishing interval, which -1 stands for.
+            asked: The requested parameters.
+            slowest_ms: The publishing interval, which a sampling interval of -1 means.
             fastest_ms: The source's period.
 
         Returns:
@@ -119,7 +119,7 @@ class Item:
         self._status_only = asked.Trigger == ua.DataChangeTrigger.Status
 
     def changed(self) -> None:
-        """Note that the variable has changed."""
+        """Record that the variable has changed."""
         if self.mode == ua.MonitoringMode.Disabled:
             return
         if (self._deadband or self._status_only) and not self._matters():
@@ -130,7 +130,7 @@ class Item:
             self._subscription.mark(self)
 
     def _matters(self) -> bool:
-        """Return whether the filter lets the present value through, and note it."""
+        """Return whether the present value passes the filter. If so, remember it for the next comparison."""
         old, new = self._sent, self.watch.value
         status = old is None or old.StatusCode != new.StatusCode
         if not status and self._status_only:
@@ -143,7 +143,9 @@ class Item:
     def _keep(self) -> None:
         now_s = time.monotonic()
         if self.queue and now_s - self._at_s < self._sampling_s:
-            self._subscription.queued_bytes -= len(self.queue.pop())  # within a sampling interval the newest counts
+            self._subscription.queued_bytes -= len(
+                self.queue.pop()
+            )  # within a sampling interval, only the newest value counts
         else:
             self._at_s = now_s
         full = self._subscription.queued_bytes > MAX_QUEUED_BYTES
@@ -161,7 +163,7 @@ class Item:
             self._subscription.queued_bytes += len(self.queue[0]) - len(old)
 
     def take(self) -> Iterator[bytes]:
-        """Yield the values to send, encoded, and forget them."""
+        """Yield the encoded values to send, and remove them from the queue."""
         if self.size == 1:
             yield self.watch.encoded
             return
@@ -171,7 +173,7 @@ class Item:
             yield value
 
     def clear(self) -> None:
-        """Forget the values that wait."""
+        """Discard the waiting values."""
         self._subscription.queued_bytes -= sum(map(len, self.queue))
         self.queue.clear()
         self._subscription.dirty.pop(self, None)
@@ -237,7 +239,7 @@ class Subscription:
         self.revise(asked)
 
     def revise(self, asked: Any) -> None:
-        """Adopt a client's wishes, within the limits."""
+        """Apply the parameters that the client requested, within the limits."""
         interval = asked.RequestedPublishingInterval
         interval = interval if math.isfinite(interval) else MAX_PUBLISHING_MS
         self.interval_ms = min(max(interval, MIN_PUBLISHING_MS), MAX_PUBLISHING_MS)
@@ -267,7 +269,7 @@ class Subscription:
         self._silent += 1
         self._unheard += 1
         if self._unheard > self.lifetime:
-            log.info("a subscription has ended: its client has asked for nothing for %d intervals", self.lifetime)
+            log.info("a subscription has ended: its client sent no request for %d intervals", self.lifetime)
             self.stop()
             self._on_end()
             return
@@ -275,7 +277,7 @@ class Subscription:
         self._idle = not self.dirty
 
     def mark(self, item: Item) -> None:
-        """Note that an item has something to send.
+        """Record that an item has values to send.
 
         If a source changes its values as often as the subscription publishes, some changes come just
         after the end of an interval. With the wait for the next end, the newest values would replace
@@ -302,7 +304,7 @@ class Subscription:
         return self._first or (self.enabled and bool(self.dirty)) or self._silent >= self.keep_alive
 
     async def publish_results(self, request: Any) -> bool:
-        """Answer a client's request to publish, if a publication is late; return whether it was."""
+        """Answer a Publish request if a publication is late. Return whether it was late."""
         self._unheard = 0
         if not self._wants():
             return False
@@ -310,7 +312,7 @@ class Subscription:
         return True
 
     def heard(self) -> None:
-        """Note that the client has asked for publications."""
+        """Record that the client has sent a Publish request."""
         self._unheard = 0
 
     def _send(self, request: Any) -> None:
@@ -329,7 +331,7 @@ class Subscription:
         self.owner.sent(result, request, self)
 
     def _pop(self) -> bytes:
-        """Return the body of a notification with the values that wait."""
+        """Return the body of a notification with the waiting values."""
         parts, count, size = [b""], 0, 0
         while self.dirty and count < self.most and size < MAX_MESSAGE_BYTES:
             item = next(iter(self.dirty))
@@ -351,11 +353,11 @@ class Subscription:
             del self._kept[next(iter(self._kept))]
 
     def acknowledge(self, number: int) -> int:
-        """Forget a message that the client has received; return a status code."""
+        """Discard a message that the client has acknowledged. Return a status code."""
         return Fault.Good if self._kept.pop(number, None) else Fault.BadSequenceNumberUnknown
 
     def republish(self, number: int) -> ua.NotificationMessage:
-        """Return a message again. ServiceError: it is no longer kept."""
+        """Return a message again. ServiceError: the subscription no longer keeps it."""
         if number not in self._kept:
             raise ServiceError(Fault.BadMessageNotAvailable)
         return self._kept[number][0]
@@ -434,7 +436,7 @@ class Subscriptions:
         return [one for one in self.subscriptions.values() if one.owner is owner]
 
     def find(self, number: int, owner: Any) -> Subscription:
-        """Return a session's own subscription. ServiceError: it has no such one."""
+        """Return a subscription of a session. ServiceError: the session has no such subscription."""
         found = self.subscriptions.get(number)
         if found is None or found.owner is not owner:
             raise ServiceError(Fault.BadSubscriptionIdInvalid)

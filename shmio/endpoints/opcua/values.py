@@ -77,7 +77,7 @@ def variant(register: Register, value: Value) -> ua.Variant:
 
 
 def unit(text: str, namespace: str) -> ua.EUInformation:
-    """Return a unit; one without a UNECE code is in the instance's namespace."""
+    """Return a unit. A unit without a UNECE code is in the instance's namespace."""
     code = _UNITS.get(text)
     name = ua.LocalizedText(text)
     if code is None:

@@ -85,7 +85,7 @@ class Part(msgspec.Struct):
     events: list[MarkedEvent]
     share: float
     reduced: bool = False
-    """Whether frames were left out so far that a plot does not need."""
+    """True if frames were left out so far that a plot does not need."""
 
 
 def signals_of(dump: Dump, paths: Sequence[str]) -> list[Signal]:

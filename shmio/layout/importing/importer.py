@@ -39,13 +39,13 @@ def import_tags(data: bytes) -> Found:
             return node_set.read(root)
         if root.tag == simatic_ml.ROOT:
             return simatic_ml.read(root)
-        raise ImportingError(f"XML whose root is {root.tag[:80]!r}; it imports: {FORMATS}")
+        raise ImportingError(f"XML with the root {root.tag[:80]!r} is unknown; shmio-layout import reads: {FORMATS}")
     first = head.partition("\n")[0].lower()
     if first.startswith((kepserver.FIRST, f'"{kepserver.FIRST}')):
         return kepserver.read(data)
     if head.startswith(step7_symbols.FIRST) or first.startswith('"') or first.count(";") == 3 or _is_list(data):
         return step7_symbols.read(data)
-    raise ImportingError(f"the format is unknown; it imports: {FORMATS}")
+    raise ImportingError(f"the format is unknown; shmio-layout import reads: {FORMATS}")
 
 
 def _is_list(data: bytes) -> bool:

@@ -18,7 +18,7 @@ from shmio.endpoints.grpc.server.error_status import Context, refuse
 from shmio.endpoints.grpc.shmio_v1.declare import DeclareCall
 from shmio.endpoints.grpc.shmio_v1.selection import MAX_PATTERNS, Selections, SourceDirection
 from shmio.endpoints.grpc.shmio_v1.tables import VALUES, Array, StatusChanges, head, head_of, pack, pack_slots
-from shmio.endpoints.grpc.shmio_v1.write import MAX_VALUES, assigned, outcome, packed
+from shmio.endpoints.grpc.shmio_v1.write import MAX_VALUES, decode_assignments, outcome, packed
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.endpoints.grpc.streams.outbox import SendQueue
 from shmio.endpoints.grpc.topics import Topics
@@ -362,7 +362,7 @@ class InjectCall(InjectionFollower):
     async def _values(self, shadow: wire.Shadow) -> tuple[Mapping[str, object], Sequence[Write]]:
         values = packed(shadow.values, self._view) if shadow.HasField("values") else {}
         if shadow.assignments:
-            source, named = await assigned(shadow.assignments, self._topics)
+            source, named = await decode_assignments(shadow.assignments, self._topics)
             if source != self.source:
                 raise PathError(f"the injection covers {self.source}, but the values are for {source}")
             values |= named

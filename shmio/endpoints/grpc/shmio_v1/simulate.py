@@ -69,7 +69,7 @@ class OutputEncoder:
             async for at in time_sliced(left.tolist()):
                 self._put(*self._at(column, int(slots[at])), part.values[at], image)
 
-    async def assigned(self, assignments: Any, image: bytearray) -> None:
+    async def decode_assignments(self, assignments: Any, image: bytearray) -> None:
         """Encode values by path, in time slices.
 
         Raises:
@@ -383,7 +383,7 @@ class SimulateCall:
         if failure is None:
             try:
                 await self._encoder.packed(done.values, image)
-                await self._encoder.assigned(done.assignments, image)
+                await self._encoder.decode_assignments(done.assignments, image)
             except (PathError, ValueRangeError) as error:
                 failure = str(error)
                 self._refused = f"step {ask.step}: {failure}"

@@ -61,7 +61,7 @@ class WriteCalls:
         try:
             if request.timeout_ms > MAX_TIMEOUT_MS:
                 raise ValueRangeError(f"timeout_ms: at most {MAX_TIMEOUT_MS} (a day) is allowed")
-            source, values = await assigned(request.values, self._topics)
+            source, values = await decode_assignments(request.values, self._topics)
             timeout_s = request.timeout_ms / 1000 or None
             commands = self._topics.feed(source).commands
             ends = await command_client.write(commands, values, timeout_s, until_accepted=request.until_accepted)
@@ -75,8 +75,8 @@ def outcome(kind: EventKind, reason: str) -> wire.Outcome:
     return wire.Outcome(kind=_OUTCOMES.get(kind, wire.Outcome.KIND_UNKNOWN), reason=reason)
 
 
-async def assigned(assignments: Any, topics: Topics) -> tuple[str, dict[str, object]]:
-    """Read values by path, in time slices.
+async def decode_assignments(assignments: Any, topics: Topics) -> tuple[str, dict[str, object]]:
+    """Decode the values of a write request. Large requests yield to other tasks.
 
     Returns:
         The source of the values, and the values by register path.

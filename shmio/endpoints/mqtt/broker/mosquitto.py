@@ -75,7 +75,9 @@ def configuration(settings: Mqtt, place: Path, *, anonymous: bool) -> str:
 class Rights(NamedTuple):
     """The rights of an account.
 
-    ``filters`` are the topics on which the account may publish.
+    Attributes:
+        read: True if the account may subscribe to all topics.
+        filters: The topic filters on which the account may publish.
     """
 
     read: bool

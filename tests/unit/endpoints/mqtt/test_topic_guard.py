@@ -8,10 +8,10 @@ import pytest
 
 from shmio.endpoints.mqtt.topic_guard import (
     AT_ONCE,
+    BREAK,
     CALM_PAUSES,
-    MOST_HEARD,
+    MAX_FOREIGN_MESSAGES,
     PAUSE,
-    REST,
     TopicGuard,
 )
 from shmio.segment import Segment
@@ -118,7 +118,7 @@ def test_during_a_flood_the_guard_stops_listening_and_then_resends_everything() 
     owner = Owner()
     rests = []
     for _ in range(3):
-        for _ in range(MOST_HEARD + 1):
+        for _ in range(MAX_FOREIGN_MESSAGES + 1):
             owner.guard.report("status")
         assert owner.watching == 0
         owner.guard.report("status")
@@ -132,5 +132,5 @@ def test_during_a_flood_the_guard_stops_listening_and_then_resends_everything() 
         owner.now_s += PAUSE.most_s
         owner.guard.run_once()
         assert owner.all == told + 1
-    assert rests == [REST.first_s, 2 * REST.first_s, 4 * REST.first_s]
+    assert rests == [BREAK.first_s, 2 * BREAK.first_s, 4 * BREAK.first_s]
     assert not owner.corrected
