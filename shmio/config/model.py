@@ -425,7 +425,7 @@ class Alert(Section):
 
     @property
     def watches(self) -> str:
-        """What the alert watches, as text."""
+        """The watched condition, sources or processes, as text."""
         what = f"process {', '.join(self.processes)}" if self.processes else f"source {', '.join(self.sources)}"
         return self.when or what
 

@@ -23,7 +23,7 @@ from shmio.segment import BlockWriter, Provenance
 
 
 class Lost(Enum):
-    """What is known of a write that the device had not answered when the connection was lost."""
+    """State of a write that the device had not answered when the connection was lost."""
 
     UNSENT = "unsent"
     """The device did not carry out the write, because none of its bytes was sent."""
@@ -181,7 +181,7 @@ class Connector(ABC):
 
     @property
     def depth(self) -> int:
-        """How many requested images may be in flight at once on the present connection."""
+        """Maximum number of requested images in flight on the present connection."""
         return 1
 
     def submit(self) -> None:  # noqa: B027  not every connector can

@@ -35,7 +35,7 @@ class Offer:
 
 @dataclass
 class Browsed:
-    """What a search in a device has found.
+    """Result of a search in a device.
 
     Attributes:
         offers: The values and groups. Each follows the group that contains it.

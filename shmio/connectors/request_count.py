@@ -1,4 +1,4 @@
-"""How much a source requests from its device in each cycle, as far as known without the device."""
+"""Counts the requests of a source's cycle, as far as they are known without the device."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class Requests:
     count: int
     """The largest number of requests in a cycle."""
     in_flight: int = 1
-    """How many requests at once the device is certain to accept."""
+    """Number of requests at once that the device is certain to accept."""
     assumption: str = ""
-    """On what the count depends, such as ``PDU of 240 bytes``; empty if it depends on nothing."""
+    """Condition for this count, such as ``PDU of 240 bytes``; empty if there is none."""
 
     @property
     def round_trips(self) -> int:
@@ -29,10 +29,10 @@ class Requests:
 
 @dataclass(frozen=True)
 class CycleRequests:
-    """What a source requests from its device in each cycle."""
+    """The requests of a source to its device in each cycle."""
 
     reads: str
-    """What the source reads, such as ``340 registers in DB5, DB7 and inputs``."""
+    """Description of the read registers, such as ``340 registers in DB5, DB7 and inputs``."""
     requests: tuple[Requests, ...] = ()
     """The requests of a cycle under each assumption; empty if the device sends values unasked."""
     note: str = ""

@@ -1,4 +1,4 @@
-"""What an emulator serves, and what its process needs of it."""
+"""The interface of an emulator that its process uses, and the layouts that it serves."""
 
 from __future__ import annotations
 

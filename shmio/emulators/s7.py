@@ -86,7 +86,7 @@ _MODE_LIST, _MODULE_LIST, _COMPONENT_LIST = 0x0424, 0x0011, 0x001C
 _RUN, _STOP = 0x08, 0x04  # operating modes in that list
 _ORDER_CODE = b"SHMIO EMULATED S7"
 _VERSIONS = {0x0001: b"\0\1\0\0", 0x0006: b"\0\1\0\0", 0x0007: b"V\0\1\0"}
-"""Of the module, its hardware and its firmware."""
+"""Versions of the module, its hardware and its firmware, by index in the list."""
 _COMPONENTS = {
     0x0001: b"shmio",
     0x0002: b"Emulated S7",

@@ -30,7 +30,7 @@ _FIRST, _SECOND = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
 
 
 class Purpose(IntEnum):
-    """What a random number is used for. Each purpose has its own sequence of numbers."""
+    """Purpose of a random number. Each purpose has its own sequence of numbers."""
 
     CHANCE = 0
     VALUE = 1

@@ -60,7 +60,7 @@ class Step:
 
 
 class StepWait(NamedTuple):
-    """What a step waits for: until a doorbell's value differs from ``seen``, at most ``rest_ns``.
+    """Wait of a step: until a doorbell's value differs from ``seen``, at most ``rest_ns``.
 
     It is the doorbell of ``block``, whose source has not answered yet. If ``block`` is None, it is
     the doorbell that processes ring when they have delivered a step.

@@ -82,7 +82,7 @@ class Reading:
 
 
 class OutcomeKind(StrEnum):
-    """What became of a written value."""
+    """Outcome of a written value."""
 
     WRITTEN = "written"
     """The device confirmed the value."""

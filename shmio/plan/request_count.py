@@ -1,4 +1,4 @@
-"""How much the sources of a checked configuration request from devices, and what may be written."""
+"""Counts the requests and the writable registers of the sources in a checked configuration."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ PATIENCE_S: Final = 60.0
 
 
 class Sources(NamedTuple):
-    """What is known of the checked sources, by source name."""
+    """Results of the check of the sources, by source name."""
 
     layouts: dict[str, Layout]
     computed: list[str]

@@ -52,7 +52,7 @@ class Doorbell:
 
 
 class WakeSource(Protocol):
-    """What a :class:`Relay` can wait for: a :class:`Doorbell`, or a ring that has a doorbell."""
+    """Something that a :class:`Relay` can wait for: a :class:`Doorbell`, or a ring with a doorbell."""
 
     def relay(self, shared: bytearray, descriptor: int, turn_ns: int, /) -> None:
         """Make ``descriptor`` readable at each ring, until stopped. It does not hold the GIL."""

@@ -79,7 +79,7 @@ class Origin:
 
 @dataclass(frozen=True, slots=True)
 class BlockSpec:
-    """What is needed to create the block of a source."""
+    """Parameters of a source's new block."""
 
     source: str
     layout: Layout

@@ -28,7 +28,7 @@ class State(Enum):
 
 
 class Event(Enum):
-    """What can change a process's state. ELAPSED: the time limit of the state has passed."""
+    """Events that can change a process's state. ELAPSED: the time limit of the state has passed."""
 
     START = "start"
     READY = "ready"
@@ -42,7 +42,7 @@ class Event(Enum):
 
 
 class Action(Enum):
-    """What the supervisor does after a change of state."""
+    """Action of the supervisor after a change of state."""
 
     SPAWN = "spawn"
     TERMINATE = "terminate"

@@ -126,7 +126,7 @@ class TestRos2(WriteConformance):
 
     def test_absent_at_start(self, absent: None, run: Run, rig: Rig) -> None:
         """The source is bad with a reason until there is a node, and then good."""
-        assert "none of the topics has a publisher or subscriber" in run.bad().reason
+        assert "no publisher or subscriber of any topic" in run.bad().reason
         rig.proxy.admit()
         run.good()
 

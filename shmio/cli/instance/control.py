@@ -33,7 +33,7 @@ PREVIEWED: Final[Mapping[str, str]] = {
     "reread": "would reload the tokens and roles of",
     "keep": "would keep",
 }
-"""What the lists of a dry run's answer mean."""
+"""Headings for the lists in the answer of a dry run."""
 
 
 def down(arguments: argparse.Namespace) -> int:

@@ -30,9 +30,9 @@ from shmio.layout.values.write import Write
 TIMEOUTS: Final = 4
 """The longest time that connecting may take, as a multiple of the option ``timeout``."""
 FIRST_S: Final = 0.1
-"""How long a new connection waits for the messages that the broker retains, in s."""
+"""Time for which a new connection waits for retained messages, in s."""
 ECHO_S: Final = 0.2
-"""How long a confirmed write waits for its own message to come back from the broker, in s."""
+"""Time for which a confirmed write waits until its message comes back from the broker, in s."""
 
 
 @dataclass

@@ -79,13 +79,13 @@ class _Client(Client):
         self._opened = opened
         self.tls_error: ssl.SSLError | None = None
         self.violation = ""
-        """What the broker did against the protocol, so that the connection ends.
+        """The broker's protocol error that ends the connection.
 
         Empty if it did nothing.
         """
         self.on_pong: Callable[[], None] = lambda: None
         self.pings = self.pongs = 0
-        """How many PINGREQs were sent and answered. Paho also sends some by itself."""
+        """Numbers of PINGREQs that were sent and answered. Paho also sends some by itself."""
         self.pinged_ns = 0
         """When the oldest unanswered PINGREQ was sent, in ns of CLOCK_MONOTONIC.
 

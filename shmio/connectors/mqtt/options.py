@@ -54,7 +54,7 @@ class MqttOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_on
     """QoS of the subscriptions."""
     write_qos: Annotated[int, msgspec.Meta(ge=0, le=1)] = 1
     retain: bool = False
-    """True if the broker is to retain written values."""
+    """True to publish written values with the retain flag."""
     max_age_ms: _Age | dict[_Text, _Age] | None = None
     """Age in ms above which a topic's last message is too old; 0: never.
 
@@ -68,7 +68,7 @@ class MqttOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_on
     templates: Annotated[dict[_Text, str], msgspec.Meta(max_length=10_000)] = msgspec.field(default_factory=dict)
     """By topic, the JSON document into which written values are inserted; default: an empty object."""
     rebirth: bool = True
-    """True if Sparkplug nodes are asked for their births."""
+    """True to request births from Sparkplug nodes."""
     max_payload_bytes: Annotated[int, msgspec.Meta(ge=100, le=1 << 24)] = 1 << 20
     """The largest payload whose values are read, in bytes."""
     username: Annotated[str, msgspec.Meta(min_length=1, max_length=256)] | None = None

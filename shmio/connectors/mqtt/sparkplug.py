@@ -48,7 +48,7 @@ log = logging.getLogger("shmio.source.mqtt")
 
 
 class _Known(NamedTuple):
-    """What a birth says about a metric."""
+    """The definition of a metric in a birth."""
 
     name: str
     alias: int | None

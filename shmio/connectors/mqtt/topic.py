@@ -26,20 +26,20 @@ class Message(NamedTuple):
 
     payload: bytes
     retained: bool
-    """True if the broker had retained it, so that the time of its publication is unknown."""
+    """True if the message was retained, so that its time of publication is unknown."""
     order: int
     monotonic_ns: int
     utc_ns: int
 
 
 class Found(NamedTuple):
-    """What a message contains for a register: text as bytes, or a JSON value."""
+    """The content of a message for a register: text as bytes, or a JSON value."""
 
     value: Any
     source_ns: int
     code: int = GOOD
     text: bool = False
-    """True if ``value`` is the payload itself, which is text."""
+    """True if ``value`` is the whole payload, as text."""
 
 
 class Origin(ABC):

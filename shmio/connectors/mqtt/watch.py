@@ -39,7 +39,7 @@ class Watch:
     def reset(self) -> None:
         """Forget what was received."""
         self.there: bool | None = None
-        """True if the device is online; None if no message has said it yet."""
+        """True if the device is online; None before the first message about it."""
         self._gone_order = 0
         self._said = ""
 

@@ -28,7 +28,7 @@ class OpcUaOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_o
     nodes: Literal["addresses", "siemens"] = "addresses"
     """Where node ids come from: the layout's addresses, or the names of a data block of an S7-1500."""
     sampling_ms: Annotated[int, msgspec.Meta(ge=-1, le=3_600_000)] = 50
-    """How often the server samples a node; 0: as fast as it can; -1: as often as it publishes."""
+    """Interval at which the server samples a node; 0: as fast as it can; -1: the publishing interval."""
     publishing_ms: Annotated[int, msgspec.Meta(ge=1, le=3_600_000)] = 100
     queue: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 1
     """Samples of a node that the server keeps between two publications."""

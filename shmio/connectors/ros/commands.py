@@ -32,7 +32,7 @@ class Publication:
     def __init__(self, topic: Topic) -> None:
         self.topic = topic
         self.begun = False
-        """True if it may have been published."""
+        """True if the message may have been published."""
         self.message: Any = None
         self.writes: set[int] = set()
         self.values: dict[int, Value] = {}

@@ -37,7 +37,7 @@ class Described(NamedTuple):
     ends: Sequence[tuple[int, str]]
     """For each register, in the order of addresses: the offset after its last byte, and its name."""
     whole: bool
-    """True if all of the block is described, and not only some addresses."""
+    """True if the layout describes the whole block, and not only some addresses."""
 
     def beyond(self, size: int) -> list[str]:
         """Return the names of the registers that do not fit in a block of ``size`` bytes."""
@@ -62,7 +62,7 @@ class BlockWatch(Query):
 
     @property
     def doubts(self) -> Mapping[int, str]:
-        """What was changed in each block that no longer fits its layout, by block number."""
+        """Description of the change in each block that no longer fits its layout, by block number."""
         return self._doubts
 
     def data(self) -> bytes:

@@ -25,7 +25,7 @@ class Query(ABC):
     """A question that is asked periodically, or once in each session."""
 
     optional: ClassVar[bool] = False
-    """True if the question is left out if the controller never answered the question for its mode."""
+    """True to skip this query if the controller has never answered the query for its mode."""
 
     def __init__(self, service: Service, interval_ns: int | None) -> None:
         """Create a question; if ``interval_ns`` is None, it is asked once in each session."""

@@ -1,4 +1,4 @@
-"""How many requests a cycle takes, by the PDU size that a controller may grant."""
+"""Counts the requests of a cycle, for each PDU size that a controller may grant."""
 
 from __future__ import annotations
 

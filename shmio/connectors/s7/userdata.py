@@ -158,7 +158,7 @@ def parse_clock(data: bytes) -> datetime | None:
 
 
 class BlockInfo(NamedTuple):
-    """What a CPU knows about a data block. It differs whenever a changed block was loaded."""
+    """Description of a data block by the CPU. It changes when a changed block is loaded."""
 
     load_size: int
     """The block's size in load memory, in bytes."""

@@ -24,7 +24,7 @@ from shmio.worker import BEAT_S, Worker
 MAX_NOTE: Final = 300
 """Maximum length of the status note, in characters."""
 WRITE_S: Final = 1.0
-"""How long to wait for the disk at the end, in s."""
+"""Maximum time to wait for the disk at the end, in s."""
 
 log = logging.getLogger("shmio.alerts")
 

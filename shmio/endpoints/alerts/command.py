@@ -22,7 +22,7 @@ MAX_AT_ONCE: Final = 4
 MAX_OUTPUT_BYTES: Final = 8192
 """Maximum amount of a command's output that goes to the log. The rest is read, and dropped."""
 LEAVE_S: Final = 1.0
-"""How long a running command may go on when this process is stopped, in s."""
+"""Maximum time for which a running command may continue when this process stops, in s."""
 
 log = logging.getLogger("shmio.alerts")
 

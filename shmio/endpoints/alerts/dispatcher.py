@@ -18,7 +18,7 @@ from shmio.endpoints.alerts.webhook import Webhook
 from shmio.segment import Segment
 
 LEAVE_S: Final = 2.0
-"""How long the actions may go on when the process is stopped, in s."""
+"""Maximum time for which actions may continue when the process stops, in s."""
 
 
 class Dispatcher:

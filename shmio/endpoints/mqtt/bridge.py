@@ -112,7 +112,7 @@ class Bridge:
         """Topics whose retained messages the bridge asked the broker for; None: not asked yet."""
         self._behind: set[Feed] = set()
         self._rest_s = 0.0
-        """How long :meth:`run_once` may wait for events, in s."""
+        """Maximum time for which :meth:`run_once` may wait for events, in s."""
         self._missed = 0
         """Number of frames that feeds had missed before they were removed."""
         self._generation = -1

@@ -1,4 +1,4 @@
-"""What all pages share: the instance, and its overview, which is computed once for all of them."""
+"""State that all pages share: the instance, and its overview, which is computed once for all pages."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Served:
         self.segment, self.cell, self.measurements, self.folders = segment, cell, measurements, folders
         self.config_file = config_file
         self.feeds = Feeds()
-        """What pages plot."""
+        """The signals that pages plot."""
         self.timeline = Timeline(segment)
         """The newest events."""
         self.recordings = Recordings(recordings)

@@ -51,7 +51,7 @@ _log = logging.getLogger("shmio.web")
 
 
 class Follower(Protocol):
-    """Who follows a feed."""
+    """A follower of a feed."""
 
     def take(self, batch: bytes) -> None:
         """Take a batch. It may be dropped."""

@@ -15,7 +15,7 @@ from shmio.layout.model import NUMBERS, ElementType, Register, array_size, eleme
 
 MAX_NUMBER: Final = 65_535
 CPU: Final = "cpu."
-"""How the addresses of values of the CPU itself begin."""
+"""Prefix of the addresses of values of the CPU itself."""
 _AREA_BYTES: Final = 65_536
 
 

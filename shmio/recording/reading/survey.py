@@ -190,7 +190,7 @@ class Track:
 
 @dataclass(slots=True)
 class Survey:
-    """What a file contains: channels, chunks, gaps and damage."""
+    """The contents of a file: channels, chunks, gaps and damage."""
 
     tracks: dict[int, Track] = field(default_factory=dict)
     """The counts and times of messages, by the channel's number."""

@@ -39,7 +39,7 @@ MAX_PATH: Final = 1024
 LOOK_S: Final = 0.25
 """Interval of the checks for disconnected clients, in s. Their injections end within a second."""
 UNSEEN_S: Final = 10.0
-"""How long an injection without a stream lasts, in s, if the kernel does not list its client."""
+"""Lifetime of an injection without a stream, in s, if the kernel does not list its client."""
 
 _MARKS: Final = frozenset(mark.value for mark in TimeTopic)
 _SCHEME: Final = re.compile(r"^[^/:]*://")

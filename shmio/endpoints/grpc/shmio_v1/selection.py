@@ -165,7 +165,7 @@ class Selections:
 
 
 class _Budget:
-    """How many more registers, elements and comparisons of paths a call may still request."""
+    """Numbers of registers, elements and path comparisons that a call may still use."""
 
     def __init__(self) -> None:
         self.registers, self.elements, self.matches = MAX_REGISTERS, MAX_ELEMENTS, MAX_MATCHES

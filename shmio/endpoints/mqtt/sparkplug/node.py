@@ -195,7 +195,7 @@ class Command(NamedTuple):
 
 
 class EdgeNode:
-    """One edge node, which outlives its sessions. Use it from one thread."""
+    """The edge node. It exists across sessions. Use it from one thread."""
 
     def __init__(
         self,

@@ -39,7 +39,7 @@ class Given(msgspec.Struct, forbid_unknown_fields=True):
 
     text: Annotated[str, Meta(max_length=MAX_CAMPAIGN)]
     keep: bool = False
-    """True if its injections continue when the page is closed."""
+    """True if the injections continue when the page is closed."""
 
 
 class Chosen(msgspec.Struct, forbid_unknown_fields=True):

@@ -18,14 +18,14 @@ _Seconds = Annotated[float, Meta(ge=1e-6, le=3600)]
 
 
 class Steps(msgspec.Struct, forbid_unknown_fields=True):
-    """How many steps to take, and how long each is in s; None: the step size."""
+    """Number of steps, and the length of each in s; None: the step size."""
 
     count: Annotated[int, Meta(ge=1, le=MAX_STEPS)] = 1
     dt_s: _Seconds | None = None
 
 
 class Rate(msgspec.Struct, forbid_unknown_fields=True):
-    """How fast time plays, relative to real time, and the length of a step in s; None: the step size."""
+    """Speed relative to real time, and the length of a step in s; None: the step size."""
 
     rate: Annotated[float, Meta(gt=0, le=1000)] = 1.0
     dt_s: _Seconds | None = None
