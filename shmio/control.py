@@ -26,7 +26,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import msgspec
 
@@ -144,19 +144,32 @@ class Where(_Request, tag="where"):
 Request = Stop | Restart | Reload | Where
 
 
+class Peer(NamedTuple):
+    """The process that has connected: its pid and its user."""
+
+    pid: int
+    uid: int
+
+
 class Answer:
     """Answers the client that sent a request. It has no effect if the client has disconnected."""
 
-    def __init__(self, server: ControlServer, client: socket.socket) -> None:
+    def __init__(self, server: ControlServer, client: socket.socket, peer: Peer) -> None:
         self._server = server
         self._client = client
+        self.peer = peer
+        """Who sent the request."""
+        self.ended: Callable[[str], object] = lambda _: None
+        """Called with each answer: why the request failed, or "" if it succeeded."""
 
     def ok(self, **values: object) -> None:
         """Answer that the request succeeded. Lists of lines are shortened to fit."""
+        self.ended("")
         self._server.answer(self._client, _shorten({"ok": True, **values}, MAX_ANSWER_BYTES - 1))
 
     def error(self, message: str) -> None:
         """Answer that the request failed."""
+        self.ended(message)
         self._server.answer(self._client, {"error": _cut_lines(message, MAX_ANSWER_BYTES // 8)})
 
 
@@ -166,11 +179,23 @@ class ControlServer:
     It uses the supervisor's selector. The data of each selector key is the function to call.
     """
 
-    def __init__(self, path: str, selector: selectors.BaseSelector, handle: Callable[[Request, Answer], None]) -> None:
+    def __init__(
+        self,
+        path: str,
+        selector: selectors.BaseSelector,
+        handle: Callable[[Request, Answer], None],
+        denied: Callable[[Peer], object] = lambda _: None,
+    ) -> None:
         """Bind the socket.
 
         The caller must have locked the instance. An existing socket is then that of a dead
         supervisor, and is removed.
+
+        Args:
+            path: The socket's path.
+            selector: The supervisor's selector.
+            handle: Called with each request.
+            denied: Called for each connection of a user who may not control the instance.
 
         Raises:
             ControlError: The socket cannot be created.
@@ -179,6 +204,7 @@ class ControlServer:
         self._path = path
         self._selector = selector
         self._handle = handle
+        self._denied = denied
         self._clients: dict[socket.socket, tuple[bytearray, float | None]] = {}
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
         try:
@@ -198,7 +224,9 @@ class ControlServer:
         except OSError:  # the client has gone, or no descriptor is free
             return
         client.setblocking(False)
-        if not _trusted(client):
+        peer = _peer(client)
+        if peer.uid not in (0, os.getuid()):
+            self._denied(peer)
             _send(client, {"error": "only the supervisor's own user and root may control it"})
             client.close()
         elif not self._has_room():
@@ -250,7 +278,7 @@ class ControlServer:
             if _hung_up(client):  # it gave up while the supervisor was delayed
                 self._drop(client)
                 return
-            self._handle(request, Answer(self, client))
+            self._handle(request, Answer(self, client, _peer(client)))
 
     def answer(self, client: socket.socket, message: dict[str, object]) -> None:
         """Send the answer and close the connection.
@@ -376,9 +404,9 @@ def _wait(client: socket.socket, deadline: float, lost: Callable[[], str | None]
                 raise
 
 
-def _trusted(client: socket.socket) -> bool:
-    _, uid, _ = _CREDENTIALS.unpack(client.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
-    return uid in (0, os.getuid())
+def _peer(client: socket.socket) -> Peer:
+    pid, uid, _ = _CREDENTIALS.unpack(client.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
+    return Peer(pid, uid)
 
 
 def _hung_up(client: socket.socket) -> bool:

@@ -1,18 +1,22 @@
-"""Logging: the format of lines, rotating files, and a rate limit for each kind of record.
+"""Logging: the formats of lines, rotating files, and a rate limit for each kind of record.
 
 A record is one line with the name of the process; extra fields follow as ``key=value``::
 
     2026-11-21T05:20:01.123456Z INFO    cell[1234] quality good source=cell cycle=1207
+
+With ``[instance] log_format = "json"`` the line is a JSON object with the same fields.
 """
 
 from __future__ import annotations
 
+import json
 import logging
 import logging.handlers
+import math
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext, suppress
 from datetime import UTC, datetime
 from io import TextIOWrapper
@@ -38,13 +42,50 @@ class LineFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the record's line, with its traceback if there is one."""
-        stamp = datetime.fromtimestamp(record.created, UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
         fields = self._always | getattr(record, "fields", {})
-        message = printable(" ".join([record.getMessage(), *(f"{key}={value}" for key, value in fields.items())]))
-        line = f"{stamp} {record.levelname:<7} {self._process} {message}"
+        message = printable(with_fields(record.getMessage(), fields))
+        line = f"{stamp(record.created)} {record.levelname:<7} {self._process} {message}"
         if record.exc_info:
             line += "\n    " + self.formatException(record.exc_info).replace("\n", "\n    ")
         return line
+
+
+class JsonFormatter(logging.Formatter):
+    """Formats a record as a JSON object in one line."""
+
+    def __init__(self, process: str, source: str | None) -> None:
+        super().__init__()
+        self._process = process
+        self._always = {} if source is None else {"source": source}
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the record's line."""
+        fields = self._always | getattr(record, "fields", {})
+        line = {
+            "time": stamp(record.created),  # first, as in a line of text: a reader sorts by it
+            "level": record.levelname,
+            "process": self._process,
+            "pid": os.getpid(),
+            "message": record.getMessage(),
+            "fields": {key: _plain(value) for key, value in fields.items()},
+        }
+        if record.exc_info:
+            line["traceback"] = self.formatException(record.exc_info)
+        return json.dumps(line)  # all characters as ASCII, whatever a device has sent
+
+
+def _plain(value: object) -> object:
+    """Return a value that JSON has: a number, a truth value or text."""
+    if isinstance(value, (bool, str)) or type(value) is int or (type(value) is float and math.isfinite(value)):
+        return value
+    return str(value)
+
+
+FORMATTERS: Final[Mapping[str, Callable[[str, str | None], logging.Formatter]]] = {
+    "text": LineFormatter,
+    "json": JsonFormatter,
+}
+"""By ``[instance] log_format``, what makes the lines of a process and its source."""
 
 
 class RotatingLog(logging.handlers.RotatingFileHandler):
@@ -100,6 +141,7 @@ def setup(
     process: str,
     *,
     source: str | None = None,
+    form: str = "text",
     console: bool = False,
     streams: bool = False,
     patient: bool = False,
@@ -110,6 +152,7 @@ def setup(
         file: The log file.
         process: The process name in each line.
         source: The source name in each line.
+        form: Format of the lines: ``text`` or ``json``.
         console: True to write records to standard error as well.
         streams: True if standard output and error go to this file. They are redirected to each new file.
         patient: True to try again later if the file cannot be written, instead of raising ConfigError.
@@ -134,7 +177,7 @@ def setup(
         root.removeHandler(old)
         old.close()
     for handler in handlers:
-        handler.setFormatter(LineFormatter(process, source))
+        handler.setFormatter(FORMATTERS[form](process, source))
         root.addHandler(handler)
     root.setLevel(logging.INFO)
     logging.captureWarnings(True)
@@ -145,6 +188,16 @@ def setup(
 def fields(**values: object) -> dict[str, dict[str, object]]:
     """Return extra fields for a record: ``log.info("connected", extra=fields(pdu=960))``."""
     return {"fields": values}
+
+
+def stamp(time_s: float) -> str:
+    """Return a UNIX time as text, in UTC. Such texts have the order of their times."""
+    return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+
+
+def with_fields(message: str, fields: Mapping[str, object]) -> str:
+    """Return a message with extra fields after it."""
+    return " ".join([message, *(f"{key}={value}" for key, value in fields.items())])
 
 
 def printable(text: str) -> str:

@@ -21,7 +21,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from shmio import logs, realtime
+from shmio.audit import trail
+from shmio.audit.file import AuditSettings
 from shmio.errors import ConfigError, LayoutError, SegmentError, ShmioError
 from shmio.segment import Activity, Report, Segment
 
@@ -41,8 +45,9 @@ class Worker:
         self._on_stop: Callable[[], object] | None = None
         self._on_reread: Callable[[], object] | None = None
         self._rereads = False  # True once SIGHUP has come, perhaps before on_reread()
-        self.log = self._set_up_log(Path(spec["log_file"]))
+        self.log = self._set_up_log(Path(spec["log_file"]), spec.get("log_format", "text"))
         self.segment = Segment.open(spec["instance"], writable=True)
+        trail.open_trail(msgspec.convert(spec.get("audit"), AuditSettings | None), spec["instance"], self.name)
         if self.segment.header.epoch != spec["epoch"]:
             raise SegmentError(
                 f"the segment of instance {spec['instance']!r} belongs to another run; this process ends"
@@ -56,10 +61,10 @@ class Worker:
         self.slot.report = self._report
         self.slot.beat()
 
-    def _set_up_log(self, file: Path) -> logging.Logger:
+    def _set_up_log(self, file: Path, form: str) -> logging.Logger:
         source = self.name if self.kind == "source" else None
         # A full disk must not stop the work: the log is retried at each record.
-        return logs.setup(file, self.name, source=source, streams=True, patient=True)
+        return logs.setup(file, self.name, source=source, form=form, streams=True, patient=True)
 
     def _take_role(self) -> None:
         """Wait until the previous process in this role has ended, and take its lock."""
@@ -156,6 +161,8 @@ def main(run: Callable[[Worker], None]) -> int:
     except Exception:
         logging.getLogger("shmio").exception("failed")
         raise
+    finally:
+        trail.close_trail()
     return 0
 
 

@@ -8,13 +8,16 @@ import io
 import json
 import math
 import os
+import re
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from datetime import datetime
 from types import FrameType, MappingProxyType
-from typing import Any, TextIO
+from typing import Any, Final, TextIO
 
 from shmio.errors import CommandError, ConfigError, ControlError, LayoutError, ShmioError
 from shmio.logs import printable
@@ -150,6 +153,26 @@ def milliseconds(text: str) -> float:
     if not 0 < found <= 1000 * MAX_SECONDS:
         raise argparse.ArgumentTypeError(f"{text.strip()!r} is not a number of milliseconds above 0")
     return found
+
+
+_AGO: Final = re.compile(r"([0-9]{1,9}(?:\.[0-9]{1,6})?)([smhd])")
+_UNITS_S: Final = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
+
+
+def moment(text: str) -> float:
+    """Convert an argument that is a date and time, or a time before now such as ``10m``.
+
+    Returns:
+        UNIX time in s.
+    """
+    if found := _AGO.fullmatch(text):
+        return time.time() - float(found[1]) * _UNITS_S[found[2]]
+    try:
+        return datetime.fromisoformat(text).astimezone().timestamp()
+    except (OverflowError, ValueError):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is neither a time before now, such as 30s, 10m, 2h or 7d, nor a date and time"
+        ) from None
 
 
 def add_json(parser: argparse._ActionsContainer, text: str = "print one JSON object") -> None:

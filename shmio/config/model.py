@@ -17,6 +17,7 @@ Milliseconds = Annotated[float, Meta(gt=0, le=3_600_000)]
 DbNumber = Annotated[int, Meta(ge=1, le=65535)]
 Seconds = Annotated[float, Meta(ge=0, le=1e9)]
 Operand = bool | int | float | str | list[Any]
+LogFormat = Literal["text", "json"]
 ClockName = Literal["wall", "stepped"]
 ReplayedInjections = Literal["keep", "leave out"]
 DistributionName = Literal["uniform", "gaussian"]
@@ -44,6 +45,10 @@ class Instance(Section):
 
     name: Name
     log_dir: Text = "logs"
+    log_format: LogFormat = "text"
+    audit: bool = True
+    audit_mb: Annotated[float, Meta(ge=0.01, le=65536)] = 10.0
+    audit_files: Annotated[int, Meta(ge=1, le=1000)] = 20
     group: Text | None = None
     ring_mb: Annotated[float, Meta(gt=0, le=65536)] = 64.0
     clock: ClockName = "wall"

@@ -7,9 +7,10 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
+from shmio.audit.trail import Attempt
 from shmio.local.writer import PATIENCE_S, RESTARTED, SILENT, PendingCommand
-from shmio.segment import Event, EventKind
-from shmio.segment.commands import CommandOutcomes, End
+from shmio.segment import DONE, Event, EventKind
+from shmio.segment.commands import CommandOutcomes, End, worst
 from shmio.segment.events import EVENT_DATA_SIZE
 
 MAX_OPEN: Final = 512
@@ -17,6 +18,9 @@ MAX_OPEN: Final = 512
 
 It is a quarter of the event ring, so that no event is overwritten before it is read.
 """
+
+SUCCESS: Final = DONE | {EventKind.ACCEPTED, EventKind.INJECTED, EventKind.LIFTED, EventKind.NOTED}
+"""Outcomes of commands of any kind that are a success."""
 
 Done = Callable[[Sequence[End]], None]
 """Function that is called once for each command, with the outcome of each of its values."""
@@ -59,6 +63,8 @@ class InFlightCommand:
         outcomes: The outcomes of the items.
         done: Called once, with the outcome of each value.
         accepted: Called once, if the source accepts the command.
+        attempt: The command's entry in the audit log, which gets the outcome.
+        paths: The path of each value.
 
     """
 
@@ -69,6 +75,8 @@ class InFlightCommand:
     outcomes: CommandOutcomes
     done: Done
     accepted: Callable[[], None] | None = None
+    attempt: Attempt | None = None
+    paths: Sequence[str] = ()
     taken: bool = False
     """True if the source has taken the command from the queue."""
     open_events: int = 0
@@ -79,6 +87,8 @@ class InFlightCommand:
         if not self.taken and event.kind == EventKind.ACCEPTED and self.accepted is not None:
             self.accepted()
         self.taken = True
+        if self.attempt is not None:
+            self.attempt.event = event.number
         return self.outcomes.follow(event)
 
     def finish(self, missing: str = "") -> None:
@@ -88,7 +98,13 @@ class InFlightCommand:
             missing: Why some outcomes are unknown; empty if all are known.
 
         """
-        self.done([self.outcomes.of(items, missing) for items in self.values])
+        ends = [self.outcomes.of(items, missing) for items in self.values]
+        if self.attempt is not None:
+            kind, reason = worst(ends)
+            if len(ends) > 1 and kind not in SUCCESS:
+                reason = f"{self.paths[ends.index((kind, reason))]}: {reason}"
+            self.attempt.end(str(kind), reason, refused=kind not in SUCCESS)
+        self.done(ends)
 
 
 class InFlightTable:
@@ -117,6 +133,7 @@ class InFlightTable:
         done: Done,
         accepted: Callable[[], None] | None = None,
         *,
+        attempt: Attempt | None = None,
         until_accepted: bool = False,
     ) -> None:
         """Add a command that was sent.
@@ -126,12 +143,17 @@ class InFlightTable:
             cost: The queue space and the events that it may need.
             done: Called once, with the outcome of each value.
             accepted: Called once, if the source accepts the command.
+            attempt: The command's entry in the audit log, which gets the outcome.
             until_accepted: Whether the command ends as soon as the source accepts it.
 
         """
+        values = ticket.values
+        if attempt is not None:
+            attempt.command = ticket.number
         self._by_number[ticket.number] = InFlightCommand(
-            ticket.incarnation, ticket.until_ns, cost, [items for _, items in ticket.values],
-            CommandOutcomes(len(ticket.paths), until_accepted=until_accepted), done, accepted, open_events=cost.events,
+            ticket.incarnation, ticket.until_ns, cost, [items for _, items in values],
+            CommandOutcomes(len(ticket.paths), until_accepted=until_accepted), done, accepted, attempt,
+            [path for path, _ in values], open_events=cost.events,
         )  # fmt: skip
         self.untaken_bytes += cost.record_bytes
         self.open_events += cost.events

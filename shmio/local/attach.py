@@ -15,11 +15,13 @@ no server. A program that also writes occupies one of the process table's extern
 from __future__ import annotations
 
 import os
+import sys
 import threading
 import time
 import weakref
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any, Final
 
 import msgspec
@@ -636,7 +638,8 @@ def _take_external_slot(segment: Segment) -> int:
     places = segment.processes.external
     for slot in places:
         if slot.writer is not None and slot.take():
-            slot.report = Report(os.getpid(), Activity.RUNNING, time.monotonic_ns())
+            program = Path(sys.argv[0]).name if sys.argv else ""  # not the arguments, which may be secret
+            slot.report = Report(os.getpid(), Activity.RUNNING, time.monotonic_ns(), (os.getuid(),), program)
             return slot.writer
     pids = ", ".join(str(slot.report.pid) for slot in places)
     raise SegmentError(

@@ -9,19 +9,25 @@ import os
 import re
 from collections import deque
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Final
+
+import msgspec
+
+from shmio.logs import with_fields
 
 _LINE = re.compile(
     r"(?P<time>[0-9T:.-]+Z) (?P<level>[A-Z]+) +(?P<process>.+?)\[(?P<pid>[0-9]{1,10})\] (?P<text>.*)", re.DOTALL
 )
-"""The form in which shmio.logs writes a line."""
+"""The form in which shmio.logs writes a line of text."""
 
 MAX_LINE_BYTES: Final = 65536
 TAIL_BYTES: Final = 65536
 """Size of the blocks in which the end of a file is read."""
-_STAMP = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{6}Z ")
-_FIRST_STAMP = re.compile(rb"\n(" + _STAMP.pattern + rb")")
+_STAMP = re.compile(rb'(?:\{"time": ?")?(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{6}Z)[" ]')
+"""The beginning of a record's line, as text or as JSON."""
+_FIRST_STAMP = re.compile(rb"\n(?=" + _STAMP.pattern + rb")")
 
 # inotify(7): events of a folder that concern its log files.
 _IN_MODIFY: Final = 0x0002
@@ -30,15 +36,45 @@ _IN_CREATE: Final = 0x0100
 _EVENT_ROOM: Final = 65536
 
 
-def parse_line(line: str) -> dict[str, Any]:
-    """Split a line into its fields.
+class _JsonLine(msgspec.Struct):
+    """A line that shmio.logs writes as JSON."""
 
-    A continuation, such as a line of a traceback, has only text.
+    time: str
+    level: str
+    process: str
+    pid: int
+    message: str
+    fields: dict[str, Any] = {}
+    traceback: str = ""
+
+
+def parse_line(line: str) -> dict[str, Any]:
+    """Split a line, which is text or JSON, into its fields.
+
+    A continuation, such as a line of a traceback, has only text. The text of a line in JSON has all
+    that a line of text would have.
     """
+    if line.startswith("{"):
+        with suppress(msgspec.MsgspecError, RecursionError):
+            record = msgspec.json.decode(line, type=_JsonLine)
+            text = with_fields(record.message, record.fields)
+            if record.traceback:
+                text += "\n    " + record.traceback.replace("\n", "\n    ")
+            return {
+                "time": record.time, "level": record.level, "process": record.process, "pid": record.pid, "text": text
+            }  # fmt: skip
     found = _LINE.fullmatch(line)
     if found is None:
         return {"time": None, "level": None, "process": None, "pid": None, "text": line}
     return {**found.groupdict(), "pid": int(found["pid"])}
+
+
+def as_text(line: str) -> str:
+    """Return a line as text. If it is JSON with a traceback, the result has several lines."""
+    found = parse_line(line) if line.startswith("{") else None
+    if found is None or found["time"] is None:
+        return line
+    return "{time} {level:<7} {process}[{pid}] {text}".format_map(found)
 
 
 def last_lines(files: Iterable[Path], count: int) -> list[bytes]:
@@ -72,8 +108,8 @@ def _start(stream: BinaryIO, count: int) -> int:
         stream.seek(at)
         data = stream.read(TAIL_BYTES)
         found = _FIRST_STAMP.search(data) if at else None
-        if found is not None and lines + data.count(b"\n", found.start(1)) >= count:
-            return at + found.start(1)
+        if found is not None and lines + data.count(b"\n", found.end()) >= count:
+            return at + found.end()
         lines += data.count(b"\n")
     return 0
 
@@ -82,7 +118,7 @@ def _lines(stream: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
     stamp = b""
     while line := stream.readline(MAX_LINE_BYTES):
         found = _STAMP.match(line)
-        stamp = found[0] if found else stamp
+        stamp = found[1] if found else stamp
         yield stamp, line.rstrip(b"\r\n")
 
 

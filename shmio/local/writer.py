@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import secrets
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -29,6 +28,7 @@ from shmio.segment.commands import (
     CommandOutcomes,
     End,
     InjectionOptions,
+    first_number,
 )
 from shmio.segment.events import Event, EventKind
 
@@ -62,8 +62,7 @@ class CommandSender:
         self.writer = writer
         self._lock = threading.Lock()
         self._pid = os.getpid()  # two processes on one queue would overwrite each other's commands
-        # Random: the previous owner of the queue may have commands whose outcomes are still to come.
-        self._next = secrets.randbits(62) + 1
+        self._next = first_number(self._pid)
 
     def submit(
         self,

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import msgspec
 
+from shmio.audit.file import AuditSettings
 from shmio.config import Config, Mqtt
 from shmio.errors import ConfigError
 from shmio.layout.model import Layout
@@ -65,6 +66,8 @@ MODULES: Final[Mapping[str, str]] = {
 RULES: Final[Mapping[str, tuple[str, ...]]] = {"grpc": ("token", "client")}
 """By kind of process, the keys of its section that the process can read again while it runs."""
 
+AUDIT_FILE: Final = "audit.jsonl"
+"""Name of the newest file of the audit log, in the folder of the log files."""
 MAX_PROCESSES = 200
 MODES = ("live", "log", "replay")
 """Modes of an instance.
@@ -87,6 +90,9 @@ class Job:
     log_file: Path
     config: dict[str, Any]
     rules: dict[str, Any] | None = None
+    log_format: str = "text"
+    audit: AuditSettings | None = None
+    """Where the process writes who did what; None: nowhere."""
 
     @property
     def rank(self) -> int:
@@ -116,6 +122,8 @@ class Job:
                 "name": self.name,
                 "kind": self.kind,
                 "log_file": str(self.log_file),
+                "log_format": self.log_format,
+                "audit": self.audit,
                 "config": config,
             },
             order="deterministic",  # compared with the description of an earlier supervisor
@@ -139,6 +147,9 @@ class Plan:
     """True if the instance's clock stands still from the start, and moves only by steps."""
     origin: Origin | None = None
     """The instance time at which the clock starts, if a recording is replayed; else None."""
+    log_format: str = "text"
+    audit: AuditSettings | None = None
+    """Where the processes write who did what; None: nowhere."""
 
     @property
     def processes(self) -> list[ProcessSpec]:
@@ -188,7 +199,7 @@ def make_plan(
         ConfigError: The instance has too many processes.
 
     """
-    log_dir = config.log_dir
+    log_dir, log_format, audit = config.log_dir, config.instance.log_format, audit_settings(config)
     ring_bytes = round(config.instance.ring_mb * 1e6)
     blocks = tuple(
         BlockSpec(
@@ -246,12 +257,24 @@ def make_plan(
         group=config.instance.group,
         config_file=config_file.resolve(),
         log_dir=log_dir,
+        log_format=log_format,
+        audit=audit,
         blocks=blocks,
-        jobs=tuple(_job(name, kind, log_dir / f"{name}.log", section) for name, kind, section in sections),
+        jobs=tuple(
+            _job(name, kind, log_dir / f"{name}.log", section, log_format, audit) for name, kind, section in sections
+        ),
         warnings=tuple(warnings),
         stepped=config.instance.clock == "stepped",
         origin=origin,
     )
+
+
+def audit_settings(config: Config) -> AuditSettings | None:
+    """Return where the instance writes who did what; None: nowhere."""
+    section = config.instance
+    if not section.audit:
+        return None
+    return AuditSettings(str(config.log_dir / AUDIT_FILE), round(section.audit_mb * 1e6), section.audit_files)
 
 
 def process_names(config: Config) -> list[str]:
@@ -306,9 +329,9 @@ def _mqtt(mqtt: Mqtt) -> list[tuple[str, str, dict[str, Any]]]:
     return [(BROKER, "mqtt", broker), ("mqtt", "mqtt", bridge)]
 
 
-def _job(name: str, kind: str, log_file: Path, section: dict[str, Any]) -> Job:
-    rules = RULES.get(kind)
-    if rules is None:
-        return Job(name, kind, log_file, section)
-    found = {key: section.pop(key) for key in rules}
-    return Job(name, kind, log_file, section, {key: value for key, value in found.items() if value})
+def _job(
+    name: str, kind: str, log_file: Path, section: dict[str, Any], log_format: str, audit: AuditSettings | None
+) -> Job:
+    keys = RULES.get(kind)
+    rules = None if keys is None else {key: value for key in keys if (value := section.pop(key))}
+    return Job(name, kind, log_file, section, rules, log_format, audit)

@@ -8,6 +8,7 @@ its writes (:class:`CommandAssembler`).
 
 from __future__ import annotations
 
+import secrets
 import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -36,6 +37,23 @@ MAX_NAME_BYTES: Final = 256
 _COMMAND: Final = struct.Struct("<QIIqBBHiQ")
 _WRITE: Final = struct.Struct("<IIB7x")
 _KEEP: Final = 2  # flag beside the direction
+
+
+_PID_SHIFT: Final = 40  # pids have at most 22 bits, proc(5)
+
+
+def first_number(pid: int) -> int:
+    """Return the number of the first command of a writer in a process.
+
+    It contains the pid, so that the events of a command tell who sent it. The rest is random: the
+    previous owner of the queue may have commands whose outcomes are still to come.
+    """
+    return pid << _PID_SHIFT | secrets.randbits(_PID_SHIFT - 1) | 1
+
+
+def pid_of(number: int) -> int:
+    """Return the pid of the process that sent a command, from the command's number."""
+    return number >> _PID_SHIFT
 
 
 class CommandKind(IntEnum):

@@ -272,7 +272,7 @@ class Playhead:
         asked = self._asked()
         if asked is None or asked[0] == answered:
             return None
-        number, document = asked
+        number, document, _ = asked
         try:
             return number, _ASKS.decode(document.rstrip(b"\0"))
         except msgspec.MsgspecError:
@@ -283,12 +283,17 @@ class Playhead:
         asked = self._asked()
         return asked[0] if asked else 0
 
-    def _asked(self) -> tuple[int, bytes] | None:
+    def asker(self) -> int:
+        """Return the pid of the program that made the last request."""
+        asked = self._asked()
+        return asked[2] if asked else 0
+
+    def _asked(self) -> tuple[int, bytes, int] | None:
         data = _atomics.cell_read(self._memory, self._ask_at, _ASK.size)
         if data is None:
             return None
-        number, _, _, document = _ASK.unpack(data)
-        return number, document
+        number, pid, _, document = _ASK.unpack(data)
+        return number, document, pid
 
     # ---- for programs that move it -------------------------------------------------------------------------------
 

@@ -113,7 +113,8 @@ class Supervised:
 class Report:
     """The worker's part of a slot.
 
-    :data:`COUNTERS` names the counters. ``note`` describes a problem of the worker.
+    :data:`COUNTERS` names the counters. That of an external program is the number of its user; its note
+    is the name of its program. ``note`` describes a problem of the worker.
     """
 
     pid: int = 0

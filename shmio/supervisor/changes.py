@@ -79,6 +79,8 @@ def refusal(plan: Plan, running: Plan) -> str | None:
         "instance.group": (running.group, plan.group),
         "instance.clock": (_clock(running), _clock(plan)),
         "instance.log_dir": (running.log_dir, plan.log_dir),
+        "instance.log_format": (running.log_format, plan.log_format),
+        **{f"instance.{key}": (_audit(running, key), _audit(plan, key)) for key in AUDIT_KEYS},
     }
     for key, (old, new) in fixed.items():
         if old != new:
@@ -91,6 +93,16 @@ def refusal(plan: Plan, running: Plan) -> str | None:
 
 def _clock(plan: Plan) -> str:
     return "stepped" if plan.stepped else "wall"
+
+
+AUDIT_KEYS: Final = ("audit", "audit_mb", "audit_files")
+
+
+def _audit(plan: Plan, key: str) -> object:
+    """Return the value of a key of ``[instance]`` about the audit log."""
+    if plan.audit is None:
+        return False if key == "audit" else None
+    return {"audit": True, "audit_mb": plan.audit.max_bytes / 1e6, "audit_files": plan.audit.files}[key]
 
 
 def _shown(value: object) -> str:

@@ -14,6 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
+from shmio.audit import trail
 from shmio.config.folder import unwritable
 from shmio.errors import SegmentError
 from shmio.local.status import assess
@@ -150,7 +151,7 @@ class Health:
 
     def publish(self, now_ns: int, *, started: bool, stopping: bool) -> None:
         """Publish the state of the instance. This also serves as the supervisor's heartbeat."""
-        note = self._logs.problem(now_ns)
+        note = self._logs.problem(now_ns) or trail.problem()
         state = self._assess(now_ns, note) if started and not stopping else InstanceState.STARTING
         if stopping:
             state = InstanceState.STOPPING

@@ -12,18 +12,23 @@ import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from types import FrameType
 from typing import Final
 
-from shmio.control import Answer, ControlServer, Reload, Request, Restart, Stop, socket_path
+from shmio.audit import trail
+from shmio.audit.reading import SUPERVISOR, last_events
+from shmio.audit.trail import Acting, Actor, program_of, uid_actor
+from shmio.control import Answer, ControlServer, Peer, Reload, Request, Restart, Stop, Where, socket_path
 from shmio.errors import ShmioError
-from shmio.logs import fields
+from shmio.logs import fields, stamp
 from shmio.plan.processes import MODULES, Plan
 from shmio.segment import Segment
 from shmio.segment import State as InstanceState
 from shmio.supervisor import policy
 from shmio.supervisor.fleet import TICK_S, Fleet, brief, log
 from shmio.supervisor.health import Health, LogFolder, Notifier
+from shmio.supervisor.local_commands import LocalCommands
 from shmio.supervisor.policy import Event, Limits, State
 from shmio.supervisor.reload import Reloader
 from shmio.supervisor.takeover import take_over
@@ -32,6 +37,8 @@ START_TICK_S: Final = 0.01
 """Interval in s of checks while a process starts: the process's report cannot wake the supervisor."""
 MAX_ADDRESSES: Final = 16
 """Largest number of a process's listening addresses in an answer."""
+ACTIONS: Final = {Stop: "down", Restart: "restart", Reload: "reload"}
+"""The action of each request in the audit log."""
 NAME_S: Final = 1.0
 """Interval in s at which to check that the segment still exists under its name."""
 
@@ -89,6 +96,8 @@ class Supervisor:
         """
         with ExitStack() as stack:
             stack.callback(self._selector.close)
+            trail.open_trail(self._plan.audit, self._plan.instance, SUPERVISOR)
+            stack.callback(trail.close_trail)
             stack.enter_context(_wake_on_signals(self._selector, self._on_signal))
             path = socket_path(self._plan.instance)
             found, self.history = take_over(self._plan, path, self._limits)
@@ -98,7 +107,7 @@ class Supervisor:
             fresh = stack.enter_context(ExitStack())  # undone if the start fails early
             if not found:
                 fresh.callback(self._segment.unlink)
-            self._control = ControlServer(path, self._selector, self._handle)
+            self._control = ControlServer(path, self._selector, self._handle, self._deny)
             stack.callback(self._control.close)
             self._fleet = Fleet(self._segment, self._selector, self._limits, self._modules)
             logs = LogFolder(self._plan.log_dir)
@@ -114,14 +123,21 @@ class Supervisor:
             else:
                 for job in self._plan.jobs:
                     self._fleet.assign(job)
+            how = {"mode": self._plan.mode, "config": str(self._plan.config_file)}
+            trail.record("up", how, "took over" if found else "done", "; ".join(self.history), who=_own_actor())
             log.info("supervising", extra=fields(instance=self._plan.instance, segment=self._segment.shared.name))
             fresh.pop_all()
+            if self._plan.audit is not None:
+                began = stamp(self._segment.header.started_utc_ns / 1e9)
+                known = last_events(Path(self._plan.audit.path), began) if found else {}
+                stack.callback(LocalCommands(self._plan.instance, known).close)
             self._loop()
             self._segment.set_state(os.getpid(), InstanceState.STOPPED)
             self._control.retire()
             self._segment.unlink()  # before answering: the client may start it again at once
             for answer in self._stop_answers:
                 answer.ok()
+            trail.record("stopped", {}, "failed" if self._failure else "done", self._failure or "")
             log.info("stopped")
         if self._failure is not None:
             raise ShmioError(self._failure)
@@ -151,7 +167,9 @@ class Supervisor:
         )
 
     def _on_signal(self, number: int) -> None:
-        log.info("%s", signal.Signals(number).name)
+        name = signal.Signals(number).name
+        log.info("%s", name)
+        trail.record("down", {}, "accepted", who=Acting(Actor("signal", name), SUPERVISOR))
         if self._stopping and number != signal.SIGHUP:  # shell and kernel may each send a SIGHUP
             self._hasten()
         self._stop()
@@ -169,6 +187,8 @@ class Supervisor:
             self._fleet.apply(managed, Event.HASTEN)
 
     def _handle(self, request: Request, answer: Answer) -> None:
+        if not (isinstance(request, Where) or (isinstance(request, Reload) and request.dry_run)):
+            answer.ended = self._audit(request, answer.peer)
         if isinstance(request, Stop):
             log.info("asked to stop")
             self._stop_answers.append(answer)
@@ -181,6 +201,21 @@ class Supervisor:
             plan, read_ns = self._reloader.plan, self._reloader.read_ns
             listen = {job.name: found for job in plan.jobs if (found := job.listening[:MAX_ADDRESSES])}
             answer.ok(config=str(plan.config_file), read_ns=read_ns, log_dir=str(plan.log_dir), listen=listen)
+
+    def _audit(self, request: Request, peer: Peer) -> Callable[[str], None]:
+        """Return a function that writes what a client asked for, and the outcome, to the audit log."""
+        action, what = ACTIONS[type(request)], {"process": request.name} if isinstance(request, Restart) else {}
+        with trail.acting(self._actor(peer), SUPERVISOR):
+            attempt = trail.Attempt(action, what)
+        return lambda failure: attempt.end("failed" if failure else "done", failure)
+
+    def _deny(self, peer: Peer) -> None:
+        reason = "only the supervisor's own user and root may control the instance"
+        trail.record("control", {}, "denied", reason, who=Acting(self._actor(peer), SUPERVISOR))
+
+    def _actor(self, peer: Peer) -> Actor:
+        own = next((managed.name for managed in self._fleet if managed.slot.report.pid == peer.pid), None)
+        return uid_actor(peer.uid, f"pid {peer.pid} {own or program_of(peer.pid)}".rstrip())
 
     def _busy(self) -> str | None:
         """Return why requests for changes are refused at present; None if they are accepted."""
@@ -276,6 +311,12 @@ class Supervisor:
         self._fleet.start_due()
         since_ns = max((m.life.ready_ns or 0 for m in self._fleet), default=0)
         self._started = policy.start_over(self._fleet.ranked, self._health.qualities(), since_ns, now_ns, self._limits)
+
+
+def _own_actor() -> Acting:
+    """Return who has started this supervisor."""
+    pid = os.getppid()
+    return Acting(uid_actor(os.getuid(), f"pid {pid} {program_of(pid)}".rstrip()), SUPERVISOR)
 
 
 @contextmanager

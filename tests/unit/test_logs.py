@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import re
@@ -16,6 +17,7 @@ import pytest
 
 from shmio import logs
 from shmio.errors import ConfigError
+from shmio.local.log_files import as_text, parse_line
 
 
 @pytest.fixture(autouse=True)
@@ -39,6 +41,35 @@ def test_a_line_names_time_level_process_and_fields(tmp_path: Path) -> None:
         rf"\d{{4}}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{{6}}Z INFO    cell\[{os.getpid()}\] connected to plc pdu=960 jobs=8",
         line,
     )
+
+
+def test_a_line_as_json_has_the_same_fields_and_reads_as_text(tmp_path: Path) -> None:
+    log = logs.setup(tmp_path / "cell.log", "cell", source="cell", form="json")
+    log.info("connected to %s", "a\n\ud800plc", extra=logs.fields(pdu=960, took=float("nan"), of=tmp_path))
+    try:
+        raise ValueError("odd")
+    except ValueError:
+        log.exception("failed")
+    first, second = (tmp_path / "cell.log").read_text().splitlines()
+    found = json.loads(first)
+    time = found.pop("time")
+    assert found == {
+        "level": "INFO", "process": "cell", "pid": os.getpid(), "message": "connected to a\n\ud800plc",
+        "fields": {"source": "cell", "pdu": 960, "took": "nan", "of": str(tmp_path)},
+    }  # fmt: skip
+    assert "ValueError: odd" in json.loads(second)["traceback"]
+    parsed = parse_line(second)
+    assert (parsed["level"], parsed["process"], parsed["pid"]) == ("ERROR", "cell", os.getpid())
+    assert parsed["text"].startswith("failed source=cell\n    Traceback")
+    assert parse_line(as_text(second).split("\n")[0])["text"] == "failed source=cell"
+    assert as_text(first.replace("\\ud800", "")).startswith(f"{time} INFO    cell[{os.getpid()}] connected to a\n")
+    assert parse_line('{"time": 1}') == {
+        "time": None,
+        "level": None,
+        "process": None,
+        "pid": None,
+        "text": '{"time": 1}',
+    }
 
 
 def test_text_from_devices_stays_on_its_line(tmp_path: Path) -> None:

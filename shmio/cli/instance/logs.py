@@ -13,7 +13,7 @@ from shmio.cli.run import dumps
 from shmio.cli.target import Target, target
 from shmio.config import load
 from shmio.errors import ConfigError, SegmentError
-from shmio.local.log_files import Follower, last_lines, parse_line
+from shmio.local.log_files import Follower, as_text, last_lines, parse_line
 from shmio.local.supervisor import ask_supervisor
 from shmio.logs import printable
 from shmio.plan.processes import process_names
@@ -66,5 +66,8 @@ def _running(wanted: Target) -> list[str]:
 def _print(lines: Iterable[bytes], *, as_json: bool) -> None:
     for line in lines:
         text = line.decode(errors="replace")
-        print(dumps(parse_line(text)) if as_json else printable(text))
+        if as_json:
+            print(dumps(parse_line(text)))
+        else:
+            print(*map(printable, as_text(text).split("\n")), sep="\n")
     sys.stdout.flush()

@@ -54,7 +54,7 @@ def _foreground(file: Path, mode: str, keys: Mapping[str, Any]) -> int:
     console = logging.StreamHandler(sys.stderr)
     console.setFormatter(_Console())
     with hold_log_folder(plan.log_dir, plan.instance):
-        logs.setup(_log_file(plan), "supervisor")
+        logs.setup(_log_file(plan), "supervisor", form=plan.log_format)
         logging.getLogger("shmio.supervisor").addHandler(console)
         Supervisor(plan, replan=_replan(plan, keys)).run()
     return 0
@@ -90,7 +90,7 @@ def _detached(file: Path, mode: str, keys: Mapping[str, Any], report: int) -> in
                 send(Started(plan.instance, history, processes))
 
         with hold_log_folder(plan.log_dir, plan.instance):
-            logs.setup(_log_file(plan), "supervisor", streams=True)
+            logs.setup(_log_file(plan), "supervisor", form=plan.log_format, streams=True)
             with _log_file(plan).open("ab") as log:
                 for stream in (sys.stdout, sys.stderr):
                     os.dup2(log.fileno(), stream.fileno())

@@ -102,7 +102,13 @@ class Bridge:
             lambda: result_filters(self.prefix, self._clients.values()),
         )
         self.outbox = Outbox(self.connection, self.command_connection.connection, round(settings.backlog_mb * 1e6))
-        self._commands = CommandReceiver(self.prefix, self._rules, self._clients, self.outbox.queue_result)
+        self._commands = CommandReceiver(
+            self.prefix,
+            self._rules,
+            self._clients,
+            self.outbox.queue_result,
+            lambda: str(self.command_connection.connection.at),
+        )
         self.command_connection.connection.on_message = self._on_command
         self.connection.on_message = self._on_message
         self.connection.on_lost = self.outbox.lose

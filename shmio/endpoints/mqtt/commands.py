@@ -12,6 +12,7 @@ from paho.mqtt.client import MQTTMessage
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
+from shmio.audit.trail import Actor, Attempt, acting
 from shmio.endpoints.commands_in_flight import MAX_OPEN, CommandCost, InFlightTable
 from shmio.endpoints.mqtt.topics import Message, TopicRules
 from shmio.errors import CommandError, PathError, ValueRangeError
@@ -30,6 +31,8 @@ With any other response topic, a client could make the bridge write values or pu
 """
 OUTPUTS: Final = ("/out", "/frames")
 RETAINED: Final = "a retained command is not carried out; publish commands without the retain flag"
+MAX_SHOWN: Final = 400
+"""Maximum number of bytes of a payload that the audit log gets. It shows fewer characters."""
 MAX_CORRELATION_BYTES: Final = 1024
 MAX_TOPIC_BYTES: Final = 65535 - len("/result")
 """Maximum length of a command's topic, in bytes.
@@ -72,13 +75,14 @@ class CommandClient:
         """
         self._source_writer.check(register)
 
-    def send(self, register: Register, value: object, done: Done) -> None:
+    def send(self, register: Register, value: object, done: Done, attempt: Attempt) -> None:
         """Send a value for a register, an array or an element.
 
         Args:
             register: The register.
             value: The value.
             done: Called once, with the outcome.
+            attempt: The command's entry in the audit log.
 
         Raises:
             CommandError: The command was not sent.
@@ -90,7 +94,8 @@ class CommandClient:
             raise CommandError(f"{self.block.source}: too many commands are under way: wait for their results")
         if self.block.retired:
             raise CommandError(RETIRED)
-        self._pending.add(self._source_writer.submit({register.path: value}), cost, partial(_report, done))
+        ticket = self._source_writer.submit({register.path: value})
+        self._pending.add(ticket, cost, partial(_report, done), attempt=attempt)
 
     def poll(self) -> None:
         """Read new events, and end the commands whose outcome is known or overdue."""
@@ -141,7 +146,14 @@ def result_filters(prefix: str, clients: Iterable[CommandClient]) -> list[str]:
 class CommandReceiver:
     """Receives commands, and sends them to their sources. Use it only in the bridge's thread."""
 
-    def __init__(self, prefix: str, rules: TopicRules, clients: Mapping[str, CommandClient], answer: Answer) -> None:
+    def __init__(
+        self,
+        prefix: str,
+        rules: TopicRules,
+        clients: Mapping[str, CommandClient],
+        answer: Answer,
+        broker: Callable[[], str],
+    ) -> None:
         """Create the receiver.
 
         Args:
@@ -149,12 +161,14 @@ class CommandReceiver:
             rules: The configuration's rules for topics.
             clients: The clients of the current sources, by name.
             answer: Called with the message of each result.
+            broker: Returns the name of the present broker.
 
         """
         self.received = 0
         self.refused = 0
         """Number of commands that were not sent to a source, such as retained ones."""
         self._prefix, self._rules, self._clients, self._answer = prefix, rules, clients, answer
+        self._broker = broker
 
     def take(self, message: MQTTMessage) -> None:
         """Handle a message. If it has the topic of a command, send its value to the source."""
@@ -170,15 +184,21 @@ class CommandReceiver:
             self.refused += 1
             return
         reply = _Reply(self._prefix, topic, message, self._answer)
+        path = topic.removeprefix(f"{self._prefix}/")
+        payload = bytes(message.payload)
+        with acting(Actor("anonymous", "", f"broker {self._broker()}{reply.asked}"), "mqtt"):
+            attempt = Attempt("write", {path.removesuffix("/in"): payload[:MAX_SHOWN].decode(errors="replace")})
         if message.retain:  # its age is unknown: the broker may have stored it before we connected
             self.refused += 1
+            attempt.end("refused", RETAINED)
             reply(EventKind.REJECTED, RETAINED)
             return
         try:
-            client, register = self._find(topic.removeprefix(f"{self._prefix}/"))
-            client.check(register)  # before decoding, because no value would be accepted
-            json = self._rules.of(client.block.source, register.path).payload != "text"
-            client.send(register, _value(bytes(message.payload), register, json=json), reply)
+            with attempt:
+                client, register = self._find(path)
+                client.check(register)  # before decoding, because no value would be accepted
+                json = self._rules.of(client.block.source, register.path).payload != "text"
+                client.send(register, _value(payload, register, json=json), reply, attempt)
         except (CommandError, PathError, ValueRangeError) as error:
             self.refused += 1
             reply(EventKind.REJECTED, str(error))
@@ -199,16 +219,18 @@ class _Reply:
         self._topic = f"{topic}/result"
         self._qos = min(1, message.qos)
         self._answer = answer
+        self.asked = ""
+        """The response topic, if any. MQTT does not say who sent the command; this is the only hint."""
         properties = vars(message.properties) if message.properties is not None else {}
         self._correlation: bytes | None = properties.get("CorrelationData")
         wanted = properties.get("ResponseTopic")
         if isinstance(wanted, str) and wanted.startswith(f"{prefix}/{REPLIES}/") and not set("+#").intersection(wanted):
             self._topic = wanted
+            self.asked = f" (response topic {shorten(wanted)})"
 
     def __call__(self, kind: EventKind, reason: str) -> None:
-        if kind not in DONE:  # MQTT does not say who sent the command; the response topic is the only hint
-            asked = "" if self._topic == f"{self._command}/result" else f" (response topic {shorten(self._topic)})"
-            log.warning("command on %s%s: %s: %s", shorten(self._command, 400), asked, kind, reason)
+        if kind not in DONE:
+            log.warning("command on %s%s: %s: %s", shorten(self._command, 400), self.asked, kind, reason)
         payload = msgspec.json.encode({"outcome": str(kind), "done": kind in DONE, "reason": reason})
         properties = None
         if self._correlation is not None and len(self._correlation) <= MAX_CORRELATION_BYTES:

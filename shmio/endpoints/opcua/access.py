@@ -22,10 +22,14 @@ MAX_PASSWORD = 1024
 
 @dataclass(frozen=True)
 class User:
-    """A client that has logged in, or an anonymous client. ``name`` is for messages."""
+    """A client that has logged in, or an anonymous client. ``name`` is for messages.
+
+    ``kind`` says by what it has logged in: ``account``, ``certificate`` or ``anonymous``.
+    """
 
     name: str
     roles: frozenset[str]
+    kind: str = "anonymous"
 
 
 class Access:
@@ -56,18 +60,18 @@ class Access:
 
         """
         roles = set(self.anonymous)
-        who = "anonymous"
+        who = kind = "anonymous"
         if name is not None:
             account = self._account(name, password or "")
             if account is None:
                 return None
-            who, roles = account.name, roles | account.roles
+            who, kind, roles = account.name, "account", roles | account.roles
         if certificate is not None and (names := self._names(certificate)):
             found = {role for one in self._clients if _matches(one.patterns, names) for role in one.roles}
             if found:
                 roles |= found
-                who = names[0] if name is None else who
-        return User(who, frozenset(roles)) if roles else None
+                who, kind = (names[0], "certificate") if name is None else (who, kind)
+        return User(who, frozenset(roles), kind) if roles else None
 
     def _account(self, name: str, password: str) -> Secret | None:
         """Return the account with this name and password, in a time that depends on neither."""

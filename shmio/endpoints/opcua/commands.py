@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Sequence
 from typing import Final
 
+from shmio.audit.trail import Attempt
 from shmio.endpoints.commands_in_flight import MAX_OPEN, CommandCost, InFlightTable
 from shmio.errors import CommandError
 from shmio.layout.model import Register
@@ -34,8 +35,13 @@ class CommandClient:
         """Return whether the configuration allows writing all of a register, an element or a part."""
         return self._source_writer.is_writable(register)
 
-    async def write(self, register: Register, value: object) -> End:
+    async def write(self, register: Register, value: object, attempt: Attempt | None = None) -> End:
         """Write a value, and wait for the outcome.
+
+        Args:
+            register: The register.
+            value: The value.
+            attempt: The command's entry in the audit log.
 
         Raises:
             CommandError: The command was not sent.
@@ -44,13 +50,14 @@ class CommandClient:
         """
         cost = CommandCost.of(sizes(register))
         await self._await_room(cost)
-        return await self._sent(self._source_writer.submit({register.path: value}), cost)
+        return await self._sent(self._source_writer.submit({register.path: value}), cost, attempt)
 
     async def lift(self, injection: int) -> End:
         """Lift an injection. CommandError: the command was not sent."""
         cost = CommandCost.of(())
-        await self._await_room(cost)
-        return await self._sent(self._source_writer.ask_to_lift(injection), cost)
+        with Attempt("lift", {"source": self.block.source, "injection": injection}) as attempt:
+            await self._await_room(cost)
+            return await self._sent(self._source_writer.ask_to_lift(injection), cost, attempt)
 
     async def _await_room(self, cost: CommandCost) -> None:
         try:
@@ -63,14 +70,14 @@ class CommandClient:
         if self.block.retired:
             raise CommandError(RETIRED)
 
-    async def _sent(self, command: PendingCommand, cost: CommandCost) -> End:
+    async def _sent(self, command: PendingCommand, cost: CommandCost, attempt: Attempt | None) -> End:
         answer: asyncio.Future[Sequence[End]] = asyncio.get_running_loop().create_future()
 
         def done(ends: Sequence[End]) -> None:
             if not answer.done():
                 answer.set_result(ends)
 
-        self._in_flight.add(command, cost, done)
+        self._in_flight.add(command, cost, done, attempt=attempt)
         return worst(await answer)
 
     def poll(self) -> None:

@@ -13,6 +13,8 @@ from asyncua.server.binary_server_asyncio import OPCUAProtocol
 from asyncua.server.uaprocessor import UaProcessor
 from asyncua.ua.ua_binary import header_from_binary, struct_from_binary, uatcp_to_binary
 
+from shmio.audit import trail
+from shmio.audit.trail import Acting, Actor
 from shmio.logs import fields
 
 MAX_CONNECTIONS: Final = 100
@@ -97,6 +99,8 @@ class Processor(UaProcessor):
         access = self.iserver.access
         certificate = self._connection.security_policy.peer_certificate
         if self.encrypted and access.asks_certificates and not (certificate and access.trusts(certificate)):
+            who = Acting(Actor("anonymous", "", ":".join(map(str, self.name[:2]))), "opcua")
+            trail.record("sign in", {}, "denied", "its certificate is not trusted", who=who)
             raise ua.uaerrors.UaStatusCodeError(Fault.BadCertificateUntrusted)
         super().open_secure_channel(algohdr, seqhdr, body)
 

@@ -13,6 +13,8 @@ from asyncua import ua
 from asyncua.common.utils import ServiceError
 from asyncua.server.internal_session import InternalSession
 
+from shmio.audit import trail
+from shmio.audit.trail import Actor
 from shmio.endpoints.opcua.access import User
 from shmio.endpoints.opcua.nodes import Method, RegisterNode, bad
 from shmio.endpoints.opcua.subscriptions import Subscription
@@ -43,6 +45,9 @@ _OUTCOMES: Final = {
 }
 """The status code of a failed write, by its outcome."""
 
+_ACTIONS: Final = {"LiftAll": "lift"}
+"""The actions of methods in the audit log, if these are not their names."""
+
 log = logging.getLogger("shmio.opcua")
 
 Fault = ua.StatusCodes
@@ -69,10 +74,21 @@ class Session(InternalSession):
         """Roles of the client."""
         return self.user.roles if isinstance(self.user, User) else frozenset()
 
-    def need(self, role: str) -> None:
-        """Raise ServiceError if the client lacks a role."""
+    @property
+    def actor(self) -> Actor:
+        """Who the client is, for the audit log."""
+        host, port, *_ = self.name if isinstance(self.name, tuple) else (str(self.name), 0)
+        origin = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+        if not isinstance(self.user, User) or self.user.kind == "anonymous":
+            return Actor("anonymous", "", origin)
+        return Actor(self.user.kind, self.user.name, origin)
+
+    def need(self, role: str, action: str = "read", what: trail.What | None = None) -> None:
+        """Raise ServiceError if the client lacks a role; ``action`` and ``what`` are for the audit log."""
         if role not in self.roles:
             self.iserver.counters.refused += 1
+            reason = f"it needs the role {role}"
+            trail.record(action, what or {}, "denied", reason, who=trail.Acting(self.actor, "opcua"))
             raise ServiceError(Fault.BadUserAccessDenied)
 
     def activate_session(
@@ -80,10 +96,19 @@ class Session(InternalSession):
     ) -> ua.ActivateSessionResult:
         """Identify the client. A client that takes over a session must be the same user."""
         before = self.user if self.is_activated() else None
-        result = super().activate_session(params, peer_certificate)
-        if before is not None and before.name != self.user.name:
-            self.user = before
-            raise ServiceError(Fault.BadIdentityTokenRejected)
+        shown = getattr(params.UserIdentityToken, "UserName", None) or ""
+        try:
+            result = super().activate_session(params, peer_certificate)
+            if before is not None and before.name != self.user.name:
+                self.user = before
+                raise ServiceError(Fault.BadIdentityTokenRejected)
+        except ServiceError as error:
+            actor = self.actor._replace(kind="account" if shown else "anonymous", name=str(shown))
+            name = ua.StatusCode(error.code).name
+            trail.record("sign in", {}, "denied", name, who=trail.Acting(actor, "opcua"))
+            raise
+        if before is None:
+            trail.record("sign in", {}, "done", who=trail.Acting(self.actor, "opcua"))
         return result
 
     async def close_session(self, delete_subs: bool = True) -> None:  # noqa: ARG002  it always ends them
@@ -197,15 +222,25 @@ class Session(InternalSession):
         """Write registers. Each write is a command to its source; its status is the outcome of the command."""
         if not self.external:
             return await super().write(params)
-        self.need("write")
+        self.need("write", "write", _first_values(params.NodesToWrite))
         _bound(params.NodesToWrite, MAX_WRITES)
-        codes = await asyncio.gather(*(self._write(asked) for asked in params.NodesToWrite))
+        with trail.acting(self.actor, "opcua"):
+            codes = await asyncio.gather(*(self._write(asked) for asked in params.NodesToWrite))
         counters = self.iserver.counters
         counters.writes += len(codes)
         counters.refused += sum(code != Fault.Good for code in codes)
         return [ua.StatusCode(code) for code in codes]
 
     async def _write(self, asked: ua.WriteValue) -> int:
+        """Write one register, and return its status."""
+        node = self.iserver.space.find(asked.NodeId)
+        path = f"{node.feed.block.source}/{node.register.path}" if isinstance(node, RegisterNode) else str(asked.NodeId)
+        with trail.Attempt("write", {path: _value(asked)}) as attempt:
+            code = await self._carry_out(asked, attempt)
+            attempt.end("refused", ua.StatusCode(code).name)  # unless the command has ended it
+        return code
+
+    async def _carry_out(self, asked: ua.WriteValue, attempt: trail.Attempt) -> int:
         node = self.iserver.space.find(asked.NodeId)
         if node is None:
             return Fault.BadNotWritable if self.iserver.space.knows(asked.NodeId) else Fault.BadNodeIdUnknown
@@ -220,12 +255,14 @@ class Session(InternalSession):
         if value is None:
             return Fault.BadTypeMismatch
         try:
-            kind, reason = await node.feed.commands.write(node.register, value)
+            kind, reason = await node.feed.commands.write(node.register, value, attempt)
         except ValueRangeError as error:
             log.info("a client's value was not written: %s", shorten(str(error)))
+            attempt.end("refused", str(error))
             return Fault.BadOutOfRange
         except CommandError as error:
             log.warning("a client's value was not written: %s", shorten(str(error)))
+            attempt.end("refused", str(error))
             return Fault.BadResourceUnavailable
         if kind in DONE:
             return Fault.Good
@@ -236,7 +273,8 @@ class Session(InternalSession):
     async def call(self, params: list[ua.CallMethodRequest]) -> list[ua.CallMethodResult]:
         """Call methods."""
         _bound(params, MAX_CALLS)
-        return [await self._call(asked) for asked in params]
+        with trail.acting(self.actor, "opcua"):
+            return [await self._call(asked) for asked in params]
 
     async def _call(self, asked: ua.CallMethodRequest) -> ua.CallMethodResult:
         result = ua.CallMethodResult()
@@ -246,7 +284,8 @@ class Session(InternalSession):
             method = self.iserver.space.find(asked.MethodId)
             if not isinstance(method, Method) or method.parent is None or method.parent.id != asked.ObjectId:
                 raise ServiceError(Fault.BadMethodInvalid)
-            self.need(method.role)
+            action = _ACTIONS.get(method.name, method.name.lower())
+            self.need(method.role, action)
             given = asked.InputArguments or []
             if len(given) < len(method.inputs):
                 raise ServiceError(Fault.BadArgumentsMissing)
@@ -257,7 +296,11 @@ class Session(InternalSession):
                 result.InputArgumentResults.append(ua.StatusCode(Fault.Good if right else Fault.BadTypeMismatch))
             if any(not one.is_good() for one in result.InputArgumentResults):
                 raise ServiceError(Fault.BadInvalidArgument)
-            result.OutputArguments = await method.call(*(one.Value for one in given))
+            arguments = {one.Name: shown.Value for one, shown in zip(method.inputs, given, strict=True)}
+            with trail.Attempt(action, arguments) as attempt:
+                result.OutputArguments = await method.call(*(one.Value for one in given))
+                if method.role == "control":  # the commands that other methods send have entries of their own
+                    attempt.end("done")
         except ServiceError as error:
             result.StatusCode = ua.StatusCode(error.code)
         except ShmioError as error:
@@ -394,6 +437,15 @@ class Session(InternalSession):
 
 MAX_ITEMS_PER_REQUEST: Final = 50_000
 """Maximum number of items that are deleted at once: as many as a session can have."""
+
+
+def _value(asked: ua.WriteValue) -> Any:
+    return None if asked.Value is None or asked.Value.Value is None else asked.Value.Value.Value
+
+
+def _first_values(asked: Iterable[ua.WriteValue] | None) -> dict[str, Any]:
+    """Return the first values of a request by node, for the audit log."""
+    return {str(one.NodeId.Identifier): _value(one) for one in islice(asked or (), trail.MAX_NAMED)}
 
 
 def _bound(asked: list[Any] | None, most: int) -> None:

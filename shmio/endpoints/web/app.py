@@ -15,6 +15,7 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket
 
+from shmio.audit import trail
 from shmio.endpoints.web.measurements import Measurements
 from shmio.endpoints.web.metrics import Exposition, InstanceCollector
 from shmio.endpoints.web.page import Page, Tab
@@ -130,6 +131,7 @@ class PageApp:
             answer.delete_cookie(COOKIE, httponly=True, samesite="strict", secure=self._secure)
             return answer
         if self._sessions.blocked(host):
+            _record_sign_in(host, "too many wrong tokens")
             return JSONResponse({"error": "too many wrong tokens: try again in a minute"}, 429)
         body = b""
         async for part in request.stream():
@@ -142,8 +144,10 @@ class PageApp:
             return JSONResponse({"error": "expected a JSON object with the key token"}, 400)
         opened = self._sessions.open(token, host)
         if opened is None:
+            _record_sign_in(host, "wrong token")
             return JSONResponse({"error": "this is no token of [[grpc.token]]"}, 403)
         cookie, user = opened
+        trail.record("sign in", {}, "done", who=trail.Acting(user.actor, "web"))
         answer = JSONResponse(self._describe(user))
         answer.set_cookie(
             COOKIE, cookie, max_age=MAX_AGE_S, httponly=True, samesite="strict", secure=self._secure, path="/"
@@ -160,6 +164,8 @@ class PageApp:
 
     async def _socket(self, socket: WebSocket) -> None:
         user = self._user(socket)
+        if "read" not in user.roles:
+            trail.record("read", {}, "denied", "it needs the role read", who=trail.Acting(user.actor, "web"))
         if "read" not in user.roles or self.open_pages >= MAX_PAGES:
             await socket.close(1008)  # before it is accepted: an answer 403
             return
@@ -168,6 +174,10 @@ class PageApp:
             await Page(self._served, socket, user, self._tabs).run()
         finally:
             self.open_pages -= 1
+
+
+def _record_sign_in(host: str, reason: str) -> None:
+    trail.record("sign in", {}, "denied", reason, who=trail.Acting(trail.Actor("anonymous", "", host), "web"))
 
 
 def _host(request: HTTPConnection) -> str:

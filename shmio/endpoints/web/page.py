@@ -14,12 +14,13 @@ import asyncio
 import logging
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from typing import Any, ClassVar, Final, NamedTuple, TypeVar
 
 import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from shmio.audit.trail import Attempt, acting
 from shmio.endpoints.web.served import Served
 from shmio.endpoints.web.sessions import User
 from shmio.errors import ShmioError
@@ -79,11 +80,12 @@ def call(
     return mark
 
 
-def release(resources: Iterable[Closable]) -> None:
-    """Close resources of a page. Skip those that another program or a source has ended."""
-    for one in resources:
-        with suppress(ShmioError):
+def release(resources: Mapping[str, Closable], user: User) -> None:
+    """Close resources of a user's page, by name. Skip those that another program or a source has ended."""
+    for name, one in resources.items():
+        with acting(user.actor, "web"), suppress(ShmioError), Attempt("lift", {name: None}) as attempt:
             one.close()
+            attempt.end("done", "the page was closed")
 
 
 class Tab:
@@ -105,6 +107,22 @@ class Tab:
 
     def close(self) -> None:
         """Release what the tab holds, because the page has been closed."""
+
+
+_ACTIONS: Final = {
+    "registers.set": "write",
+    "registers.override": "inject",
+    "injections.start": "declare",
+    "injections.lift_all": "lift",
+}
+"""The actions of calls in the audit log, if these are not the calls' own names."""
+
+
+def _outcome(result: Any) -> tuple[str, str]:
+    """Return the outcome and its reason from the result of a call."""
+    if isinstance(result, dict) and "outcome" in result:
+        return str(result["outcome"]), str(result.get("reason", ""))
+    return "done", ""
 
 
 class Page:
@@ -175,6 +193,17 @@ class Page:
         text: str | None = message.get("text") if message["type"] == "websocket.receive" else None
         return text
 
+    def _attempt(self, message: _Message) -> Attempt:
+        """Begin an entry of the audit log for a call."""
+        tab, _, name = message.call.partition(".")
+        with acting(self.user.actor, "web"):
+            attempt = Attempt(_ACTIONS.get(message.call, name.replace("_", " ")), {"tab": tab})
+        arguments = msgspec.json.decode(message.arguments)
+        if isinstance(arguments, dict):
+            named = {str(arguments["path"]): arguments["value"]} if arguments.keys() == {"path", "value"} else arguments
+            attempt.what = named
+        return attempt
+
     async def _answer(self, text: str) -> None:
         """Make the call of a message, and send its result."""
         number = 0
@@ -186,12 +215,19 @@ class Page:
                 made, tab = self._calls.get(message.call, (None, None))
                 if made is None:
                     raise ShmioError(f"there is no call {message.call[:80]!r}")
+                attempt = None if made.role == "read" else self._attempt(message)
                 if made.role not in self.user.roles:
-                    raise ShmioError(self._denial(made.role))
+                    denial = self._denial(made.role)
+                    (attempt or self._attempt(message)).end("denied", denial)
+                    raise ShmioError(denial)
                 arguments = msgspec.json.decode(message.arguments, type=made.arguments)
             except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
                 raise ShmioError(f"the call is malformed: {error}") from None
-            answer = {"id": number, "result": await made.function(tab, arguments)}
+            with attempt or nullcontext():
+                result = await made.function(tab, arguments)
+                if attempt is not None:
+                    attempt.end(*_outcome(result))
+            answer = {"id": number, "result": result}
         except ShmioError as error:
             answer = {"id": number, "error": str(error)}
         except asyncio.CancelledError:

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from shmio.audit.trail import Actor
 from shmio.config.credentials import Secret, digest
 from shmio.config.model import ROLES
 
@@ -35,6 +36,11 @@ class User:
     name: str
     roles: frozenset[str]
     host: str = ""
+
+    @property
+    def actor(self) -> Actor:
+        """The user in the audit log."""
+        return Actor("token" if self.name else "anonymous", self.name, self.host)
 
     @property
     def listed_roles(self) -> list[str]:

@@ -38,6 +38,7 @@ FAILING: dict[Main, dict[str, list[str]]] = {
         "reload": NOT_THERE,
         "check": ["-c", "no.toml"],
         "logs": NOT_THERE,
+        "audit": NOT_THERE,
     },
 }
 """Arguments with which each verb that has ``--json`` fails.

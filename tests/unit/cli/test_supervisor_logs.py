@@ -131,6 +131,25 @@ def test_logs_as_json(instance_logs: Path, capsys: pytest.CaptureFixture[str]) -
     assert json.loads(capsys.readouterr().out)["error"].startswith("no process 'cel'; there are: ")
 
 
+def test_logs_of_both_formats_are_merged_and_printed_as_text(
+    instance_logs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = {
+        "time": "2026-11-21T05:20:01.500000Z",
+        "level": "ERROR",
+        "process": "grpc",
+        "pid": 7,
+        "message": "no\x1b",
+        "fields": {"a": 1},
+    }
+    (instance_logs / "grpc.log").write_text(json.dumps(line | {"traceback": "Traceback\nodd"}) + "\n")
+    assert main(["logs"]) == 0
+    grpc = f"{line['time']} ERROR   grpc[7] no\\x1b a=1\n    Traceback\n    odd\n"
+    assert capsys.readouterr().out == stamped(1, "cell running") + grpc + stamped(2, "connected \\x1b[31mred")
+    assert main(["logs", "grpc", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["text"] == "no\x1b a=1\n    Traceback\n    odd"
+
+
 def test_unknown_process_is_refused_with_the_valid_names(
     instance_logs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

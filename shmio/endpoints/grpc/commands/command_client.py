@@ -14,6 +14,7 @@ from typing import Any, Final, Unpack
 
 import msgspec
 
+from shmio.audit.trail import MAX_NAMED, Actor, Attempt, acting, values_of
 from shmio.config import Declaration
 from shmio.endpoints.commands_in_flight import MAX_OPEN, CommandCost, Done, InFlightTable
 from shmio.endpoints.grpc.commands.injections import InjectionFollower, InjectionFollowers
@@ -22,10 +23,10 @@ from shmio.endpoints.grpc.wakeups import BatchReader, WakeUps
 from shmio.errors import CommandError
 from shmio.layout.model import Register
 from shmio.layout.topic import find
-from shmio.layout.values.write import Write, merge, sizes
+from shmio.layout.values.write import Write, merge, paths_of, sizes
 from shmio.local.writer import RETIRED, PendingCommand, SourceWriter
 from shmio.segment import Block, Event, EventKind
-from shmio.segment.commands import End, InjectionOptions
+from shmio.segment.commands import Direction, End, InjectionOptions
 
 RETRY_S: Final = 0.25
 """Pause in s before asking a source again to lift an injection."""
@@ -142,7 +143,8 @@ class CommandClient:
 
         """
         submit = partial(self._source_writer.submit, values, timeout_s)
-        await self._send(submit, self._cost(values), done, accepted, until_accepted=until_accepted)
+        with Attempt("write", values_of(self.block.source, values)) as attempt:
+            await self._send(submit, self._cost(values), done, accepted, attempt, until_accepted=until_accepted)
 
     async def give(
         self,
@@ -169,9 +171,10 @@ class CommandClient:
             ValueRangeError: A value does not fit its register.
 
         """
-        writes = self._source_writer.joined(values, raw)
-        cost = CommandCost.of([len(write.data) for write in writes])
-        await self._send(partial(self._source_writer.give, injection, writes), cost, done, accepted)
+        with Attempt("feed", values_of(self.block.source, values)) as attempt:
+            writes = self._source_writer.joined(values, raw)
+            cost = CommandCost.of([len(write.data) for write in writes])
+            await self._send(partial(self._source_writer.give, injection, writes), cost, done, accepted, attempt)
 
     def inject(self, bits: bytes, follower: InjectionFollower, done: Done, **options: Unpack[InjectionOptions]) -> int:
         """Ask the source to create an injection, without waiting for the outcome.
@@ -191,7 +194,8 @@ class CommandClient:
         """
         writes = merge(bits, bits, [(0, len(bits))])
         cost = CommandCost.of([len(write.data) for write in writes], options.get("name", ""))
-        return self._create(self._source_writer.ask_to_inject(writes, **options), cost, follower, done)
+        with Attempt("inject", partial(_described, self.block, writes, options)) as attempt:
+            return self._create(self._source_writer.ask_to_inject(writes, **options), cost, follower, done, attempt)
 
     def declare(self, declaration: Declaration, follower: InjectionFollower, done: Done, *, keep: bool) -> int:
         """Ask the source to create a declared injection, without waiting for the outcome.
@@ -210,10 +214,15 @@ class CommandClient:
 
         """
         cost = CommandCost.of([len(msgspec.json.encode(declaration))], declaration.name)
-        return self._create(self._source_writer.ask_to_declare(declaration, keep=keep), cost, follower, done)
+        what = {"source": self.block.source, **msgspec.to_builtins(declaration), "keep": keep}
+        with Attempt("declare", what) as attempt:
+            ticket = self._source_writer.ask_to_declare(declaration, keep=keep)
+            return self._create(ticket, cost, follower, done, attempt)
 
-    def _create(self, ticket: PendingCommand, cost: CommandCost, follower: InjectionFollower, done: Done) -> int:
-        self._in_flight.add(ticket, cost, done)
+    def _create(
+        self, ticket: PendingCommand, cost: CommandCost, follower: InjectionFollower, done: Done, attempt: Attempt
+    ) -> int:
+        self._in_flight.add(ticket, cost, done, attempt=attempt)
         self._start_timer()
         self.followers.add(ticket.number, follower)
         return ticket.number
@@ -225,7 +234,8 @@ class CommandClient:
             CommandError: The command was not sent.
 
         """
-        self._in_flight.add(self._source_writer.ask_to_lift(injection), CommandCost.of(()), done)
+        with Attempt("lift", {"source": self.block.source, "injection": injection}) as attempt:
+            self._in_flight.add(self._source_writer.ask_to_lift(injection), CommandCost.of(()), done, attempt=attempt)
         self._start_timer()
 
     async def _send(
@@ -234,6 +244,7 @@ class CommandClient:
         cost: CommandCost,
         done: Done,
         accepted: Callable[[], None] | None,
+        attempt: Attempt,
         *,
         until_accepted: bool = False,
     ) -> None:
@@ -248,7 +259,7 @@ class CommandClient:
                 raise CommandError(
                     f"source {self.block.source} does not answer; shmio-supervisor status shows its state"
                 )
-            self._in_flight.add(submit(), cost, done, accepted, until_accepted=until_accepted)
+            self._in_flight.add(submit(), cost, done, accepted, attempt=attempt, until_accepted=until_accepted)
             self._start_timer()
 
     async def _prepare(self) -> None:
@@ -339,6 +350,17 @@ class CommandClient:
         self._silent |= self._in_flight.expire()
         self._free()
         self._set_timer()
+
+
+def _described(block: Block, writes: Sequence[Write], options: InjectionOptions) -> Mapping[str, Any]:
+    """Describe an injection for the audit log."""
+    paths = paths_of(block.layout, writes, MAX_NAMED)
+    return {
+        "source": block.source,
+        "paths": paths,
+        "direction": options.get("direction", Direction.OUT).name.lower(),
+        **{key: options[key] for key in ("priority", "keep", "name") if key in options},
+    }
 
 
 # ---- commands awaited ----------------------------------------------------------------------------------------------
@@ -457,9 +479,10 @@ async def have_lifted(commands: CommandClient, injection: int, name: str) -> Non
 
     """
     commands.followers.remove(injection)
-    while stands(commands, injection) and (reason := await lift(commands, injection)):
-        log.warning("%s: an injection is not lifted yet: %s", name, reason)
-        await asyncio.sleep(RETRY_S)
+    with acting(Actor("process", "grpc", "the client has ended its stream or its connection"), "grpc"):
+        while stands(commands, injection) and (reason := await lift(commands, injection)):
+            log.warning("%s: an injection is not lifted yet: %s", name, reason)
+            await asyncio.sleep(RETRY_S)
 
 
 def stands(commands: CommandClient, injection: int) -> bool:

@@ -10,6 +10,7 @@ from typing import Final, NamedTuple
 
 import grpc
 
+from shmio.audit.trail import Actor
 from shmio.config import Address, Grpc, UnixAddress, parse_address
 from shmio.config.credentials import Secret, digest, read_tokens
 from shmio.config.listening import encrypted, takes_tokens
@@ -59,6 +60,25 @@ def _calls() -> Iterator[tuple[str, str]]:
 
 NEEDS: Final[Mapping[str, str]] = dict(_calls())
 """The role that a call needs, by the call's full name."""
+
+_ACTIONS: Final[Mapping[str, str]] = {
+    "setStepSize": "step size",
+    "SetStepSize": "step size",
+    "Steps": "step",
+    "start": "play",
+    "stop": "pause",
+    "LiftAll": "lift",
+    "PublishSynch": "write",
+    "Publish": "write",
+}
+
+
+def action_of(method: str) -> str:
+    """Return the action of a call in the audit log, from the call's full name."""
+    if NEEDS.get(method) == READ:
+        return "read"
+    name = method.rpartition("/")[2]
+    return _ACTIONS.get(name, name.lower())
 
 
 _SCHEME: Final = "bearer "
@@ -179,6 +199,13 @@ class ListenerAccess:
         if needed in by_name or (secret is not None and needed in secret.roles):
             return secret.name if secret else None
         raise self._denial(method, needed, secret, shown, by_name)
+
+    def actor(self, shown: Credentials, peer: str) -> Actor:
+        """Return who a client is, for the audit log. Its token may lack roles, or not be known."""
+        secret = None if shown.token is None else self.keys.secret(shown.token)
+        if secret is not None:
+            return Actor("token", secret.name, peer)
+        return Actor("certificate", shown.names[0], peer) if shown.names else Actor("anonymous", "", peer)
 
     def _secret(self, shown: bytes) -> Secret | None:
         if not self.keys.secrets:

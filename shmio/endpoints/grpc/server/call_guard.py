@@ -18,7 +18,16 @@ from typing import Any, Final
 import grpc
 from google.protobuf.message import DecodeError
 
-from shmio.endpoints.grpc.server.access import Credentials, DeniedError, ListenerAccess, client_of
+from shmio.audit import trail
+from shmio.endpoints.grpc.server.access import (
+    NEEDS,
+    READ,
+    Credentials,
+    DeniedError,
+    ListenerAccess,
+    action_of,
+    client_of,
+)
 from shmio.endpoints.grpc.server.error_status import Context
 from shmio.errors import EndpointError
 from shmio.layout.topic import shorten
@@ -91,13 +100,16 @@ class _Call:
     ``denial`` is the reason why the guard ends the call, or None.
     """
 
-    __slots__ = ("access", "client", "denial", "method", "shown", "task")
+    __slots__ = ("access", "acting", "client", "denial", "method", "shown", "task")
 
-    def __init__(self, method: str, access: ListenerAccess, shown: Credentials, client: str) -> None:
+    def __init__(
+        self, method: str, access: ListenerAccess, shown: Credentials, client: str, acting: trail.Acting
+    ) -> None:
         self.method = method
         self.access = access
         self.shown = shown
         self.client = client
+        self.acting = acting
         self.task = asyncio.current_task()
         self.denial: DeniedError | None = None
 
@@ -131,13 +143,18 @@ class OpenCalls:
         """
         peer = context.peer()
         shown = Credentials.of(context.invocation_metadata() or (), context.auth_context())
+        acting = trail.act(access.actor(shown, peer), "grpc")
         try:
             client = client_of(peer, access.admit(method, shown))
             self._check(client)
         except DeniedError as error:
             self.refusals.add(str(error), method, peer)
+            denied = error.code is not grpc.StatusCode.RESOURCE_EXHAUSTED
+            if denied or NEEDS.get(method) != READ:
+                what = {"call": method}
+                trail.record(action_of(method), what, "denied" if denied else "refused", str(error), who=acting)
             raise
-        call = _Call(method, access, shown, client)
+        call = _Call(method, access, shown, client, acting)
         self._open.add(call)
         self._by_client[client] += 1
         return call
@@ -245,7 +262,11 @@ class CallGuard(grpc.aio.ServerInterceptor):
             except asyncio.CancelledError:
                 if call.denial is None:
                     raise
+                _record_end(call, str(call.denial))
                 await context.abort(call.denial.code, str(call.denial))
+            except grpc.aio.AbortError:
+                _record_end(call, context.details())
+                raise
             except grpc.aio.InternalError:  # the client is gone, and nothing can be sent
                 raise asyncio.CancelledError from None
             finally:
@@ -261,6 +282,12 @@ class CallGuard(grpc.aio.ServerInterceptor):
         if data is grpc.aio.EOF:
             await context.abort(grpc.StatusCode.INVALID_ARGUMENT, f"{call.method}: the client sent no message")
         return await _parsed(call.method, decode, data, context)
+
+
+def _record_end(call: _Call, reason: str) -> None:
+    """Write that a call which needs more than the role read has failed, unless its command says so already."""
+    if NEEDS.get(call.method) != READ and not call.acting.refused:
+        trail.record(action_of(call.method), {"call": call.method}, "refused", reason, who=call.acting)
 
 
 async def _decoded(method: str, decode: Decode, messages: AsyncIterator[bytes], context: Context) -> AsyncIterator[Any]:

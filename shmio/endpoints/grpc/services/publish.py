@@ -12,6 +12,7 @@ import grpc
 from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import DecodeError
 
+from shmio.audit import trail
 from shmio.endpoints.commands_in_flight import Done, in_words
 from shmio.endpoints.grpc.server.call_guard import Refusals
 from shmio.endpoints.grpc.services.injection import ShadowKind, Shadows
@@ -193,11 +194,14 @@ class Publisher:
             path = request.path
             destination = await self._resolve(request)
         except DecodeError:
-            self._refusals.add(f"{len(message)} bytes are not a valid PubRequest", path, peer)
+            reason = f"{len(message)} bytes are not a valid PubRequest"
+            self._refusals.add(reason, path, peer)
+            trail.record("write", {}, "refused", reason)
             value.end()
             return
         except ShmioError as error:
             self._refusals.add(str(error), path, peer)
+            trail.record("write", {"topic": path}, "refused", str(error))
             value.end()
             return
         except BaseException:  # such as the cancellation of the call

@@ -5,10 +5,13 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import threading
+from functools import partial
 from typing import Any, Final
 
 import grpc
+import msgspec
 
+from shmio.audit.trail import Attempt
 from shmio.endpoints.grpc.server.error_status import Context, refuse
 from shmio.errors import ShmioError, ValueRangeError
 from shmio.local.replays import ReplayRequest, Replays
@@ -48,7 +51,9 @@ class ReplayCalls:
             if wanted.nothing:
                 found = await asyncio.to_thread(self._replays.status, wanted.sources)
             else:
-                found = await self._change(wanted)
+                with Attempt("replay", partial(msgspec.to_builtins, wanted)) as attempt:
+                    found = await self._change(wanted)
+                    attempt.end("done")
         except ShmioError as error:
             await refuse(context, error)
         return wire.ReplayResponse(sources=map(_to_wire, found))

@@ -11,6 +11,7 @@ from typing import Any
 import grpc
 import numpy as np
 
+from shmio.audit import trail
 from shmio.endpoints.grpc.encoding import field
 from shmio.endpoints.grpc.server.error_status import Context, refuse
 from shmio.endpoints.grpc.server.limits import time_sliced
@@ -164,6 +165,7 @@ class SimulateCalls:
         try:
             simulation = await self._joining(requests, context.peer())
             first = await simulation.join()
+            trail.record("simulate", {"source": simulation.block.source, "model": simulation.name}, "done")
             self._ring(simulation.block)
             taking = asyncio.get_running_loop().create_task(simulation.take(requests))
             taking.add_done_callback(simulation.taken)

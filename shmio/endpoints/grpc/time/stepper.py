@@ -10,6 +10,7 @@ from contextlib import asynccontextmanager, closing, suppress
 from functools import partial
 from typing import Any, Final, TypeVar
 
+from shmio.audit.trail import Attempt
 from shmio.endpoints.grpc.streams.feed import Feed, VirtualTime
 from shmio.endpoints.grpc.streams.outbox import OpenStreams, Outboxes
 from shmio.endpoints.grpc.time.timeline import Timeline, TimeStatus
@@ -247,8 +248,10 @@ class Stepper:
             TimeError: Another program controls time.
 
         """
-        _check(dt_ns)
-        await self._do(self._change(partial(self._coordinator.set_step_size, dt_ns)))
+        with _attempt("step size", dt_ns) as attempt:
+            _check(dt_ns)
+            await self._do(self._change(partial(self._coordinator.set_step_size, dt_ns)))
+            attempt.end("done")
 
     async def step(self, dt_ns: int | None = None, peer: str = "") -> Step:
         """Make a step. Return when all streams have taken the marker of the step.
@@ -267,12 +270,16 @@ class Stepper:
 
         """
         done: asyncio.Future[Step] = self._loop.create_future()
-        task = self._spawn(_complete(self._step(dt_ns, peer), done))
-        try:
-            return await done
-        finally:
-            if task is not self._moving:  # do not abort a step in progress
-                task.cancel()
+        with _attempt("step", dt_ns) as attempt:
+            task = self._spawn(_complete(self._step(dt_ns, peer), done))
+            try:
+                step = await done
+            finally:
+                if task is not self._moving:  # do not abort a step in progress
+                    task.cancel()
+            attempt.what = {"step": step.number, "dt_s": step.dt_ns / 1e9, "time_s": step.time_ns / 1e9}
+            attempt.end("done")
+        return step
 
     async def play(self, dt_ns: int | None = None, rate: float = 1.0) -> TimeStatus:
         """Play at ``rate`` times real time in steps of ``dt_ns``. Return the state of time.
@@ -282,7 +289,10 @@ class Stepper:
             ValueRangeError: ``dt_ns`` is out of range.
 
         """
-        return await self._do(self._begin_play(dt_ns, rate))
+        with _attempt("play", dt_ns, rate=rate) as attempt:
+            status = await self._do(self._begin_play(dt_ns, rate))
+            attempt.end("done")
+        return status
 
     async def pause(self, *, end: bool = False) -> TimeStatus:
         """Stop playing, and return the state of time.
@@ -294,7 +304,10 @@ class Stepper:
             TimeError: Another program controls time.
 
         """
-        return await self._do(self._end_play(end))
+        with _attempt("pause", None) as attempt:
+            status = await self._do(self._end_play(end))
+            attempt.end("done")
+        return status
 
     async def release(self) -> TimeStatus:
         """Let time run as real time again.
@@ -303,7 +316,10 @@ class Stepper:
             TimeError: Another program controls time, or the instance has no real time.
 
         """
-        return await self._do(self._end_virtual())
+        with _attempt("release", None) as attempt:
+            status = await self._do(self._end_virtual())
+            attempt.end("done")
+        return status
 
     async def stop(self) -> None:
         """Stop moving time. If time was played, the next process resumes playing."""
@@ -430,6 +446,10 @@ async def _complete(work: Coroutine[Any, Any, _Result], done: asyncio.Future[_Re
     else:
         if not done.done():
             done.set_result(result)
+
+
+def _attempt(action: str, dt_ns: int | None, **more: float) -> Attempt:
+    return Attempt(action, ({} if dt_ns is None else {"dt_s": dt_ns / 1e9}) | more)
 
 
 def _check(dt_ns: int | None) -> None:

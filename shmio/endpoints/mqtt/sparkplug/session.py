@@ -14,8 +14,10 @@ from typing import Final
 import msgspec
 from paho.mqtt.client import MQTTMessage
 
+from shmio.audit.trail import Actor, Attempt, acting
 from shmio.config import Mqtt, Sparkplug
 from shmio.endpoints.mqtt.broker.directory import own_socket
+from shmio.endpoints.mqtt.commands import RETAINED
 from shmio.endpoints.mqtt.connection.connection import FEW_IN_FLIGHT, BrokerConnection
 from shmio.endpoints.mqtt.connection.reconnect import ReconnectPolicy, targets
 from shmio.endpoints.mqtt.feed import Feed
@@ -333,11 +335,18 @@ class Session:
             self._host_lost = self._host_lost or (self.node.alive and not self._host.online)
             return
         self._received += 1
+        with acting(Actor("anonymous", "", f"broker {self.connection.at}"), "sparkplug"):
+            self._carry_out(topic, message)
+
+    def _carry_out(self, topic: str, message: MQTTMessage) -> None:
+        whole = Attempt("write", {"topic": topic})
         if message.retain:  # the broker stored it before we connected
             self._refused += 1
+            whole.end("refused", RETAINED)
             return
         try:
-            command = self.node.command(topic, bytes(message.payload), self._check)
+            with whole:
+                command = self.node.command(topic, bytes(message.payload), self._check)
         except (CommandError, PathError, ValueRangeError) as error:
             self._refuse(str(error))
             return
@@ -348,7 +357,8 @@ class Session:
         for path, value in command.values.items():
             register = self.node.metrics[command.device][path].register
             try:
-                device.command_client.send(register, value, _Outcome(f"{command.device}/{path}"))
+                with Attempt("write", {f"{command.device}/{path}": value}) as attempt:
+                    device.command_client.send(register, value, _Outcome(f"{command.device}/{path}"), attempt)
             except (CommandError, ValueRangeError) as error:
                 self._refuse(str(error))
 

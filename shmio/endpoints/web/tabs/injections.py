@@ -64,7 +64,8 @@ class Injections(Tab):
         """Lift the campaigns of this page that are not to be kept."""
         campaigns, self._campaigns = self._campaigns, []
         if campaigns:
-            asyncio.get_running_loop().run_in_executor(None, release, campaigns)
+            named = {", ".join(f"{one.source}: {one.name}" for one in held.declared): held for held in campaigns}
+            asyncio.get_running_loop().run_in_executor(None, release, named, self.page.user)
 
     @call("read", Nothing)
     async def follow(self, _: Nothing) -> None:

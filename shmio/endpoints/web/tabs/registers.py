@@ -79,9 +79,9 @@ class Registers(Tab):
 
     def close(self) -> None:
         """Lift the overrides of this page."""
-        overrides, self._overrides = list(self._overrides.values()), {}
+        overrides, self._overrides = self._overrides, {}
         if overrides:
-            asyncio.get_running_loop().run_in_executor(None, release, overrides)
+            asyncio.get_running_loop().run_in_executor(None, release, overrides, self.page.user)
 
     @call("read", Shown)
     async def rows(self, given: Shown) -> dict[str, Any]:

@@ -1,0 +1,120 @@
+"""Reads the entries of an audit log."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from shmio.audit.trail import Entry
+
+SUPERVISOR: Final = "supervisor"
+"""Name of the process that writes the entries of programs which nobody serves."""
+MAX_LINE_BYTES: Final = 1 << 16
+
+_decode: Final = msgspec.json.Decoder(Entry).decode
+
+
+def present_files(newest: Path) -> list[Path]:
+    """Return the files of an audit log that exist, the oldest first."""
+    numbered = {
+        int(number): path
+        for path in newest.parent.glob(f"{newest.name}.*")
+        if (number := path.name.removeprefix(f"{newest.name}.")).isdecimal() and number.isascii()
+    }
+    older = [numbered[number] for number in sorted(numbered, reverse=True)]
+    return [*older, newest] if newest.exists() else older
+
+
+def parse_entry(line: bytes) -> Entry | None:
+    """Return the entry of a line; None if it is damaged."""
+    try:
+        return _decode(line)
+    except (msgspec.MsgspecError, UnicodeDecodeError):
+        return None
+
+
+def entries(newest: Path, since_s: float = 0.0) -> Iterator[Entry]:
+    """Yield the entries of an audit log, the oldest first. Damaged lines are skipped.
+
+    Args:
+        newest: The newest file.
+        since_s: UNIX time in s; older files are not read. Entries before it may be yielded.
+
+    Raises:
+        OSError: A file cannot be read.
+
+    """
+    for path in present_files(newest):
+        with suppress(FileNotFoundError):  # another process has rotated meanwhile
+            if path.stat().st_mtime < since_s:
+                continue
+            with path.open("rb") as stream:
+                while line := stream.readline(MAX_LINE_BYTES):
+                    if (entry := parse_entry(line)) is not None:
+                        yield entry
+
+
+@dataclass(frozen=True, slots=True)
+class EntryFilter:
+    """Chooses entries. An empty field chooses all.
+
+    Attributes:
+        since: Time as in the entries.
+        who: Name of the actor, or pattern of it.
+        action: The action.
+        pattern: Pattern of a path or of another word in what the entry is about.
+
+    """
+
+    since: str = ""
+    who: str = ""
+    action: str = ""
+    pattern: str = ""
+
+    def chooses(self, entry: Entry) -> bool:
+        """Return whether an entry is chosen."""
+        return (
+            entry.time >= self.since
+            and (not self.who or fnmatchcase(entry.who, self.who) or fnmatchcase(entry.kind, self.who))
+            and self.action in ("", entry.action)
+            and (not self.pattern or any(fnmatchcase(word, self.pattern) for word in _words(entry.what)))
+        )
+
+
+def _words(what: Any) -> Iterator[str]:
+    if isinstance(what, str):
+        yield what
+    elif isinstance(what, Mapping):
+        for key, value in what.items():
+            yield key
+            yield from _words(value)
+    elif isinstance(what, list):
+        for value in what:
+            yield from _words(value)
+
+
+def last_events(newest: Path, since: str) -> dict[str, int]:
+    """Return for each source the last event that has an entry of the supervisor, of all entries since a time."""
+    found: dict[str, int] = {}
+    try:
+        for entry in entries(newest):
+            if entry.event and entry.process == SUPERVISOR and entry.time >= since:
+                source = source_of(entry)
+                found[source] = max(entry.event, found.get(source, 0))
+    except OSError:  # then the commands of this run are entered again
+        return {}
+    return found
+
+
+def source_of(entry: Entry) -> str:
+    """Return the source that an entry is about; empty if it is about none."""
+    if not isinstance(entry.what, Mapping) or not entry.what:
+        return ""
+    named = entry.what.get("source")
+    return named if isinstance(named, str) else str(next(iter(entry.what))).partition("/")[0]

@@ -1,0 +1,438 @@
+"""What this process writes to the audit log.
+
+A module calls :func:`record`, or creates an :class:`Attempt` and ends it when the outcome is known.
+Neither waits: a thread encodes the entries and writes them to the file. A process without an audit
+log, such as a test or a user's program, ignores them.
+
+Who acts is in a context variable, so that it need not be passed through all layers: the code that
+identifies a client sets it (:func:`acting`), and asyncio and thread pools pass it on.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any, Final, NamedTuple
+
+import msgspec
+
+from shmio.audit.file import AuditFile, AuditSettings
+from shmio.errors import ShmioError
+from shmio.logs import stamp
+
+MAX_WAITING: Final = 10_000
+"""Maximum number of entries that wait for a disk that does not take them. Further ones are counted."""
+MAX_NAMED: Final = 32
+"""Maximum number of values in an entry. The others are counted."""
+MAX_ELEMENTS: Final = 16
+"""Maximum number of an array's elements in an entry."""
+MAX_TEXT: Final = 200
+"""Maximum number of characters of a text in an entry."""
+MAX_REASON: Final = 500
+"""Maximum number of characters of a reason."""
+MAX_BATCH: Final = 500
+"""Maximum number of entries in a write."""
+MERGED: Final = frozenset({"feed", "step"})
+"""Actions that a client repeats many times a second. Repetitions of a second are one entry, with their number."""
+MERGE_S: Final = 1.0
+MAX_MERGED: Final = 1000
+"""Maximum number of different repetitions at a time. Further ones have an entry each."""
+RETRY_S: Final = 1.0
+"""Pause in s before the next attempt after a write has failed."""
+CLOSE_S: Final = 2.0
+"""How long the end of a process waits for the last entries to be written, in s."""
+
+log = logging.getLogger("shmio.audit")
+
+
+class Actor(NamedTuple):
+    """Who acts, and from where.
+
+    Attributes:
+        kind: How the actor is known: ``token``, ``certificate``, ``account``, ``uid``, ``host`` (of
+            Sparkplug), ``process`` (of the instance), ``signal``, or ``anonymous``.
+        name: Name of the token or the account, first name in the certificate, number of the user.
+        origin: Address of the client, or the program and its pid.
+
+    """
+
+    kind: str = "anonymous"
+    name: str = ""
+    origin: str = ""
+
+
+@dataclass(slots=True)
+class Acting:
+    """An actor at work, for example during a call.
+
+    ``refused`` tells whether a refusal is recorded already, so that no other layer records it again.
+    """
+
+    actor: Actor
+    endpoint: str
+    refused: bool = False
+
+
+_present: ContextVar[Acting | None] = ContextVar("acting", default=None)
+
+
+def act(actor: Actor, endpoint: str) -> Acting:
+    """From now on, this task or thread acts for ``actor``."""
+    found = Acting(actor, endpoint)
+    _present.set(found)
+    return found
+
+
+@contextmanager
+def acting(actor: Actor, endpoint: str) -> Iterator[Acting]:
+    """Act for ``actor`` within a ``with`` block."""
+    found = Acting(actor, endpoint)
+    before = _present.set(found)
+    try:
+        yield found
+    finally:
+        _present.reset(before)
+
+
+def uid_actor(uid: int | None, origin: str) -> Actor:
+    """Return the actor for a user of this host; None: the user is not known."""
+    return Actor("uid", "" if uid is None else str(uid), origin)
+
+
+def program_of(pid: int) -> str:
+    """Return the name of a process's program; empty if it has ended."""
+    try:
+        return Path(f"/proc/{pid}/comm").read_text(errors="replace").strip()
+    except OSError:
+        return ""
+
+
+class Entry(msgspec.Struct):
+    """A line of the audit log. docs/reference/audit.md describes the fields."""
+
+    time: str
+    instance: str
+    process: str
+    pid: int
+    endpoint: str
+    kind: str
+    who: str
+    origin: str = msgspec.field(name="from")
+    action: str
+    outcome: str
+    reason: str
+    what: Any
+    left_out: int
+    count: int
+    command: int
+    event: int
+
+
+What = Mapping[str, Any] | Callable[[], Mapping[str, Any]]
+
+
+class _Waiting(NamedTuple):
+    time_s: float
+    acting: Acting
+    action: str
+    what: What
+    outcome: str
+    reason: str
+    command: int
+    event: int
+    times: int
+
+    @property
+    def kind(self) -> tuple[object, ...] | None:
+        """Equal for repetitions of the same action; None if each of these has an entry of its own."""
+        if self.action not in MERGED or not isinstance(self.what, Mapping):
+            return None
+        return self.acting.actor, self.acting.endpoint, self.action, self.outcome, self.reason, *self.what
+
+
+class _Repeated:
+    """Repetitions of an action that have no entry yet."""
+
+    __slots__ = ("last", "times", "until_s")
+
+    def __init__(self, until_s: float) -> None:
+        self.until_s = until_s
+        self.times = 0
+        self.last: _Waiting | None = None
+
+
+def record(
+    action: str,
+    what: What,
+    outcome: str,
+    reason: str = "",
+    *,
+    who: Acting | None = None,
+    command: int = 0,
+    event: int = 0,
+    count: int = 1,
+) -> None:
+    """Write an entry. This never waits, and never fails.
+
+    Args:
+        action: What was done or attempted, such as ``write``.
+        what: To what: values by path or by name. A function returns them later, in another thread.
+        outcome: The outcome, such as ``written`` or ``denied``.
+        reason: The reason of the outcome; empty for a success.
+        who: Who acts; None: the actor of the present task.
+        command: Number of the command; 0: none.
+        event: Number of the source's event that ended the command; 0: none, or not known.
+        count: How many times this was done.
+
+    """
+    trail = _trail
+    if trail is None:
+        return
+    who = who or _present.get() or Acting(Actor("process", trail.process), trail.process)
+    trail.add(_Waiting(time.time(), who, action, _brief(what), outcome, reason, command, event, count))
+
+
+class Attempt:
+    """An action whose outcome is not known yet. Only the first call of :meth:`end` has an effect.
+
+    In a ``with`` block, an exception ends it. The end of the block does not: the outcome may come
+    later.
+    """
+
+    __slots__ = ("_action", "_ended", "_who", "command", "event", "what")
+
+    def __init__(self, action: str, what: What) -> None:
+        """Begin. The actor is that of the present task."""
+        self._action = action
+        self._who = _present.get()
+        self._ended = False
+        self.what = what
+        """What the action is about; see :func:`record`."""
+        self.command = 0
+        """Number of the command, if one was sent."""
+        self.event = 0
+        """Number of the source's event that ended the command, if it is known."""
+
+    def __enter__(self) -> Attempt:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+        if error is None:
+            return
+        expected = isinstance(error, ShmioError)
+        reason = str(error) if expected else type(error).__name__
+        self.end("refused" if expected else "cancelled", reason, refused=expected)
+
+    def end(self, outcome: str, reason: str = "", *, refused: bool = False) -> None:
+        """Write the entry.
+
+        Args:
+            outcome: The outcome.
+            reason: Its reason.
+            refused: Whether this is a failure that no other layer has to record.
+
+        """
+        if self._ended:
+            return
+        self._ended = True
+        if refused and self._who is not None:
+            self._who.refused = True
+        record(self._action, self.what, outcome, reason, who=self._who, command=self.command, event=self.event)
+
+
+def values_of(source: str, values: Mapping[str, Any]) -> What:
+    """Return values by path within a source as values by full path."""
+    first = {f"{source}/{path}": _cut(value) for path, value in islice(values.items(), MAX_NAMED)}
+    return _Cut(first, max(0, len(values) - MAX_NAMED))
+
+
+def _brief(what: What) -> What:
+    """Return ``what`` without the values that are not written anyway, so that they need no memory."""
+    if callable(what) or isinstance(what, _Cut):
+        return what
+    return _Cut({key: _cut(value) for key, value in islice(what.items(), MAX_NAMED)}, max(0, len(what) - MAX_NAMED))
+
+
+class _Cut(dict[str, Any]):
+    """The first values of a mapping; ``left_out`` is the number of the others."""
+
+    def __init__(self, values: Mapping[str, Any], left_out: int) -> None:
+        super().__init__(values)
+        self.left_out = left_out
+
+
+def _cut(value: Any, most: int = MAX_TEXT) -> Any:
+    if isinstance(value, str):
+        return value if len(value) <= most else value[:most] + "…"
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)  # JSON has no such numbers
+    if isinstance(value, (bool, int, float)) or value is None:
+        return value
+    if isinstance(value, (bytes, bytearray, memoryview)):
+        return value[:MAX_TEXT].hex()
+    if isinstance(value, Mapping):
+        return {str(key): _cut(one) for key, one in islice(value.items(), MAX_ELEMENTS)}
+    if hasattr(value, "__len__") and hasattr(value, "__getitem__"):  # a list, a tuple or an array
+        first = [_cut(value[at]) for at in range(min(len(value), MAX_ELEMENTS))]
+        return first if len(value) <= MAX_ELEMENTS else [*first, f"… {len(value) - MAX_ELEMENTS} more"]
+    item = getattr(value, "item", None)  # a number of numpy
+    return _cut(str(value) if item is None else item())
+
+
+class Trail:
+    """Writes the entries of one process, in a thread."""
+
+    def __init__(self, settings: AuditSettings, instance: str, process: str) -> None:
+        self.process = process
+        self.problem = ""
+        """Why entries cannot be written at present; empty if they can."""
+        self._instance = instance
+        self._path = settings.path
+        self._file = AuditFile(settings)
+        self._waiting: SimpleQueue[_Waiting | None] = SimpleQueue()
+        self._lost = 0
+        self._counting = threading.Lock()
+        self._closing = threading.Event()
+        self._repeated: dict[object, _Repeated] = {}
+        self._thread = threading.Thread(target=self._run, name="audit", daemon=True)
+        self._thread.start()
+
+    def add(self, entry: _Waiting) -> None:
+        """Add an entry. Any thread may call this."""
+        if self._waiting.qsize() < MAX_WAITING:
+            self._waiting.put(entry)
+        else:
+            with self._counting:
+                self._lost += 1
+
+    def close(self) -> None:
+        """Write what waits, for a limited time."""
+        self._closing.set()
+        self._waiting.put(None)
+        self._thread.join(CLOSE_S)
+
+    def _run(self) -> None:
+        while not self._closing.is_set() or self._waiting.qsize():
+            batch = [*self._merge(self._batch(self._due_s()))]
+            if batch and not self._keep_writing(b"".join(map(self._line, batch))):
+                return
+        for one in self._repeated.values():
+            if one.last is not None:
+                self._keep_writing(self._line(one.last._replace(times=one.times)))
+        self._file.close()
+
+    def _due_s(self) -> float | None:
+        """Return the time in s until an entry for repetitions is due; None: there are none."""
+        if not self._repeated:
+            return None
+        return max(0.0, min(one.until_s for one in self._repeated.values()) - time.monotonic())
+
+    def _merge(self, batch: list[_Waiting]) -> Iterator[_Waiting]:
+        """Yield the entries to write now: those of a batch, and those for earlier repetitions."""
+        now_s = time.monotonic()
+        for entry in batch:
+            kind = entry.kind
+            known = None if kind is None else self._repeated.get(kind)
+            if known is not None:
+                known.times += entry.times
+                known.last = entry
+                continue
+            if kind is not None and len(self._repeated) < MAX_MERGED:
+                self._repeated[kind] = _Repeated(now_s + MERGE_S)
+            yield entry
+        for key, one in list(self._repeated.items()):
+            if one.until_s > now_s:
+                continue
+            if one.last is None:
+                del self._repeated[key]
+            else:
+                yield one.last._replace(times=one.times)
+                self._repeated[key] = _Repeated(now_s + MERGE_S)
+
+    def _batch(self, wait_s: float | None) -> list[_Waiting]:
+        """Wait for an entry, at most ``wait_s``, and return it with those that have come meanwhile."""
+        found: list[_Waiting | None] = []
+        try:
+            found.append(self._waiting.get(timeout=wait_s))
+            while len(found) < MAX_BATCH:
+                found.append(self._waiting.get_nowait())
+        except Empty:
+            pass
+        batch = [entry for entry in found if entry is not None]
+        with self._counting:
+            lost, self._lost = self._lost, 0
+        if lost:
+            reason = f"more than {MAX_WAITING} entries waited for the disk"
+            own = Acting(Actor("process", self.process), self.process)
+            batch.append(_Waiting(time.time(), own, "audit", {"entries": lost}, "lost", reason, 0, 0, 1))
+        return batch
+
+    def _keep_writing(self, lines: bytes) -> bool:
+        """Write lines as soon as that is possible. Return False if the process ends before."""
+        while True:
+            try:
+                self._file.append(lines)
+            except OSError as error:
+                before, self.problem = self.problem, f"audit: {self._path} cannot be written: {error.strerror}"
+                if self.problem != before:
+                    log.error("%s; up to %d entries wait, and commands are carried out", self.problem, MAX_WAITING)
+            else:
+                if self.problem:
+                    log.warning("audit: %s can be written again", self._path)
+                self.problem = ""
+                return True
+            if self._closing.wait(RETRY_S):
+                return False
+
+    def _line(self, waiting: _Waiting) -> bytes:
+        who = waiting.acting
+        what = waiting.what
+        if callable(what):
+            try:
+                what = _brief(what())
+            except Exception as error:  # noqa: BLE001  whatever the client has sent, there is an entry
+                what = {"error": f"this cannot be shown: {type(error).__name__}"}
+        entry = Entry(
+            stamp(waiting.time_s), self._instance, self.process, os.getpid(), who.endpoint, who.actor.kind,
+            _cut(who.actor.name), _cut(who.actor.origin), waiting.action, waiting.outcome,
+            _cut(waiting.reason, MAX_REASON), what, getattr(what, "left_out", 0),
+            waiting.times, waiting.command, waiting.event,
+        )  # fmt: skip
+        try:
+            return msgspec.json.encode(entry) + b"\n"
+        except (UnicodeEncodeError, ValueError, OverflowError):  # text that is not Unicode, or a very large number
+            return json.dumps(msgspec.to_builtins(entry)).encode() + b"\n"
+
+
+_trail: Trail | None = None
+
+
+def open_trail(settings: AuditSettings | None, instance: str, process: str) -> None:
+    """Write the entries of this process to an audit log from now on; None: there is none."""
+    global _trail  # noqa: PLW0603  one for each process, as for log lines
+    close_trail()
+    _trail = None if settings is None else Trail(settings, instance, process)
+
+
+def close_trail() -> None:
+    """Write what waits, and end."""
+    global _trail
+    trail, _trail = _trail, None
+    if trail is not None:
+        trail.close()
+
+
+def problem() -> str:
+    """Return why entries of this process cannot be written; empty if they can, or if there is no audit log."""
+    return "" if _trail is None else _trail.problem

@@ -1,0 +1,353 @@
+"""Writes to the audit log what programs on this host do to the instance by its shared memory.
+
+Nobody serves these programs, so nobody but their sources sees their commands, and a source must not
+wait for a disk. A thread of the supervisor reads the sources' events instead, which have the number
+of each command, and in it the pid of the program. Other processes of the instance write their
+entries themselves; only if one was killed before it knew the outcome of a command, the entry is made
+here.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from shmio.audit import trail
+from shmio.audit.trail import MAX_NAMED, Acting, Actor, uid_actor
+from shmio.model.clock import Clock
+from shmio.segment import Block, Event, EventKind, Segment
+from shmio.segment.commands import pid_of, worst
+from shmio.segment.events import ENDS, EVENT_DATA_SIZE
+from shmio.segment.processes import WRITERS
+
+if TYPE_CHECKING:
+    from shmio.segment.explain import Explained, Explainer
+
+TURN_S: Final = 0.05
+"""Pause between two turns in s. An event ring takes longer to fill."""
+LIVELY_S: Final = 0.005
+"""Pause after a turn in which a block had many events."""
+LIVELY: Final = 256
+"""Number of a block's events in a turn that are many."""
+MAX_READ: Final = 1024
+"""Maximum number of a block's events that are read before those of the other blocks."""
+MAX_OPEN: Final = 4096
+"""Maximum number of commands of a block whose ends are awaited."""
+CLOSE_S: Final = 2.0
+"""How long the end waits for the thread, in s."""
+RESTARTED: Final = "the source was restarted before it told the outcome"
+
+_KINDS: Final = {writer: kind for kind, writer in WRITERS.items()}
+_WRITES: Final = frozenset(
+    {EventKind.WRITTEN, EventKind.REFUSED, EventKind.EXPIRED, EventKind.UNKNOWN, EventKind.TAKEN}
+)
+
+log = logging.getLogger("shmio.audit")
+
+
+class Programs:
+    """Knows the programs that may change the instance: its own processes and others."""
+
+    def __init__(self, segment: Segment) -> None:
+        self._segment = segment
+        self._own: set[int] = set()
+        self._others: dict[int, Actor] = {}
+        self._ended: dict[int, bool] = {}
+
+    def look(self) -> None:
+        """Look at the process table. Call this often: a program may be gone when its events are read."""
+        self._ended.clear()
+        self._own |= {slot.report.pid for slot in self._segment.processes}
+        for slot in self._segment.processes.external:
+            report = slot.report
+            if report.pid and report.pid not in self._others:
+                uid = _uid_of(report.pid, report.counters[0])
+                self._others[report.pid] = uid_actor(uid, f"pid {report.pid} {report.note}".rstrip())
+        if len(self._others) > MAX_OPEN:
+            self._others.clear()
+
+    def is_own(self, pid: int, writer: int | None = None) -> bool:
+        """Return whether a process is one of the instance; these write their own entries."""
+        return pid in self._own or writer in _KINDS
+
+    def has_ended(self, pid: int) -> bool:
+        """Return whether a process has ended."""
+        if pid not in self._ended:
+            self._ended[pid] = not Path(f"/proc/{pid}").exists()
+        return self._ended[pid]
+
+    def actor(self, pid: int, writer: int | None = None) -> Acting:
+        """Return who acts as the process with this pid."""
+        if self.is_own(pid, writer):
+            kind = "web" if writer is None else _KINDS.get(writer, "web")
+            return Acting(Actor("process", kind, f"pid {pid}, which has ended before it could tell for whom"), kind)
+        found = self._others.get(pid)
+        if found is None:
+            uid = _uid_of(pid, None)
+            origin = f"pid {pid} {trail.program_of(pid)}".rstrip()
+            found = uid_actor(uid, origin)
+        return Acting(found, "local")
+
+
+def _uid_of(pid: int, told: int | None) -> int | None:
+    """Return the user of a process; ``told`` if it has ended."""
+    try:
+        return Path(f"/proc/{pid}").stat().st_uid
+    except OSError:
+        return told
+
+
+class _OpenCommand:
+    """The events of a command, until its end is known."""
+
+    def __init__(self) -> None:
+        self.events: list[Event] = []
+        self._accepted: set[int] = set()
+        self._ended: set[int] = set()
+
+    def add(self, event: Event) -> bool:
+        """Add an event; return whether the end of the command may be known now."""
+        self.events.append(event)
+        if event.kind == EventKind.ACCEPTED:
+            self._accepted.add(event.item)
+        elif event.kind in _WRITES:
+            self._ended.update(range(event.item, event.item + max(1, event.items)))
+        return event.kind in ENDS
+
+    @property
+    def over(self) -> bool:
+        """True if each accepted item has an end."""
+        return self._accepted <= self._ended or self.events[-1].kind not in _WRITES
+
+
+class BlockCommands:
+    """Follows the commands to one block. Use it from one thread."""
+
+    def __init__(self, block: Block, programs: Programs, after: int) -> None:
+        """Begin after the event with number ``after``."""
+        self.block = block
+        self._programs = programs
+        self._cursor = block.events.cursor(after=after)
+        self._open: dict[tuple[int, int, int], _OpenCommand] = {}
+        self._ending: dict[tuple[int, int, int], None] = {}
+        self._explainer: Explainer | None = None
+        self._asked = 0 if block.playhead is None else block.playhead.asked()
+        self._present = block.events.head()
+
+    @property
+    def over(self) -> bool:
+        """True if a reload has retired the block, and all its events have been read."""
+        return self._cursor.ended
+
+    def turn(self) -> int:
+        """Read new events; return their number."""
+        count = 0
+        while count < MAX_READ and (event := self._cursor.poll()) is not None:
+            count += 1
+            if missed := self._cursor.take_missed():
+                self._lose(missed, event.number)
+            self._take(event)
+        if count < MAX_READ:  # no further event of these commands is there
+            self._end([key for key in self._ending if self._open[key].over])
+            self._ending.clear()
+            self._follow_replay()
+        return count
+
+    def _lose(self, missed: int, before: int) -> None:
+        self._open.clear()
+        self._ending.clear()
+        self._explainer = None
+        reason = "events were overwritten before they were read, and commands of local programs may be among them"
+        trail.record("audit", {"source": self.block.source, "events": missed}, "lost", reason, event=before - 1)
+
+    def _take(self, event: Event) -> None:
+        if event.kind == EventKind.STARTED:
+            self._end([key for key in self._open if key[0] != event.incarnation], RESTARTED)
+            self._ending.clear()
+        if not event.command:
+            return
+        key = event.command_key
+        known = self._open.get(key)
+        if known is None:
+            if len(self._open) >= MAX_OPEN:
+                oldest = next(iter(self._open))
+                self._ending.pop(oldest, None)
+                self._end([oldest], "too many commands are under way")
+            known = self._open[key] = _OpenCommand()
+        if known.add(event):
+            self._ending[key] = None
+
+    def _end(self, keys: Iterable[tuple[int, int, int]], missing: str = "") -> None:
+        """Make the entries of commands; ``missing`` says why some outcomes are not known."""
+        for key in keys:
+            events = self._open.pop(key).events
+            if events[0].kind == EventKind.INJECTED and not self._is_whole(events):
+                self._open[key] = _OpenCommand()
+                self._open[key].events = events
+                continue
+            _, writer, number = key
+            pid = pid_of(number)
+            if self._programs.is_own(pid, writer):  # it has made the entry, unless it was killed just now
+                wanted = events[-1].number > self._present and self._programs.has_ended(pid)
+            else:
+                wanted = True
+            if wanted:
+                self._record(events, self._programs.actor(pid, writer), number, missing)
+
+    @staticmethod
+    def _is_whole(events: Sequence[Event]) -> bool:
+        """Return whether all parts of an injection's definition are there."""
+        if len(events[-1].data) < EVENT_DATA_SIZE:
+            return True
+        try:
+            msgspec.json.decode(b"".join(event.data for event in events))
+        except msgspec.MsgspecError:
+            return False
+        return True
+
+    def _record(self, events: Sequence[Event], who: Acting, number: int, missing: str) -> None:
+        found = [self._explain(event) for event in events]
+        last, kind = events[-1], EventKind(events[-1].kind)
+        places = {place.path: place for one in found for place in one.places}
+        values: dict[str, Any] = {path: place.plain if place.valued else None for path, place in places.items()}
+        for one in found:
+            values |= {place.path: place.plain for place in one.places if place.valued}
+        outcome, reason = str(kind), last.text
+        if kind is EventKind.INJECTED:
+            laid = next((one.laid for one in reversed(found) if one.laid is not None), None) or {}
+            action, what = ("declare" if "target" in laid else "inject"), {
+                "source": self.block.source, "injection": last.injection, **laid, "paths": list(places)[:MAX_NAMED],
+            }  # fmt: skip
+            reason = ""
+        elif kind in (EventKind.LIFTED, EventKind.NOTED):
+            action = "lift" if kind is EventKind.LIFTED else "note"
+            about = {"injection": last.injection} if kind is EventKind.LIFTED else {"note": reason}
+            what, reason = {"source": self.block.source, **about}, ""
+        elif kind in _WRITES or kind is EventKind.ACCEPTED:
+            ends = [(EventKind(one.kind), one.text) for one in events if one.kind in _WRITES]
+            action, what = "write", values
+            kind, reason = worst([*ends, (EventKind.UNKNOWN, missing)] if missing else ends)
+            outcome = str(kind)
+        else:
+            action, what = ("feed" if kind is EventKind.SHADOWED else "write" if last.size else "command"), values
+        what = what or {"source": self.block.source}
+        trail.record(action, what, outcome, reason, who=who, command=number, event=last.number)
+
+    def _explain(self, event: Event) -> Explained:
+        if self._explainer is None:
+            from shmio.segment.explain import Explainer  # noqa: PLC0415  loads numpy, which is not always needed
+
+            self._explainer = Explainer(self.block.source, self.block.layout, MAX_NAMED)
+            self._explainer.know(self.block.injections.read())
+        return self._explainer.explain(event)
+
+    def _follow_replay(self) -> None:
+        """Make an entry if a program has moved the replay. Of several requests in a turn, it is the last."""
+        playhead = self.block.playhead
+        if playhead is None or (asked := playhead.asks(self._asked)) is None:
+            return
+        self._asked, request = asked
+        pid = playhead.asker()
+        if not self._programs.is_own(pid):
+            what = {"source": self.block.source, **({} if request is None else msgspec.to_builtins(request))}
+            trail.record("replay", what, "requested", who=self._programs.actor(pid))
+
+
+class TimeChanges:
+    """Follows who moves the instance's time. Use it from one thread."""
+
+    def __init__(self, segment: Segment, programs: Programs) -> None:
+        self._clock = segment.clock
+        self._programs = programs
+        self._before = self._clock.last_written()
+
+    def turn(self) -> None:
+        """Make entries for what has changed. Several steps of a turn have one entry."""
+        before, now = self._before, self._clock.last_written()
+        if now == before:
+            return
+        self._before = now
+        pid = now.owner or before.owner
+        if not pid or self._programs.is_own(pid):
+            return
+        who = self._programs.actor(pid)
+        for action, what in _changes(before, now):
+            count = now.step - before.step if action == "step" else 1
+            trail.record(action, what, "done", who=who, count=count)
+
+
+def _changes(before: Clock, now: Clock) -> Iterable[tuple[str, Mapping[str, Any]]]:
+    if now.step_size_ns != before.step_size_ns:
+        yield "step size", {"dt_s": now.step_size_ns / 1e9}
+    if now.step > before.step and not before.playing:
+        yield "step", {
+            "step": now.step, "dt_s": now.dt_ns / 1e9, "time_s": now.time_ns / 1e9
+        }  # fmt: skip
+    if now.playing != before.playing:
+        yield ("play", {"rate": now.rate}) if now.playing else ("pause", {})
+    if now.virtual != before.virtual:
+        yield ("stop time", {}) if now.virtual else ("release", {})
+
+
+class LocalCommands:
+    """Follows all sources of an instance in a thread."""
+
+    def __init__(self, instance: str, after: Mapping[str, int] | None) -> None:
+        """Begin.
+
+        Args:
+            instance: Name of the instance.
+            after: For each source, the number of the last event that an earlier supervisor has recorded.
+                For other sources, it begins with the oldest event.
+
+        """
+        self._segment = Segment.open(instance)
+        self._programs = Programs(self._segment)
+        self._time = TimeChanges(self._segment, self._programs)
+        self._after = dict(after or {})
+        self._blocks: dict[int, BlockCommands] = {}
+        self._seen: set[int] = set()
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="local commands", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Read what is there, and end."""
+        self._stopping.set()
+        self._thread.join(CLOSE_S)
+        if not self._thread.is_alive():
+            self._segment.close()
+
+    def _run(self) -> None:
+        pause_s, failure = 0.0, ""
+        while True:
+            stopping, count = self._stopping.wait(pause_s), 0
+            try:
+                count = self._turn()
+                pause_s = LIVELY_S if count > LIVELY else TURN_S
+            except Exception as error:
+                pause_s, before, failure = 1.0, failure, repr(error)
+                if failure != before:
+                    log.exception("commands of local programs cannot be written to the audit log")
+            if stopping and count < MAX_READ:
+                return
+
+    def _turn(self) -> int:
+        """Read new events of all sources, and return the largest number of events of a source."""
+        self._segment.refresh()
+        self._programs.look()
+        for block in (*self._segment.ended, *self._segment.blocks.values()):
+            if block.section not in self._seen:
+                self._seen.add(block.section)
+                after = min(self._after.pop(block.source, 0), block.events.head())
+                self._blocks[block.section] = BlockCommands(block, self._programs, after)
+        most = max((commands.turn() for commands in self._blocks.values()), default=0)
+        for section in [section for section, commands in self._blocks.items() if commands.over]:
+            del self._blocks[section]
+        self._time.turn()
+        return most

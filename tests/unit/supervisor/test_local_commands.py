@@ -1,0 +1,135 @@
+"""Commands of programs on this host: their entries in the audit log, made from the sources' events."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shmio.audit import trail
+from shmio.audit.file import AuditSettings
+from shmio.audit.reading import last_events
+from shmio.layout.model import Layout, Register
+from shmio.segment import Activity, BlockSpec, BlockWriter, EventKind, ProcessSpec, Record, Report, Segment
+from shmio.segment.commands import first_number
+from shmio.segment.events import EVENT_SLOTS
+from shmio.supervisor.local_commands import RESTARTED, LocalCommands
+
+LAYOUT = Layout("DB1", 1, 4, False, (
+    Register("a", "INT", (), 0, None, 2, 1), Register("b", "INT", (), 2, None, 2, 1)
+))  # fmt: skip
+GUEST, GRPC = 0, 4
+
+
+class Case:
+    """A source whose events a test writes, and the audit log that comes of them."""
+
+    def __init__(self, segment: Segment, path: Path) -> None:
+        self.segment = segment
+        self.path = path
+        self.writer: BlockWriter = segment.writer("cell")
+        self.number = first_number(os.getpid())
+
+    def accepted(self, item: int, value: int, writer: int = GUEST, **more: int) -> None:
+        data = value.to_bytes(2, "big")
+        number = more.get("number", self.number)
+        self.writer.event(Record(EventKind.ACCEPTED, "", writer, number, item, 1, 2 * item, 0, 2, data))
+
+    def ended(
+        self, kind: EventKind, item: int, items: int = 1, text: str = "", writer: int = GUEST, **more: int
+    ) -> None:
+        number = more.get("number", self.number)
+        self.writer.event(Record(kind, text, writer, number, item, items, 2 * item, 0, 2))
+
+    def entries(self, after: dict[str, int] | None = None) -> list[dict[str, Any]]:
+        """Return the entries that come of the events so far."""
+        trail.open_trail(AuditSettings(str(self.path), 10**7, 2), self.segment.instance, "supervisor")
+        LocalCommands(self.segment.instance, after).close()
+        trail.close_trail()
+        return [json.loads(line) for line in self.path.read_bytes().splitlines()]
+
+
+@pytest.fixture
+def case(instance: str, tmp_path: Path) -> Iterator[Case]:
+    block = BlockSpec("cell", LAYOUT, 20_000_000, 10**9, 1 << 22)
+    with Segment.create(instance, [block], [ProcessSpec("cell", "source"), ProcessSpec("grpc", "grpc")]) as segment:
+        yield Case(segment, tmp_path / "audit.jsonl")
+        segment.unlink()
+
+
+def ended_pid() -> int:
+    """Return the pid of a process that has ended."""
+    done = subprocess.Popen([sys.executable, "-c", ""])
+    done.wait()
+    return done.pid
+
+
+def test_a_write_has_its_values_program_and_worst_outcome(case: Case) -> None:
+    case.accepted(0, 7)
+    case.accepted(1, 8)
+    case.ended(EventKind.WRITTEN, 0)
+    case.ended(EventKind.REFUSED, 1, text="out of range")
+    (entry,) = case.entries()
+    assert (entry["kind"], entry["who"], entry["endpoint"]) == ("uid", str(os.getuid()), "local")
+    assert entry["from"].startswith(f"pid {os.getpid()} ")
+    assert (entry["action"], entry["what"]) == ("write", {"cell/a": 7, "cell/b": 8})
+    assert (entry["outcome"], entry["reason"], entry["event"]) == ("refused", "out of range", 5)
+    assert last_events(case.path, "") == {"cell": 5}
+
+
+def test_a_program_that_has_ended_is_known_by_its_slot(case: Case) -> None:
+    pid = ended_pid()
+    case.segment.processes.external[0].report = Report(pid, Activity.RUNNING, 0, (4711,), "press.py")
+    case.ended(EventKind.REJECTED, 0, 2, "not writable", number=first_number(pid))
+    (entry,) = case.entries()
+    assert (entry["who"], entry["from"]) == ("4711", f"pid {pid} press.py")
+    assert (entry["outcome"], entry["reason"]) == ("rejected", "not writable")
+
+
+@pytest.mark.parametrize("alive", [True, False])
+def test_a_command_of_an_endpoint_has_an_entry_only_if_the_endpoint_was_killed(
+    case: Case, alive: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pid = os.getpid() if alive else ended_pid()
+    number = first_number(pid)
+    trail.open_trail(AuditSettings(str(case.path), 10**7, 2), case.segment.instance, "supervisor")
+    local = LocalCommands(case.segment.instance, {})
+    case.accepted(0, 7, GRPC, number=number)
+    case.ended(EventKind.WRITTEN, 0, writer=GRPC, number=number)
+    local.close()
+    trail.close_trail()
+    found = [json.loads(line) for line in case.path.read_bytes().splitlines()] if case.path.exists() else []
+    if alive:
+        assert found == []
+    else:
+        (entry,) = found
+        assert (entry["kind"], entry["who"], entry["what"]) == ("process", "grpc", {"cell/a": 7})
+
+
+def test_the_next_supervisor_goes_on_where_the_last_one_ended(case: Case) -> None:
+    case.ended(EventKind.REJECTED, 0, text="first")
+    assert [entry["reason"] for entry in case.entries()] == ["first"]
+    case.ended(EventKind.REJECTED, 0, text="second")
+    assert [entry["reason"] for entry in case.entries(last_events(case.path, ""))] == ["first", "second"]
+
+
+def test_a_restart_of_the_source_ends_its_commands(case: Case) -> None:
+    case.accepted(0, 7)
+    case.segment.writer("cell")  # publishes STARTED
+    (entry,) = case.entries()
+    assert (entry["outcome"], entry["reason"]) == ("unknown", RESTARTED)
+
+
+def test_overwritten_events_are_reported(case: Case) -> None:
+    for _ in range(EVENT_SLOTS + 10):
+        case.ended(EventKind.QUALITY, 0, number=0)
+    case.ended(EventKind.REJECTED, 0, text="last")
+    lost, last = case.entries()
+    assert (lost["outcome"], lost["what"]["events"] >= 10) == ("lost", True)
+    assert last["reason"] == "last"
