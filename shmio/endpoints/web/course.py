@@ -25,6 +25,7 @@ from shmio.recording.decimation import Decimator, Samples
 from shmio.recording.dump import Dump
 from shmio.recording.reading.batch import Batch
 from shmio.recording.reading.part import DumpBlock
+from shmio.segment import EventKind
 from shmio.segment.explain import Explainer, kind_of
 
 PART_S: Final = 0.1
@@ -311,8 +312,9 @@ def events(dump: Dump, sources: Collection[str], window: Window) -> Iterator[Par
                 found[column].count += 1
             else:
                 paths = [place.path for place in explained.places]
+                text = f"{event.quality} {event.text}".strip() if event.kind == EventKind.QUALITY else event.text
                 found[column] = MarkedEvent(
-                    time_ns / 1e9, block.source, kind_of(event), explained.by, event.text, paths[:MAX_PATHS],
+                    time_ns / 1e9, block.source, kind_of(event), explained.by, text, paths[:MAX_PATHS],
                     max(0, len(paths) - MAX_PATHS),
                 )  # fmt: skip
         if time.monotonic() - started_s >= PART_S:

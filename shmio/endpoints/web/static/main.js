@@ -6,6 +6,7 @@ import { InjectionsTab } from "./injections.js";
 import { LogTab } from "./log.js";
 import { OverviewTab } from "./overview.js";
 import { PlotsTab, plot } from "./plots.js";
+import { RecordingsTab } from "./recordings.js";
 import { RegistersTab } from "./registers.js";
 import { session, signIn, signOut } from "./session.js";
 import { TimeTab } from "./time.js";
@@ -23,6 +24,7 @@ const TABS = {
   plots: { title: "Plots", make: (context) => new PlotsTab(context) },
   injections: { title: "Injections", make: (context) => new InjectionsTab(context) },
   time: { title: "Time", make: (context) => new TimeTab(context) },
+  recordings: { title: "Recordings", make: (context) => new RecordingsTab(context) },
   log: { title: "Log", make: (context) => new LogTab(context) },
 };
 

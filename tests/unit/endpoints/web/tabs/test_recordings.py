@@ -215,7 +215,10 @@ def test_events_are_marks_with_their_text(browser: Connection, folder: Path) -> 
         for number in range(1, 31):
             work.event(number, 2 * number, f"event {number}")
     _, events = plot(browser, "a.mem", "cell/count")
-    assert [(one["time_s"], one["text"]) for one in events][:2] == [(moment(2), "event 1"), (moment(4), "event 2")]
+    assert [(one["time_s"], one["text"]) for one in events][:2] == [
+        (moment(2), "good event 1"),
+        (moment(4), "good event 2"),
+    ]
     _, few = plot(browser, "a.mem", "cell/count", columns=3)
     assert len(few) <= 4
     assert sum(one.get("count", 1) for one in few) == 30
