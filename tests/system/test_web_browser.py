@@ -7,11 +7,16 @@ import os
 import shutil
 import signal
 from collections.abc import Callable, Iterator
+from contextlib import suppress
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+import shmio
+from shmio.errors import RecordingError
+from shmio.segment import EventKind
 from shmio.testing.cell import CONFIG, Cell, until
 from shmio.testing.ports import reserved_port
 
@@ -21,6 +26,8 @@ CHROMIUM = shutil.which("chromium")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
 expect: Any = playwright.expect
 PATIENCE_MS = 30_000
+LEFT_PX = 70
+"""Left margin of a plot."""
 AXIS = "cell/Robot_800/Axs1_Pos"
 
 
@@ -35,7 +42,7 @@ def address() -> Iterator[str]:
 def cell(make_cell: Callable[..., Cell], address: str) -> Cell:
     """A running cell with a page."""
     config = CONFIG.replace("timeout = 1000", 'timeout = 1000\nwritable = ["Outputs"]')
-    cell = make_cell(config=f'{config}[web]\nlisten = "{address}"\n')
+    cell = make_cell(config=f'{config}[web]\nlisten = "{address}"\n[recorder]\ndirectory = "dumps"\n')
     cell.up()
     return cell
 
@@ -163,6 +170,117 @@ def test_user_steps_time_and_returns_to_real_time(cell: Cell, page: Any) -> None
     expect(page.locator(".time dl")).not_to_contain_text("yes, at")
     page.get_by_role("button", name="Back to real time").click()
     until(lambda: cell.status()["clock"]["mode"] == "wall", "real time")
+
+
+def saved_table(page: Any) -> list[list[str]]:
+    """Return the rows of the table that the page saves, with its head."""
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Save CSV").click()
+    return [line.split(",") for line in download.value.path().read_text().splitlines()]
+
+
+def recorded_s(cell: Cell) -> float:
+    """Return the length of the recording that is being written."""
+    [file] = (cell.folder / "dumps").glob("*.mem")
+    with suppress(RecordingError), shmio.open_dump(file) as dump:
+        return (dump.end_ns - dump.begin_ns) / 1e9
+    return 0.0  # nothing is recorded yet
+
+
+def zoom(page: Any, share: float, turns: int) -> None:
+    """Turn the wheel with the pointer at a share of the time axis."""
+    box = page.locator(".lane canvas").first.bounding_box()
+    page.mouse.move(box["x"] + LEFT_PX + share * (box["width"] - LEFT_PX), box["y"] + box["height"] / 2)
+    for _ in range(turns):
+        page.mouse.wheel(0, -100)
+
+
+def test_user_examines_a_recording(cell: Cell, page: Any) -> None:
+    until(
+        lambda: any((cell.folder / "dumps").glob("*.mem")) and recorded_s(cell) > 12, "a recording longer than the ring"
+    )
+    cell.output("shmio", "set", "cell/Outputs/500", "7")
+    open_tab(page, "Recordings")
+    row = page.get_by_role("table", name="recordings").get_by_role("row").nth(1)
+    expect(row).to_contain_text("being written")
+    row.click()
+    expect(page.locator(".info")).to_contain_text("22 registers")
+    search = page.get_by_label("Add a register")
+    search.fill("cell/nothing")
+    search.press("Enter")
+    expect(
+        page.get_by_text("no register of this recording has such a path").or_(page.get_by_text("cell/nothing"))
+    ).to_be_visible()
+    expect(page.locator(".lane")).to_have_count(0)
+    search.fill(AXIS)
+    search.press("Enter")
+    value = page.locator(f'.legend li[data-path="{AXIS}"] output')
+    expect(value).not_to_have_text("no value")
+    page.get_by_role("button", name="Check for damage").click()
+    expect(page.get_by_label("Result of the check")).to_contain_text("no damage")
+    zoom(page, 0.5, 12)
+    [file] = (cell.folder / "dumps").glob("*.mem")
+
+    def shows_frames() -> bool:
+        head, *rows = saved_table(page)
+        assert head == ["time", AXIS]
+        times = [datetime.fromisoformat(time).timestamp() for time, _ in rows]
+        with shmio.open_dump(file) as dump:
+            found = dump.columns(AXIS, round((times[0] - 0.0005) * 1e9), round((times[-1] + 0.0015) * 1e9))
+        return [float(value) for _, value in rows] == [float(one) for one in found["Robot_800/Axs1_Pos"]]
+
+    until(shows_frames, "each frame in view, as it is in the file")
+    keep(page, "recordings")
+
+    open_tab(page, "Plots")
+    search.fill(AXIS)
+    search.press("Enter")
+    expect(value).not_to_have_text("no value")
+    page.get_by_label("Time span").select_option("120")
+
+    def past_s() -> float:
+        times = [datetime.fromisoformat(time).timestamp() for time, _ in saved_table(page)[1:]]
+        return times[-1] - times[0]
+
+    until(lambda: past_s() > 11, "the past from the recording")
+    keep(page, "past")
+
+
+def test_user_controls_a_replay(cell: Cell, page: Any) -> None:
+    until(lambda: recorded_s(cell) > 3, "a recording")
+    cell.output("shmio", "set", "cell/Outputs/500", "7")
+    cell.down()
+    [file] = (cell.folder / "dumps").glob("*.mem")
+    with shmio.open_dump(file) as dump:
+        written_ns = next(entry.time_ns for entry in dump.events() if entry.item.kind == EventKind.WRITTEN)
+    cell.output("shmio-supervisor", "up", "--detach", "--mode", "replay", "--paused", "--from", str(file))
+    expect(page.get_by_role("alert")).to_be_hidden()
+    open_tab(page, "Recordings")
+    expect(page.get_by_role("table", name="recordings").get_by_role("row").nth(1)).to_contain_text("closed")
+    position = page.get_by_label("Present position")
+    expect(position).to_contain_text("paused")
+    with shmio.attach(cell.instance) as attached:
+
+        def playing() -> Any:
+            return attached.replay.status()[0]
+
+        page.get_by_label("Position", exact=True).fill("1.5")
+        until(lambda: playing().position_s == pytest.approx(1.5), "the position")
+        expect(position).to_contain_text("1.500 s of")
+        page.get_by_label("jump there instead of playing").check()
+        page.get_by_label("Kind of event").select_option("written")
+        page.get_by_role("button", name="To the next event").click()
+        until(lambda: playing().time_s == pytest.approx(written_ns / 1e9, abs=1e-6), "the position of the event")
+        keep(page, "replay")
+        page.get_by_label("Speed").fill("2")
+        page.get_by_label("Speed").press("Enter")
+        until(lambda: playing().speed == 2, "the speed")
+        page.get_by_label("start again at the end").check()
+        until(lambda: playing().loop, "the loop")
+        page.get_by_role("button", name="Play").click()
+        until(lambda: not playing().paused, "that it plays")
+        page.get_by_role("button", name="Pause").click()
+        until(lambda: playing().paused, "the pause")
 
 
 def test_user_restarts_a_process(cell: Cell, page: Any) -> None:

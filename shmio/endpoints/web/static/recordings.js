@@ -185,12 +185,15 @@ export class RecordingsTab {
     const span = found.from ? `${moment(Date.parse(found.from) / 1000)}, ${duration(found.duration_s)}, ${bytes(found.size)}` : "it has no frames";
     setText(this.info, [span, end, by, missed, ...blocks].join(" · "));
     replace(this.damage, ...found.damage.map((/** @type {string} */ text) => element("li", {}, text)));
-    const [down, up] = found.commands;
-    const replaying = this.context.overview?.mode === "replay";
-    const why = replaying
-      ? "To replay it in place of the present replay, run on this instance's host:"
-      : "A replay takes the place of the sources, so it needs this instance's name and addresses. This page stops no cell. Run on this instance's host:";
-    replace(this.commands, element("p", {}, why), this.command(down), this.command(up), element("p", {}, "Then this tab controls the replay."));
+    const { beside, instead } = found.replay;
+    replace(
+      this.commands,
+      element("p", {}, "This page starts and stops no cell. To replay the recording beside this instance, with a page of its own, run on this instance's host:"),
+      this.command(beside.replace("PORT", String(Number(location.port || 8080) + 1))),
+      element("p", {}, "To replay it in place of this instance, with all its interfaces:"),
+      this.command(instead),
+      element("p", {}, "This tab of the replay's page then pauses, moves and speeds it up."),
+    );
   }
 
   /** @param {string} text */
@@ -203,7 +206,7 @@ export class RecordingsTab {
         notify("The browser copies only over https or on the same host: select the text.", "problem");
       }
     };
-    return element("pre", {}, text, " ", element("button", { type: "button", click: copy }, "Copy"));
+    return element("div", { class: "command" }, element("pre", {}, text), element("button", { type: "button", click: copy }, "Copy"));
   }
 
   async suggest() {

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from itertools import islice
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final
 
 import msgspec
@@ -34,6 +35,10 @@ MAX_FOUND: Final = 50
 """Maximum number of registers that a search returns."""
 MAX_SHOWN: Final = 100
 """Maximum number of blocks and gaps that the description of a recording lists."""
+MAX_INSTANCE: Final = 40
+"""Maximum length of an instance's name."""
+BESIDE: Final = "-replay"
+"""End of the name of an instance that replays a recording beside the one that made it."""
 CHECKED_BYTES: Final = 1 << 20
 """Number of bytes after which a check reports its progress."""
 
@@ -118,9 +123,7 @@ class RecordingsTab(Tab):
         found = await self._once(lambda beat: describe(path, own=True, beat=beat))
         found["blocks"], found["gaps"] = found["blocks"][:MAX_SHOWN], found["gaps"][:MAX_SHOWN]
         del found["attachments"]
-        config = f"-c {shlex.quote(self.page.served.config_file)}"
-        command = f"shmio-supervisor up {config} --mode replay --from {shlex.quote(str(path))}"
-        return found | {"commands": [f"shmio-supervisor down {config}", command]}
+        return found | {"replay": self._commands(path)}
 
     @call("read", Search)
     async def registers(self, given: Search) -> list[dict[str, str]]:
@@ -218,6 +221,27 @@ class RecordingsTab(Tab):
             replay = self.page.served.cell.replay
             found = await run_in_threadpool(replay.change, wanted, self._closed.is_set)
         return [asdict(one) for one in found]
+
+    def _commands(self, path: Path) -> dict[str, str]:
+        """Return the commands that replay a file: beside this instance, and in its place.
+
+        The page starts no instance itself: a replay in place of this one would stop it. In the first command, PORT
+        stands for the port of the page of the replay.
+        """
+        served = self.page.served
+        name = f"{served.segment.instance[: MAX_INSTANCE - len(BESIDE)]}{BESIDE}"
+        replay = f"--mode replay --from {shlex.quote(str(path))}"
+        config = f"-c {shlex.quote(served.config_file)}"
+        return {
+            "beside": f"mkdir {name} && cd {name}\n"
+            "cat > supervisor.toml <<'END'\n"
+            f'[instance]\nname = "{name}"\n'
+            f"[recorder]\ndirectory = {msgspec.json.encode(str(path.parent)).decode()}\n"
+            '[web]\nlisten = "127.0.0.1:PORT"\n'
+            "END\n"
+            f"shmio-supervisor up {replay}",
+            "instead": f"shmio-supervisor down {config}\nshmio-supervisor up {config} {replay}",
+        }
 
     def _start(self, work: Work[Any]) -> int:
         if len(self._works) >= MAX_WORKS:
