@@ -225,11 +225,10 @@ export class RecordingsTab {
       return;
     }
     this.search.value = "";
-    const before = this.lanes.lanes.map((lane) => lane.paths);
-    this.lanes.make([...before, [path]]);
+    this.lanes.make([...this.lanes.lanes.map((lane) => lane.paths), [path]]);
     const { from, to } = this.lanes;
     const known = this.overview !== null;
-    if (!(await this.readOverview())) this.lanes.make(before);
+    if (!(await this.readOverview())) this.lanes.remove(path);
     else if (known) this.lanes.showRange(from, to);
   }
 

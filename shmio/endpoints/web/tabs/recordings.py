@@ -233,13 +233,12 @@ class RecordingsTab(Tab):
         replay = f"--mode replay --from {shlex.quote(str(path))}"
         config = f"-c {shlex.quote(served.config_file)}"
         return {
-            "beside": f"mkdir {name} && cd {name}\n"
-            "cat > supervisor.toml <<'END'\n"
+            "beside": f"mkdir -p {name} && cat > {name}/supervisor.toml <<'END'\n"
             f'[instance]\nname = "{name}"\n'
             f"[recorder]\ndirectory = {msgspec.json.encode(str(path.parent)).decode()}\n"
             '[web]\nlisten = "127.0.0.1:PORT"\n'
             "END\n"
-            f"shmio-supervisor up {replay}",
+            f"shmio-supervisor up -c {name}/supervisor.toml {replay}",
             "instead": f"shmio-supervisor down {config}\nshmio-supervisor up {config} {replay}",
         }
 
