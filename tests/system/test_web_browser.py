@@ -19,6 +19,7 @@ from shmio.errors import RecordingError
 from shmio.segment import EventKind
 from shmio.testing.cell import CONFIG, Cell, until
 from shmio.testing.ports import reserved_port
+from tests.system.page import printed
 
 pytest.importorskip("uvicorn")
 playwright = pytest.importorskip("playwright.sync_api")
@@ -249,13 +250,15 @@ def test_user_examines_a_recording(cell: Cell, page: Any) -> None:
 def test_user_controls_a_replay(cell: Cell, page: Any) -> None:
     until(lambda: recorded_s(cell) > 3, "a recording")
     cell.output("shmio", "set", "cell/Outputs/500", "7")
-    cell.down()
+    open_tab(page, "Recordings")
+    page.get_by_role("table", name="recordings").get_by_role("row").nth(1).click()
+    page.get_by_text("Replay it", exact=True).click()
+    commands = page.locator(".command pre").last.inner_text()
+    printed(f"{commands} --paused --detach", cell.folder)
     [file] = (cell.folder / "dumps").glob("*.mem")
     with shmio.open_dump(file) as dump:
         written_ns = next(entry.time_ns for entry in dump.events() if entry.item.kind == EventKind.WRITTEN)
-    cell.output("shmio-supervisor", "up", "--detach", "--mode", "replay", "--paused", "--from", str(file))
     expect(page.get_by_role("alert")).to_be_hidden()
-    open_tab(page, "Recordings")
     expect(page.get_by_role("table", name="recordings").get_by_role("row").nth(1)).to_contain_text("closed")
     position = page.get_by_label("Present position")
     expect(position).to_contain_text("paused")

@@ -16,7 +16,7 @@ from websockets.sync.connection import Connection
 from shmio.endpoints.web import signals
 from shmio.endpoints.web.tabs import plots
 from shmio.recorder.file_output import Output, create
-from shmio.recorder.instance_follower import FROM_THE_FIRST, InstanceFollower, StartPositions
+from shmio.recorder.instance_follower import FROM_THE_FIRST, InstanceFollower
 from shmio.recorder.recorder import Recorder
 from shmio.recording.format.encoding import SUPERVISED
 from shmio.segment import BlockWriter, Provenance, Quality, Segment
@@ -205,9 +205,9 @@ def test_number_of_registers_is_bounded(segment: Segment, monkeypatch: pytest.Mo
         assert "at most 1" in said(browser, "plots.follow", source="cell", paths=[POSITION, "cell/step"])["error"]
 
 
-def recorder(segment: Segment, folder: Path, start: StartPositions = FROM_THE_FIRST) -> Recorder:
+def recorder(segment: Segment, folder: Path) -> Recorder:
     path, fd = create(folder, segment.instance)
-    return Recorder(InstanceFollower(segment, start), Output(path, fd, limit_bytes=1 << 24), by=SUPERVISED)
+    return Recorder(InstanceFollower(segment, FROM_THE_FIRST), Output(path, fd, limit_bytes=1 << 24), by=SUPERVISED)
 
 
 def flush(work: Recorder) -> None:
