@@ -236,10 +236,10 @@ def _follow(campaign: Campaign, over: threading.Event, options: argparse.Namespa
     """Print events until no injection is left, the time is up, or a signal arrives."""
     deadline_s = None if options.for_s is None else time.monotonic() + options.for_s
     names = {(one.source, one.number): one.name for one in campaign.declared}
-    unheard = set(names)
-    while unheard:  # the events begin with the start of each injection
+    awaited = set(names)
+    while awaited:  # the events begin with the start of each injection
         event = next(campaign)
-        unheard.discard((event.source, event.number))
+        awaited.discard((event.source, event.number))
         _print_event(event, names, as_json=options.json)
     if options.keep:
         return

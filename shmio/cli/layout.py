@@ -65,10 +65,10 @@ def _size(text: str) -> tuple[str, int]:
 
 def _compile(names: Sequence[str], block: str | None, sizes: Mapping[str, int], *, as_json: bool) -> int:
     program = Program([_read(name) for name in names])
-    if block is not None and block.lower() not in {held.name.lower() for held in program.blocks}:
+    if block is not None and block.lower() not in {one.name.lower() for one in program.blocks}:
         program.compile(())  # reports damaged sources first
-        held = ", ".join(held.name for held in program.blocks)
-        raise ConfigError(f"--block: no data block {block!r}; there are: {held}")
+        names = ", ".join(one.name for one in program.blocks)
+        raise ConfigError(f"--block: no data block {block!r}; there are: {names}")
     try:
         compiled = program.compile(None if block is None else (block,), sizes)
     except LayoutError as error:

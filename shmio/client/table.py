@@ -267,11 +267,11 @@ class Table:
         """
         try:
             changes = self.read(values)
-            for column, slots, news in changes:
+            for column, slots, new in changes:
                 if len(slots) == len(self.arrays[column]):
-                    self.arrays[column][:] = news
+                    self.arrays[column][:] = new
                 else:
-                    self.arrays[column][slots] = news
+                    self.arrays[column][slots] = new
         except (IndexError, ValueError, KeyError) as error:
             raise RemoteError(f"source {self.source}: the endpoint sent an invalid update: {error}") from None
         return changes
@@ -288,13 +288,13 @@ class Table:
             if values.HasField(name):
                 part = getattr(values, name)
                 if column is Column.TEXT:
-                    news = np.array(list(part.values), dtype=object)
+                    new = np.array(list(part.values), dtype=object)
                 else:
-                    news = np.frombuffer(part.values, DTYPES[column])
+                    new = np.frombuffer(part.values, DTYPES[column])
                 slots = np.frombuffer(part.slots, np.uint32) if part.slots else self._everything[column]
-                if len(slots) != len(news):
-                    raise ValueError(f"{len(news)} values for {len(slots)} elements")
-                yield Change(column, slots, news)
+                if len(slots) != len(new):
+                    raise ValueError(f"{len(new)} values for {len(slots)} elements")
+                yield Change(column, slots, new)
 
     def take_statuses(self, found: Any) -> list[int]:
         """Copy a message's statuses, and return the indices of their registers.

@@ -189,9 +189,9 @@ class Tables:
             RemoteError: The message is invalid.
         """
         for one in found.tables:
-            news = Table(one)
-            self.known = {number: old for number, old in self.known.items() if not _same(old, news)}
-            self.known[news.number] = news
+            new = Table(one)
+            self.known = {number: old for number, old in self.known.items() if not _same(old, new)}
+            self.known[new.number] = new
         for update in found.updates:
             table = self.known.get(update.table)
             if table is None:
@@ -210,9 +210,9 @@ class Tables:
                     yield update
 
 
-def _same(old: Table, news: Table) -> bool:
-    """Return whether ``news`` replaces ``old``, because both have one source and direction."""
-    return (old.source, old.direction) == (news.source, news.direction)
+def _same(old: Table, new: Table) -> bool:
+    """Return whether ``new`` replaces ``old``, because both have one source and direction."""
+    return (old.source, old.direction) == (new.source, new.direction)
 
 
 class Snapshot:

@@ -333,7 +333,7 @@ class Computed(ABC):
         If the source is ``prompt``, its present image.
         """
 
-    def news(self) -> bool:
+    def has_changed(self) -> bool:
         """Return whether :meth:`begin` would return a changed image; called between two steps."""
         return False
 

@@ -259,7 +259,7 @@ class SourceLoop:
         self._retries = 0
         self._connected_ns: int | None = None
         self._accepting = False
-        self._under_way: deque[_Submitted] = deque()
+        self._in_flight: deque[_Submitted] = deque()
         self._quality_log = QualityLog(writer)
         self.counters = Counters()
 
@@ -309,8 +309,8 @@ class SourceLoop:
             self._write()
             end_ns = self._schedule.due_ns(cycle + 1)
             self._collect(end_ns, leave=self._connector.depth - 1)  # late answers make room
-            if len(self._under_way) < self._connector.depth:
-                self._under_way.append(self._asked(cycle))
+            if len(self._in_flight) < self._connector.depth:
+                self._in_flight.append(self._asked(cycle))
                 self._call(self._connector.submit)
                 self._collect(end_ns)
             else:
@@ -344,16 +344,16 @@ class SourceLoop:
 
     def _drain(self) -> None:
         """Publish all requested images before a write: its event must not precede older frames."""
-        while self._under_way:
+        while self._in_flight:
             self._collect(self._clock.now_ns() + round(self._connector.timeout_s * 1e9))
 
     def _collect(self, until_ns: int, leave: int = 0) -> None:
         """Publish the images that arrive by ``until_ns``; ``leave`` requests may stay in flight."""
-        while len(self._under_way) > leave:
+        while len(self._in_flight) > leave:
             raw = self._call(lambda: self._connector.collect(until_ns))
             if raw is None:
                 return
-            asked = self._under_way.popleft()
+            asked = self._in_flight.popleft()
             took_ns = self._clock.now_ns() - asked.asked_ns
             self.counters.round_trip_us = took_ns // 1000
             if took_ns > self._writer.block.stale_ns:  # the age of the image is unknown
@@ -391,7 +391,7 @@ class SourceLoop:
     def _fail(self, cycle: int, reason: str) -> bool:
         self.counters.failures += 1
         self._connected_ns = None
-        self._under_way.clear()
+        self._in_flight.clear()
         self._confirm_last()
         self._disconnected(cycle, reason)  # first, because it may take time to close the connection
         self._connector.close()

@@ -127,8 +127,8 @@ class _Placer:
         if path in self._found:
             raise PathError("given twice")
         if path in layout.by_path:
-            held = layout.registers[layout.by_path[path]].over
-            what = "another table has this register" if held else f"{layout.name} has a register of this path"
+            over = layout.registers[layout.by_path[path]].over
+            what = "another table has this register" if over else f"{layout.name} has a register of this path"
             raise PathError(f"{what}; choose another path")
         if layout.members(path):
             raise PathError(f"{layout.name} has a structure of this path; choose another one")
@@ -207,12 +207,14 @@ def lay_tables(
     """
     for table in tables:
         if table.block and table.block.lower() not in {name.lower() for name in blocks}:
-            held = ", ".join(blocks)
-            report.add(Diagnostic(table.file, 1, 1, f"block: no data block {table.block!r}; there are: {held}"))
+            names = ", ".join(blocks)
+            report.add(Diagnostic(table.file, 1, 1, f"block: no data block {table.block!r}; there are: {names}"))
             continue
         if not table.block and len(layouts) > 1 and not chosen:
-            held = ", ".join(blocks)
-            what = f'the sources hold several data blocks ({held}): say by block = "NAME" which one the table lies over'
+            names = ", ".join(blocks)
+            what = (
+                f'the sources have several data blocks ({names}): say by block = "NAME" which one the table lies over'
+            )
             report.add(Diagnostic(table.file, 1, 1, what))
             continue
         if table.block and layouts and table.block.lower() not in {layout.name.lower() for layout in layouts}:

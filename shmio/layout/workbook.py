@@ -64,8 +64,8 @@ def read_rows(data: bytes, choose: Callable[[list[str]], str | None]) -> list[Ro
             names = [sheet.title for sheet in book.worksheets]
             name = choose(names)
             if name is None:
-                held = ", ".join(names[:20]) or "none"
-                raise WorkbookError(f"the workbook has no sheet of this name; it has: {held}")
+                listed = ", ".join(names[:20]) or "none"
+                raise WorkbookError(f"the workbook has no sheet of this name; it has: {listed}")
             return list(_rows(book, name))
     except WorkbookError:
         raise

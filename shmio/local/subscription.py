@@ -58,7 +58,7 @@ class Following(Generic[Item]):
                 if self._closed:
                     raise StopIteration
                 for relay in self._relays.values():
-                    relay.heard()  # before reading
+                    relay.acknowledge()  # before reading
                 found = self._take()
                 poll = select.poll()
                 for relay in self._relays.values():

@@ -95,26 +95,26 @@ class LayoutFiles:
         compiled = found
         warnings = [one for one in compiled.warnings if not (optimized and compiler.is_of_access(one))]
         self.warnings += [line for line in summarize(warnings) if line not in self.warnings]
-        held = ", ".join(layout.name for layout in compiled.layouts)
-        self.odd += [f"{key}.type_bytes: nothing in {held} has the type {name!r}" for name in compiled.unused]
+        names = ", ".join(layout.name for layout in compiled.layouts)
+        self.odd += [f"{key}.type_bytes: nothing in {names} has the type {name!r}" for name in compiled.unused]
         return compiled.layouts
 
 
 def _choose(
     key: str, section: Source | Emulator, blocks: Sequence[compiler.BlockName], number: int | None
 ) -> compiler.BlockName:
-    held = ", ".join(block.name for block in blocks)
+    names = ", ".join(block.name for block in blocks)
     if section.block is not None:
         for block in blocks:
             if block.name.lower() == section.block.lower():
                 return block
-        raise ConfigError(f"{key}.block: no data block {section.block!r}; there are: {held}")
+        raise ConfigError(f"{key}.block: no data block {section.block!r}; there are: {names}")
     found = [block for block in blocks if block.number is not None and block.number == number]
     if len(found) != 1:
         if number is not None:
-            raise ConfigError(f"{key}.dbNumber: no data block has the number {number} ({held}); choose one by block")
+            raise ConfigError(f"{key}.dbNumber: no data block has the number {number} ({names}); choose one by block")
         raise ConfigError(
-            f"{key}.layout: the files contain several data blocks ({held}); choose one by block or dbNumber"
+            f"{key}.layout: the files contain several data blocks ({names}); choose one by block or dbNumber"
         )
     return found[0]
 

@@ -291,8 +291,8 @@ def _read_from(key: str, emulator: Emulator, config: Config, files: LayoutFiles)
             f'{key}.layout: this key is needed, because no source with connector = "{emulator.kind}" reads {listen}'
         )
     if emulator.program != IDLE and len(found) > 1:
-        held = ", ".join(one.layout.name for one in found)
-        raise ConfigError(f"{key}.layout: this key is needed: program {emulator.program} runs on one of {held}")
+        names = ", ".join(one.layout.name for one in found)
+        raise ConfigError(f"{key}.layout: this key is needed: program {emulator.program} runs on one of {names}")
     return found
 
 

@@ -91,7 +91,7 @@ class Output:
         self._given = 0
         self._full = False
         self._pieces: deque[bytes] = deque()
-        self._news = threading.Condition()
+        self._condition = threading.Condition()
         self._after = after
         self.whole = False
         """True if the file is complete: all bytes were written, and no more will come."""
@@ -117,9 +117,9 @@ class Output:
         """End the present piece, and queue it for writing."""
         if self._piece:
             self._given += len(self._piece)
-            with self._news:
+            with self._condition:
                 self._pieces.append(bytes(self._piece))
-                self._news.notify()
+                self._condition.notify()
             self._piece.clear()
 
     @property
@@ -159,9 +159,9 @@ class Output:
         The thread writes the waiting bytes, however long the disk takes.
         """
         self.flush()
-        with self._news:
+        with self._condition:
             self._ending = True
-            self._news.notify()
+            self._condition.notify()
 
     @property
     def ended(self) -> bool:
@@ -174,9 +174,9 @@ class Output:
         Return whether all are safely on the disk.
         """
         self.flush()
-        with self._news:
+        with self._condition:
             self._ending = self._closing = True
-            self._news.notify()
+            self._condition.notify()
         self._thread.join(patience_s)
         if self._thread.is_alive():
             self.error = self.error or "the disk does not answer"
@@ -191,14 +191,14 @@ class Output:
         if not self._is_next():
             return
         while True:
-            with self._news:
+            with self._condition:
                 while not self._pieces and not self._ending:
-                    self._news.wait()
+                    self._condition.wait()
                 if not self._pieces:
                     break
                 piece = self._pieces[0]
             if self._put(piece):
-                with self._news:
+                with self._condition:
                     self._pieces.popleft()
                     self.written += len(piece)
                 if self._fsync_s and time.monotonic() - self._synced_s >= self._fsync_s:
@@ -237,9 +237,9 @@ class Output:
 
     def _wait(self) -> bool:
         """Wait before the next attempt. Return False if the file is being closed."""
-        with self._news:
+        with self._condition:
             if not self._closing:
-                self._news.wait_for(lambda: self._closing, RETRY_S)
+                self._condition.wait_for(lambda: self._closing, RETRY_S)
                 return True
         return False
 

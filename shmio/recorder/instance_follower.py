@@ -113,7 +113,7 @@ class BlockFollower:
                 return
             yield from self._entries(side)
 
-    def rest(self) -> Iterator[BlockEntry]:
+    def remaining(self) -> Iterator[BlockEntry]:
         """Yield gaps for the frames and events that are missing after the last entry."""
         for side in (self._frames, self._events):
             if side.cursor.last > side.last and side.held is None:
@@ -311,7 +311,7 @@ class InstanceFollower:
             taken = list(follower.take(batch))
             more |= len(taken) >= batch
             if follower.done:
-                taken += follower.rest()
+                taken += follower.remaining()
             most = max(most, len(taken))
             entries += taken
         self._lively = most > LIVELY
@@ -334,9 +334,9 @@ class InstanceFollower:
         now_ns = self.now()
         return [InstanceEntry(now_ns, change) for change in changes]
 
-    def rest(self) -> list[BlockEntry]:
+    def remaining(self) -> list[BlockEntry]:
         """Return gaps for the frames and events that are missing after the last entries."""
-        return [entry for follower in self.followers for entry in follower.rest()]
+        return [entry for follower in self.followers for entry in follower.remaining()]
 
     @property
     def pause_s(self) -> float:

@@ -355,7 +355,7 @@ class Recorder:
         """
         while self.run_once():
             pass
-        self.put(self.tap.rest())
+        self.put(self.tap.remaining())
         self.end()
         return self.output.close(patience_s)
 

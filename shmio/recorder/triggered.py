@@ -296,6 +296,6 @@ class TriggeredRecorder:
         """
         while self.run_once():
             pass
-        self._end(self.tap.rest())
+        self._end(self.tap.remaining())
         until_s = time.monotonic() + patience_s
         return [text for series in self._ending for text in series.close(max(0.1, until_s - time.monotonic()))]

@@ -206,13 +206,13 @@ class _Numbers:
             begin = self._first.get(key, number)
             if begin != channel.after + 1:
                 self._broken(key, channel.after, begin)
-        self._go_on(key, number, number)
+        self._continue(key, number, number)
 
     def gap(self, gap: Gap) -> None:
         """Check the range of numbers in the next gap."""
-        self._go_on((gap.source, gap.block, gap.what), gap.first, gap.last)
+        self._continue((gap.source, gap.block, gap.what), gap.first, gap.last)
 
-    def _go_on(self, key: tuple[str, int, str], first: int, last: int) -> None:
+    def _continue(self, key: tuple[str, int, str], first: int, last: int) -> None:
         if key not in self._last:
             if len(self._last) >= MAX_BLOCKS:
                 raise RecordingError(f"the file has messages and gaps of more than {MAX_BLOCKS} blocks")

@@ -63,7 +63,7 @@ class Relay:
 
     A thread waits for the doorbell without the GIL (``relay.h``). It makes ``descriptor`` readable
     at the start, after each ring, and after ``turn_ns`` without a ring. The descriptor stays
-    readable until the loop calls :meth:`heard`.
+    readable until the loop calls :meth:`acknowledge`.
     """
 
     def __init__(self, word: WakeSource, name: str, turn_ns: int = TURN_NS) -> None:
@@ -80,7 +80,7 @@ class Relay:
         """True if the thread still runs."""
         return self._thread.is_alive()
 
-    def heard(self) -> None:
+    def acknowledge(self) -> None:
         """Acknowledge a notification.
 
         Call this before you check for changes, so that you miss none.

@@ -109,7 +109,7 @@ class Explainer:
         self._most = most
         self._injections: dict[int, _Injection] = {}
         self._documents: dict[int, bytes] = {}
-        self._under_way: dict[tuple[int, int, int], dict[int, list[Place]]] = {}
+        self._in_flight: dict[tuple[int, int, int], dict[int, list[Place]]] = {}
         self._gone: frozenset[int] = frozenset()
         """Injections that ended before event ``_gone_at`` or with it."""
         self._gone_at = 0
@@ -129,7 +129,7 @@ class Explainer:
             present: The injections that exist now.
             newest: Number of the newest event, determined after ``present`` was read.
         """
-        self._under_way.clear()
+        self._in_flight.clear()
         self._documents.clear()
         self._gone = frozenset(self._injections) - {one.number for one in present}
         self._gone_at = newest
@@ -142,8 +142,8 @@ class Explainer:
                 self._injections.pop(number, None)
             self._gone = frozenset()
         if event.kind == EventKind.STARTED:  # commands to the previous process get no further events
-            for key in [key for key in self._under_way if key[0] != event.incarnation]:
-                del self._under_way[key]
+            for key in [key for key in self._in_flight if key[0] != event.incarnation]:
+                del self._in_flight[key]
         definition = self._definition(event) if event.kind == EventKind.INJECTED else None
         known = self._injections.get(event.injection)
         direction, places = "", tuple[Place, ...]()
@@ -175,18 +175,18 @@ class Explainer:
                 self._remember(event, places)
             return places
         key = event.command_key
-        accepted = self._under_way.get(key, {})
+        accepted = self._in_flight.get(key, {})
         found: list[Place] = []
         for item in range(event.item, event.item + min(event.items, MAX_REMEMBERED)):
             found += self._at_most(accepted.pop(item, ()), found)
         if not accepted:
-            self._under_way.pop(key, None)
+            self._in_flight.pop(key, None)
         return tuple(found) or self._places(event.offset, event.size, event.mask)
 
     def _remember(self, event: Event, places: tuple[Place, ...]) -> None:
-        if len(self._under_way) >= MAX_REMEMBERED:
-            self._under_way.pop(next(iter(self._under_way)))
-        items = self._under_way.setdefault(event.command_key, {})
+        if len(self._in_flight) >= MAX_REMEMBERED:
+            self._in_flight.pop(next(iter(self._in_flight)))
+        items = self._in_flight.setdefault(event.command_key, {})
         if len(items) < MAX_REMEMBERED:
             known = items.setdefault(event.item, [])
             known += (place._replace(value=None, valued=False) for place in self._at_most(places, known))

@@ -140,24 +140,24 @@ def _stop_orphans(segment: Segment, shared: SharedObject) -> list[str]:
 
     Lock all slots, so that no process can start later.
     """
-    held = {slot.index: slot for slot in segment.processes if not shared.try_lock(slot.index + 1)}
+    alive = {slot.index: slot for slot in segment.processes if not shared.try_lock(slot.index + 1)}
     found: list[Worker] = []
     deadline = time.monotonic() + GRACE_S
     try:
-        while held and time.monotonic() < deadline:
-            for index, slot in list(held.items()):
+        while alive and time.monotonic() < deadline:
+            for index, slot in list(alive.items()):
                 worker = holder(slot, shared)  # a process that has just locked its slot may not have written its pid
                 if worker is not None:
                     found.append(worker)
                 if worker is not None or shared.try_lock(index + 1):
-                    del held[index]
-            time.sleep(0.01 if held else 0)
+                    del alive[index]
+            time.sleep(0.01 if alive else 0)
         end(segment.instance, found)
     finally:
         for worker in found:
             os.close(worker.pidfd)
-    if held:
-        names = ", ".join(slot.name for slot in held.values())
+    if alive:
+        names = ", ".join(slot.name for slot in alive.values())
         raise SegmentError(
             f"instance {segment.instance!r} has processes that cannot be identified: {names}; end them first"
         )
@@ -291,12 +291,12 @@ def survivor(pid: int) -> str:
     state = ""
     with suppress(OSError, IndexError):  # "pid (name) state …", where the name may be anything: proc_pid_stat(5)
         state = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()[0]
-    held = (
+    alive = (
         "is blocked in the kernel (state D), for example by a disk or a device that hangs"
         if state == "D"
         else "still runs"
     )
-    return f"pid {pid} was killed and {held}: remove the cause, or restart the host"
+    return f"pid {pid} was killed and {alive}: remove the cause, or restart the host"
 
 
 def _ended(pidfds: Collection[int], timeout_s: float) -> set[int]:

@@ -267,10 +267,10 @@ class Supervisor:
         if not self._stopping and now_ns - self._found_ns >= NAME_S * 1e9:
             self._found_ns = now_ns
             self._follow_name()
-        taking_over = self._reloader.under_way
+        taking_over = self._reloader.in_progress
         self._reloader.step()
         if taking_over:
-            if not self._reloader.under_way and not self._started:
+            if not self._reloader.in_progress and not self._started:
                 self._started = True
                 self.history += self._replaced()
         elif not self._stopping and not self._started:

@@ -196,7 +196,7 @@ class Reloader:
         self._next_previewers: list[Answer] = []
 
     @property
-    def under_way(self) -> bool:
+    def in_progress(self) -> bool:
         """True while processes and blocks are being changed."""
         return self._change is not None
 

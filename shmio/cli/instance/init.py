@@ -309,12 +309,12 @@ def _emulated(block: Layout, number: str, address: Address) -> list[str]:
     ]
 
 
-def _emulators(layout: str, blocks: Sequence[Layout], held: int, number: str) -> tuple[list[Address], list[str]]:
+def _emulators(layout: str, blocks: Sequence[Layout], count: int, number: str) -> tuple[list[Address], list[str]]:
     """Return each block's emulator address, and the sections.
 
     One emulator serves all blocks if possible.
     """
-    together = len(blocks) == held > 1 and all(block.number is not None for block in blocks)
+    together = len(blocks) == count > 1 and all(block.number is not None for block in blocks)
     ports = _free(S7_PORTS, 1 if together else len(blocks))
     if not together and len(ports) < len(blocks):
         raise ConfigError(
@@ -323,7 +323,7 @@ def _emulators(layout: str, blocks: Sequence[Layout], held: int, number: str) ->
         )
     lines: list[str] = []
     for index, block in enumerate(blocks[: len(ports)]):
-        key = [f"block = {_toml(block.name)}"] if held > 1 else []
+        key = [f"block = {_toml(block.name)}"] if count > 1 else []
         lines += [
             "[[emulator]]                          # a process that plays the controller; for a real one: without it",
             f"name = {_toml('plc' if index == 0 else f'plc-{index + 1}')}",

@@ -166,7 +166,7 @@ def _lines(
 ) -> Iterator[str]:
     channel, time_ns, item = message
     if isinstance(item, Frame):
-        if views[channel.number].news(item):
+        if views[channel.number].take(item):
             yield from printer.frame(time_ns, views[channel.number], item)
     elif isinstance(item, Event):
         yield printer.event(time_ns, channel.source, item, explainers[channel.number].explain(item))
@@ -188,7 +188,7 @@ class View:
         self._scan = ChangeScan(self.registers)
         self._shown: Frame | None = None
 
-    def news(self, frame: Frame) -> bool:
+    def take(self, frame: Frame) -> bool:
         """Return whether a value or the quality differs from those in the frame printed last.
 
         If so, this frame becomes the one printed last.

@@ -119,7 +119,7 @@ class Remote(Computed):
         self._connected(self._last_model)
         return bytes(self._images.shown)
 
-    def news(self) -> bool:
+    def has_changed(self) -> bool:
         """Return whether a model has connected, disconnected or been replaced."""
         return self._link.model() != self._last_model
 

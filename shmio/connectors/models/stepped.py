@@ -311,7 +311,7 @@ class SteppedLoop:
         elif not state.stepping:
             self._handled = self._writer.cycle = state.step
             self._writer.at_ns = self._page.monotonic_ns(state.time_ns)
-            if self._source.news():
+            if self._source.has_changed():
                 self._show(state.step)
         wait_ns = None
         if self.commands.waiting:

@@ -314,7 +314,7 @@ class Search:
         self._entries: Iterator[Entry] = recorded.entries(find.after_ns + 1)
         self._what = f"event {find.event}" if find.event else f"change of {find.path}"
 
-    def go_on(self) -> PlayheadAnswer | None:
+    def advance(self) -> PlayheadAnswer | None:
         """Read the next piece. Return the result, or None if the search is not finished."""
         for _ in range(SEARCH_PIECE):
             entry = next(self._entries, None)
@@ -606,7 +606,7 @@ class ReplayLoop:
             except PathError as error:
                 self._answer(number, PlayheadAnswer(str(error)))
                 return True
-        if (found := self._search[1].go_on()) is not None:
+        if (found := self._search[1].advance()) is not None:
             self._answer(number, found)
         return True
 

@@ -144,7 +144,7 @@ class Recording:
             raise RecordingError(f"{error.filename}: {error.strerror}") from None
         self._file = self._dump.files[0]
         for reader in self._dump.readers:
-            reader.records.hold()
+            reader.records.lock()
         try:
             self._measure()
         except BaseException:

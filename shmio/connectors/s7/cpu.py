@@ -205,7 +205,7 @@ class _CpuQuery(Query):
 
     def refused(self, refusal: RefusedError) -> None:
         """Turn the registers bad, and ask again in the next session."""
-        self.rest()
+        self.skip()
         status = BAD_USER_ACCESS_DENIED if refusal.code == ACCESS_DENIED else BAD_NOT_SUPPORTED
         self.note(self.tags, lambda _: None, status, str(refusal))
 

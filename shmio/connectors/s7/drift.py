@@ -75,12 +75,12 @@ class BlockWatch(Query):
         """Compare the information about a block with the last, and go on to the next block."""
         block = self._round[-1]
         self._compare(block, parse_block(data, block.db_number))
-        self._go_on()
+        self._continue()
 
     def refused(self, refusal: RefusedError) -> None:  # noqa: ARG002 - that it is refused says enough
         """Go on to the next block; if all are refused, ask again only in the next session."""
         self._refused.add(self._round[-1].db_number)
-        self._go_on()
+        self._continue()
 
     def given_up(self, why: str) -> None:
         """Log that changes will not be noticed, and why."""
@@ -92,12 +92,12 @@ class BlockWatch(Query):
         self._refused.clear()
         super().lost(alive=alive)
 
-    def _go_on(self) -> None:
+    def _continue(self) -> None:
         self._round.pop()
         if self._round:
-            self.hurry()
+            self.ask_now()
         elif len(self._refused) == len(self._blocks):
-            self.rest()
+            self.skip()
 
     def _compare(self, block: Described, info: BlockInfo) -> None:
         known = self._last.get(block.db_number)

@@ -88,7 +88,7 @@ class ModeQuery(Query):
         self._stop()
 
     def _stop(self) -> None:
-        self.rest()
+        self.skip()
         self.given_up("does not support the query")
 
     def lost(self, *, alive: bool = True) -> None:

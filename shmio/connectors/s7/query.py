@@ -121,11 +121,11 @@ class Query(ABC):
             self.silent = True
             self._give_up("does not answer the query")
 
-    def rest(self) -> None:
+    def skip(self) -> None:
         """Do not ask the question again in this session."""
         self._due_ns = None
 
-    def hurry(self) -> None:
+    def ask_now(self) -> None:
         """Make the question due at once."""
         self._due_ns = 0
 

@@ -153,7 +153,7 @@ class S7Session(ABC):
         self._session = pdu.Session(0, 0)
         # References continue after a reconnect, so that a late answer matches no new request.
         self._window = Window(0, 0)
-        self._under_way: deque[Read] = deque()
+        self._in_flight: deque[Read] = deque()
         self._idle: list[Read] = []
         self._mode = ModeQuery()
         self._queries: list[Query] = []
@@ -187,7 +187,7 @@ class S7Session(ABC):
     @property
     def depth(self) -> int:
         """Largest number of reads in flight in this session, at least 1."""
-        return max(1, len(self._idle) + len(self._under_way))
+        return max(1, len(self._idle) + len(self._in_flight))
 
     @property
     def doubt(self) -> str:
@@ -237,7 +237,7 @@ class S7Session(ABC):
         self.submit()
         image = None
         while image is None:
-            image = self.collect(self._under_way[0].deadline_ns)
+            image = self.collect(self._in_flight[0].deadline_ns)
         return image
 
     def submit(self) -> None:
@@ -256,7 +256,7 @@ class S7Session(ABC):
         with self._close_on_error:
             read = self._idle.pop()
             read.begin(time.monotonic_ns() + self._timeout_ns)
-            self._under_way.append(read)
+            self._in_flight.append(read)
             self._window.add(read)
             self._ask()
             self._flush()
@@ -278,9 +278,9 @@ class S7Session(ABC):
         """
         if self._transport is None:
             raise ConnectorError("shmio is not connected to the controller")
-        if not self._under_way:
+        if not self._in_flight:
             raise RuntimeError("no read is in flight")
-        read = self._under_way[0]
+        read = self._in_flight[0]
         with self._close_on_error:
             if not self._advance(read, min(until_ns, read.deadline_ns)):
                 if time.monotonic_ns() >= read.deadline_ns:
@@ -288,7 +288,7 @@ class S7Session(ABC):
                 return None
             if read.refusal is not None:
                 raise self._explained(read.refusal, read.deadline_ns)
-            self._idle.append(self._under_way.popleft())
+            self._idle.append(self._in_flight.popleft())
             return read.data
 
     def write(self, writes: Sequence[Write]) -> list[str]:
@@ -321,7 +321,7 @@ class S7Session(ABC):
                 spent_ns = time.monotonic_ns() - begun_ns  # the writes delayed these answers
                 for query in self._queries:
                     query.deadline_ns += spent_ns
-                for read in self._under_way:
+                for read in self._in_flight:
                     read.deadline_ns += spent_ns
         except ConnectorError as error:
             raise WriteLostError(str(error), ends(outcomes, begun)) from None
@@ -333,7 +333,7 @@ class S7Session(ABC):
             self._transport.close()
             self._transport = None
         self._window = Window(0, self._window.reference)
-        self._under_way.clear()
+        self._in_flight.clear()
         self._idle.clear()
         for query in self._queries:  # a controller that has just set a session up is alive too
             query.lost(alive=not self._answers or self._answers > query.begun_after)

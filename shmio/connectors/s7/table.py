@@ -87,7 +87,7 @@ class Planner:
         self._cycle = 0
         self.refused: dict[Field, tuple[int, int]] = {}
         """For each refused field, its status and when to try it again, ns of CLOCK_MONOTONIC."""
-        self.news: dict[int, int] = {}
+        self.changes: dict[int, int] = {}
         """Statuses of refused registers that the image does not show yet, by index in the layout."""
 
     def use(self, pdu_size: int) -> None:
@@ -153,7 +153,7 @@ class Planner:
         if field not in self.refused:
             self._note(field, why)
         self.refused[field] = status, time.monotonic_ns() + RETRY_NS
-        self.news[field.register] = status
+        self.changes[field.register] = status
         self.split(part, ())
 
     def explain(self, part: Range, code: int) -> str:
@@ -168,7 +168,7 @@ class Planner:
         if self.refused and any(field in self.refused for field in part.fields):
             for field in part.fields:
                 if self.refused.pop(field, None):
-                    self.news.pop(field.register, None)
+                    self.changes.pop(field.register, None)
                     log.info("%s can be read again", self._named(field))
             self._merge()
 
@@ -461,9 +461,9 @@ class S7TableConnector(S7Session, Connector):
         assert image is not None  # noqa: S101 - _reads() checked it
         self._cpu.store(image)
         planner = self._planner
-        for index, status in planner.news.items():
+        for index, status in planner.changes.items():
             image.fail(index, status)
-        planner.news.clear()
+        planner.changes.clear()
         if self._watch.doubts.keys() != self._uncertain:
             self._uncertain = frozenset(self._watch.doubts)
             planner.forget()

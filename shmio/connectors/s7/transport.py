@@ -168,13 +168,13 @@ class Window:
         self.jobs = jobs
         self.reference = reference
         self._queue: deque[Operation] = deque()
-        self._under_way: dict[int, tuple[Operation, int]] = {}
+        self._in_flight: dict[int, tuple[Operation, int]] = {}
         self._given: list[tuple[Operation, int]] = []  # by the last ``due``: operations, each with its first request
 
     @property
     def idle(self) -> bool:
         """True if no request is in flight."""
-        return not self._under_way
+        return not self._in_flight
 
     @property
     def waiting(self) -> bool:
@@ -195,13 +195,13 @@ class Window:
         """
         parts: list[bytes | memoryview] = []
         self._given.clear()
-        while self._queue and (free := self.jobs - len(self._under_way)) > 0:
+        while self._queue and (free := self.jobs - len(self._in_flight)) > 0:
             operation = self._queue[0]
             begin = operation.sent
             self._given.append((operation, begin))
             parts.append(operation.take(min(free, operation.count - begin), self.reference))
             for index in range(begin, operation.sent):
-                self._under_way[self.reference] = operation, index
+                self._in_flight[self.reference] = operation, index
                 self.reference = (self.reference + 1) & 0xFFFF
             if operation.sent == operation.count:
                 self._queue.popleft()
@@ -220,7 +220,7 @@ class Window:
 
         """
         reference = pdu.reference_of(frame)
-        owner = self._under_way.pop(reference, None)
+        owner = self._in_flight.pop(reference, None)
         if owner is None:
             pdu.check_answer(frame)  # raises a more precise error if it is not an answer
             raise ConnectorError(f"the controller answered a request that is not in flight (reference {reference})")

@@ -53,7 +53,7 @@ class Alerts:
         self._dispatcher = Dispatcher(settings.alert, settings.mqtt, segment, self._selector, self.wake, before.waiting)
         self._monitor = Monitor(segment, settings.alert, before.progress(settings.alert), self._selector)
         self._steps = Relay(segment.clock.slot_bell(self._slot), "alerts-steps")
-        self._selector.register(self._steps.descriptor, selectors.EVENT_READ, lambda _: self._steps.heard())
+        self._selector.register(self._steps.descriptor, selectors.EVENT_READ, lambda _: self._steps.acknowledge())
         self._clock.deliver(self._slot, 0)  # from now on, each step waits until its frames are evaluated
         self._notices = 0
         self._told_s = 0.0

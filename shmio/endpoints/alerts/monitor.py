@@ -255,4 +255,4 @@ class Monitor:
 
 
 def _heard(relay: Relay, _events: int) -> None:
-    relay.heard()
+    relay.acknowledge()

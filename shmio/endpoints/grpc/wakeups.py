@@ -14,7 +14,7 @@ log = logging.getLogger("shmio.grpc")
 
 Callback = Callable[[], object]
 
-REST_S: Final = 0.005
+PAUSE_S: Final = 0.005
 """Pause between wake-ups while all listeners are patient, in s."""
 
 
@@ -39,7 +39,7 @@ class WakeUp:
         """Listeners that do not need a call at once."""
         self._loop = asyncio.get_running_loop()
         self._relay = Relay(word, name, turn_ns)
-        self._resting: asyncio.TimerHandle | None = None
+        self._pausing: asyncio.TimerHandle | None = None
         self.unmute()
 
     @property
@@ -55,13 +55,13 @@ class WakeUp:
         """Call the listeners again."""
         self._loop.add_reader(self._relay.descriptor, self._ring)
 
-    def rest(self) -> None:
-        """Pause for ``REST_S``, if all listeners are patient."""
-        if self._resting is None and self.patient >= self.listeners.keys():
+    def pause(self) -> None:
+        """Pause for ``PAUSE_S``, if all listeners are patient."""
+        if self._pausing is None and self.patient >= self.listeners.keys():
             self.mute()
-            self._resting = self._loop.call_later(REST_S, self._rested)
+            self._pausing = self._loop.call_later(PAUSE_S, self._pause_over)
 
-    def _rested(self) -> None:
+    def _pause_over(self) -> None:
         """Call the listeners after a pause."""
         self.resume()
         for ring in tuple(self.listeners):
@@ -69,9 +69,9 @@ class WakeUp:
 
     def resume(self) -> None:
         """End the pause."""
-        if self._resting is not None:
-            self._resting.cancel()
-            self._resting = None
+        if self._pausing is not None:
+            self._pausing.cancel()
+            self._pausing = None
             self.unmute()
 
     def stop(self) -> None:
@@ -85,7 +85,7 @@ class WakeUp:
         self._relay.join()
 
     def _ring(self) -> None:
-        self._relay.heard()
+        self._relay.acknowledge()
         for ring in tuple(self.listeners):
             ring()
 
@@ -116,14 +116,14 @@ class WakeUps:
         else:
             wake_up.resume()
 
-    def rest(self, block: Block, ring: Callback) -> None:
+    def pause(self, block: Block, ring: Callback) -> None:
         """Mark ``ring`` as patient.
 
         The wake-ups pause while all listeners of the block are patient.
         """
         if wake_up := self._wake_ups.get(block.section):
             wake_up.patient.add(ring)
-            wake_up.rest()
+            wake_up.pause()
 
     def resume(self, block: Block, ring: Callback) -> None:
         """Mark ``ring`` as no longer patient."""
@@ -204,7 +204,7 @@ class BatchReader:
         if not self.alive:
             return  # stopped during the wake-up
         if self._passes is not None and self._passes():
-            self._wake_ups.rest(self._block, self.read_batch)
+            self._wake_ups.pause(self._block, self.read_batch)
         else:
             self.read()
 

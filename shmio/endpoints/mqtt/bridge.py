@@ -130,7 +130,9 @@ class Bridge:
         self._add_feeds(self._read(()))
         self.steps = StepDelivery(segment.clock, slot.index, f"{self.prefix}/simlog/step", self.connection, self.outbox)
         self._step_relay = Relay(segment.clock.slot_bell(slot.index), "bell-steps", TURN_NS)
-        self._selector.register(self._step_relay.descriptor, selectors.EVENT_READ, lambda _: self._step_relay.heard())
+        self._selector.register(
+            self._step_relay.descriptor, selectors.EVENT_READ, lambda _: self._step_relay.acknowledge()
+        )
 
     @property
     def counters(self) -> tuple[int, ...]:
@@ -290,7 +292,7 @@ class Bridge:
         feed.command_client.poll()
 
     def _wake_feed(self, feed: Feed, relay: Relay, _events: int) -> None:
-        relay.heard()
+        relay.acknowledge()
         self._behind.add(feed)
 
     # ---- sources that come and go ------------------------------------------------------------------------------------

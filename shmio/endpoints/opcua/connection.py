@@ -75,11 +75,11 @@ class Processor(UaProcessor):
         """True if the client reads its messages."""
         return self._pass.is_set() and not self._transport.is_closing()
 
-    def hold(self) -> None:
-        """Stop processing requests until :meth:`release`."""
+    def pause(self) -> None:
+        """Stop processing requests until :meth:`resume`."""
         self._pass.clear()
 
-    def release(self) -> None:
+    def resume(self) -> None:
         """Process requests again."""
         self._pass.set()
 
@@ -205,7 +205,7 @@ class Protocol(OPCUAProtocol):
     def pause_writing(self) -> None:
         """Stop processing requests of a client that does not read, and disconnect it after a while."""
         if self.processor is not None:
-            self.processor.hold()
+            self.processor.pause()
         self._stuck = asyncio.get_running_loop().call_later(STUCK_S, self._drop, "it does not read what it is sent")
 
     def resume_writing(self) -> None:
@@ -214,7 +214,7 @@ class Protocol(OPCUAProtocol):
             self._stuck.cancel()
             self._stuck = None
         if self.processor is not None:
-            self.processor.release()
+            self.processor.resume()
 
     def data_received(self, data: bytes) -> None:
         """Split received bytes into messages."""

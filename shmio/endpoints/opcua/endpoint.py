@@ -105,7 +105,7 @@ class Endpoint:
             loop.add_reader(relay.descriptor, partial(self._wake, source, relay))
 
     def _wake(self, source: SourceNode, relay: Relay) -> None:
-        relay.heard()
+        relay.acknowledge()
         self._poll(source)
 
     def _poll(self, source: SourceNode) -> None:

@@ -371,7 +371,7 @@ class Session(InternalSession):
         if not mine:
             raise ServiceError(Fault.BadNoSubscription)
         for one in mine:
-            one.heard()
+            one.reset_lifetime()
         results = []
         for ack in acks or ():
             try:
@@ -471,20 +471,20 @@ def _joined(first: Any, rest: Any) -> Any:
 
 def _size(value: ua.DataValue) -> int:
     """Return the approximate size of a value in bytes."""
-    held = None if value.Value is None else value.Value.Value
-    if not isinstance(held, list | str | bytes):
+    content = None if value.Value is None else value.Value.Value
+    if not isinstance(content, list | str | bytes):
         return 32
-    return 32 + _length(held, 1 if value.Value.VariantType in _BYTES else 8)
+    return 32 + _length(content, 1 if value.Value.VariantType in _BYTES else 8)
 
 
 _BYTES: Final = (ua.VariantType.Boolean, ua.VariantType.Byte, ua.VariantType.SByte)
 
 
-def _length(held: Any, element: int) -> int:
-    if isinstance(held, list):
-        nested = held and isinstance(held[0], list | str | bytes)
-        return sum(_length(one, element) for one in held) if nested else element * len(held)
-    return 4 + len(held) * (4 if isinstance(held, str) else 1)
+def _length(content: Any, element: int) -> int:
+    if isinstance(content, list):
+        nested = content and isinstance(content[0], list | str | bytes)
+        return sum(_length(one, element) for one in content) if nested else element * len(content)
+    return 4 + len(content) * (4 if isinstance(content, str) else 1)
 
 
 def _plain(given: ua.Variant | None, register: Register) -> Any:
@@ -508,9 +508,9 @@ def _part(value: ua.DataValue, text: str) -> ua.DataValue:
         return bad(Fault.BadIndexRangeInvalid)
     if value.Value is None:
         return value
-    held = value.Value.Value
-    whole = isinstance(held, list) and not value.Value.Dimensions
-    if not whole or low >= len(held):
+    content = value.Value.Value
+    whole = isinstance(content, list) and not value.Value.Dimensions
+    if not whole or low >= len(content):
         return bad(Fault.BadIndexRangeNoData)
-    found = ua.Variant(held[low : high + 1], value.Value.VariantType, is_array=True)
+    found = ua.Variant(content[low : high + 1], value.Value.VariantType, is_array=True)
     return ua.DataValue(found, value.StatusCode, value.SourceTimestamp, value.ServerTimestamp)

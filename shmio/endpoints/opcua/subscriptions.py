@@ -230,7 +230,7 @@ class Subscription:
         self._kept: dict[int, tuple[ua.NotificationMessage, int]] = {}
         self._next_item = 1
         self._silent = 0
-        self._unheard = 0
+        self._idle_intervals = 0
         self._first = True
         self._timer: asyncio.TimerHandle | None = None
         self._due_s = 0.0
@@ -267,8 +267,8 @@ class Subscription:
     def _tick(self) -> None:
         self._schedule()
         self._silent += 1
-        self._unheard += 1
-        if self._unheard > self.lifetime:
+        self._idle_intervals += 1
+        if self._idle_intervals > self.lifetime:
             log.info("a subscription has ended: its client sent no request for %d intervals", self.lifetime)
             self.stop()
             self._on_end()
@@ -305,22 +305,22 @@ class Subscription:
 
     async def publish_results(self, request: Any) -> bool:
         """Answer a Publish request if a publication is late. Return whether it was late."""
-        self._unheard = 0
+        self._idle_intervals = 0
         if not self._wants():
             return False
         self._send(request)
         return True
 
-    def heard(self) -> None:
+    def reset_lifetime(self) -> None:
         """Record that the client has sent a Publish request."""
-        self._unheard = 0
+        self._idle_intervals = 0
 
     def _send(self, request: Any) -> None:
         result = ua.PublishResult()
         result.SubscriptionId = self.id
         message = result.NotificationMessage
         message.SequenceNumber = self._sequence
-        self._first, self._silent, self._unheard = False, 0, 0
+        self._first, self._silent, self._idle_intervals = False, 0, 0
         if self.enabled and self.dirty:
             body = self._pop()
             message.NotificationData = [ua.ExtensionObject(_DATA_CHANGE, body)]

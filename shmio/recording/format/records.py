@@ -310,7 +310,7 @@ class Records:
             yield opcode, data[at : at + size]
             at += size
 
-    def hold(self) -> None:
+    def lock(self) -> None:
         """Lock the file until it is closed, so that no recorder deletes it.
 
         This has no effect on a file system without locks.

@@ -182,7 +182,7 @@ def test_two_tables_need_a_block_and_lie_over_it_together() -> None:
 def test_of_several_blocks_a_table_names_its_own() -> None:
     blocks = SMALL + SMALL.replace(b'"cell"', b'"other"')
     assert (
-        'names.toml:1:1: error: the sources hold several data blocks (cell, other): say by block = "NAME"'
+        'names.toml:1:1: error: the sources have several data blocks (cell, other): say by block = "NAME"'
         in refusal('[registers]\na = "Inputs/1"', blocks)
     )
     assert "block: no data block 'third'; there are: cell, other" in refusal(

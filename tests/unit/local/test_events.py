@@ -117,7 +117,7 @@ def test_the_outcome_of_many_items_names_a_bounded_number_of_registers(segment: 
         writer.event(Record(Recorded.WRITTEN, "", 3, 7, 0, MAX_PATHS + 500, 0, 0, 1))
         paths = next(events).paths
     assert paths == tuple(f"many/r{at}" for at in range(MAX_PATHS))
-    assert not events._readers[0]._explainer._under_way
+    assert not events._readers[0]._explainer._in_flight
 
 
 def test_the_outcome_of_a_long_item_names_a_bounded_number_of_registers(segment: Segment, cell: Attachment) -> None:
@@ -127,7 +127,7 @@ def test_the_outcome_of_a_long_item_names_a_bounded_number_of_registers(segment:
         for at in range(0, 4096, EVENT_DATA_SIZE):
             writer.event(Record(Recorded.ACCEPTED, "", 3, 7, 0, 1, at, 0, EVENT_DATA_SIZE, bytes(EVENT_DATA_SIZE)))
             next(events)
-        ((known,),) = (items.values() for items in events._readers[0]._explainer._under_way.values())
+        ((known,),) = (items.values() for items in events._readers[0]._explainer._in_flight.values())
         assert len(known) == MAX_PATHS
         assert not any(place.valued for place in known)
         writer.event(Record(Recorded.WRITTEN, "", 3, 7, 0, 1, 0, 0, 4096))
@@ -139,12 +139,12 @@ def test_command_whose_outcome_is_lost_is_forgotten(segment: Segment, cell: Atta
     with cell.events("cell") as events:
         writer.event(Record(Recorded.ACCEPTED, "", 3, 7, 0, 1, 2, 0, 2, b"\1\2"))
         next(events)
-        under_way = events._readers[0]._explainer._under_way
-        assert under_way
+        in_flight = events._readers[0]._explainer._in_flight
+        assert in_flight
         for _ in range(EVENT_SLOTS + 100):
             writer.event(NOTE)
         assert next(events).missed
-        assert not under_way
+        assert not in_flight
 
 
 def test_command_of_an_earlier_process_is_forgotten(segment: Segment, cell: Attachment) -> None:
@@ -153,7 +153,7 @@ def test_command_of_an_earlier_process_is_forgotten(segment: Segment, cell: Atta
         writer.event(Record(Recorded.ACCEPTED, "", 3, 7, 0, 1, 2, 0, 2, b"\1\2"))
         segment.writer("cell")
         assert [next(events).kind for _ in range(2)] == ["accepted", "started"]
-        assert not events._readers[0]._explainer._under_way
+        assert not events._readers[0]._explainer._in_flight
 
 
 def test_an_injection_whose_end_is_lost_is_forgotten(segment: Segment, cell: Attachment) -> None:

@@ -38,7 +38,7 @@ class WaitingLoop:
         """Wait for a wake-up, and acknowledge it. Return whether one came."""
         told = bool(self._poll.poll(timeout_ms))
         if told:
-            self._relay.heard()
+            self._relay.acknowledge()
         return told
 
 
@@ -135,7 +135,7 @@ def test_after_the_stop_the_descriptor_is_not_read(segment: Segment) -> None:
     if reading != relay.descriptor:
         os.dup2(reading, relay.descriptor)
     os.write(writing, bytes(8))
-    relay.heard()
+    relay.acknowledge()
     assert os.read(reading, 8) == bytes(8)
     for descriptor in {reading, writing, relay.descriptor}:
         os.close(descriptor)

@@ -41,7 +41,7 @@ LOOK_S: Final = 0.25
 UNSEEN_S: Final = 10.0
 """Lifetime of an injection without a stream, in s, if the kernel does not list its client."""
 
-_MARKS: Final = frozenset(mark.value for mark in TimeTopic)
+_TIME_TOPICS: Final = frozenset(topic.value for topic in TimeTopic)
 _SCHEME: Final = re.compile(r"^[^/:]*://")
 
 log = logging.getLogger("shmio.grpc")
@@ -268,7 +268,7 @@ class Injection(InjectionFollower):
 
     def _tell_again(self) -> None:
         for subject in self._subjects:
-            self.feed.tell_again(subject)
+            self.feed.deliver_again(subject)
 
     # ---- events of the source ----------------------------------------------------------------
 
@@ -313,10 +313,10 @@ class Shadow(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Client:
-    """A client that holds an injection without a stream.
+    """A client that uses an injection without a stream.
 
     ``peer`` is None if the kernel does not list the client's connection. Then ``until_s`` is the
-    end of the hold.
+    end of the use.
     """
 
     peer: Peer | None
@@ -324,12 +324,12 @@ class _Client:
 
 
 class Shadows:
-    """All shadow topics and their injections. When no client holds an injection, it is lifted."""
+    """All shadow topics and their injections. An injection that no client uses is lifted."""
 
     def __init__(self, topics: Topics) -> None:
         self._topics = topics
         self._named: dict[str, Shadow] = {}
-        self._holders: dict[Injection, set[object]] = {}
+        self._users: dict[Injection, set[object]] = {}
         self._releasing: asyncio.Task[None] | None = None
 
     def find(self, path: str) -> Shadow | None:
@@ -337,7 +337,7 @@ class Shadows:
         return self._named.get(self._topics.name(path)) if self._named else None
 
     async def create(
-        self, target: Topic, shape: Shape, kinds: Mapping[str, ShadowKind], holder: object, peer: str
+        self, target: Topic, shape: Shape, kinds: Mapping[str, ShadowKind], user: object, peer: str
     ) -> Injection:
         """Create an injection with these shadow topics, or join the one that has them.
 
@@ -345,7 +345,7 @@ class Shadows:
             target: The topic to create the injection over.
             shape: The registers that the target names.
             kinds: The shadow topics, by path.
-            holder: The object that holds the injection until :meth:`release`.
+            user: The object that holds the injection until :meth:`release`.
             peer: The client, for the list of all injections.
 
         Raises:
@@ -360,17 +360,17 @@ class Shadows:
         injection = self._joined(target, kinds)
         if injection is None:
             feed = self._topics.feed(target.source)
-            if sum(other.feed is feed for other in self._holders) >= MAX_INJECTIONS:
+            if sum(other.feed is feed for other in self._users) >= MAX_INJECTIONS:
                 raise EndpointError(f"{MAX_INJECTIONS} injections cover {target.source} already, the maximum: end one")
             injection = Injection(target, shape, feed, f"{shorten(next(iter(kinds)), 60)} of {shorten(peer, 40)}")
             self._named |= {self._topics.name(path): Shadow(injection, kind) for path, kind in kinds.items()}
-            self._holders[injection] = set()
+            self._users[injection] = set()
             injection.ends[self] = partial(self._forget, injection)
-        self._holders[injection].add(holder)
+        self._users[injection].add(user)
         try:
             await injection.created()
         except BaseException:
-            self.release(injection, holder)
+            self.release(injection, user)
             raise
         return injection
 
@@ -390,23 +390,23 @@ class Shadows:
             self._releasing = asyncio.get_running_loop().create_task(self._release_abandoned())
         return injection
 
-    def hold(self, injection: Injection, stream: object) -> None:
-        """Make a stream the holder of an injection, in place of the clients without a stream."""
-        holders = self._holders.get(injection, set())
-        holders.difference_update([holder for holder in holders if isinstance(holder, _Client)])
-        holders.add(stream)
+    def take_over(self, injection: Injection, stream: object) -> None:
+        """Make a stream use an injection, instead of the clients without a stream."""
+        users = self._users.get(injection, set())
+        users.difference_update([user for user in users if isinstance(user, _Client)])
+        users.add(stream)
 
-    def release(self, injection: Injection, holder: object) -> None:
-        """End a hold on an injection; the end of the last hold lifts the injection."""
-        holders = self._holders.get(injection, set())
-        if holder in holders:
-            holders.remove(holder)
-            if not holders:
+    def release(self, injection: Injection, user: object) -> None:
+        """End the use of an injection by a client. The end of the last use lifts the injection."""
+        users = self._users.get(injection, set())
+        if user in users:
+            users.remove(user)
+            if not users:
                 injection.end("no client uses the injection any more")
 
     def move(self, sources: Collection[str]) -> None:
         """End the injections on sources whose blocks a reload has replaced."""
-        for injection in list(self._holders):
+        for injection in list(self._users):
             if injection.target.source in sources:
                 injection.end(RETIRED)
 
@@ -424,7 +424,7 @@ class Shadows:
             if name == str(target):
                 raise ValueRangeError(f"{shorten(path)} is the target of the injection: a shadow needs another path")
             shadow = self._named.get(name)
-            if name in _MARKS or (shadow and (shadow.injection.target != target or shadow.kind is not kind)):
+            if name in _TIME_TOPICS or (shadow and (shadow.injection.target != target or shadow.kind is not kind)):
                 use = f"the shadow of {shadow.injection.target}" if shadow else "served by shmio"
                 raise ConflictError(f"{shorten(path)} is {use}: name another path")
             found = shadow.injection if shadow else found
@@ -432,7 +432,7 @@ class Shadows:
 
     def _forget(self, injection: Injection) -> None:
         log.info("injection over %s: %s", injection.target, injection.over)
-        del self._holders[injection]
+        del self._users[injection]
         self._named = {name: shadow for name, shadow in self._named.items() if shadow.injection is not injection}
 
     async def _release_abandoned(self) -> None:
@@ -448,10 +448,7 @@ class Shadows:
 
     def _clients(self) -> list[tuple[Injection, _Client]]:
         return [
-            (injection, holder)
-            for injection, holders in self._holders.items()
-            for holder in holders
-            if isinstance(holder, _Client)
+            (injection, user) for injection, users in self._users.items() for user in users if isinstance(user, _Client)
         ]
 
 

@@ -416,7 +416,7 @@ class Subscriber:
         to_message = encoder(injection.shape, injection.feed.block.layout)
         if shadow.kind is ShadowKind.ORIGINALS:
             leave = injection.originals("v2", to_message, self.outbox, shorten(path), finish)
-            self._shadows.hold(injection, key)
+            self._shadows.take_over(injection, key)
         else:
             leave = injection.given_values("v2", to_message, EventLane(self.outbox, shorten(path), finish))
 

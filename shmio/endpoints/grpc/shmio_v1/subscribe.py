@@ -365,8 +365,8 @@ class SubscribeCall:
         In virtual time, updates of a source that steps with the instance wait until the step has
         ended.
         """
-        held = self._virtual_time.on and updates.view.block.attributes.stepped
-        return not held or bool(self._step_marks) or updates.follower.frame is None
+        suspended = self._virtual_time.on and updates.view.block.attributes.stepped
+        return not suspended or bool(self._step_marks) or updates.follower.frame is None
 
     def _ring(self, updates: BlockUpdates) -> None:
         """Wake the stream, because a block has a new frame or event."""

@@ -120,7 +120,7 @@ class Feed:
     """Delivers the changes of one block's registers to listeners, while the quality is good.
 
     After bad quality, the feed delivers every register again. In virtual time, the feed of a block
-    on the instance's clock is *held*: only :meth:`step` delivers values. Use it only in the event
+    on the instance's clock is *suspended*: only :meth:`step` delivers values. Use it only in the event
     loop's thread.
     """
 
@@ -147,8 +147,8 @@ class Feed:
         """Sends commands to the block's source."""
         self.messages = 0
         self._virtual_time = virtual_time or VirtualTime()
-        self._held = self._virtual_time.on and block.attributes.stepped
-        self._stepped = False  # whether a step was delivered since the feed has been held
+        self._suspended = self._virtual_time.on and block.attributes.stepped
+        self._stepped = False  # whether a step was delivered since the feed has been suspended
         self._shown: Frame | DeliveredImage | None = None  # the last delivery; None while the quality is bad
         self._good = False  # the quality that was reported last
         self._loop = asyncio.get_running_loop()
@@ -175,7 +175,7 @@ class Feed:
 
     def start(self) -> None:
         """Start following the block."""
-        if self._held:
+        if self._suspended:
             self._adopt(self.block.latest())
         self._follower.restart()
         self.commands.start()  # first, so that a write is delivered before the frame that shows it
@@ -212,24 +212,24 @@ class Feed:
                 self._outdated = True
                 self._loop.call_soon(self._rebuild)
 
-    def tell_again(self, subject: Subject) -> None:
+    def deliver_again(self, subject: Subject) -> None:
         """Deliver the value of a subject again, because it has changed without a new frame."""
         if channel := self._channels.get(subject):
             self._awaiting_value |= dict.fromkeys(channel.listeners, channel)
             self._settle()
 
-    def hold(self) -> None:
+    def suspend(self) -> None:
         """If the block is on the instance's clock, deliver only by :meth:`step` from now on."""
-        self._held = self.block.attributes.stepped
+        self._suspended = self.block.attributes.stepped
 
-    def release(self) -> None:
+    def resume(self) -> None:
         """Deliver every frame again.
 
         The newest frame comes first, because it may be newer than the last step.
         """
-        if not self._held:
+        if not self._suspended:
             return
-        self._held = self._stepped = False
+        self._suspended = self._stepped = False
         self._follower.restart()
         self._reader.read_batch()
         self._settle()
@@ -243,7 +243,7 @@ class Feed:
             SegmentError: No frame can be read.
 
         """
-        if not self._held:
+        if not self._suspended:
             return
         self._stepped = True
         frame = self.block.latest()
@@ -264,13 +264,13 @@ class Feed:
 
     def _adopt(self, frame: Frame | None) -> None:
         """Deliver the first good image, if no step has been delivered yet."""
-        if self._held and not self._stepped and self._shown is None and frame and frame.quality is not Quality.BAD:
+        if self._suspended and not self._stepped and self._shown is None and frame and frame.quality is not Quality.BAD:
             self._shown = DeliveredImage(*self._virtual_time.moment, frame.image, frame.raw)
             self._settle()
 
     def _settle(self) -> None:
         """Deliver the current value, if it is good, to the listeners that wait for a value."""
-        if self._held:
+        if self._suspended:
             if self._shown is not None:
                 for listener, channel in list(self._awaiting_value.items()):
                     self._keep([listener], channel.encode(self._shown))
@@ -307,7 +307,7 @@ class Feed:
     # ---- what the source publishes -----------------------------------------------------------------------------
 
     def _passes(self) -> bool:
-        return not self._held and self._back_pressure.passes()
+        return not self._suspended and self._back_pressure.passes()
 
     def _refill(self) -> None:
         """Continue to read, because a stream that was busy can take more values."""
@@ -319,15 +319,15 @@ class Feed:
     def _read(self) -> bool:
         """Read a few new frames. If there are none, check the age of the last frame."""
         follower = self._follower
-        if not self._held:  # a held feed delivers only steps
+        if not self._suspended:  # a suspended feed delivers only steps
             self._back_pressure.skip(follower)
-        take = self._regard if self._held else self._take
+        take = self._regard if self._suspended else self._take
         for count in range(TURN_FRAMES):
             frame = follower.poll()
             if frame is not None:
                 take(frame)
                 continue
-            if not (count or self._held) and follower.became_stale():
+            if not (count or self._suspended) and follower.became_stale():
                 self._turn_bad(follower.last + 1)
             if follower.ended:
                 self._reader.stop()
@@ -387,7 +387,7 @@ class Feed:
 
     def present(self) -> Frame | DeliveredImage | None:
         """Return the image that a new listener would get, or None if the quality is not good."""
-        if self._held:
+        if self._suspended:
             self._virtual_time.update()
             return self._shown
         frame = self.block.latest()
@@ -398,7 +398,7 @@ class Feed:
 
         They are those of the event's frame, or in virtual time those of the last step.
         """
-        return self._virtual_time.moment if self._held else Moment(event.frame, event.clock_ns)
+        return self._virtual_time.moment if self._suspended else Moment(event.frame, event.clock_ns)
 
 
 class Feeds(Mapping[str, Feed]):

@@ -168,14 +168,14 @@ class _Delivery:
         self._virtual_time.on = True
         self._virtual_time.moment = moment
         for feed in self._feeds.values():
-            feed.hold()
+            feed.suspend()
 
     def end(self) -> None:
         """Switch back to real time. Call this only while not :attr:`busy`."""
         self._virtual_time.on = False
         for feed in list(self._feeds.values()):
             try:
-                feed.release()
+                feed.resume()
             except SegmentError as error:
                 log.warning("on the return to real time, values were not sent: %s", str(error))
         for receiver in self.receivers:

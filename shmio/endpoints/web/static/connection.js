@@ -20,7 +20,7 @@ export class Connection extends EventTarget {
     this.open = false;
     this.delayMs = FIRST_DELAY_MS;
     this.last = 0;
-    this.heard = 0;
+    this.receivedAt = 0;
     /** @type {Map<number, { done: (result: any) => void, failed: (error: Error) => void }>} */
     this.calls = new Map();
     /** @type {Map<string, Set<(data: any) => void>>} */
@@ -37,14 +37,14 @@ export class Connection extends EventTarget {
     const socket = new WebSocket(`${scheme}//${location.host}/socket`);
     socket.binaryType = "arraybuffer";
     this.socket = socket;
-    this.heard = Date.now();
+    this.receivedAt = Date.now();
     socket.onopen = () => {
       this.open = true;
       this.delayMs = FIRST_DELAY_MS;
       this.dispatchEvent(new Event("open"));
     };
     socket.onmessage = (event) => {
-      this.heard = Date.now();
+      this.receivedAt = Date.now();
       if (event.data instanceof ArrayBuffer) this.onBatch(event.data);
       else this.receive(JSON.parse(event.data));
     };
@@ -116,6 +116,6 @@ export class Connection extends EventTarget {
   }
 
   checkSilence() {
-    if (this.socket !== null && Date.now() - this.heard > SILENCE_MS) this.connect();
+    if (this.socket !== null && Date.now() - this.receivedAt > SILENCE_MS) this.connect();
   }
 }

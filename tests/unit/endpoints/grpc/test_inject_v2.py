@@ -268,7 +268,7 @@ def test_a_client_can_inject_and_subscribe_again_after_another_lifted_it(segment
             await served.add("injector", path_out)
             await write(served, "cell/step", value)
             assert await message(stream) == (path_out, value)
-            (injection,) = served.service._shadows._holders
+            (injection,) = served.service._shadows._users
             injection.end("a test")
             await lifted(served)
         await write(served, "cell/running", True)

@@ -64,7 +64,7 @@ def test_a_listener_that_leaves_during_a_ring_leaves_others_listening(segment: S
 
 
 def test_a_bell_rests_while_all_listeners_are_patient(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shmio.endpoints.grpc.wakeups.REST_S", 1000.0)
+    monkeypatch.setattr("shmio.endpoints.grpc.wakeups.PAUSE_S", 1000.0)
 
     async def test() -> None:
         block, writer, wake_ups = segment.blocks["cell"], segment.writer("cell"), WakeUps()
@@ -83,27 +83,27 @@ def test_a_bell_rests_while_all_listeners_are_patient(segment: Segment, monkeypa
 
         wake_ups.join(block, busy)
         wake_ups.join(block, patient, patient=True)
-        wake_ups.rest(block, busy)
+        wake_ups.pause(block, busy)
         heard.clear()
         for number in range(100):
             writer.publish(image(step=number), cycle=number)
             await asyncio.sleep(0)
         assert not heard
-        wake_ups.join(block, prompt)  # an impatient listener ends the rest for all
+        wake_ups.join(block, prompt)  # an impatient listener ends the pause for all
         async with asyncio.timeout(TIMEOUT_S):
             await rung.wait()
             assert heard == ["busy", "patient", "prompt"]
-            wake_ups.rest(block, busy)
+            wake_ups.pause(block, busy)
             rung.clear()
             writer.publish(image(), cycle=100)
             await rung.wait()
             wake_ups.leave(block, prompt)
-            wake_ups.rest(block, busy)
+            wake_ups.pause(block, busy)
             heard.clear()
             wake_ups.resume(block, busy)
             while not heard:  # noqa: ASYNC110  another thread changes it
                 await asyncio.sleep(0)
-            wake_ups.rest(block, patient)  # busy is still to be woken
+            wake_ups.pause(block, patient)  # busy is still to be woken
             heard.clear()
             writer.publish(image(), cycle=101)
             while not heard:  # noqa: ASYNC110  another thread changes it
@@ -114,7 +114,7 @@ def test_a_bell_rests_while_all_listeners_are_patient(segment: Segment, monkeypa
 
 
 def test_a_bell_that_has_rested_rings_once_and_continues(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shmio.endpoints.grpc.wakeups.REST_S", 0.001)
+    monkeypatch.setattr("shmio.endpoints.grpc.wakeups.PAUSE_S", 0.001)
 
     async def test() -> None:
         writer, heard = segment.writer("cell"), asyncio.Event()
@@ -128,7 +128,7 @@ def test_a_bell_that_has_rested_rings_once_and_continues(segment: Segment, monke
             heard.clear()
 
         await rings()
-        bell.rest()
+        bell.pause()
         await rings()  # though no frame was published since
         writer.publish(image(), cycle=1)
         await rings()

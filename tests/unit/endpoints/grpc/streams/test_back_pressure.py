@@ -102,7 +102,7 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Never look for stale frames, count every frame as late, and let feeds sleep until they are woken."""
     monkeypatch.setattr(back_pressure, "LOOK_S", 1000.0)
     monkeypatch.setattr(back_pressure, "LATE_S", 0.0)
-    monkeypatch.setattr(wakeups, "REST_S", 1000.0)
+    monkeypatch.setattr(wakeups, "PAUSE_S", 1000.0)
 
 
 def test_frames_that_no_stream_can_take_are_not_read(segment: Segment) -> None:
@@ -252,7 +252,7 @@ def test_a_resting_feed_notices_a_failed_source_without_a_ring(
     segment: Segment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(wakeups, "TURN_NS", 1_000_000_000_000)
-    monkeypatch.setattr(wakeups, "REST_S", 0.001)
+    monkeypatch.setattr(wakeups, "PAUSE_S", 0.001)
 
     async def test(followed: Followed) -> None:
         passes, heard = followed.feed._back_pressure.passes, asyncio.Event()

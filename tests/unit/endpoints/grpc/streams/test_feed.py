@@ -129,7 +129,7 @@ def test_a_model_replaced_by_a_reload_in_virtual_time_is_shown_step_by_step(inst
 def test_a_held_feed_skips_no_frames(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The feed gives the frames to its streams later, so no stream counts as slow."""
     monkeypatch.setattr(back_pressure, "LOOK_S", 1000.0)
-    monkeypatch.setattr(ringing, "REST_S", 0.001)
+    monkeypatch.setattr(ringing, "PAUSE_S", 0.001)
 
     async def run(opened: Segment) -> None:
         told, wake_ups = list[bool](), WakeUps()
@@ -141,7 +141,7 @@ def test_a_held_feed_skips_no_frames(instance: str, monkeypatch: pytest.MonkeyPa
         async with asyncio.timeout(TIMEOUT_S):
             while told[-1:] != [True]:  # noqa: ASYNC110  another thread changes it
                 await asyncio.sleep(0)
-            feed.hold()
+            feed.suspend()
             for cycle in range(2, 2 * back_pressure.CATCH_UP_FRAMES):
                 writer.publish(bytes(MODEL_LAYOUT.size), cycle=cycle)
             writer.publish(bytes(MODEL_LAYOUT.size), cycle=2 * back_pressure.CATCH_UP_FRAMES, quality=Quality.BAD)
