@@ -300,7 +300,7 @@ def test_variables_of_a_node_set() -> None:
         (b"", "the format is unknown"),
         (b"hello\n", "the format is unknown"),
         (b"PK\x03\x04", "not a workbook"),
-        (b"<a/>", "XML whose root is 'a'"),
+        (b"<a/>", "XML with the root 'a'"),
         (b"<Document><SW.Blocks.FC/></Document>", "expected a PLC tag table or a global data block, found SW"),
         (b"<UANodeSet/>", "expected nodes below UANodeSet"),
         (b"<UANodeSet>", "not XML that can be read"),
