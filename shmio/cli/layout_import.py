@@ -19,7 +19,7 @@ def main(arguments: Sequence[str]) -> int:
         prog="shmio-layout import",
         description=f"Convert a tag list into a tag table, and report what was left out. Imports {FORMATS}.",
     )
-    parser.add_argument("file", metavar="FILE", type=Path, help="the list, as the vendor's tool wrote it")
+    parser.add_argument("file", metavar="FILE", type=Path, help="the list that the vendor's tool has exported")
     parser.add_argument(
         "-o", "--output", metavar="TABLE.toml", type=Path, help="the new tag table; default: standard output"
     )

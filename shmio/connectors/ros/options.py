@@ -10,7 +10,7 @@ _Topic = Annotated[str, msgspec.Meta(min_length=2, max_length=256)]
 
 
 class TopicOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
-    """Time-outs, and what counts as a good value."""
+    """Keys that both ROS connectors share: time-outs, ages and time stamps."""
 
     timeout: Annotated[int, msgspec.Meta(ge=10, le=600_000)] = 4000
     """Time-out for connecting, for each answer, and for the writes of a cycle, in ms."""

@@ -161,7 +161,7 @@ class Participant:
         return bool(self._endpoints[topic].reader.get_requested_incompatible_qos_status().total_count)
 
     def take(self) -> Iterator[tuple[str, Any]]:
-        """Yield each topic that has a new message, with the newest; None if that cannot be decoded.
+        """Yield the topics with new messages, each with its newest message, or None if that is malformed.
 
         Raises:
             ConnectorError: The library reports an error.

@@ -369,7 +369,7 @@ class SimulateCall:
         self.end()
 
     def taken(self, task: asyncio.Task[None]) -> None:
-        """End the call when the task of :meth:`take` has ended."""
+        """Callback for the end of the :meth:`take` task: end the call."""
         if not task.cancelled():
             error = task.exception()
             self.end(error if isinstance(error, ShmioError) else None)
