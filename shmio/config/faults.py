@@ -18,15 +18,19 @@ from msgspec import ValidationError
 from shmio.config.model import (
     NAME_PATTERN,
     NAME_RULE,
+    AlongName,
     BrokerName,
     ClockName,
     DistributionName,
+    FormName,
+    JointTypeName,
     OperationName,
     PayloadName,
     ProcessState,
     QualityName,
     ReplayedInjections,
     Severity,
+    UnitName,
 )
 from shmio.errors import ConfigError, LayoutError
 
@@ -57,15 +61,19 @@ _POSITION: Final = re.compile(r"\(at line (\d+), column (\d+)\)\Z")
 _BARE: Final = re.compile(r"[^\s,=#\[\]{}\"']+")
 _TEXT: Final = re.compile(r"[^\W\d].*|.*[:/].*|\d+(?:\.\d+){2,}")  # a name, a path or an address
 _WORDS: Final = {
+    "along": AlongName,
     "broker": BrokerName,
     "clock": ClockName,
     "distribution": DistributionName,
+    "form": FormName,
     "injections": ReplayedInjections,
     "operation": OperationName,
     "payload": PayloadName,
     "quality": QualityName,
     "severity": Severity,
     "state": ProcessState,
+    "type": JointTypeName,
+    "unit": UnitName,
 }
 """The keys whose value must be one of a few words, with the type that lists these words."""
 _TYPES: Final = {
@@ -357,6 +365,12 @@ class Faults:
         if message not in self._found:
             self._found[message] = line
             self.count += 1
+
+    def include(self, other: Faults) -> None:
+        """Add the faults and warnings of another file. They are shown after those of this one."""
+        for message in sorted(other._found, key=other._found.__getitem__):
+            self._note(message, math.inf)
+        self._warnings += other._warnings
 
     def warn(self, message: str) -> None:
         """Add a warning, ``key: what is unusual``, which is shown after the faults."""

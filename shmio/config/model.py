@@ -27,6 +27,10 @@ PayloadName = Literal["text", "json", "structure", "frames"]
 ProcessState = Literal["starting", "running", "backoff", "stopped", "fatal"]
 QualityName = Literal["bad", "uncertain", "good"]
 Severity = Literal["info", "warning", "critical"]
+JointTypeName = Literal["revolute", "prismatic"]
+FormName = Literal["box", "cylinder", "sphere"]
+AlongName = Literal["x", "y", "z"]
+UnitName = Literal["deg", "rad", "mm", "m"]
 TypeBytes = Annotated[dict[Text, Annotated[int, Meta(ge=1, le=1 << 20)]], Meta(max_length=1000)]
 """For types whose members are unknown: the size in bytes by type name."""
 RealtimePriority = Annotated[int, Meta(ge=1, le=99)]
@@ -389,10 +393,12 @@ class Metrics(Section):
 class Web(Metrics):
     """``[web]``: the address of the web page, which also has what ``[metrics]`` has.
 
-    ``roles`` are those of users who show no token. Its tokens are those of ``[[grpc.token]]``.
+    ``roles`` are those of users who show no token. Its tokens are those of ``[[grpc.token]]``. ``scene`` is the file
+    that describes the cell in 3D (``scene.py``).
     """
 
     roles: Annotated[list[Text], Meta(max_length=len(ROLES))] | None = None
+    scene: Text | None = None
 
 
 class Alert(Section):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -128,8 +128,8 @@ def examine(file: Path) -> Examined:
         ConfigError: The file cannot be read or is not TOML.
 
     """
-    text = _read_text(file)
-    tables = _parse(file, text)
+    text = read_text(file, "; create it with shmio-supervisor init")
+    tables = parse(file, text)
     return _examine(tables, file.resolve().parent, Faults(file, tables, text))
 
 
@@ -140,11 +140,15 @@ def read_tables(file: Path) -> dict[str, Any]:
         ConfigError: The file cannot be read or is not TOML.
 
     """
-    return _parse(file, _read_text(file))
+    return parse(file, read_text(file))
 
 
-def _read_text(file: Path) -> str:
-    """Return the text of a file.
+def read_text(file: Path, remedy: str = "") -> str:
+    """Return the text of a TOML file.
+
+    Args:
+        file: The file.
+        remedy: What to say if there is no such file, after the reason.
 
     Raises:
         ConfigError: The file cannot be read, is too large, or is not UTF-8.
@@ -154,7 +158,7 @@ def _read_text(file: Path) -> str:
         with file.open("rb") as stream:
             data = stream.read(MAX_FILE_BYTES + 1)
     except FileNotFoundError as error:
-        raise ConfigError(f"{file}: {error.strerror}; create it with shmio-supervisor init") from None
+        raise ConfigError(f"{file}: {error.strerror}{remedy}") from None
     except IsADirectoryError as error:
         raise ConfigError(f"{file}: {error.strerror}; name the file, such as {file / 'supervisor.toml'}") from None
     except OSError as error:
@@ -164,7 +168,7 @@ def _read_text(file: Path) -> str:
     return decode(data, str(file))
 
 
-def _parse(file: Path, text: str) -> dict[str, Any]:
+def parse(file: Path, text: str) -> dict[str, Any]:
     """Parse TOML text.
 
     Raises:
@@ -246,7 +250,7 @@ def _examine(tables: dict[str, Any], folder: Path, faults: Faults) -> Examined:
                 f"source: there are {len(sources)} sources, but an instance has at most {MAX_SOURCES} processes; "
                 f"only the first {MAX_SOURCES} sources are checked"
             )
-    sound, places = _Structure(faults, folder, broken).sections(tables)
+    sound, places = _ConfigStructure(faults, folder, broken).sections(tables)
     faults.places = places
     config = convert({**sound, "folder": str(folder)}, Config)
     for source in config.source:
@@ -291,15 +295,23 @@ def _fields(kind: type[Section]) -> tuple[msgspec.structs.FieldInfo, ...]:
     return tuple(field for field in msgspec.structs.fields(kind) if field.name not in _DERIVED)
 
 
-class _Structure:
+class Structure:
     """Checks each key by itself: whether it is known, present where needed, and of the right type."""
 
     def __init__(
-        self, faults: Faults, folder: Path, broken: dict[int, tuple[str, dict[str, Any], dict[str, str]]]
+        self, faults: Faults, whole: type[Section], kinds: Mapping[str, type[Section]], several: Collection[str]
     ) -> None:
+        """Create the structure of one kind of file.
+
+        Args:
+            faults: Takes the faults.
+            whole: The type of the file.
+            kinds: The type of each table, by its dotted name without indices.
+            several: Names of the tables that may repeat.
+
+        """
         self._faults = faults
-        self._folder = folder
-        self._broken = broken
+        self._whole, self._kinds, self._several = whole, kinds, several
 
     def sections(self, tables: dict[str, Any]) -> tuple[dict[str, Any], dict[str, list[int]]]:
         """Return the sections without faults.
@@ -308,14 +320,15 @@ class _Structure:
         """
         sound: dict[str, Any] = {}
         places: dict[str, list[int]] = {}
-        hinted = self._unknown(tables, "", Config)
-        if "instance" not in tables and "instance" not in hinted:
-            self._faults.add("instance: this key is needed")
-        for name in (one for one in _TABLES if "." not in one):
+        hinted = self._unknown(tables, "", "")
+        for field in _fields(self._whole):
+            if field.required and field.name not in tables and field.name not in hinted:
+                self._faults.add(f"{field.name}: this key is needed")
+        for name in (one for one in self._kinds if "." not in one):
             if name not in tables:
                 continue
             value = tables[name]
-            if name not in _SEVERAL:
+            if name not in self._several:
                 good, found = self.table(value, name, name)
                 sound |= {name: found} if good else {}
             elif isinstance(value, list):
@@ -324,33 +337,11 @@ class _Structure:
                 sound[name] = [found for good, found in results if good]
             else:
                 self._no_list(name, value)
-        sound.setdefault("instance", {"name": "unnamed"})
         return sound, places
 
     def _one(self, value: Any, name: str, index: int) -> tuple[bool, Any]:
-        key = f"{name}[{index}]"
-        if name != "source" or not isinstance(value, dict):
-            return self.table(value, key, name)
-        common = {*Source.__struct_fields__} - {*_DERIVED}
-        options = {name: item for name, item in value.items() if name not in common}
-        before = self._faults.count
-        for fault in text_faults(options, key):
-            self._faults.add(fault)
-        texts: dict[str, str] = {}
-        properties = value.get("properties")
-        if isinstance(properties, str) and not any(text_faults(properties, "")):
-            with self._faults.catching():
-                read = read_properties(self._folder / properties, key)
-                texts = {name: text for name, (text, _) in read.items() if name not in options}
-                self._faults.lies_in(properties, key, {name: line for name, (_, line) in read.items() if name in texts})
-        usable = self._faults.count == before
-        good, found = self.table({name: value[name] for name in value if name in common}, key, name)
-        if good and usable:
-            return True, found | {"options": options, "texts": texts}
-        connector = value.get("connector")
-        if isinstance(connector, str) and usable:
-            self._broken[index] = connector, options, texts
-        return False, found
+        """Check one of several tables with the same name."""
+        return self.table(value, f"{name}[{index}]", name)
 
     def _no_list(self, key: str, value: Any) -> None:
         if isinstance(value, dict):
@@ -363,23 +354,23 @@ class _Structure:
         if not isinstance(value, dict):
             self._faults.add(f"{key}: expected a table [{name}]")
             return False, {}
-        kind = _TABLES[name]
+        kind = self._kinds[name]
         before = self._faults.count
-        hinted = self._unknown(value, key, kind)
+        hinted = self._unknown(value, key, name)
         found: dict[str, Any] = {}
         for field in _fields(kind):
             inner = f"{key}.{field.name}"
             if field.name not in value:
                 if field.required and field.name not in hinted:
                     self._faults.add(f"{inner}: this key is needed")
-            elif f"{name}.{field.name}" in _TABLES:
+            elif f"{name}.{field.name}" in self._kinds:
                 found[field.name] = self._inner(value[field.name], inner, f"{name}.{field.name}")
             elif self._field(value[field.name], inner, field.type):
                 found[field.name] = value[field.name]
         return self._faults.count == before, found
 
     def _inner(self, value: Any, key: str, name: str) -> Any:
-        if name not in _SEVERAL:
+        if name not in self._several:
             return self.table(value, key, name)[1]
         if not isinstance(value, list):
             self._no_list(name, value)
@@ -403,19 +394,61 @@ class _Structure:
             return False
         return True
 
-    def _unknown(self, table: dict[str, Any], key: str, kind: type[Section]) -> set[str]:
+    def _unknown(self, table: dict[str, Any], key: str, name: str) -> set[str]:
         """Add a fault for each unknown key; return the known keys that are probably meant."""
-        known = [name for name in kind.__struct_fields__ if name not in _DERIVED]
+        known = _known(self._kinds[name] if name else self._whole)
         hinted: set[str] = set()
-        for name in table:
-            if name in known:
+        for one in table:
+            if one in known:
                 continue
             if self._faults.full:
                 self._faults.count += 1
                 continue
-            self._faults.add(_unknown(f"{key}.{name}".lstrip("."), key, Config if not key else kind))
-            hinted |= {*near(name, known)}
+            self._faults.add(_unknown(f"{key}.{one}".lstrip("."), known))
+            hinted |= {*near(one, known)}
         return hinted
+
+
+class _ConfigStructure(Structure):
+    """Also checks what only ``supervisor.toml`` has: sources, whose connectors have keys of their own."""
+
+    def __init__(
+        self, faults: Faults, folder: Path, broken: dict[int, tuple[str, dict[str, Any], dict[str, str]]]
+    ) -> None:
+        super().__init__(faults, Config, _TABLES, _SEVERAL)
+        self._folder = folder
+        self._broken = broken
+
+    def sections(self, tables: dict[str, Any]) -> tuple[dict[str, Any], dict[str, list[int]]]:
+        """Return the sections without faults, and a section ``instance`` in any case."""
+        sound, places = super().sections(tables)
+        sound.setdefault("instance", {"name": "unnamed"})
+        return sound, places
+
+    def _one(self, value: Any, name: str, index: int) -> tuple[bool, Any]:
+        if name != "source" or not isinstance(value, dict):
+            return super()._one(value, name, index)
+        key = f"{name}[{index}]"
+        common = {*Source.__struct_fields__} - {*_DERIVED}
+        options = {name: item for name, item in value.items() if name not in common}
+        before = self._faults.count
+        for fault in text_faults(options, key):
+            self._faults.add(fault)
+        texts: dict[str, str] = {}
+        properties = value.get("properties")
+        if isinstance(properties, str) and not any(text_faults(properties, "")):
+            with self._faults.catching():
+                read = read_properties(self._folder / properties, key)
+                texts = {name: text for name, (text, _) in read.items() if name not in options}
+                self._faults.lies_in(properties, key, {name: line for name, (_, line) in read.items() if name in texts})
+        usable = self._faults.count == before
+        good, found = self.table({name: value[name] for name in value if name in common}, key, name)
+        if good and usable:
+            return True, found | {"options": options, "texts": texts}
+        connector = value.get("connector")
+        if isinstance(connector, str) and usable:
+            self._broken[index] = connector, options, texts
+        return False, found
 
 
 def convert(tables: dict[str, Any], kind: type[_Table]) -> _Table:
@@ -433,19 +466,26 @@ def convert(tables: dict[str, Any], kind: type[_Table]) -> _Table:
         unknown = re.search(r"unknown field `([^`]*)`", text)
         if unknown is None:
             raise ConfigError(explain(error)) from None
-        raise ConfigError(_unknown(f"{path}.{unknown[1]}" if path else unknown[1], path, kind)) from None
+        table = re.sub(r"\[[^]]*\]", "", path)
+        known = kind if not table else _TABLES.get(table)
+        raise ConfigError(
+            _unknown(f"{path}.{unknown[1]}" if path else unknown[1], _known(known) if known else [])
+        ) from None
 
 
-def _unknown(key: str, table: str, whole: type[Section] = Config) -> str:
-    known = whole if not table else _TABLES.get(re.sub(r"\[[^]]*\]", "", table))
-    names = [name for name in known.__struct_fields__ if name not in _DERIVED] if known else []
-    remedy = hint(key.rpartition(".")[2], names, f"known here: {', '.join(names)}")
+def _known(kind: type[Section]) -> list[str]:
+    """Return the names of the keys of a table."""
+    return [name for name in kind.__struct_fields__ if name not in _DERIVED]
+
+
+def _unknown(key: str, known: Sequence[str]) -> str:
+    remedy = hint(key.rpartition(".")[2], known, f"known here: {', '.join(known)}")
     return f"{key}: unknown key; {remedy}"
 
 
 def unknown_option(index: int, key: str, known: list[str]) -> str:
     """Return the message for a key of ``source[index]`` that the connector does not know either."""
-    names = [*known, *(name for name in Source.__struct_fields__ if name not in _DERIVED)]
+    names = [*known, *_known(Source)]
     remedy = hint(key, names, f"the connector knows: {', '.join(known)}")
     return f"source[{index}].{key}: unknown key; {remedy}"
 

@@ -61,8 +61,8 @@ def _check_roles(web: Web, address: Address, config: Config) -> None:
 def resolve_web(config: Config) -> None:
     """Make the paths in the sections absolute."""
     for _, section in http_sections(config):
-        for field in ("certificate", "key"):
-            if name := getattr(section, field):
+        for field in ("certificate", "key", "scene"):
+            if name := getattr(section, field, None):
                 setattr(section, field, str(config.path(name)))
 
 

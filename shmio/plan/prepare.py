@@ -34,6 +34,7 @@ from shmio.plan.layouts import LayoutFiles
 from shmio.plan.ports import check_listening
 from shmio.plan.processes import ALERTS, Plan, make_plan, process_names
 from shmio.plan.replay import Recordings, replayed
+from shmio.plan.scene import check_scene
 from shmio.plan.sources import check_sources, note_options
 from shmio.recording.selection import Selection
 
@@ -111,6 +112,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
     declared, described = dict[str, bytes](), tuple[str, ...]()
     with faults.catching():
         declared, described = check_injections(config, layouts)
+    scene = check_scene(config, layouts, faults, replayed=mode == "replay")
     if config.recorder and config.recorder.trigger:
         with faults.catching():
             _check_trigger(config.recorder.trigger.when, layouts)
@@ -145,6 +147,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
         remote=sources.remote,
         origin=origin,
         recordings=directory,
+        scene=scene,
     )
     open_to = None if mode == "log" else exposure(config)  # mode log has no endpoints
     return Prepared(config, plan, layouts, emulated, described, (open_to,) if open_to else ())

@@ -176,6 +176,7 @@ def make_plan(
     remote: Mapping[str, tuple[Sequence[str], Sequence[str]]] | None = None,
     origin: Origin | None = None,
     recordings: Path | None = None,
+    scene: Mapping[str, Any] | None = None,
 ) -> Plan:
     """Plan an instance.
 
@@ -194,6 +195,7 @@ def make_plan(
             outputs and in-outs.
         origin: The clock's origin in a replayed recording; None if there is none.
         recordings: The directory of the configured recorder, also if the mode leaves it out; None if there is none.
+        scene: The cell in 3D, which the web page draws; None if the configuration has none.
 
     Raises:
         ConfigError: The instance has too many processes.
@@ -242,6 +244,7 @@ def make_plan(
         tokens = msgspec.to_builtins(config.grpc.token) if config.grpc else []
         more = {"folders": _folders(config), "token": tokens, "config_file": str(config_file.resolve())}
         more["recordings"] = recordings and str(recordings)
+        more["scene"] = scene  # in place of its path
         sections.append(("web", "web", msgspec.to_builtins(config.web) | more))
     if config.alert and mode == "live":
         sections.append((ALERTS, "alerts", _alerts(config, log_dir)))

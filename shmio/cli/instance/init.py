@@ -30,7 +30,7 @@ from shmio.plan.layouts import read_program, summarize
 from shmio.plan.ports import in_use
 from shmio.segment import instances
 
-EXAMPLE = ("supervisor.toml", "db201.db")
+EXAMPLE = ("supervisor.toml", "db201.db", "scene.toml")
 EXAMPLE_NAME = "a50"
 SOURCES = (".db", ".udt", ".scl", ".awl")
 TABLES = (".toml", ".csv", ".xlsx")
@@ -90,8 +90,8 @@ def init(arguments: argparse.Namespace) -> int:
 def _example(file: Path) -> dict[Path, str]:
     """Return the files of the A50 cell with its emulated controller, by path."""
     folder = resources.files("shmio.cli") / "a50"
-    config, layout = ((folder / name).read_text(encoding="utf-8") for name in EXAMPLE)
-    return {file: config, file.parent / EXAMPLE[1]: layout}
+    config, *others = ((folder / name).read_text(encoding="utf-8") for name in EXAMPLE)
+    return {file: config} | {file.parent / name: text for name, text in zip(EXAMPLE[1:], others, strict=True)}
 
 
 def _refuse_present(path: Path) -> None:
@@ -104,10 +104,11 @@ def _refuse_present(path: Path) -> None:
 def _write(files: dict[Path, str]) -> None:
     """Write all files or none.
 
-    Never change an existing file; an identical ``.db`` file may exist.
+    Never change an existing file; an identical ``.db`` file or scene may exist.
     """
     for path, content in files.items():
-        if not (path.is_file() and path.suffix == ".db" and path.read_bytes() == content.encode()):
+        kept = path.suffix == ".db" or path.name in EXAMPLE[1:]
+        if not (path.is_file() and kept and path.read_bytes() == content.encode()):
             _refuse_present(path)
     for path, content in files.items():
         if not path.exists():

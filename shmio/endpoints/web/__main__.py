@@ -49,6 +49,7 @@ async def _serve(worker: Worker) -> None:
     given: list[dict[str, Any]] = worker.config.pop("token", [])
     file: str = worker.config.pop("config_file", "")
     recordings: str | None = worker.config.pop("recordings", None)
+    scene: dict[str, Any] | None = worker.config.pop("scene", None)
     config = msgspec.convert(worker.config, Web if worker.name == "web" else Metrics)
     loop = asyncio.get_running_loop()
     stopping = asyncio.Event()
@@ -58,7 +59,7 @@ async def _serve(worker: Worker) -> None:
     if isinstance(config, Web):
         cell = attach(worker.segment.instance, writable=True)
         sessions = Sessions(read_tokens(msgspec.convert(given, list[Token])), config.roles or ())
-        served = Served(worker.segment, cell, measurements, folders, file, recordings)
+        served = Served(worker.segment, cell, measurements, folders, file, recordings, scene)
         page = PageApp(served, sessions, TABS, secure=config.certificate is not None)
         app = page.app(measurements, config.registers)
     else:

@@ -85,7 +85,8 @@ class PageApp:
             secure: Whether the server uses TLS. Then browsers send the session's cookie over TLS only.
 
         """
-        self._served, self._sessions, self._tabs, self._secure = served, sessions, tabs, secure
+        self._served, self._sessions, self._secure = served, sessions, secure
+        self._tabs = [tab for tab in tabs if tab.offered(served)]
         self.open_pages = 0
         """Number of open pages."""
         self._files = {
@@ -160,6 +161,7 @@ class PageApp:
             "name": user.name,
             "roles": user.listed_roles,
             "takes_tokens": self._sessions.takes_tokens,
+            "tabs": [tab.name for tab in self._tabs],
         }
 
     async def _socket(self, socket: WebSocket) -> None:

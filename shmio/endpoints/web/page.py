@@ -105,6 +105,11 @@ class Tab:
     def __init__(self, page: Page) -> None:
         self.page = page
 
+    @classmethod
+    def offered(cls, served: Served) -> bool:  # noqa: ARG003  a tab may need something
+        """Return whether pages of this instance have this tab."""
+        return True
+
     def close(self) -> None:
         """Release what the tab holds, because the page has been closed."""
 

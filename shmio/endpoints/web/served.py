@@ -49,6 +49,7 @@ class Served:
         folders: Mapping[str, str],
         config_file: str = "",
         recordings: str | None = None,
+        scene: Mapping[str, Any] | None = None,
     ) -> None:
         """Begin without an overview.
 
@@ -59,10 +60,11 @@ class Served:
             folders: Folders in which the instance writes files, by purpose.
             config_file: Path of the configuration.
             recordings: The recorder's directory; None if no recorder is configured.
+            scene: The cell in 3D, as shmio/plan/scene.py makes it; None if the configuration has none.
 
         """
         self.segment, self.cell, self.measurements, self.folders = segment, cell, measurements, folders
-        self.config_file = config_file
+        self.config_file, self.scene = config_file, scene
         self.feeds = Feeds()
         """The signals that pages plot."""
         self.timeline = Timeline(segment)

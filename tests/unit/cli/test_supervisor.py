@@ -63,10 +63,13 @@ def example(capsys: pytest.CaptureFixture[str]) -> Edit:
 
 def test_init_writes_the_example_of_the_repository(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["init"]) == 0
-    assert capsys.readouterr().out.splitlines()[:2] == ["wrote supervisor.toml", "wrote db201.db"]
-    assert Path("db201.db").read_bytes() == (ROOT / "db201.db").read_bytes()
+    assert capsys.readouterr().out.splitlines()[:3] == [
+        f"wrote {name}" for name in ("supervisor.toml", "db201.db", "scene.toml")
+    ]
+    for name in ("db201.db", "scene.toml"):
+        assert Path(name).read_bytes() == (ROOT / name).read_bytes()
     without_page, page = Path("supervisor.toml").read_text().split("# [web]")  # its libraries may be missing
-    assert f"{without_page}[web]{page}".replace("\n# listen", "\nlisten") == (ROOT / "supervisor.toml").read_text()
+    assert f"{without_page}[web]{page}".replace("\n# ", "\n") == (ROOT / "supervisor.toml").read_text()
 
 
 def test_init_names_tag_tables(capsys: pytest.CaptureFixture[str]) -> None:

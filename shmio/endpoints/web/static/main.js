@@ -8,6 +8,7 @@ import { OverviewTab } from "./overview.js";
 import { PlotsTab, plot } from "./plots.js";
 import { RecordingsTab } from "./recordings.js";
 import { RegistersTab } from "./registers.js";
+import { SceneTab } from "./scene/tab.js";
 import { session, signIn, signOut } from "./session.js";
 import { TimeTab } from "./time.js";
 
@@ -22,6 +23,7 @@ const TABS = {
   overview: { title: "Overview", make: (context) => new OverviewTab(context) },
   registers: { title: "Registers", make: (context) => new RegistersTab(context) },
   plots: { title: "Plots", make: (context) => new PlotsTab(context) },
+  scene: { title: "3D", make: (context) => new SceneTab(context) },
   injections: { title: "Injections", make: (context) => new InjectionsTab(context) },
   time: { title: "Time", make: (context) => new TimeTab(context) },
   recordings: { title: "Recordings", make: (context) => new RecordingsTab(context) },
@@ -30,17 +32,19 @@ const TABS = {
 
 const connection = new Connection();
 /** @type {import("./session.js").Session} */
-let user = { instance: "", name: "", roles: [], takes_tokens: false };
+let user = { instance: "", name: "", roles: [], takes_tokens: false, tabs: [] };
 /** @type {Tab | null} */
 let shown = null;
+let shownName = "";
 /** @type {Context} */
 const context = { connection, overview: null, may: (role) => user.roles.includes(role), show: (name) => (location.hash = name) };
 
 function showTab() {
   const wanted = location.hash.slice(1).split("/")[0];
-  const name = wanted in TABS ? wanted : "overview";
+  const name = wanted in TABS && user.tabs.includes(wanted) ? wanted : "overview";
   shown?.close();
   shown = TABS[name].make(context);
+  shownName = name;
   replace(byId("main"), shown.root);
   if (connection.open) shown.resume?.();
   for (const button of byId("tabs").children) {
@@ -52,7 +56,7 @@ function showTab() {
 
 function makeTabs() {
   const buttons = Object.entries(TABS).map(([name, { title }]) =>
-    element("button", { type: "button", role: "tab", id: `tab-${name}`, click: () => context.show(name) }, title),
+    element("button", { type: "button", role: "tab", id: `tab-${name}`, hidden: true, click: () => context.show(name) }, title),
   );
   byId("tabs").replaceChildren(...buttons);
   byId("tab-plots").addEventListener("dragover", (event) => event.preventDefault());
@@ -63,9 +67,10 @@ function makeTabs() {
   });
   byId("tabs").addEventListener("keydown", (event) => {
     const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
-    const at = buttons.findIndex((button) => button === document.activeElement);
+    const present = buttons.filter((button) => !button.hidden);
+    const at = present.findIndex((button) => button === document.activeElement);
     if (step === undefined || at < 0) return;
-    const next = buttons[(at + step + buttons.length) % buttons.length];
+    const next = present[(at + step + present.length) % present.length];
     next.focus();
     next.click();
   });
@@ -88,6 +93,7 @@ function showHead(overview) {
 /** @param {import("./session.js").Session} found */
 function showUser(found) {
   user = found;
+  for (const name of Object.keys(TABS)) byId(`tab-${name}`).hidden = !found.tabs.includes(name);
   setText(byId("instance"), user.instance);
   const roles = user.roles.join(", ") || "no role";
   const act = user.name
@@ -120,10 +126,11 @@ function makeTheme() {
 }
 
 connection.follow("overview", showHead);
-connection.addEventListener("open", () => {
+connection.addEventListener("open", async () => {
   byId("offline").hidden = true;
+  showUser(await session().catch(() => user)); // a restart may have brought other tabs
   connection.call("overview.follow").catch(() => {});
-  if (shown === null) showTab();
+  if (shown === null || !user.tabs.includes(shownName)) showTab();
   else shown.resume?.();
 });
 connection.addEventListener("lost", async () => {

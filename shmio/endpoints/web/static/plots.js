@@ -1,18 +1,16 @@
 // The plots tab: registers over time, live, and their past from the recording of this run.
 
 import { element, notify, replace, setText } from "./dom.js";
+import { Feeds, sourceOf } from "./feeds.js";
 import { Lanes } from "./lanes.js";
 import { Course } from "./recorded.js";
-import { Series, batchNumber, readBatch } from "./series.js";
 
 /** @typedef {import("./main.js").Context} Context */
-/** @typedef {import("./lanes.js").Signal} Signal */
-/** @typedef {{ number: number, signals: Signal[] }} Feed */
+/** @typedef {import("./series.js").Series} Series */
 
 const MAX_SIGNALS = 200;
 const MAX_SAMPLES = 4_000_000;
 const MAX_PAST = 32; // registers of a source whose past is read
-const RETRY_MS = 3000;
 const SETTLE_MS = 250; // after the last movement, before the past is requested
 const WINDOWS_S = [2, 8, 30, 120, 600, 3600];
 const KEY = "plots";
@@ -44,37 +42,30 @@ export class PlotsTab {
   /** @param {Context} context */
   constructor(context) {
     this.context = context;
-    /** @type {Map<string, Series>} */
-    this.series = new Map();
-    /** @type {Map<string, Signal>} */
-    this.signals = new Map();
-    /** @type {Map<string, Feed>} */
-    this.feeds = new Map();
-    /** @type {Map<number, Feed>} */
-    this.byNumber = new Map();
+    /** @type {Feeds} */
+    this.feeds = new Feeds(context.connection, () => this.lanes.paths, () => this.lanes.request(), MAX_SAMPLES);
     /** @type {Map<string, Course>} The past of each source. */
     this.pasts = new Map();
     /** @type {Map<string, Course>} The past of each source that was requested last. */
     this.wanted = new Map();
-    this.lagS = Infinity; // of this computer's clock against the server's times
 
     this.search = element("input", { type: "search", placeholder: "Add a register", "aria-label": "Add a register", list: "plot-paths", maxlength: 200 });
     this.found = element("datalist", { id: "plot-paths" });
     this.search.addEventListener("input", () => this.suggest());
     this.lanes = new Lanes({
       series: (path) => this.allSeries(path),
-      signal: (path) => this.signals.get(path),
+      signal: (path) => this.feeds.signals.get(path),
       marks: () => [],
       changed: (lanes) => {
         sessionStorage.setItem(KEY, JSON.stringify(lanes));
         this.help.hidden = lanes.length > 0;
       },
       removed: (path) => {
-        this.series.delete(path);
-        this.follow(sourceOf(path));
+        this.feeds.series.delete(path);
+        this.feeds.follow(sourceOf(path));
       },
       moved: () => this.needPast(),
-      newest: () => (Number.isFinite(this.lagS) ? Date.now() / 1000 - this.lagS : Date.now() / 1000),
+      newest: () => (Number.isFinite(this.feeds.lagS) ? Date.now() / 1000 - this.feeds.lagS : Date.now() / 1000),
       name: () => this.context.overview?.instance ?? "plot",
     });
     this.windowSelect = element(
@@ -112,26 +103,19 @@ export class PlotsTab {
       this.add(event.dataTransfer?.getData("text/plain") ?? "");
     });
     this.lanes.make(stored());
-    this.context.connection.onBatch = (batch) => this.take(batch);
-    this.stop = context.connection.follow("plots", (numbers) => this.lost(numbers));
     this.timer = setInterval(() => this.lanes.request(), 250); // time goes on while no data comes
   }
 
   close() {
-    this.stop();
+    this.feeds.close();
     clearInterval(this.timer);
-    clearTimeout(this.retry);
     clearTimeout(this.settling);
     this.lanes.close();
-    this.context.connection.onBatch = () => {};
-    for (const source of this.feeds.keys()) this.context.connection.call("plots.follow", { source, paths: [] }).catch(() => {});
   }
 
   /** Follow all registers again: the connection is new. */
   resume() {
-    this.feeds.clear();
-    this.byNumber.clear();
-    this.followAll();
+    this.feeds.resume();
   }
 
   /** @param {string} path */
@@ -139,14 +123,14 @@ export class PlotsTab {
     if (!path || this.lanes.paths.includes(path)) return;
     this.search.value = "";
     this.lanes.make([...this.lanes.lanes.map((lane) => lane.paths), [path]]);
-    if (!(await this.follow(sourceOf(path)))) this.lanes.remove(path);
+    if (!(await this.feeds.follow(sourceOf(path)))) this.lanes.remove(path);
     else this.needPast();
   }
 
   /** @param {string} path @returns {Series[]} Its past, and what came since the page follows it. */
   allSeries(path) {
     const past = this.pasts.get(sourceOf(path))?.series.get(path);
-    const live = this.series.get(path);
+    const live = this.feeds.series.get(path);
     return [past, live].filter((series) => series !== undefined);
   }
 
@@ -161,7 +145,7 @@ export class PlotsTab {
   /** @param {string} source */
   async readPast(source) {
     const paths = this.lanes.paths.filter((path) => sourceOf(path) === source).slice(0, MAX_PAST);
-    const begun = paths.map((path) => this.series.get(path)).filter((series) => series !== undefined && series.count > 0);
+    const begun = paths.map((path) => this.feeds.series.get(path)).filter((series) => series !== undefined && series.count > 0);
     const until = Math.min(this.lanes.to, ...begun.map((series) => series?.times[0] ?? Infinity));
     const { from } = this.lanes;
     const old = this.pasts.get(source);
@@ -193,68 +177,6 @@ export class PlotsTab {
     replace(this.found, ...paths.map((/** @type {string} */ path) => element("option", { value: path })));
     this.context.connection.call("registers.rows", { first: 0, count: 0 }).catch(() => {});
   }
-
-  async followAll() {
-    clearTimeout(this.retry);
-    const sources = new Set(this.lanes.paths.map(sourceOf));
-    for (const source of sources) if (!this.feeds.has(source)) await this.follow(source);
-  }
-
-  /**
-   * Follow the registers of a source that are plotted now.
-   *
-   * @param {string} source
-   * @returns {Promise<boolean>} False if the server refused it.
-   */
-  async follow(source) {
-    const paths = this.lanes.paths.filter((path) => sourceOf(path) === source);
-    try {
-      const feed = await this.context.connection.call("plots.follow", { source, paths });
-      const old = this.feeds.get(source);
-      if (old !== undefined && old.number !== feed?.number) this.byNumber.delete(old.number);
-      this.feeds.delete(source);
-      if (feed === null) return true;
-      this.feeds.set(source, feed);
-      this.byNumber.set(feed.number, feed);
-      for (const signal of feed.signals) this.signals.set(signal.path, signal);
-      return true;
-    } catch (error) {
-      if (!this.context.connection.open) return true;
-      notify(String(/** @type {Error} */ (error).message), "problem");
-      this.retry = setTimeout(() => this.followAll(), RETRY_MS);
-      return false;
-    }
-  }
-
-  /** Follow the sources again whose feeds have ended. @param {number[]} numbers The feeds that are left. */
-  lost(numbers) {
-    for (const [source, feed] of this.feeds) {
-      if (numbers.includes(feed.number)) continue;
-      this.feeds.delete(source);
-      this.byNumber.delete(feed.number);
-    }
-    this.followAll();
-  }
-
-  /** @param {ArrayBuffer} batch See shmio/endpoints/web/signals.py. */
-  take(batch) {
-    const feed = this.byNumber.get(batchNumber(batch));
-    if (feed === undefined) return;
-    const { before, times, columns } = readBatch(batch, feed.signals.length);
-    const most = Math.min(600_000, Math.floor(MAX_SAMPLES / feed.signals.length));
-    feed.signals.forEach(({ path }, index) => {
-      let series = this.series.get(path);
-      if (series === undefined) this.series.set(path, (series = new Series()));
-      series.append(before, times, columns[index].values, columns[index].marks, most);
-    });
-    this.lagS = Math.min(this.lagS, Date.now() / 1000 - times[times.length - 1]);
-    this.lanes.request();
-  }
-}
-
-/** @param {string} path @returns {string} */
-function sourceOf(path) {
-  return path.split("/")[0];
 }
 
 /** @param {number} seconds @returns {string} */

@@ -2,7 +2,7 @@
 
 import { element } from "./dom.js";
 
-/** @typedef {{ instance: string, name: string, roles: string[], takes_tokens: boolean }} Session */
+/** @typedef {{ instance: string, name: string, roles: string[], takes_tokens: boolean, tabs: string[] }} Session `tabs`: names of the tabs that the server offers. */
 
 /** @returns {Promise<Session>} */
 export async function session() {

@@ -9,7 +9,8 @@ from shmio.endpoints.web.tabs.overview import Overview
 from shmio.endpoints.web.tabs.plots import Plots
 from shmio.endpoints.web.tabs.recordings import RecordingsTab
 from shmio.endpoints.web.tabs.registers import Registers
+from shmio.endpoints.web.tabs.scene import Scene
 from shmio.endpoints.web.tabs.time import Time
 
-TABS: Final[tuple[type[Tab], ...]] = (Overview, Registers, Plots, Injections, Time, RecordingsTab, Log)
+TABS: Final[tuple[type[Tab], ...]] = (Overview, Registers, Plots, Scene, Injections, Time, RecordingsTab, Log)
 """All tabs, in the order in which a page shows them."""

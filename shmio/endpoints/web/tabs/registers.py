@@ -62,6 +62,12 @@ class Named(msgspec.Struct, forbid_unknown_fields=True):
     path: _Path
 
 
+class Followed(msgspec.Struct, forbid_unknown_fields=True):
+    """Registers whose values the page shows."""
+
+    paths: Annotated[list[_Path], Meta(max_length=MAX_ROWS)]
+
+
 class Registers(Tab):
     """Shows registers, and writes and overrides them."""
 
@@ -87,12 +93,13 @@ class Registers(Tab):
     async def rows(self, given: Shown) -> dict[str, Any]:
         """Return rows, and send the values of these rows from now on, whenever they change."""
         found, total = await run_in_threadpool(self._rows, given)
-        self._visible = [(row.path, row.register) for row in found if row.register is not None]
-        self._sent = {}
-        if self._sending is None:
-            self._sending = self.page.start(self._send())
-        self._send_values()
+        self._show([(row.path, row.register) for row in found if row.register is not None])
         return {"first": given.first, "total": total, "rows": [self._describe(row) for row in found]}
+
+    @call("read", Followed)
+    async def follow(self, given: Followed) -> None:
+        """Send the values of these registers from now on, in place of those of the rows."""
+        self._show([(path, self._cell.resolve(path)[1]) for path in given.paths])
 
     @call("write", Given)
     async def set(self, given: Given) -> dict[str, str]:
@@ -122,6 +129,12 @@ class Registers(Tab):
         if shadow is None:
             raise PathError(f"{given.path}: this page does not override it; the tab Injections lifts others")
         await run_in_threadpool(shadow.close)
+
+    def _show(self, visible: list[tuple[str, Register]]) -> None:
+        self._visible, self._sent = visible, {}
+        if self._sending is None:
+            self._sending = self.page.start(self._send())
+        self._send_values()
 
     def _typed(self, given: Given) -> tuple[str, Any]:
         block, register = self._cell.resolve(given.path)
