@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import shutil
@@ -29,7 +30,20 @@ expect: Any = playwright.expect
 PATIENCE_MS = 30_000
 LEFT_PX = 70
 """Left margin of a plot."""
+SOFTWARE_GL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 AXIS = "cell/Robot_800/Axs1_Pos"
+BIT = "cell/Outputs/500.%X0"
+SCENE = f"""
+[[body]]
+name = "flag"
+joint = {{ type = "prismatic", axis = [1, 0, 0], register = "{BIT}", scale = 4000 }}
+shape = [{{ form = "box", size_mm = [1000, 1000, 1000], color = "#ff0000" }}]
+[[body]]
+name = "wall"
+position_mm = [0, 3000, 0]
+label = "Wall"
+shape = [{{ form = "box", size_mm = [10000, 100, 2000], color = "#00ff00" }}]
+"""
 
 
 @pytest.fixture
@@ -40,10 +54,18 @@ def address() -> Iterator[str]:
 
 
 @pytest.fixture
-def cell(make_cell: Callable[..., Cell], address: str) -> Cell:
+def scene() -> str:
+    """The description of the cell in 3D; none."""
+    return ""
+
+
+@pytest.fixture
+def cell(make_cell: Callable[..., Cell], address: str, scene: str) -> Cell:
     """A running cell with a page."""
     config = CONFIG.replace("timeout = 1000", 'timeout = 1000\nwritable = ["Outputs"]')
-    cell = make_cell(config=f'{config}[web]\nlisten = "{address}"\n[recorder]\ndirectory = "dumps"\n')
+    more = 'scene = "scene.toml"\n' if scene else ""
+    cell = make_cell(config=f'{config}[web]\nlisten = "{address}"\n{more}[recorder]\ndirectory = "dumps"\n')
+    (cell.folder / "scene.toml").write_text(scene)
     cell.up()
     return cell
 
@@ -54,7 +76,7 @@ def page(cell: Cell, address: str) -> Iterator[Any]:
     expect.set_options(timeout=PATIENCE_MS)
     errors: list[str] = []
     with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *SOFTWARE_GL])
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         page.set_default_timeout(PATIENCE_MS)
         page.on("pageerror", lambda error: errors.append(str(error)))
@@ -286,6 +308,78 @@ def test_user_controls_a_replay(cell: Cell, page: Any) -> None:
         until(lambda: playing().paused, "the pause")
 
 
+# Counts the pixels of a PNG in which red or green is far above the others.
+COUNT_PIXELS = """async png => {
+  const picture = await createImageBitmap(new Blob([Uint8Array.from(atob(png), one => one.charCodeAt(0))]));
+  const pen = new OffscreenCanvas(picture.width, picture.height).getContext("2d");
+  pen.drawImage(picture, 0, 0);
+  const { data } = pen.getImageData(0, 0, picture.width, picture.height);
+  const found = { left: 0, right: 0, green: 0 };
+  for (let at = 0; at < data.length; at += 4) {
+    const [red, green, blue] = [data[at], data[at + 1], data[at + 2]];
+    const side = (at / 4) % picture.width < picture.width / 2 ? "left" : "right";
+    if (red > 60 && red > 2 * green && red > 2 * blue) found[side] += 1;
+    if (green > 60 && green > 2 * red && green > 2 * blue) found.green += 1;
+  }
+  return found;
+}"""
+
+
+# Returns where bodies are, of which a register with the value -90 turns one.
+PLACES = """async () => {
+  const { Kinematics } = await import("/scene/kinematics.js");
+  const still = { joint: null, position_mm: [0, 0, 0], rotation_deg: [0, 0, 0] };
+  const turned = {
+    type: "revolute", register: "r", axis: [0, 2, 0], unit: "deg", scale: -0.5, offset: 45, smooth_s: 0
+  };
+  const bodies = [
+    { ...still, parent: -1, position_mm: [1000, 0, 0], rotation_deg: [0, 0, 90] },
+    { ...still, parent: 0, position_mm: [0, 500, 0], joint: turned },
+    { ...still, parent: 1, position_mm: [200, 0, 0] },
+    { ...still, parent: -1, rotation_deg: [90, 0, 90] },
+    { ...still, parent: 3, position_mm: [0, 100, 0] },
+  ];
+  const kinematics = new Kinematics(bodies);
+  kinematics.move(() => -90, 0);
+  kinematics.judge(() => "bad");
+  return [kinematics.world.map(matrix => [...matrix.slice(12, 15)]), kinematics.states];
+}"""
+
+
+@pytest.mark.parametrize("scene", [SCENE])
+def test_registers_move_the_cell_in_3d(cell: Cell, page: Any) -> None:
+    open_tab(page, "3D")
+    page.get_by_role("button", name="Front").click()
+
+    def seen() -> dict[str, int]:
+        """Return the numbers of red pixels in both halves of the picture, and of green ones."""
+        picture = page.locator(".scene-picture canvas").screenshot()
+        found: dict[str, int] = page.evaluate(COUNT_PIXELS, base64.b64encode(picture).decode())
+        return found
+
+    until(lambda: seen()["left"] > 0 and seen()["green"] > 0, "the picture")
+    line = page.locator(f'.scene-registers tr[data-path="{BIT}"]')
+    expect(line).to_contain_text("false")
+    before = seen()
+    places, states = page.evaluate(PLACES)
+    expected = [(1, 0, 0), (0.5, 0, 0), (0.5, 0, -0.2), (0, 0, 0), (0, 0, 0.1)]
+    assert [pytest.approx(one, abs=1e-6) for one in expected] == places
+    assert states == ["good", "bad", "bad", "good", "good"]
+    cell.output("shmio", "set", BIT, "1")
+    expect(line).to_contain_text("true")
+    until(lambda: seen()["right"] > before["right"] + 500, "the body moves to the right")
+    keep(page, "scene")
+    cell.output("shmio", "set", BIT, "0")
+    until(lambda: abs(seen()["left"] - before["left"]) < before["left"] / 5, "the body moves back")
+
+    os.kill(cell.processes()["plc"]["pid"], signal.SIGSTOP)
+    expect(page.locator(".scene-reasons")).to_contain_text("stale")
+    expect(line).to_contain_text("bad")
+    until(lambda: seen()["left"] == 0 and seen()["green"] > 0, "the body is grey, the wall is not")
+    os.kill(cell.processes()["plc"]["pid"], signal.SIGCONT)
+    until(lambda: seen()["left"] > 0, "the body is red again")
+
+
 def test_user_restarts_a_process(cell: Cell, page: Any) -> None:
     before = cell.processes()["cell"]["pid"]
     page.on("dialog", lambda dialog: dialog.accept())
@@ -295,6 +389,7 @@ def test_user_restarts_a_process(cell: Cell, page: Any) -> None:
 
 
 def test_user_filters_the_log(page: Any) -> None:
+    expect(page.get_by_role("tab", name="3D")).to_be_hidden()  # this cell has no scene
     open_tab(page, "Log")
     log = page.get_by_label("Log", exact=True).last
     expect(log).to_contain_text("supervisor: supervising")
