@@ -87,6 +87,8 @@ class Part(msgspec.Struct):
     share: float
     reduced: bool = False
     """True if frames were left out so far that a plot does not need."""
+    damage: list[str] = []
+    """The last part: messages about places that could not be read."""
 
 
 def signals_of(dump: Dump, paths: Sequence[str]) -> list[Signal]:
@@ -107,8 +109,16 @@ def signals_of(dump: Dump, paths: Sequence[str]) -> list[Signal]:
     return found
 
 
-def course(dump: Dump, signals: Sequence[Signal], window: Window) -> Iterator[Part]:
-    """Yield the course of registers in a window of log times, and then the events of their sources."""
+def course(dump: Dump, signals: Sequence[Signal], window: Window, damage: Sequence[str] = ()) -> Iterator[Part]:
+    """Yield the course of registers in a window of log times, and then the events of their sources.
+
+    Args:
+        dump: The recording.
+        signals: The registers.
+        window: The window.
+        damage: Messages about places of the recording that could not be read; they may become more.
+
+    """
     sources = list(dict.fromkeys(signal.source for signal in signals))
     turns = len(sources) + 1
     for turn, source in enumerate(sources):
@@ -119,6 +129,7 @@ def course(dump: Dump, signals: Sequence[Signal], window: Window) -> Iterator[Pa
     for part in events(dump, sources or dump.sources, window):
         part.share = (turns - 1 + part.share) / turns
         yield part
+    yield Part([], [], 1.0, damage=list(damage))
 
 
 def past(dump: Dump, signals: Sequence[Signal], window: Window, utc_ns: int) -> Iterator[Part]:

@@ -38,7 +38,7 @@ MAX_OF_RUN: Final = 256
 MAX_OPEN: Final = 64
 """Maximum number of files that are open at a time."""
 MAX_DAMAGE: Final = 20
-"""Maximum number of damaged places that are listed while a plot is read."""
+"""Maximum number of damaged places of an open recording that are listed."""
 OPENING_S: Final = 60.0
 """Time limit in s for opening a file."""
 PART_S: Final = 30.0
@@ -333,8 +333,9 @@ def _open(path: Path, state: _State) -> Opened:
     started_s, watch, damage = time.monotonic(), _Watch(), list[str]()
 
     def damaged(_: Path, place: Any) -> None:
-        if len(damage) < MAX_DAMAGE:
-            damage.append(lost(place))
+        text = lost(place)
+        if len(damage) < MAX_DAMAGE and text not in damage:
+            damage.append(text)
 
     try:
         part = Part(path, damaged, own=True, beat=watch)

@@ -4,7 +4,7 @@ import { Series, readBatch } from "./series.js";
 
 /** @typedef {import("./connection.js").Connection} Connection */
 /** @typedef {{ time_s: number, source: string, kind: string, by: string, text: string, paths: string[], more?: number, count?: number }} RecordedEvent */
-/** @typedef {{ batches: string[], events: RecordedEvent[], share: number, reduced?: boolean }} Part */
+/** @typedef {{ batches: string[], events: RecordedEvent[], share: number, reduced: boolean, damage: string[] }} Part */
 
 /** The course of some registers in a window of time. It grows while it is read. */
 export class Course {
@@ -16,6 +16,8 @@ export class Course {
     this.share = 0;
     this.whole = false; // whether all of it is here
     this.series = new Map(paths.map((path) => [path, new Series()]));
+    /** @type {string[]} Messages about places that could not be read. */
+    this.damage = [];
     /** @type {import("./chart.js").Mark[]} */
     this.marks = [];
   }
@@ -35,6 +37,7 @@ export class Course {
     }
     if (part.reduced) for (const series of this.series.values()) series.reduced = true;
     this.marks.push(...part.events.map((event) => ({ time: event.time_s, text: textOf(event) })));
+    this.damage.push(...part.damage);
     this.share = part.share;
   }
 

@@ -184,7 +184,7 @@ export class RecordingsTab {
     const end = found.closed ? "closed" : "not closed: it is being written, or its recorder was killed";
     const span = found.from ? `${moment(Date.parse(found.from) / 1000)}, ${duration(found.duration_s)}, ${bytes(found.size)}` : "it has no frames";
     setText(this.info, [span, end, by, missed, ...blocks].join(" · "));
-    replace(this.damage, ...found.damage.map((/** @type {string} */ text) => element("li", {}, text)));
+    if (found.damage.length) this.showDamage(found.damage);
     const { beside, instead } = found.replay;
     replace(
       this.commands,
@@ -295,6 +295,7 @@ export class RecordingsTab {
       });
       if (this.works.get(kind) !== plot.number) return true;
       course.whole = true;
+      if (course.damage.length) this.showDamage(course.damage);
       setText(this.progress, "");
       this.lanes.request();
       this.works.delete(kind);
@@ -335,7 +336,7 @@ export class RecordingsTab {
         if (this.works.get("check") !== number) return;
         if (part === null) break;
         if (part.chunks === undefined) setText(this.checkState, `${Math.floor(100 * part.share)} % checked`);
-        else this.showDamage(part);
+        else this.showResult(part);
       }
     } catch (error) {
       setText(this.checkState, String(/** @type {Error} */ (error).message));
@@ -345,10 +346,15 @@ export class RecordingsTab {
   }
 
   /** @param {{ chunks: number, messages: number, damage: string[] }} part */
-  showDamage(part) {
+  showResult(part) {
     const whole = `${part.chunks} chunks with ${part.messages} messages are whole`;
     setText(this.checkState, part.damage.length ? `damaged; ${whole}` : `no damage: ${whole}`);
-    if (part.damage.length) replace(this.damage, ...part.damage.map((text) => element("li", {}, text)));
+    if (part.damage.length) this.showDamage(part.damage);
+  }
+
+  /** @param {string[]} damage */
+  showDamage(damage) {
+    replace(this.damage, ...damage.map((text) => element("li", {}, text)));
   }
 
   /** @param {string} kind */

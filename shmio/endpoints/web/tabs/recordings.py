@@ -145,7 +145,7 @@ class RecordingsTab(Tab):
             from_ns = dump.begin_ns if given.from_s is None else round(given.from_s * 1e9)
             to_ns = dump.end_ns if given.to_s is None else round(given.to_s * 1e9)
             window = Window(from_ns, max(from_ns + 1, to_ns), given.columns)
-            number = self._start(Work(self._recordings, lambda _: course(dump, signals, window), opened))
+            number = self._start(Work(self._recordings, lambda _: course(dump, signals, window, opened.damage), opened))
         except BaseException:
             self._recordings.release(opened)
             raise
@@ -157,7 +157,6 @@ class RecordingsTab(Tab):
             "from_s": from_ns / 1e9,
             "to_s": to_ns / 1e9,
             "signals": [_described(path, register) for path, register in described],
-            "damage": dump.damage,
         }
 
     @call("read", Named)

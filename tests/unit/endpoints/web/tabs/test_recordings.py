@@ -231,6 +231,9 @@ def test_damage_costs_only_its_chunk(browser: Connection, folder: Path) -> None:
     middle = len(data) // 2
     data[middle : middle + 4] = b"\xff\xff\xff\xff"
     file.write_bytes(data)
+    number = result(browser, "plot", name="a.mem", paths=["cell/count"], columns=9)["number"]
+    parts = iter(lambda: result(browser, "more", number=number), None)
+    assert "lost after" in [*parts][-1]["damage"][0]
     ((_, values, _),), _ = plot(browser, "a.mem", "cell/count")
     good = [value for value in values if not math.isnan(value)]
     assert 950 <= len(good) < 1000
