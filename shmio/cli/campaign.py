@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from shmio.cli.run import add_json, complete, exit_on_signals, load, run
+from shmio.cli.run import add_json, complete, exit_on_signals, load, milliseconds, run, seconds, seed_number
 from shmio.errors import ConfigError, LayoutError, PathError, ValueRangeError
 from shmio.version import __version__
 
@@ -52,8 +52,39 @@ def _parser() -> argparse.ArgumentParser:
         judge.add_argument(
             option, dest=what, metavar="TIME", help=f"{what} there: 2026-11-21T08:30:00, or seconds of the recording"
         )
+    _reports(judge)
     add_json(judge)
+
+    live = verb("run", "run a campaign on an instance, and judge it")
+    live.add_argument("campaign", type=Path, metavar="CAMPAIGN.toml")
+    where = live.add_mutually_exclusive_group()
+    where.add_argument(
+        "-c", dest="config", type=Path, metavar="FILE", help="the instance of this supervisor.toml; starts and stops it"
+    )
+    where.add_argument("--instance", metavar="NAME", help="a running instance (default: the only one)")
+    live.add_argument(
+        "--for", dest="for_s", type=seconds, metavar="S", help="duration (default: duration_s of the file)"
+    )
+    live.add_argument(
+        "--step-ms",
+        type=milliseconds,
+        metavar="N",
+        help="length of a step (default: the shortest period)",
+    )
+    live.add_argument("--real-time", action="store_true", help="run in real time, even if all sources could be stepped")
+    live.add_argument(
+        "--seed", type=seed_number, metavar="N", help="seed for those injections of the file that have none"
+    )
+    live.add_argument("--stop", action="store_true", help="stop at the first failure")
+    live.add_argument("--record", type=Path, metavar="FILE.mem", help="record the run to a new file")
+    _reports(live)
+    add_json(live)
     return parser
+
+
+def _reports(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with plots: one HTML file")
+    verb.add_argument("--junit", type=Path, metavar="FILE.xml", help="write a report as JUnit XML, for CI servers")
 
 
 if __name__ == "__main__":

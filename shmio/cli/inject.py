@@ -15,10 +15,11 @@ from typing import Any, Final
 
 import msgspec
 
-from shmio.cli.run import dumps, seconds, stop_on_signals
+from shmio.cli.run import dumps, seconds, seed_number, stop_on_signals
 from shmio.cli.set import Pairs
 from shmio.config import Declaration
 from shmio.config.campaign import read_campaign
+from shmio.config.declaration import shifted, with_seed
 from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
 from shmio.layout.model import Layout
 from shmio.layout.topic import Topic, look_up, parse_topic
@@ -42,7 +43,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("pairs", nargs="*", action=Pairs, metavar="PATH VALUE", help="register or array element")
     parser.add_argument("--file", type=Path, metavar="CAMPAIGN.toml", help="inject what a campaign file declares")
-    parser.add_argument("--seed", type=_seed, metavar="N", help="seed for those injections of the file that have none")
+    parser.add_argument(
+        "--seed", type=seed_number, metavar="N", help="seed for those injections of the file that have none"
+    )
     parser.add_argument(
         "--from-now", action="store_true", help="count the times in the file from now, not from the start"
     )
@@ -99,13 +102,6 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
         if not options.keep:
             _wait(options.for_s)
     return 0
-
-
-def _seed(text: str) -> int:
-    """Convert the argument of ``--seed``."""
-    if not text.isascii() or not text.isdecimal() or len(text) > 19 or int(text) >= 2**63:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0 to {2**63 - 1}")
-    return int(text)
 
 
 def _read(layouts: Mapping[str, Layout], path: str, text: str) -> tuple[Topic, Value]:
@@ -214,10 +210,10 @@ def run_campaign(cell: Cell, options: argparse.Namespace) -> int:
     """
     seed = secrets.randbits(SEED_BITS) if options.seed is None else options.seed
     read = read_campaign(options.file)
-    declarations = [_with_seed(declaration, seed) for declaration in read]
+    declarations = [with_seed(declaration, seed) for declaration in read]
     now_s = cell.clock().present_ns / 1e9
     if options.from_now:
-        declarations = [_shifted(declaration, now_s) for declaration in declarations]
+        declarations = [shifted(declaration, now_s) for declaration in declarations]
     else:
         _refuse_past(declarations, now_s)
     with stop_on_signals() as over, cell.declare(declarations, keep=options.keep) as campaign:
@@ -282,17 +278,6 @@ def _refuse_past(declarations: Sequence[Declaration], now_s: float) -> None:
                 f"the time of injection {one.name!r} has passed: its end_s is {one.end_s:g}, the instance's clock "
                 f"is at {now_s:.3f} s; --from-now counts the file's times from now"
             )
-
-
-def _with_seed(declaration: Declaration, seed: int) -> Declaration:
-    """Return a declaration with the given seed, unless the declaration has its own."""
-    return msgspec.structs.replace(declaration, seed=seed) if declaration.seed is None else declaration
-
-
-def _shifted(declaration: Declaration, now_s: float) -> Declaration:
-    """Return a declaration whose times are counted from now."""
-    end_s = None if declaration.end_s is None else declaration.end_s + now_s
-    return msgspec.structs.replace(declaration, start_s=(declaration.start_s or 0) + now_s, end_s=end_s)
 
 
 def _print_event(event: InjectionEvent, names: Mapping[tuple[str, int], str], *, as_json: bool) -> None:

@@ -175,6 +175,13 @@ def moment(text: str) -> float:
         ) from None
 
 
+def seed_number(text: str) -> int:
+    """Convert an argument that is a seed."""
+    if not text.isascii() or not text.isdecimal() or len(text) > 19 or int(text) >= 2**63:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0 to {2**63 - 1}")
+    return int(text)
+
+
 def add_json(parser: argparse._ActionsContainer, text: str = "print one JSON object") -> None:
     """Add the option ``--json``, which also makes :func:`run` print errors as JSON."""
     parser.add_argument("--json", action="store_true", help=f"{text}; an error, too")

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from msgspec import field
+from msgspec import Meta, field
 
 from shmio.config.declaration import check_declarations
 from shmio.config.expectation import expectation_faults
@@ -18,6 +18,7 @@ from shmio.errors import ConfigError
 class Campaign(Section):
     """The contents of a campaign file."""
 
+    duration_s: Annotated[float, Meta(gt=0, le=1e6)] | None = None
     injection: list[Declaration] = field(default_factory=list)
     expect: list[Expectation] = field(default_factory=list)
 

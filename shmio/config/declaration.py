@@ -7,6 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+import msgspec
+
 from shmio.config.model import Declaration
 from shmio.errors import ConfigError
 
@@ -49,6 +51,17 @@ KEYS: Final[Mapping[str, Keys]] = {
     "flip": Keys(free=("bits", "probability")),
 }
 _OPERANDS: Final = tuple(dict.fromkeys(key for keys in KEYS.values() for key in sorted(keys.known)))
+
+
+def with_seed(declaration: Declaration, seed: int) -> Declaration:
+    """Return a declaration with the given seed, unless the declaration has its own."""
+    return msgspec.structs.replace(declaration, seed=seed) if declaration.seed is None else declaration
+
+
+def shifted(declaration: Declaration, by_s: float) -> Declaration:
+    """Return a declaration whose times are ``by_s`` seconds later."""
+    end_s = None if declaration.end_s is None else declaration.end_s + by_s
+    return msgspec.structs.replace(declaration, start_s=(declaration.start_s or 0) + by_s, end_s=end_s)
 
 
 def check_declarations(declarations: Sequence[Declaration]) -> None:

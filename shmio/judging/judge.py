@@ -15,7 +15,7 @@ from shmio.injection.program import number_register
 from shmio.judging.expectation import Formula, read_expectations
 from shmio.judging.formula import Network
 from shmio.judging.operators import Node
-from shmio.judging.source import Frames, Rows, Signal, Source
+from shmio.judging.source import Frames, Rows, Signal, Source, Trouble
 from shmio.judging.verdict import Outcome, Outer, Verdict, Whole
 from shmio.layout.model import Layout, Register
 
@@ -85,6 +85,14 @@ class Judge:
     def signals(self, source: str) -> tuple[Signal, ...]:
         """Return the signals of a source that the expectations read."""
         return self._sources[source].signals
+
+    def read_by(self, index: int) -> tuple[Signal, ...]:
+        """Return the signals that an expectation reads, by its index."""
+        return self._cases[index].formula.signals
+
+    def troubles(self, source: str) -> Sequence[Trouble]:
+        """Return the times in which values of a source were unknown, and why."""
+        return self._sources[source].troubles
 
     def follow(self, name: str, layout: Layout, stale_ns: int) -> None:
         """Set the block from which the next frames of a source come, such as after a reload.

@@ -15,37 +15,39 @@ from shmio.recording.reading.batch import Batch
 from shmio.recording.reading.part import MAX_NS, DumpBlock
 
 
-def judge_recording(
-    dump: Dump,
-    expectations: Sequence[Expectation],
-    from_ns: int = 0,
-    to_ns: int = MAX_NS,
-    seen: Callable[[Mapping[str, Rows]], None] = lambda _rows: None,
-) -> Judge:
-    """Judge expectations over a recording, chunk by chunk.
-
-    Args:
-        dump: The recording.
-        expectations: The expectations.
-        from_ns: Start of the range, log time.
-        to_ns: End of the range, log time.
-        seen: Called with the values of the signals, by source, in order.
-
-    Returns:
-        The judge with its verdicts.
+def recording_judge(dump: Dump, expectations: Sequence[Expectation]) -> Judge:
+    """Return a judge of the sources of a recording.
 
     Raises:
         ConfigError: An expectation is invalid; the message starts as ``expect[0].formula: …``.
         RecordingError: The recording has no source.
 
     """
-    blocks: dict[str, DumpBlock] = {}
-    for block in dump.blocks:
-        blocks.setdefault(block.source, block)
+    blocks = _first_blocks(dump)
     if not blocks:
         raise RecordingError(f"{dump.files[0]}: it has no source")
     layouts = {source: block.layout for source, block in blocks.items()}
-    judge = Judge(expectations, layouts, {source: block.stale_ns for source, block in blocks.items()})
+    return Judge(expectations, layouts, {source: block.stale_ns for source, block in blocks.items()})
+
+
+def judge_recording(
+    dump: Dump,
+    judge: Judge,
+    from_ns: int = 0,
+    to_ns: int = MAX_NS,
+    seen: Callable[[Mapping[str, Rows]], None] = lambda _rows: None,
+) -> None:
+    """Judge a recording, chunk by chunk.
+
+    Args:
+        dump: The recording.
+        judge: A new judge of it.
+        from_ns: Start of the range, log time.
+        to_ns: End of the range, log time.
+        seen: Called with the values of the signals, by source, in order.
+
+    """
+    blocks = _first_blocks(dump)
     readers = {source: _batches(dump, judge, source, from_ns, to_ns) for source in judge.sources}
     come_to = dict.fromkeys(readers, -1)
     while readers:
@@ -62,7 +64,13 @@ def judge_recording(
         come_to[source] = int(frames.clock_ns[-1])
         seen(judge.turn())
     seen(judge.finish())
-    return judge
+
+
+def _first_blocks(dump: Dump) -> dict[str, DumpBlock]:
+    blocks: dict[str, DumpBlock] = {}
+    for block in dump.blocks:
+        blocks.setdefault(block.source, block)
+    return blocks
 
 
 def _batches(dump: Dump, judge: Judge, source: str, from_ns: int, to_ns: int) -> Iterator[tuple[DumpBlock, Frames]]:

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 
+from shmio.campaigns.digests import of_file, of_layouts
+from shmio.cli.campaigns.reports import Reports
 from shmio.cli.campaigns.verdicts import tell
 from shmio.cli.recordings.common import DamageReport, time_range
 from shmio.config.campaign import load_campaign
 from shmio.errors import ConfigError
-from shmio.recording.judge import judge_recording
+from shmio.recording.injection_times import InjectionTimes
+from shmio.recording.judge import judge_recording, recording_judge
 
 
 def judge(arguments: argparse.Namespace) -> int:
@@ -23,8 +27,21 @@ def judge(arguments: argparse.Namespace) -> int:
     report = DamageReport()
     with report.open(arguments.files) as dump:
         begin, end = time_range(arguments, dump.begin_ns)
+        reports = Reports(arguments)
         try:
-            found = judge_recording(dump, campaign.expect, begin, end)
+            found = recording_judge(dump, campaign.expect)
+            judge_recording(dump, found, begin, end, reports.collector(lambda: found))
         except ConfigError as error:
             raise ConfigError(f"{arguments.campaign}: {error}") from None
+        times = InjectionTimes()
+        for _, block, event in dump.events(None, begin, end):
+            if block is not None:
+                times.follow(block.source, event)
+        facts = [("campaign", f"{arguments.campaign}, sha256 {of_file(arguments.campaign)}")]
+        facts += [("recording", f"{file}, sha256 {of_file(file)}") for file in arguments.files]
+        facts += of_layouts({block.source: block.layout for block in dump.blocks})
+    words = ["shmio-campaign", "judge", *map(str, arguments.files), "-f", str(arguments.campaign)]
+    for option, text in (("--from", arguments.begin), ("--to", arguments.end)):
+        words += [] if text is None else [option, text]
+    reports.write(found, f"Campaign {arguments.campaign.name}", facts, shlex.join(words), times.spans)
     return tell(found, {"files": [str(file) for file in arguments.files]}, as_json=arguments.json)

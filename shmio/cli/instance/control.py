@@ -48,7 +48,9 @@ def down(arguments: argparse.Namespace) -> int:
     try:
         with suppress(UnfinishedError), wanted.open() as segment:
             if segment.supervised:
-                _stop(segment)
+                print(f"stopping {segment.instance}, supervisor pid {segment.supervisor[0]}", flush=True)
+                stop(segment)
+                print(f"{segment.instance} is stopped")
                 return 0
     except FormatError as error:  # the segment is unreadable, so its configuration file is unknown
         if wanted.file is not None:
@@ -66,10 +68,14 @@ def _forget(path: str, name: str) -> None:
         remove_socket(path)
 
 
-def _stop(segment: Segment) -> None:
-    pid = segment.supervisor[0]
-    print(f"stopping {segment.instance}, supervisor pid {pid}", flush=True)
-    pidfd = _pidfd(pid)
+def stop(segment: Segment) -> None:
+    """Ask the supervisor to stop the instance, and wait for its end.
+
+    Raises:
+        ControlError: It does not answer.
+
+    """
+    pidfd = _pidfd(segment.supervisor[0])
     try:
         ask_supervisor(segment, control.Stop(), STOP_S)
         if pidfd is not None:
@@ -77,7 +83,6 @@ def _stop(segment: Segment) -> None:
     finally:
         if pidfd is not None:
             os.close(pidfd)
-    print(f"{segment.instance} is stopped")
 
 
 def _pidfd(pid: int) -> int | None:

@@ -11,7 +11,7 @@ import select
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -62,7 +62,32 @@ StartMessage = Configured | Started | Failed
 def detach(arguments: argparse.Namespace) -> int:
     """Start the instance in another process; return when it runs."""
     file, mode = config_file(arguments), arguments.mode
-    words = replay_words(replay_keys(arguments))
+    log_file, started = start(file, mode, replay_words(replay_keys(arguments)))
+    for line in started.history:
+        say(line)
+    status = read_status(started.instance)
+    say(headline(started.instance, mode, status.segment_bytes, Path(log_file).parent))
+    for line in started.processes:
+        say(line)
+    _tell_how(status, option_for(file))
+    return 0
+
+
+def start(file: Path, mode: str, words: Sequence[str] = ()) -> tuple[str, Started]:
+    """Start an instance in another process, and wait until it runs.
+
+    Args:
+        file: The configuration.
+        mode: The mode of the instance.
+        words: More options for ``shmio-supervisor up``.
+
+    Returns:
+        The supervisor's log file, and its message.
+
+    Raises:
+        ControlError: The start failed.
+
+    """
     command = (sys.executable, "-P", "-m", "shmio.cli.supervisor", "up")
     reader, writer = os.pipe()
     with os.fdopen(reader, "rb") as answers:
@@ -76,20 +101,13 @@ def detach(arguments: argparse.Namespace) -> int:
         )
         os.close(writer)
         try:
-            log_file, started = _await(answers.fileno())
+            found = _await(answers.fileno())
         except BaseException:
             child.terminate()
             child.wait()
             raise
     child.returncode = 0  # keeps Popen from warning that the child still runs
-    for line in started.history:
-        say(line)
-    status = read_status(started.instance)
-    say(headline(started.instance, mode, status.segment_bytes, Path(log_file).parent))
-    for line in started.processes:
-        say(line)
-    _tell_how(status, option_for(file))
-    return 0
+    return found
 
 
 def headline(instance: str, mode: str, segment_bytes: int | None, log_dir: Path) -> str:

@@ -1,0 +1,1 @@
+"""Runs campaigns on an instance, and judges what they expect."""

@@ -1,0 +1,65 @@
+"""Digests of what a run depends on: its configuration, its models and its layouts."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Final
+
+from shmio.config import load
+from shmio.errors import ConfigError
+from shmio.layout.model import Layout
+
+MAX_BYTES: Final = 64 << 20
+"""Files larger than this have no digest."""
+
+
+def of_file(file: Path) -> str:
+    """Return the SHA-256 of a file, or why there is none."""
+    try:
+        with file.open("rb") as stream:
+            data = stream.read(MAX_BYTES + 1)
+    except OSError as error:
+        return f"not readable: {error.strerror}"
+    return hashlib.sha256(data).hexdigest() if len(data) <= MAX_BYTES else f"larger than {MAX_BYTES} bytes"
+
+
+def of_layouts(layouts: Mapping[str, Layout]) -> Iterator[tuple[str, str]]:
+    """Yield a name and the digest of each layout."""
+    for source, layout in layouts.items():
+        yield f"layout of {source}", layout.hash.hex()
+
+
+def of_configuration(file: Path) -> Iterator[tuple[str, str]]:
+    """Yield a name and the digest of a ``supervisor.toml`` and of the files of its models."""
+    yield "configuration", f"{file}, sha256 {of_file(file)}"
+    try:
+        sources = load(file).source
+    except ConfigError:  # it was changed since the instance was started
+        return
+    for source in sources:
+        model = source.options.get("model")
+        if isinstance(model, str):
+            found = _module(model.partition(":")[0], file.resolve().parent)
+            yield f"model of {source.name}", model if found is None else f"{model}, sha256 {of_file(found)}"
+
+
+def _module(name: str, folder: Path) -> Path | None:
+    """Return the file of a Python module, without importing it."""
+    parts = name.split(".")
+    if not all(part.isidentifier() for part in parts):
+        return None
+    roots = [folder]
+    spec = importlib.util.find_spec(parts[0])
+    if spec is not None and spec.origin is not None:
+        roots.append(
+            Path(spec.origin).parent if spec.submodule_search_locations is None else Path(spec.origin).parent.parent
+        )
+    for root in roots:
+        place = root.joinpath(*parts)
+        for file in (place.with_suffix(".py"), place / "__init__.py"):
+            if file.is_file():
+                return file
+    return None

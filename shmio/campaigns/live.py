@@ -1,0 +1,242 @@
+"""Runs a campaign on a running instance of this host, and judges it meanwhile."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from math import ceil
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from shmio.config import Declaration, Expectation
+from shmio.config.declaration import shifted
+from shmio.errors import ConfigError, NotRunningError, RecordingError, ShmioError
+from shmio.judging.judge import Judge
+from shmio.judging.source import Frames, Rows
+from shmio.local.attach import Attachment
+from shmio.recorder.file_output import Output
+from shmio.recorder.instance_follower import BlockEntry, InstanceEntry, InstanceFollower, StartPositions
+from shmio.recorder.recorder import CLOSE_S, AttachedFiles, Recorder, no_attachments
+from shmio.recording.injection_times import InjectionTimes
+from shmio.segment import Block, Event, Frame, Segment
+from shmio.segment.block import Layouts
+
+MAX_STEPS: Final = 64
+"""Maximum number of steps of virtual time between two turns of the judge."""
+GOOD_S: Final = 10.0
+"""Time in s to wait at the begin until the sources that the expectations read are good."""
+LOOK_S: Final = 0.02
+BUFFER_BYTES: Final = 256 << 20
+"""Maximum number of bytes of the recording that may wait for the disk."""
+BY: Final = "shmio-campaign"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run does.
+
+    Attributes:
+        injections: The declared injections, with their seeds; their times count from the begin.
+        expectations: The expectations.
+        duration_s: Duration on the instance's clock.
+        step_s: Length of a step; None: the shortest period of the sources.
+        real_time: Whether to run in real time, even if all sources could be stepped.
+        stop: Whether to stop at the first failure.
+        record: A file for the recording; None: none.
+    """
+
+    injections: Sequence[Declaration]
+    expectations: Sequence[Expectation]
+    duration_s: float
+    step_s: float | None = None
+    real_time: bool = False
+    stop: bool = False
+    record: Path | None = None
+
+
+class LiveRun:
+    """One run of a campaign. The judge and the recording get the same frames."""
+
+    def __init__(
+        self,
+        segment: Segment,
+        plan: Plan,
+        attachments: AttachedFiles = no_attachments,
+        seen: Callable[[Mapping[str, Rows]], None] = lambda _rows: None,
+    ) -> None:
+        """Prepare a run.
+
+        Args:
+            segment: The instance's segment, writable.
+            plan: What to do.
+            attachments: Returns the files to attach to the recording.
+            seen: Called with the values of the signals, by source, in order.
+
+        Raises:
+            ConfigError: An expectation is invalid.
+        """
+        self._segment = segment
+        self._plan = plan
+        self._attachments = attachments
+        self._seen = seen
+        blocks = segment.blocks
+        stale_ns = {source: block.stale_ns for source, block in blocks.items()}
+        self.judge = Judge(plan.expectations, Layouts(blocks), stale_ns)
+        self.injections = InjectionTimes()
+        """When injections were active."""
+        self.virtual = False
+        """True if the run is in virtual time."""
+        self.step_s = 0.0
+        """Length of a step of virtual time."""
+        self.problem: ShmioError | None = None
+        """What ended the run early."""
+        self._blocks: dict[str, Block] = {source: blocks[source] for source in self.judge.sources}
+
+    def run(self, over: threading.Event, begun: Callable[[], None] = lambda: None) -> None:
+        """Run until the end, the first failure, or until ``over`` is set.
+
+        Args:
+            over: Ends the run when it is set.
+            begun: Called when the run has begun.
+
+        Raises:
+            ConfigError: An injection is invalid, or a length of steps was given, but a source
+                cannot be stepped.
+            CommandError: A source refuses an injection.
+            RecordingError: The file of the recording cannot be created.
+        """
+        plan = self._plan
+        with ExitStack() as stack:
+            cell = stack.enter_context(Attachment(self._segment))
+            was_virtual = cell.clock.virtual
+            self.virtual = not plan.real_time and (was_virtual or not cell.real_sources())
+            if plan.real_time and was_virtual:
+                raise ConfigError("--real-time: the time of this instance is virtual already")
+            if plan.step_s is not None and not self.virtual:
+                raise ConfigError(f"--step-ms: this run is in real time, because of {', '.join(cell.real_sources())}")
+            self.step_s = plan.step_s or min(block.period_ns for block in self._segment.blocks.values()) / 1e9
+            self._await_good(over)
+            if self.virtual:
+                cell.pause()
+                if not was_virtual:
+                    stack.callback(cell.release)
+            tap = InstanceFollower(self._segment, StartPositions(first=False))
+            recorder = stack.enter_context(self._recording(tap))
+            now_s = cell.clock.present_ns / 1e9
+            if plan.injections:
+                stack.enter_context(cell.declare([shifted(one, now_s) for one in plan.injections]))
+            begun()
+            try:
+                turn = self._turns(tap, recorder)
+                for _ in self._steps(cell, over) if self.virtual else self._waits(tap, over):
+                    next(turn)
+                    if plan.stop and self.judge.failed:
+                        break
+            except ShmioError as error:
+                self.problem = error
+            next(turn)
+            self._seen(self.judge.finish())
+
+    def _await_good(self, over: threading.Event) -> None:
+        """Wait until the judged sources are good. If they are not in time, the verdicts will say so."""
+        until_s = time.monotonic() + GOOD_S
+        while time.monotonic() < until_s and not over.wait(LOOK_S):
+            frames = [(block, block.latest()) for block in self._blocks.values()]
+            if all(frame is not None and block.assess(frame)[0] for block, frame in frames):
+                return
+
+    @contextmanager
+    def _recording(self, tap: InstanceFollower) -> Iterator[Recorder | None]:
+        """Record while the ``with`` block runs, if the plan says so."""
+        file = self._plan.record
+        if file is None:
+            yield None
+            return
+        try:
+            fd = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise RecordingError(f"--record {file}: {error.strerror}") from None
+        output = Output(file, fd, limit_bytes=BUFFER_BYTES)
+        recorder = Recorder(tap, output, by=BY, attachments=self._attachments)
+        try:
+            yield recorder
+        finally:
+            recorder.end()  # not close(), which would read frames that are not judged
+            closed = output.close(CLOSE_S)
+        if not closed:
+            raise RecordingError(f"{file}: {output.problem or 'it is not complete yet'}")
+
+    def _steps(self, cell: Attachment, over: threading.Event) -> Iterator[None]:
+        """Step time, several steps at once."""
+        left = ceil(self._plan.duration_s / self.step_s - 1e-9)
+        room = min(block.ring.slot_count for block in self._segment.blocks.values()) // 4
+        while left and not over.is_set():
+            count = max(1, min(left, MAX_STEPS, room))
+            cell.step(self.step_s, count)
+            left -= count
+            yield
+
+    def _waits(self, tap: InstanceFollower, over: threading.Event) -> Iterator[None]:
+        """Wait, again and again."""
+        until_s = time.monotonic() + self._plan.duration_s
+        while (rest_s := until_s - time.monotonic()) > 0 and not over.wait(min(tap.pause_s, rest_s)):
+            if not self._segment.shared.current():
+                raise NotRunningError(f"instance {self._segment.instance!r} has stopped")
+            yield
+
+    def _turns(self, tap: InstanceFollower, recorder: Recorder | None) -> Iterator[None]:
+        """Each time, record and judge what is new."""
+        while True:
+            more = True
+            while more:
+                entries, more = tap.take()
+                if recorder is not None:
+                    recorder.put(entries)
+                self._judge(entries)
+            self._seen(self.judge.turn())
+            yield
+
+    def _judge(self, entries: Sequence[BlockEntry | InstanceEntry]) -> None:
+        frames: dict[int, tuple[Block, list[Frame]]] = {}
+        for entry in entries:
+            if isinstance(entry, InstanceEntry):
+                continue
+            block = entry.follower.block
+            if isinstance(entry.item, Event):
+                self.injections.follow(block.source, entry.item)
+            elif isinstance(entry.item, Frame) and block.source in self._blocks:
+                frames.setdefault(block.section, (block, []))[1].append(entry.item)
+        for block, some in frames.values():
+            source = block.source
+            if block is not self._blocks[source]:
+                self._blocks[source] = block
+                self.judge.follow(source, block.layout, block.stale_ns)
+            self.judge.add(source, frames_of(some, block.layout.size, raws=self.judge.needs_raw(source)))
+
+
+def frames_of(frames: Sequence[Frame], size: int, *, raws: bool) -> Frames:
+    """Return frames as arrays for a judge.
+
+    Args:
+        frames: Frames of one block.
+        size: Size of an image in bytes.
+        raws: Whether the judge needs what the source delivered.
+    """
+
+    def images(some: Iterator[bytes]) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+        return np.frombuffer(b"".join(some), np.uint8).reshape(len(frames), size)
+
+    return Frames(
+        np.array([frame.number for frame in frames], np.uint64),
+        np.array([frame.clock_ns for frame in frames], np.int64),
+        np.array([int(frame.quality) for frame in frames], np.uint8),
+        np.array([frame.delay_us for frame in frames], np.uint32),
+        images(frame.image for frame in frames),
+        images(frame.raw for frame in frames) if raws else None,
+    )

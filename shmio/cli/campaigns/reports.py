@@ -1,0 +1,72 @@
+"""Writes the reports of a judged campaign."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from shmio.errors import RecordingError
+from shmio.judging.judge import Judge
+from shmio.judging.report import Drawn, Report, Span, html, junit
+from shmio.judging.source import Rows
+from shmio.judging.trace import Traces
+
+
+class Reports:
+    """The reports that a command line asks for. They collect signals only if they have plots."""
+
+    def __init__(self, arguments: argparse.Namespace) -> None:
+        """Begin. ``arguments`` has ``report`` and ``junit``: files, or None."""
+        self._html: Path | None = arguments.report
+        self._junit: Path | None = arguments.junit
+        self._traces: Traces | None = None
+
+    def collector(self, judge: Callable[[], Judge]) -> Callable[[Mapping[str, Rows]], None]:
+        """Return a function that collects signals; ``judge`` returns their judge when it exists."""
+        if self._html is None:
+            return lambda _rows: None
+
+        def seen(rows: Mapping[str, Rows]) -> None:
+            if self._traces is None:
+                found = judge()
+                self._traces = Traces({source: found.signals(source) for source in found.sources})
+            self._traces.add(rows)
+
+        return seen
+
+    def write(
+        self,
+        judge: Judge,
+        title: str,
+        facts: Sequence[tuple[str, str]],
+        command: str,
+        injections: Sequence[Span],
+    ) -> None:
+        """Write the reports.
+
+        Raises:
+            RecordingError: A file cannot be written.
+
+        """
+        if self._html is None and self._junit is None:
+            return
+        verdicts = judge.verdicts
+        drawn: list[list[Drawn]] = [[] for _ in verdicts]
+        if self._traces is not None:
+            drawn = [
+                [Drawn(one, self._traces.plot(one), judge.troubles(one.source)) for one in judge.read_by(index)]
+                for index in range(len(verdicts))
+            ]
+        report = Report(title, facts, command, judge.begin_ns, judge.end_ns or 1, verdicts, drawn, injections)
+        if self._html is not None:
+            _write(self._html, html(report).encode("utf-8", "replace"))
+        if self._junit is not None:
+            _write(self._junit, junit(report))
+
+
+def _write(file: Path, data: bytes) -> None:
+    try:
+        file.write_bytes(data)
+    except OSError as error:
+        raise RecordingError(f"{file}: {error.strerror}") from None

@@ -1,0 +1,274 @@
+"""Reports on verdicts: one HTML page without scripts or other files, and JUnit XML."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from typing import Final, NamedTuple
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from shmio.config import Expectation
+from shmio.judging.source import Signal, Trouble
+from shmio.judging.trace import Plot
+from shmio.judging.verdict import Outcome, Verdict, distance
+
+_Place = Callable[[float], float]
+_WIDTH, _HEIGHT, _LEFT, _BOTTOM = 860, 130, 70, 20
+_NO_XML: Final = dict.fromkeys(
+    [*range(9), 11, 12, *range(14, 32), 0xFFFE, 0xFFFF, *range(0xD800, 0xE000)], "\N{REPLACEMENT CHARACTER}"
+)
+"""Characters that XML cannot contain."""
+_STYLE: Final = """
+body { font: 14px/1.5 system-ui, sans-serif; margin: 2em auto; max-width: 960px; padding: 0 1em; color: #1c2733;
+  background: #fff }
+h1 { font-size: 1.5em } h2 { font-size: 1.15em; margin: 2em 0 .3em; border-top: 1px solid #d5dbe1; padding-top: 1em }
+table { border-collapse: collapse; width: 100% } td, th { text-align: left; padding: .2em .7em .2em 0;
+  vertical-align: top; border-bottom: 1px solid #e6eaee } th { font-weight: 600 }
+code, pre { font: 13px ui-monospace, monospace; overflow-wrap: anywhere; white-space: pre-wrap; margin: .2em 0 }
+.passed { color: #18713a } .failed { color: #b3261e } .inconclusive { color: #8a5a00 }
+.outcome { font-weight: 600 } .dim { color: #5b6875 }
+svg { display: block; margin: .4em 0 } svg text { font: 11px system-ui, sans-serif; fill: #5b6875 }
+@media print { h2 { break-after: avoid } svg { break-inside: avoid } }
+"""
+
+
+class Span(NamedTuple):
+    """A time in which an injection was active, on the instance's clock; ``end_ns`` None: to the end."""
+
+    name: str
+    source: str
+    begin_ns: int
+    end_ns: int | None
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A signal of an expectation, with what its plot shows."""
+
+    signal: Signal
+    plot: Plot
+    troubles: Sequence[Trouble] = ()
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a report says.
+
+    Attributes:
+        title: Its heading.
+        facts: Names and values, such as the seed and digests.
+        command: The command that repeats the run.
+        begin_ns: Begin of the judged time; None if it never began.
+        end_ns: End of the judged time.
+        verdicts: The verdicts.
+        signals: The signals of each verdict's expectation.
+        injections: When injections were active.
+    """
+
+    title: str
+    facts: Sequence[tuple[str, str]]
+    command: str
+    begin_ns: int | None
+    end_ns: int
+    verdicts: Sequence[Verdict]
+    signals: Sequence[Sequence[Drawn]]
+    injections: Sequence[Span] = field(default=())
+
+
+def describe(expectation: Expectation) -> str:
+    """Return what an expectation expects, as keys and values."""
+    left_out = ("name", "severity", "text", "requirement")
+    keys = {key: value for key, value in msgspec.to_builtins(expectation).items() if key not in left_out}
+    return "\n".join(f"{key} = {msgspec.json.encode(value).decode()}" for key, value in keys.items())
+
+
+# -- HTML --------------------------------------------------------------------------------------------------------------
+
+
+def html(report: Report) -> str:
+    """Return the report as an HTML page."""
+    return "\n".join(_page(report)) + "\n"
+
+
+def _page(report: Report) -> Iterator[str]:
+    yield f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(report.title)}</title>'
+    yield "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'\">"
+    yield f"<style>{_STYLE}</style></head><body>\n<h1>{escape(report.title)}</h1>"
+    counts = [(outcome, sum(one.outcome is outcome for one in report.verdicts)) for outcome in Outcome]
+    yield "<p>" + ", ".join(f'<span class="outcome {one}">{count} {one}</span>' for one, count in counts) + "</p>"
+    yield "<table>"
+    for name, value in report.facts:
+        yield f"<tr><th>{escape(name)}</th><td><code>{escape(value)}</code></td></tr>"
+    yield f"</table>\n<p>Repeat it:</p><pre>{escape(report.command)}</pre>"
+    heads = ("expectation", "verdict", "robustness", "severity", "requirement", "reason")
+    yield f"<h2>Verdicts</h2>\n<table><tr>{''.join(f'<th>{head}' for head in heads)}</tr>"
+    for at, verdict in enumerate(report.verdicts):
+        one = verdict.expectation
+        yield (
+            f'<tr><td><a href="#e{at}">{escape(one.name)}</a><td>{_outcome(verdict)}<td>{_robustness(verdict)}'
+            f"<td>{one.severity}<td>{escape(one.requirement)}<td>{escape(verdict.reason)}{_moment(verdict)}</tr>"
+        )
+    yield "</table>"
+    for at, (verdict, signals) in enumerate(zip(report.verdicts, report.signals, strict=True)):
+        yield from _section(report, at, verdict, signals)
+    yield "</body></html>"
+
+
+def _section(report: Report, at: int, verdict: Verdict, signals: Sequence[Drawn]) -> Iterator[str]:
+    one = verdict.expectation
+    requirement = f' <span class="dim">{escape(one.requirement)}</span>' if one.requirement else ""
+    yield f'<h2 id="e{at}">{escape(one.name)}: {_outcome(verdict)}{requirement}</h2>'
+    if one.text:
+        yield f"<p>{escape(one.text)}</p>"
+    yield f"<pre>{escape(describe(one))}</pre>"
+    if verdict.reason:
+        yield f"<p>{escape(verdict.reason)}{_moment(verdict)}</p>"
+    for drawn in signals:
+        yield _svg(report, verdict, drawn)
+    if verdict.around:
+        yield "<table><tr><th>around the moment<th>time and value</tr>"
+        for name, pairs in verdict.around.items():
+            values = ", ".join(f"{time / 1e9:.3f} s: {_number(value)}" for time, value in pairs)
+            yield f"<tr><td><code>{escape(name)}</code><td>{values}</tr>"
+        yield "</table>"
+
+
+def _outcome(verdict: Verdict) -> str:
+    return f'<span class="outcome {verdict.outcome}">{verdict.outcome}</span>'
+
+
+def _robustness(verdict: Verdict) -> str:
+    if verdict.robustness is not None:
+        return _number(verdict.robustness)
+    low, high = distance(verdict.low), distance(verdict.high)
+    return "" if low is None and high is None else f"{_number(low, 'any')} to {_number(high, 'any')}"
+
+
+def _moment(verdict: Verdict) -> str:
+    return "" if verdict.moment_ns is None else f" at {verdict.moment_ns / 1e9:.3f} s"
+
+
+def _number(value: float | None, otherwise: str = "unknown") -> str:
+    return otherwise if value is None else f"{value:.6g}"
+
+
+def _svg(report: Report, verdict: Verdict, drawn: Drawn) -> str:
+    """Return the plot of a signal as SVG: a line of steps, and behind it the injections and unknown times."""
+    begin = report.begin_ns or 0
+    end = max(report.end_ns, begin + 1)
+    plot = drawn.plot
+    known = np.isfinite(plot.least) & np.isfinite(plot.greatest)
+    least = float(plot.least[known].min()) if known.any() else 0.0
+    greatest = float(plot.greatest[known].max()) if known.any() else 1.0
+    if least == greatest:
+        least, greatest = least - 0.5, greatest + 0.5
+    middle, half = least / 2 + greatest / 2, greatest / 2 - least / 2
+
+    def x(time_ns: float) -> float:
+        return _LEFT + (_WIDTH - _LEFT) * min(max((time_ns - begin) / (end - begin), 0.0), 1.0)
+
+    def y(value: float) -> float:
+        return (_HEIGHT - _BOTTOM) / 2 - (value - middle) / half * ((_HEIGHT - _BOTTOM) / 2 - 6)
+
+    size = f'viewBox="0 0 {_WIDTH} {_HEIGHT}" width="{_WIDTH}" height="{_HEIGHT}"'
+    parts = [f'<svg {size} role="img"><title>{escape(drawn.signal.name)}</title>']
+    parts += (
+        _band(x(span.begin_ns), x(end if span.end_ns is None else span.end_ns), "#f2a60033",
+              f"injection {span.name} on {span.source}")
+        for span in report.injections
+    )  # fmt: skip
+    parts += (_band(x(trouble.begin_ns), x(trouble.end_ns), "#77777755", trouble.reason) for trouble in drawn.troubles)
+    parts.append(f'<path d="{_steps(plot, known, x, y, end)}" fill="none" stroke="#1f6feb" stroke-width="1.2"/>')
+    if verdict.moment_ns is not None:
+        at = x(verdict.moment_ns)
+        parts.append(
+            f'<line x1="{at:.1f}" x2="{at:.1f}" y1="0" y2="{_HEIGHT - _BOTTOM}" stroke="#b3261e" stroke-width="1.5">'
+            f"<title>failed at {verdict.moment_ns / 1e9:.3f} s</title></line>"
+        )
+    floor = _HEIGHT - _BOTTOM
+    parts.append(f'<path d="M{_LEFT} 0V{floor}H{_WIDTH}" fill="none" stroke="#9aa5b1"/>')
+    for value, at in ((greatest, 10), (least, floor - 2)):
+        parts.append(f'<text x="{_LEFT - 6}" y="{at}" text-anchor="end">{value:.5g}</text>')
+    parts.append(f'<text x="{_LEFT}" y="{_HEIGHT - 5}">{begin / 1e9:.3f} s</text>')
+    parts.append(f'<text x="{_WIDTH / 2}" y="{_HEIGHT - 5}" text-anchor="middle">{escape(drawn.signal.name)}</text>')
+    parts.append(f'<text x="{_WIDTH}" y="{_HEIGHT - 5}" text-anchor="end">{(end - 1) / 1e9:.3f} s</text></svg>')
+    return "".join(parts)
+
+
+def _band(left: float, right: float, colour: str, title: str) -> str:
+    width = max(right - left, 0.6)
+    return (
+        f'<rect x="{left:.1f}" y="0" width="{width:.1f}" height="{_HEIGHT - _BOTTOM}" fill="{colour}">'
+        f"<title>{escape(title)}</title></rect>"
+    )
+
+
+def _steps(plot: Plot, known: npt.NDArray[np.bool_], x: _Place, y: _Place, end: int) -> str:
+    """Return the line as an SVG path, with a gap where values are unknown."""
+    following = np.append(plot.time_ns[1:], end).tolist()
+    path: list[str] = []
+    drawing = False
+    for time, least, greatest, good, after in zip(
+        plot.time_ns.tolist(), plot.least.tolist(), plot.greatest.tolist(), known.tolist(), following, strict=True
+    ):
+        if not good:
+            drawing = False
+            continue
+        low, high = f"{y(least):.1f}", f"{y(greatest):.1f}"
+        path.append(f"V{low}" if drawing else f"M{x(time):.1f} {low}")
+        path.append(f"H{x(after):.1f}" if low == high else f"V{high}H{x(after):.1f}")
+        drawing = True
+    return "".join(path)
+
+
+# -- JUnit -------------------------------------------------------------------------------------------------------------
+
+
+def junit(report: Report) -> bytes:
+    """Return the report as JUnit XML. An inconclusive verdict is an error."""
+    duration_s = 0.0 if report.begin_ns is None else (report.end_ns - 1 - report.begin_ns) / 1e9
+    failed, inconclusive = (
+        sum(one.outcome is outcome for one in report.verdicts) for outcome in (Outcome.FAILED, Outcome.INCONCLUSIVE)
+    )
+    suite = ET.Element(
+        "testsuite", name=_text(report.title), tests=str(len(report.verdicts)), failures=str(failed),
+        errors=str(inconclusive), skipped="0", time=f"{duration_s:.3f}",
+    )  # fmt: skip
+    properties = ET.SubElement(suite, "properties")
+    for name, value in (*report.facts, ("command", report.command)):
+        ET.SubElement(properties, "property", name=_text(name), value=_text(value))
+    for verdict in report.verdicts:
+        _case(suite, report.title, verdict, duration_s)
+    ET.indent(suite)
+    data: bytes = ET.tostring(suite, encoding="utf-8", xml_declaration=True)
+    return data + b"\n"
+
+
+def _case(suite: ET.Element, title: str, verdict: Verdict, duration_s: float) -> None:
+    one = verdict.expectation
+    case = ET.SubElement(suite, "testcase", classname=_text(title), name=_text(one.name), time=f"{duration_s:.3f}")
+    properties = ET.SubElement(case, "properties")
+    values = {"severity": one.severity, "requirement": one.requirement, "text": one.text}
+    if verdict.robustness is not None:
+        values["robustness"] = repr(verdict.robustness)
+    for name, value in values.items():
+        if value:
+            ET.SubElement(properties, "property", name=name, value=_text(value))
+    if verdict.outcome is Outcome.PASSED:
+        return
+    at = "" if verdict.moment_ns is None else f" at {verdict.moment_ns / 1e9:.3f} s"
+    kind = "failure" if verdict.outcome is Outcome.FAILED else "error"
+    found = ET.SubElement(case, kind, type=str(verdict.outcome), message=_text(f"{verdict.reason}{at}"))
+    lines = [describe(one)]
+    for name, pairs in verdict.around.items():
+        lines.append(f"{name}: {', '.join(f'{time / 1e9:.3f} s: {_number(value)}' for time, value in pairs)}")
+    found.text = _text("\n".join(lines))
+
+
+def _text(text: str) -> str:
+    return text.translate(_NO_XML)

@@ -1,0 +1,91 @@
+"""Keeps signals for plots, within a limit of memory."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from shmio.judging.pieces import Times, Values
+from shmio.judging.source import Rows, Signal
+
+MAX_POINTS: Final = 2000
+"""Maximum number of points of a plotted signal."""
+
+
+class Plot(NamedTuple):
+    """A signal for a plot: the least and the greatest value from each time to the next, shape (n,).
+
+    NaN: the value was unknown in all of that time.
+    """
+
+    time_ns: Times
+    least: Values
+    greatest: Values
+
+
+class Traces:
+    """Collects the signals of a run. It joins neighbouring values when there are too many."""
+
+    def __init__(self, signals: Mapping[str, Sequence[Signal]]) -> None:
+        """Begin to collect. ``signals`` are those of each source, in the order of its rows."""
+        self._traces = {source: (some, _Trace(len(some))) for source, some in signals.items()}
+
+    def add(self, rows: Mapping[str, Rows]) -> None:
+        """Add the values that :meth:`Judge.turn` returned."""
+        for source, some in rows.items():
+            self._traces[source][1].add(some)
+
+    def plot(self, signal: Signal) -> Plot:
+        """Return the plot of a signal."""
+        signals, trace = self._traces[signal.source]
+        return trace.plot(signals.index(signal))
+
+
+class _Trace:
+    """The signals of one source. Each point stands for at most ``_each`` values."""
+
+    def __init__(self, signals: int) -> None:
+        self._each = 1
+        self._points: _Points = np.empty(0, np.int64), np.empty((signals, 0)), np.empty((signals, 0))
+        self._rows: list[Rows] = []
+        self._waiting = 0
+
+    def add(self, rows: Rows) -> None:
+        """Add values. They wait until there are many."""
+        self._rows.append(rows)
+        self._waiting += len(rows.time)
+        if self._waiting >= MAX_POINTS // 2 * self._each:
+            self._compress()
+
+    def _compress(self) -> None:
+        if not self._rows:
+            return
+        time = np.concatenate([rows.time for rows in self._rows])
+        values = np.concatenate([rows.values for rows in self._rows], axis=1)
+        self._rows, self._waiting = [], 0
+        added = _joined((time, values, values), self._each)
+        time, least, greatest = (np.concatenate(pair, axis=-1) for pair in zip(self._points, added, strict=True))
+        self._points = time, least, greatest
+        while len(self._points[0]) > MAX_POINTS:
+            self._points = _joined(self._points, 2)
+            self._each *= 2
+
+    def plot(self, index: int) -> Plot:
+        """Return the plot of a signal."""
+        self._compress()
+        time, least, greatest = self._points
+        return Plot(time, least[index], greatest[index])
+
+
+_Points = tuple[Times, Values, Values]
+
+
+def _joined(points: _Points, count: int) -> _Points:
+    """Join each ``count`` neighbouring points; the last ones may be fewer."""
+    time, least, greatest = points
+    if count == 1 or not len(time):
+        return points
+    begin = np.arange(0, len(time), count)
+    return time[begin], np.fmin.reduceat(least, begin, axis=1), np.fmax.reduceat(greatest, begin, axis=1)
