@@ -58,6 +58,8 @@ _QUOTES: Final = "'"
 _DOUBLE: Final = ("Cannot overwrite", "Cannot declare", "Duplicate inline table key")
 _ESCAPE: Final = ("Unescaped", "Invalid hex", "Escaped character", "Illegal character")
 _POSITION: Final = re.compile(r"\(at line (\d+), column (\d+)\)\Z")
+_IN_TOML: Final = re.compile(r"\(at line (\d{1,9}), column \d+\)")
+_NUMBERED: Final = re.compile(r"(\d{1,9}): ")
 _BARE: Final = re.compile(r"[^\s,=#\[\]{}\"']+")
 _TEXT: Final = re.compile(r"[^\W\d].*|.*[:/].*|\d+(?:\.\d+){2,}")  # a name, a path or an address
 _WORDS: Final = {
@@ -304,6 +306,29 @@ def named(message: str, tables: Mapping[str, Any]) -> str:
     except (LookupError, TypeError):
         return message
     return f'{message} ({key[1]} "{name}")' if isinstance(name, str) else message
+
+
+def locate(message: str, file: str, lines: Lines) -> tuple[int, str]:
+    """Return the line of a message about a file, and the message without the name of the file.
+
+    The line is 0 if the message is about the whole file. If it is about another file, the line is 0
+    and the message complete.
+
+    Args:
+        message: As :class:`Faults` makes it.
+        file: Path of the file, as in the message.
+        lines: The lines of the file's keys.
+
+    """
+    if not message.startswith(f"{file}:"):
+        return 0, message
+    text = message.removeprefix(f"{file}:").strip()
+    if numbered := _NUMBERED.match(text):
+        return int(numbered[1]), text[numbered.end() :]
+    if place := _IN_TOML.search(text):
+        return int(place[1]), text
+    key = _KEY.match(text.removeprefix("warning: "))
+    return lines.of(key[0]) if key else 0, text
 
 
 class Faults:

@@ -18,6 +18,8 @@ _WORDS: Final = frozenset({"pass", "pw", "pin", "auth"})
 _PARTS: Final = re.compile(
     r"password|passwd|passphrase|passcode|pwd|secret|token|credential|authorization|bearer|sha256|psk"
 )
+_WHOLE: Final = frozenset({"webhook"})
+"""Whole names of keys. The address of a webhook often contains a secret."""
 _NO_SECRETS: Final = frozenset({"tokens_in_plain_text"})
 _PATH_SUFFIXES: Final = ("_file", "_path", "_dir")
 _KEY_FILES: Final = re.compile(r"""["']?[^"']*\.(?:pem|key|der|crt|p8)["']?""", re.IGNORECASE)
@@ -43,7 +45,7 @@ def is_secret(key: str) -> bool:
         return False
     joined = re.sub(r"[^a-z0-9]", "", folded)
     words = {word.lower() for word in _WORD.findall(key)}
-    return bool(_PARTS.search(joined) or words & _WORDS or joined.endswith("key"))
+    return bool(folded in _WHOLE or _PARTS.search(joined) or words & _WORDS or joined.endswith("key"))
 
 
 def mask_value(key: str, value: Any) -> Any:

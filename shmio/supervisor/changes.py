@@ -165,6 +165,8 @@ def _differences(old: Mapping[str, Any], new: Mapping[str, Any], table: str = ""
 
 
 def _text(value: Any) -> str:
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
     return "none" if value is None else msgspec.json.encode(value).decode()
 
 

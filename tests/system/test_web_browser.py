@@ -388,6 +388,81 @@ def test_user_restarts_a_process(cell: Cell, page: Any) -> None:
     assert cell.processes()["cell"]["pid"] != before
 
 
+def edit(cell: Cell, old: str, new: str) -> None:
+    file = cell.folder / "supervisor.toml"
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+
+
+def test_user_reloads_the_configuration(cell: Cell, page: Any) -> None:
+    edit(cell, "timeout = 1000", 'timeout = 1000 # password: "hunter2"')
+    open_tab(page, "Configuration")
+    file = page.get_by_label("Configuration file")
+    changes = page.locator(".plan .changes")
+    expect(changes).to_contain_text("change nothing")
+    expect(file).to_contain_text("timeout = 1000 # password: •••")
+    assert "hunter2" not in page.content()
+
+    edit(cell, "period_ms = 20", "period_ms = -1")
+    number = (cell.folder / "supervisor.toml").read_text().split("\n").index("period_ms = -1") + 1
+    expect(file.locator(f'[data-line="{number}"] .message')).to_contain_text("fault: source[0].period_ms")
+    expect(changes).to_contain_text("be refused: the file has a fault")
+    expect(page.get_by_role("button", name="Reload …")).to_be_disabled()
+    keep(page, "configuration-fault")
+
+    edit(cell, "period_ms = -1", "period_ms = 50")
+    edit(cell, 'writable = ["Outputs"]', 'writable = ["Outpts"]')
+    expect(file.locator(".message")).to_contain_text("warning: source[0].writable: 'Outpts' names nothing")
+    expect(changes.locator(".diff")).to_contain_text("± restart cell")
+    expect(changes.locator(".diff")).to_contain_text("period_ms: 50 instead of 20")
+    keep(page, "configuration")
+    before = {name: process["pid"] for name, process in cell.processes().items()}
+    page.get_by_role("button", name="Reload …").click()
+    dialog = page.get_by_role("dialog")
+    expect(dialog).to_contain_text("± restart cell")
+    keep(page, "configuration-confirm")
+    dialog.get_by_role("button", name="Cancel").click()
+    assert {name: process["pid"] for name, process in cell.processes().items()} == before
+    page.get_by_role("button", name="Reload …").click()
+    dialog.get_by_role("button", name="Reload", exact=True).click()
+    expect(page.locator(".plan .messages")).to_contain_text("cell: restarted, as its configuration has changed")
+    expect(changes).to_contain_text("change nothing")
+    after = {name: process["pid"] for name, process in cell.processes().items()}
+    assert after.pop("cell") != before.pop("cell")
+    assert after == before
+    with shmio.attach(cell.instance) as reader:
+        assert reader.block("cell").period_ns == 50_000_000
+
+
+def test_page_returns_after_a_reload_that_restarts_its_server(cell: Cell, page: Any) -> None:
+    open_tab(page, "Configuration")
+    edit(cell, "[web]", '[web]\nhosts = ["cell.example"]')
+    pid = cell.processes()["web"]["pid"]
+    expect(page.locator(".plan .diff")).to_contain_text("± restart web")
+    page.get_by_role("button", name="Reload …").click()
+    expect(page.get_by_role("dialog")).to_contain_text("connects again by itself")
+    page.get_by_role("dialog").get_by_role("button", name="Reload", exact=True).click()
+    expect(page.locator(".plan .changes")).to_contain_text("change nothing")
+    assert cell.processes()["web"]["pid"] != pid
+
+
+def test_user_sees_the_registers_of_dropped_files(cell: Cell, page: Any) -> None:
+    open_tab(page, "Configuration")
+    files = page.get_by_label("Files", exact=True)
+    files.set_input_files(cell.folder / "db201.db")
+    rows = page.get_by_role("table", name="Registers of the files")
+    expect(rows.get_by_role("row").filter(has_text="Axs1_Pos").first).to_be_visible()
+    expect(page.locator(".drop [role=status]")).to_contain_text("DB201")
+    page.get_by_role("button", name="Theme").click()
+    keep(page, "configuration-dropped")
+    page.get_by_label("Search registers").fill("Robot_800/Axs3_Pos")
+    expect(rows.get_by_role("row")).to_have_count(1)
+    files.set_input_files({"name": "x.db", "mimeType": "text/plain", "buffer": b"DATA_BLOCK x STRUCT a : INTT;"})
+    expect(page.locator(".drop .messages")).to_contain_text("x.db:1:")
+    expect(rows).to_be_hidden()
+
+
 def test_user_filters_the_log(page: Any) -> None:
     expect(page.get_by_role("tab", name="3D")).to_be_hidden()  # this cell has no scene
     open_tab(page, "Log")

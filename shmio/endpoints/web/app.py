@@ -16,17 +16,21 @@ from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket
 
 from shmio.audit import trail
+from shmio.endpoints.web.dropped import MAX_BYTES, MAX_HEAD_BYTES, compile_dropped
 from shmio.endpoints.web.measurements import Measurements
 from shmio.endpoints.web.metrics import Exposition, InstanceCollector
 from shmio.endpoints.web.page import Page, Tab
 from shmio.endpoints.web.served import Served
 from shmio.endpoints.web.sessions import COOKIE, MAX_AGE_S, Sessions, User
+from shmio.errors import ShmioError
 from shmio.segment import Segment
 
 STATIC: Final = Path(__file__).parent / "static"
 MAX_PAGES: Final = 64
 """Maximum number of open pages."""
 MAX_LOGIN_BYTES: Final = 4096
+MAX_DROPPED: Final = 2
+"""Maximum number of requests with dropped files at a time."""
 _TYPES: Final = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
 _POLICY: Final = {
     "content-security-policy": (
@@ -89,6 +93,7 @@ class PageApp:
         self._tabs = [tab for tab in tabs if tab.offered(served)]
         self.open_pages = 0
         """Number of open pages."""
+        self._dropping = 0
         self._files = {
             f"/{file.relative_to(STATIC)}": (file.read_bytes(), _TYPES[file.suffix])
             for file in STATIC.rglob("*")
@@ -107,6 +112,7 @@ class PageApp:
         routes: list[BaseRoute] = [
             _metrics(self._served.segment, measurements, self._served.folders, registers),
             Route("/session", self._session, methods=["GET", "POST", "DELETE"]),
+            Route("/layout", self._layout, methods=["POST"]),
             WebSocketRoute("/socket", self._socket),
             Route("/{path:path}", self._file),
         ]
@@ -134,11 +140,9 @@ class PageApp:
         if self._sessions.blocked(host):
             _record_sign_in(host, "too many wrong tokens")
             return JSONResponse({"error": "too many wrong tokens: try again in a minute"}, 429)
-        body = b""
-        async for part in request.stream():
-            body += part
-            if len(body) > MAX_LOGIN_BYTES:
-                return JSONResponse({"error": "this is no token"}, 413)
+        body = await _body(request, MAX_LOGIN_BYTES)
+        if body is None:
+            return JSONResponse({"error": "this is no token"}, 413)
         try:
             token = msgspec.json.decode(body, type=_Login).token
         except (msgspec.MsgspecError, UnicodeDecodeError):
@@ -154,6 +158,23 @@ class PageApp:
             COOKIE, cookie, max_age=MAX_AGE_S, httponly=True, samesite="strict", secure=self._secure, path="/"
         )
         return answer
+
+    async def _layout(self, request: Request) -> Response:
+        """Answer with the registers of files that the user has dropped on the page. They are not stored."""
+        if "read" not in self._user(request).roles:
+            return JSONResponse({"error": "this needs the role read: sign in"}, 403)
+        if self._dropping >= MAX_DROPPED:
+            return JSONResponse({"error": "other files are being read: try again"}, 429)
+        self._dropping += 1
+        try:
+            body = await _body(request, MAX_BYTES + MAX_HEAD_BYTES)
+            if body is None:
+                return JSONResponse({"error": f"these files have more than {MAX_BYTES >> 20} MB"}, 413)
+            return Response(await compile_dropped(body), media_type="application/json")
+        except ShmioError as error:
+            return JSONResponse({"error": str(error)}, 422)
+        finally:
+            self._dropping -= 1
 
     def _describe(self, user: User) -> dict[str, object]:
         return {
@@ -180,6 +201,16 @@ class PageApp:
 
 def _record_sign_in(host: str, reason: str) -> None:
     trail.record("sign in", {}, "denied", reason, who=trail.Acting(trail.Actor("anonymous", "", host), "web"))
+
+
+async def _body(request: Request, most_bytes: int) -> bytes | None:
+    """Return the body of a request; None if it is larger."""
+    body = bytearray()
+    async for part in request.stream():
+        body += part
+        if len(body) > most_bytes:
+            return None
+    return bytes(body)
 
 
 def _host(request: HTTPConnection) -> str:

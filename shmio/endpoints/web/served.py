@@ -13,9 +13,11 @@ from typing import Any, Final
 import msgspec
 
 from shmio.endpoints.alerts.state_file import alert_states
+from shmio.endpoints.web.configuration import ConfigurationFile
 from shmio.endpoints.web.measurements import Measurements
 from shmio.endpoints.web.recordings import Recordings
 from shmio.endpoints.web.signals import Feeds
+from shmio.endpoints.web.supervisor import Supervisor
 from shmio.endpoints.web.timeline import Timeline
 from shmio.local.attach import Attachment
 from shmio.local.status import SourceStatus, status_of
@@ -65,6 +67,8 @@ class Served:
         """
         self.segment, self.cell, self.measurements, self.folders = segment, cell, measurements, folders
         self.config_file, self.scene = config_file, scene
+        self.supervisor = Supervisor(segment)
+        self.configuration = ConfigurationFile(config_file, self.supervisor)
         self.feeds = Feeds()
         """The signals that pages plot."""
         self.timeline = Timeline(segment)

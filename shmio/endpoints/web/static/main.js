@@ -1,5 +1,6 @@
 // The page: head line, tabs, theme and session.
 
+import { ConfigurationTab } from "./configuration.js";
 import { Connection } from "./connection.js";
 import { byId, element, replace, setText } from "./dom.js";
 import { InjectionsTab } from "./injections.js";
@@ -27,6 +28,7 @@ const TABS = {
   injections: { title: "Injections", make: (context) => new InjectionsTab(context) },
   time: { title: "Time", make: (context) => new TimeTab(context) },
   recordings: { title: "Recordings", make: (context) => new RecordingsTab(context) },
+  configuration: { title: "Configuration", make: (context) => new ConfigurationTab(context) },
   log: { title: "Log", make: (context) => new LogTab(context) },
 };
 

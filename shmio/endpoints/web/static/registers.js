@@ -2,6 +2,7 @@
 
 import { element, notify, replace, setText } from "./dom.js";
 import { plot } from "./plots.js";
+import { VirtualRows } from "./virtual.js";
 
 /** @typedef {import("./main.js").Context} Context */
 /**
@@ -10,11 +11,6 @@ import { plot } from "./plots.js";
  */
 /** @typedef {[string | null, string, string, string, number | null]} Value Text, quality, reason, provenance, source time. */
 
-const ROW_PX = 26;
-const SPARE_ROWS = 10;
-const MAX_ROWS = 200;
-// Browsers cannot make elements of any height. Beyond this, each pixel of the scroll bar stands for several rows.
-const MAX_HEIGHT_PX = 8_000_000;
 const FILTER_DELAY_MS = 200;
 
 export class RegistersTab {
@@ -47,9 +43,9 @@ export class RegistersTab {
     /** @type {ReturnType<typeof setTimeout> | undefined} */
     this.typing = undefined;
     this.count = element("span", { class: "dim" });
-    this.body = element("div", { class: "tree-rows", role: "rowgroup" });
-    this.space = element("div", { class: "tree-space" }, this.body);
-    this.view = element("div", { class: "tree", role: "treegrid", tabindex: 0, "aria-label": "Registers", scroll: () => this.request() }, this.space);
+    this.virtual = new VirtualRows({ role: "treegrid", "aria-label": "Registers" }, () => this.request());
+    this.view = this.virtual.root;
+    this.body = this.virtual.body;
     this.view.addEventListener("keydown", (event) => this.key(event));
     this.detail = element("form", { class: "detail", "aria-label": "Register" });
     this.detail.addEventListener("submit", (event) => event.preventDefault());
@@ -63,13 +59,11 @@ export class RegistersTab {
       this.detail,
     );
     this.stop = context.connection.follow("registers", (values) => this.show(values));
-    this.resize = new ResizeObserver(() => this.request());
-    this.resize.observe(this.view);
   }
 
   close() {
     this.stop();
-    this.resize.disconnect();
+    this.virtual.close();
     this.context.connection.call("registers.rows", { first: 0, count: 0 }).catch(() => {});
   }
 
@@ -85,11 +79,8 @@ export class RegistersTab {
 
   /** Request the rows that are visible now. */
   async request() {
-    const fit = Math.ceil(this.view.clientHeight / ROW_PX);
-    const first = Math.max(0, this.row() - SPARE_ROWS);
     const given = {
-      first,
-      count: Math.min(MAX_ROWS, fit + 2 * SPARE_ROWS),
+      ...this.virtual.wanted(),
       expanded: this.untouched ? null : [...this.expanded],
       filter: this.filter.value,
     };
@@ -108,19 +99,9 @@ export class RegistersTab {
     }
   }
 
-  /** Return the number of the topmost visible row. */
-  row() {
-    const height = Math.min(this.total * ROW_PX, MAX_HEIGHT_PX);
-    return height === 0 ? 0 : Math.floor((this.view.scrollTop / height) * this.total);
-  }
-
   draw() {
-    const height = Math.min(this.total * ROW_PX, MAX_HEIGHT_PX);
-    this.space.style.height = `${height}px`;
-    const top = height < MAX_HEIGHT_PX ? this.first * ROW_PX : this.view.scrollTop - (this.row() - this.first) * ROW_PX;
-    this.body.style.transform = `translateY(${top}px)`;
+    this.virtual.show(this.first, this.total, this.rows.map((row) => this.makeRow(row)));
     setText(this.count, `${this.total} rows`);
-    replace(this.body, ...this.rows.map((row) => this.makeRow(row)));
     this.fill();
   }
 

@@ -3,6 +3,7 @@
 from typing import Final
 
 from shmio.endpoints.web.page import Tab
+from shmio.endpoints.web.tabs.configuration import Configuration
 from shmio.endpoints.web.tabs.injections import Injections
 from shmio.endpoints.web.tabs.log import Log
 from shmio.endpoints.web.tabs.overview import Overview
@@ -12,5 +13,15 @@ from shmio.endpoints.web.tabs.registers import Registers
 from shmio.endpoints.web.tabs.scene import Scene
 from shmio.endpoints.web.tabs.time import Time
 
-TABS: Final[tuple[type[Tab], ...]] = (Overview, Registers, Plots, Scene, Injections, Time, RecordingsTab, Log)
+TABS: Final[tuple[type[Tab], ...]] = (
+    Overview,
+    Registers,
+    Plots,
+    Scene,
+    Injections,
+    Time,
+    RecordingsTab,
+    Configuration,
+    Log,
+)
 """All tabs, in the order in which a page shows them."""

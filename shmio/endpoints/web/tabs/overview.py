@@ -8,11 +8,9 @@ from typing import Annotated, ClassVar, Final
 
 import msgspec
 from msgspec import Meta
-from starlette.concurrency import run_in_threadpool
 
 from shmio.control import Restart
 from shmio.endpoints.web.page import Nothing, Page, Tab, call
-from shmio.local.supervisor import ask_supervisor
 
 INTERVAL_S: Final = 1.0
 """Interval at which the overview is sent, in s."""
@@ -51,7 +49,7 @@ class Overview(Tab):
         _log.info(
             "%s asks to restart %s", f"user {self.page.user.name!r}" if self.page.user.name else "a page", given.name
         )
-        await run_in_threadpool(ask_supervisor, self.page.served.segment, Restart(given.name), RESTART_S)
+        await self.page.served.supervisor.ask(Restart(given.name), RESTART_S)
 
     async def _follow(self) -> None:
         while True:

@@ -41,7 +41,7 @@ class Pages:
         self.port = server.port
 
     def request(
-        self, method: str, path: str, body: str | None = None, **headers: str
+        self, method: str, path: str, body: str | bytes | None = None, **headers: str
     ) -> tuple[int, http.client.HTTPMessage, str]:
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=TIMEOUT_S)
         try:
@@ -64,12 +64,13 @@ def pages(
     folders: Mapping[str, str] | None = None,
     recordings: Path | None = None,
     scene: Mapping[str, Any] | None = None,
+    config_file: str = "",
 ) -> Iterator[Pages]:
     """Serve the page of a segment on a free port."""
     measurements = Measurements(segment)
     with Segment.open(segment.instance, writable=True) as mapped:
         folder = None if recordings is None else str(recordings)
-        shown = Served(segment, Attachment(mapped), measurements, folders or {}, recordings=folder, scene=scene)
+        shown = Served(segment, Attachment(mapped), measurements, folders or {}, config_file, folder, scene)
         served = PageApp(shown, Sessions(secrets, roles), TABS, secure=False)
         server = HttpServer(served.app(measurements, ()), Address("127.0.0.1", 0), sockets=True)
         loop = asyncio.new_event_loop()

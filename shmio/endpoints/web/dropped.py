@@ -1,0 +1,199 @@
+"""Compiles files that a user drops on a page: sources of data blocks, tag tables, other tools' tag lists.
+
+Nobody has checked these files. A process of its own reads them, from its standard input, with limits of
+time and memory. No file is written.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import resource
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import PurePath
+from typing import Annotated, Any, Final
+
+import msgspec
+from msgspec import Meta
+
+from shmio.errors import CommandError, LayoutError
+from shmio.layout.compiler import Source, compile_sources
+from shmio.layout.importing.found import Found, ImportingError
+from shmio.layout.importing.importer import import_tags
+from shmio.layout.model import Layout, Register
+from shmio.layout.tags import SUFFIXES, place_tags
+from shmio.logs import printable
+
+MAX_BYTES: Final = 8 << 20
+"""Maximum size of all files together."""
+MAX_HEAD_BYTES: Final = 64 << 10
+"""Maximum size of the line with the names."""
+MAX_FILES: Final = 100
+MAX_ROWS: Final = 100_000
+"""Maximum number of registers that are shown."""
+MAX_ANSWER_BYTES: Final = 16 << 20
+"""Maximum size of the shown registers as JSON."""
+MAX_MESSAGES: Final = 200
+MAX_TEXT: Final = 500
+"""Number of characters of a text that are shown."""
+LIMIT_S: Final = 30
+"""Longest time in s to compile files."""
+MEMORY_BYTES: Final = 1 << 30
+"""Largest address space of the process that compiles."""
+_SOURCES: Final = (".db", ".udt", ".awl", ".scl")
+
+_Name = Annotated[str, Meta(min_length=1, max_length=255)]
+_Bytes = Annotated[int, Meta(ge=0, le=MAX_BYTES)]
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True):
+    """The name and the size of a file, in the line before the contents."""
+
+    name: _Name
+    size: _Bytes
+
+
+async def compile_dropped(body: bytes) -> bytes:
+    """Compile files in a process of its own; return its answer, which is JSON.
+
+    Args:
+        body: A line with a JSON list of names and sizes, and then the contents of the files.
+
+    Raises:
+        CommandError: It took too much time or memory.
+
+    """
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-P", "-m", "shmio.endpoints.web.dropped"),
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.DEVNULL,
+    )
+    try:
+        async with asyncio.timeout(LIMIT_S):
+            answer, _ = await process.communicate(body)
+    except TimeoutError:
+        answer = b""
+    finally:
+        if process.returncode is None:
+            with suppress(ProcessLookupError):
+                process.kill()
+            await process.wait()
+    if process.returncode != 0 or not answer:
+        raise CommandError(
+            f"reading these files took more than {LIMIT_S} s or {MEMORY_BYTES >> 20} MB: use shmio-layout for them"
+        )
+    return answer
+
+
+def describe(body: bytes) -> dict[str, Any]:
+    """Return the layouts in the files of a request, and the messages about them.
+
+    Args:
+        body: As for :func:`compile_dropped`.
+
+    """
+    try:
+        files = list(_files(body))
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, ValueError) as error:
+        return _answer((), [f"the request is malformed: {error}"])
+    try:
+        layouts, messages = _compile(files)
+    except LayoutError as error:
+        return _answer((), str(error).split("\n"))
+    return _answer(layouts, messages)
+
+
+def _files(body: bytes) -> Iterator[Source]:
+    head, _, rest = body.partition(b"\n")
+    described = msgspec.json.decode(head, type=Annotated[list[_File], Meta(min_length=1, max_length=MAX_FILES)])
+    if sum(file.size for file in described) != len(rest):
+        raise ValueError("the sizes are not those of the contents")
+    for file in described:
+        yield Source(printable(PurePath(file.name).name or file.name), rest[: file.size])
+        rest = rest[file.size :]
+
+
+def _compile(files: Sequence[Source]) -> tuple[Sequence[Layout], list[str]]:
+    """Compile files as ``shmio-layout`` does; import a single file that is a tag list of another tool.
+
+    Raises:
+        LayoutError: Neither can be done.
+
+    """
+    single = files[0] if len(files) == 1 and not files[0].file.lower().endswith(_SOURCES) else None
+    if single is not None and not single.file.lower().endswith(SUFFIXES) and (found := _import(single)) is not None:
+        return found
+    try:
+        compiled = compile_sources(files)
+    except LayoutError:
+        if single is not None and (found := _import(single)) is not None:
+            return found
+        raise
+    return compiled.layouts, [str(warning) for warning in compiled.warnings]
+
+
+def _import(file: Source) -> tuple[Sequence[Layout], list[str]] | None:
+    """Import a tag list of another tool; return None if it is none."""
+    try:
+        found: Found = import_tags(file.text)
+    except ImportingError:
+        return None
+    layouts = [place_tags(PurePath(file.file).stem or "tags", found.tags)] if found.tags else []
+    return layouts, list(found.report())
+
+
+def _answer(layouts: Sequence[Layout], messages: Sequence[str]) -> dict[str, Any]:
+    room_rows, room_bytes = MAX_ROWS, MAX_ANSWER_BYTES
+    shown = []
+    for layout in layouts:
+        rows: list[list[Any]] = []
+        for register in layout.registers:
+            row = _row(register)
+            room_rows, room_bytes = room_rows - 1, room_bytes - len(msgspec.json.encode(row))
+            if room_rows < 0 or room_bytes < 0:
+                break
+            rows.append(row)
+        shown.append(
+            {
+                "name": _short(layout.name),
+                "number": layout.number,
+                "size": layout.size,
+                "count": len(layout.registers),
+                "registers": rows,
+            }
+        )
+    lines = [_short(printable(line)) for line in messages[:MAX_MESSAGES]]
+    if len(messages) > MAX_MESSAGES:
+        lines.append(f"{len(messages) - MAX_MESSAGES} more messages: shmio-layout prints them")
+    return {"layouts": shown, "messages": lines}
+
+
+def _row(register: Register) -> list[Any]:
+    """Return path, type, place, size, initial value, unit and comment of a register."""
+    bounds = "".join(f"[{low}..{high}]" for low, high in register.dims)
+    place = register.address or (str(register.offset) if register.bit is None else f"{register.offset}.{register.bit}")
+    texts = (register.path, f"{register.type}{bounds}", place)
+    more = (" ".join((register.initial or "").split()), register.unit, register.comment)
+    return [*map(_short, texts), register.size, *map(_short, more)]
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]}…"
+
+
+def main() -> None:
+    """Read a request from standard input, and write the answer to standard output."""
+    signal.alarm(2 * LIMIT_S)  # if the process that waits for it has died
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+    resource.setrlimit(resource.RLIMIT_CPU, (LIMIT_S, LIMIT_S))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+    body = sys.stdin.buffer.read(MAX_BYTES + MAX_HEAD_BYTES)
+    sys.stdout.buffer.write(msgspec.json.encode(describe(body)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,57 @@
+"""Requests of pages to the supervisor."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from contextlib import suppress
+from typing import Any, Final
+
+from shmio.control import Request
+from shmio.local.supervisor import ask_supervisor
+from shmio.segment import Segment
+
+MAX_REQUESTS: Final = 4
+"""Maximum number of requests at a time. The supervisor has room for more, so that commands can still reach it."""
+
+
+class Supervisor:
+    """The supervisor of the instance. Use it in the event loop's thread only."""
+
+    def __init__(self, segment: Segment) -> None:
+        self._segment = segment
+        self._room = asyncio.Semaphore(MAX_REQUESTS)
+
+    async def ask(self, request: Request, timeout_s: float) -> dict[str, Any]:
+        """Return the answer to a request.
+
+        The thread that waits does not keep this process alive: the request may be to restart it.
+
+        Raises:
+            ControlError: The supervisor refuses, does not answer, or seems to be dead.
+
+        """
+        loop = asyncio.get_running_loop()
+        answered: asyncio.Future[dict[str, Any]] = loop.create_future()
+
+        def settle(answer: dict[str, Any] | None, error: BaseException | None) -> None:
+            self._room.release()
+            if answered.done():  # the page was closed
+                return
+            if error is not None:
+                answered.set_exception(error)
+            elif answer is not None:
+                answered.set_result(answer)
+
+        def run() -> None:
+            answer, failure = None, None
+            try:
+                answer = ask_supervisor(self._segment, request, timeout_s)
+            except Exception as error:  # noqa: BLE001  raised by ``ask``
+                failure = error
+            with suppress(RuntimeError):  # the event loop has ended
+                loop.call_soon_threadsafe(settle, answer, failure)
+
+        await self._room.acquire()  # released when the thread ends, also if the page is closed before
+        threading.Thread(target=run, name="ask", daemon=True).start()
+        return await answered

@@ -1,0 +1,83 @@
+"""The configuration tab: the file with its faults, what a reload would do, and the reload."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import Annotated, Any, ClassVar, Final
+
+import msgspec
+from msgspec import Meta
+
+from shmio.control import Reload
+from shmio.endpoints.web.configuration import version
+from shmio.endpoints.web.page import Nothing, Page, Tab, call
+from shmio.errors import CommandError
+
+INTERVAL_S: Final = 1.0
+"""Interval in s at which to check that the file is still the same."""
+RELOAD_S: Final = 90.0
+"""Longest time in s of a reload."""
+
+_log = logging.getLogger("shmio.web")
+
+
+class Seen(msgspec.Struct, forbid_unknown_fields=True):
+    """The version of the file that the user has seen."""
+
+    version: Annotated[str, Meta(max_length=200)]
+
+
+class Configuration(Tab):
+    """Shows the configuration file, and reloads it. It never changes the file."""
+
+    name: ClassVar[str] = "configuration"
+
+    def __init__(self, page: Page) -> None:
+        super().__init__(page)
+        self._file = page.served.configuration
+        self._following: asyncio.Task[None] | None = None
+
+    @call("read", Nothing)
+    async def follow(self, _: Nothing) -> None:
+        """Send the file and its state now, and then whenever one changes, until ``leave``."""
+        await self.leave(_)
+        self._following = self.page.start(self._follow())
+
+    @call("read", Nothing)
+    async def leave(self, _: Nothing) -> None:
+        """End what ``follow`` began."""
+        if self._following is not None:
+            self._following.cancel()
+            self._following = None
+
+    @call("read", Nothing)
+    async def check(self, _: Nothing) -> dict[str, Any]:
+        """Check the file now; return it and its state."""
+        return await self._described()
+
+    @call("control", Seen)
+    async def reload(self, given: Seen) -> dict[str, Any]:
+        """Apply the changes of the file, if it is still the version that the user has seen."""
+        if version(self.page.served.config_file) != given.version:
+            raise CommandError("the file has changed since you saw what a reload would do: look at it again")
+        _log.info("%s asks to reload", f"user {self.page.user.name!r}" if self.page.user.name else "a page")
+        try:
+            answer = await self.page.served.supervisor.ask(Reload(), RELOAD_S)
+        finally:
+            self._file.outdate()
+        return {key: answer[key] for key in ("done", "problems", "kept")}
+
+    async def _follow(self) -> None:
+        seen = None
+        while True:
+            present = await self._file.state()
+            if present != seen:
+                described = await self._described()
+                self.page.push("configuration", described)
+                seen = None if described["problem"] else present  # the supervisor may have been busy
+            await asyncio.sleep(INTERVAL_S)
+
+    async def _described(self) -> dict[str, Any]:
+        _, read_ns = await self._file.state()
+        return await self._file.checked() | {"read_s": None if read_ns is None else read_ns / 1e9}

@@ -1,0 +1,125 @@
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shmio.endpoints.web import app, dropped
+from shmio.endpoints.web.dropped import compile_dropped, describe
+from shmio.errors import CommandError
+from shmio.segment import Segment
+from tests.unit.endpoints.web.test_page import SECRETS, pages
+
+BLOCK = b"""DATA_BLOCK "Press"
+{ S7_Optimized_Access := 'FALSE' }
+STRUCT
+  Speed : Real := 1.5; // of the ram
+  Done : Bool;
+END_STRUCT;
+BEGIN
+END_DATA_BLOCK
+"""
+KEPSERVER = (
+    b"Tag Name,Address,Data Type,Respect Data Type,Client Access,Scan Rate\n"
+    b'"Pump.Speed","DB1.REAL0",Float,1,R/W,100\n"Odd","DB1.X",Nothing,1,R/W,100\n'
+)
+TABLE = b'[registers]\n"pump/Speed" = { type = "REAL", address = "holding 100", unit = "rpm" }\n'
+
+
+def request(**files: bytes) -> bytes:
+    head = [{"name": name.replace("_", "."), "size": len(data)} for name, data in files.items()]
+    return json.dumps(head).encode() + b"\n" + b"".join(files.values())
+
+
+def compiled(**files: bytes) -> dict[str, Any]:
+    return describe(request(**files))
+
+
+def test_registers_of_a_data_block() -> None:
+    found = compiled(press_db=BLOCK)
+    (layout,) = found["layouts"]
+    assert (layout["name"], layout["count"], found["messages"]) == ("Press", 2, [])
+    assert layout["registers"] == [
+        ["Speed", "REAL", "0", 4, "1.5", "", "of the ram"],
+        ["Done", "BOOL", "4.0", 1, "", "", ""],
+    ]
+
+
+def test_files_use_each_others_types() -> None:
+    block = BLOCK.replace(b"Done : Bool", b'Axis : "Axis"')
+    udt = b'TYPE "Axis"\nVERSION : 0.1\nSTRUCT\n  Pos : Real;\nEND_STRUCT;\nEND_TYPE\n'
+    missing = compiled(press_db=block)
+    assert missing["layouts"] == []
+    assert missing["messages"][0].startswith("press.db:5:")
+    paths = [row[0] for row in compiled(press_db=block, axis_udt=udt)["layouts"][0]["registers"]]
+    assert paths == ["Speed", "Axis/Pos"]
+
+
+def test_tag_table_and_the_list_of_another_tool() -> None:
+    (layout,) = compiled(tags_toml=TABLE)["layouts"]
+    assert layout["registers"] == [["pump/Speed", "REAL", "holding 100", 4, "", "rpm", ""]]
+    found = compiled(list_csv=KEPSERVER)
+    assert [row[0] for row in found["layouts"][0]["registers"]] == ["Pump/Speed"]
+    assert found["messages"][0].startswith("imported 1 tag from")
+    assert "skipped 1" in found["messages"][1]
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"",
+        b"[]\n",
+        b"[" * 9000,
+        b'[{"name": "a.db", "size": 5}]\nabc',
+        b'[{"name": "a.db", "size": -1}]\n',
+        b'[{"name": "", "size": 0}]\n',
+        json.dumps([{"name": "a.db", "size": 0}] * 101).encode() + b"\n",
+    ],
+)
+def test_malformed_request_is_refused(body: bytes) -> None:
+    found = describe(body)
+    assert found["layouts"] == []
+    assert "malformed" in found["messages"][0]
+
+
+@given(st.sampled_from(["db", "toml", "csv", "xlsx", "xml", "sdf", "x"]), st.binary(max_size=200))
+def test_any_file_is_answered(suffix: str, data: bytes) -> None:
+    assert json.dumps(compiled(**{f"a_{suffix}": data}))
+
+
+def test_answer_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dropped, "MAX_ROWS", 1)
+    (layout,) = compiled(press_db=BLOCK)["layouts"]
+    assert (layout["count"], len(layout["registers"])) == (2, 1)
+    monkeypatch.setattr(dropped, "MAX_ROWS", 10)
+    monkeypatch.setattr(dropped, "MAX_ANSWER_BYTES", 60)
+    (layout,) = compiled(press_db=BLOCK)["layouts"]
+    assert (layout["count"], len(layout["registers"])) == (2, 1)
+
+
+def test_page_gets_the_registers_of_its_files(segment: Segment) -> None:
+    with pages(segment) as server:
+        status, headers, text = server.request("POST", "/layout", request(press_db=BLOCK))
+        assert (status, headers["content-type"]) == (200, "application/json")
+        assert json.loads(text)["layouts"][0]["name"] == "Press"
+        too_large = b"x" * (dropped.MAX_BYTES + dropped.MAX_HEAD_BYTES + 1)
+        assert server.request("POST", "/layout", too_large)[0] == 413
+
+
+def test_users_without_a_role_and_foreign_pages_drop_nothing(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pages(segment, SECRETS, roles=()) as server:
+        assert server.request("POST", "/layout", request(press_db=BLOCK))[0] == 403
+    with pages(segment) as server:
+        assert server.request("POST", "/layout", b"", Origin="http://evil.example")[0] == 403
+        monkeypatch.setattr(app, "MAX_DROPPED", 0)
+        assert server.request("POST", "/layout", request(press_db=BLOCK))[0] == 429
+
+
+def test_page_is_told_if_files_take_too_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dropped, "LIMIT_S", 0)
+    with pytest.raises(CommandError, match="use shmio-layout"):
+        asyncio.run(compile_dropped(request(press_db=BLOCK)))
