@@ -15,6 +15,7 @@ from typing import Any, Final, get_args
 
 from msgspec import ValidationError
 
+from shmio.config.masking import mask_line
 from shmio.config.model import (
     NAME_PATTERN,
     NAME_RULE,
@@ -32,6 +33,7 @@ from shmio.config.model import (
     Severity,
     UnitName,
 )
+from shmio.config.tokens import TOKEN
 from shmio.errors import ConfigError, LayoutError
 
 MAX_KEY: Final = 1_000
@@ -47,11 +49,6 @@ MAX_CHARACTERS: Final = 500
 
 A message may quote text that is as long as the file.
 """
-TOKEN: Final = re.compile(
-    r"""\#[^\n]*|\"\"\"(?:\\.|[^\\])*?(?:\"{3,5}|\Z)|'''.*?(?:'{3,5}|\Z)|"(?:\\.|[^"\\\n])*"?|'[^'\n]*'?"""
-    r"""|\[\[|\]\]|[\[\]{}=.,\n]|[^\s"'\#\[\]{}=.,]+""",
-    re.DOTALL,
-)
 _KEY: Final = re.compile(r"[A-Za-z0-9_-]+(?:\[[0-9]+\]|\.[A-Za-z0-9_-]+)*(?=[:\s])")
 _PLACE: Final = re.compile(r"\b(source|emulator|injection|expect|alert)\[([0-9]+)\]")
 _QUOTES: Final = "'"
@@ -275,6 +272,8 @@ def explain_toml(error: Exception, text: str) -> str:
         return str(error)
     lines = text.replace("\r\n", "\n").split("\n")
     line, column = lines[int(place[1]) - 1], int(place[2]) - 1
+    if (masked := mask_line(line)) != line:
+        return f"{error}: {masked.strip()[:MAX_LINE]}"
     shown = line.strip()[:MAX_LINE]
     double = Lines(text).double
     if double and str(error).startswith(_DOUBLE):

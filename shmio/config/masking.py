@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from shmio.config.faults import TOKEN
+from shmio.config.tokens import TOKEN
 
 MASK: Final = "•••"
 _WORDS: Final = frozenset({"pass", "pw", "pin", "auth"})

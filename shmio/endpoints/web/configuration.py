@@ -83,10 +83,9 @@ class ConfigurationFile:
             found["problem"] = str(error)
         messages = [("fault", line) for line in answer["faults"]]
         messages += [("warning", line) for line in answer["warnings"]]
-        found |= await run_in_threadpool(_annotated, self._file, text, messages)
         if "keep" in answer:
             found["changes"] = {kind: answer[kind] for kind in _KINDS}
-        return found
+        return found | await run_in_threadpool(_annotated, self._file, text, messages)
 
 
 def version(file: str) -> str:

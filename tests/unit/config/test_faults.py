@@ -183,3 +183,10 @@ def test_hostile_files_are_refused_with_a_bounded_number_of_lines(
     assert max(map(len, told)) < 700
     if lines > 1000:
         assert told[-1].endswith(" more faults")
+
+
+@pytest.mark.parametrize("line", ['password = "hunter2', "password = hunter2", "api_key: hunter2"])
+def test_a_secret_is_not_quoted(tmp_path: Path, line: str) -> None:
+    (message,) = refused(tmp_path, f'[[source]]\nname = "cell"\n{line}\n')
+    assert "hunter2" not in message
+    assert "(at line 3, column " in message
