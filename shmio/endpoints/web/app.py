@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -10,7 +11,7 @@ import msgspec
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
-from starlette.requests import HTTPConnection, Request
+from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket
@@ -204,13 +205,15 @@ def _record_sign_in(host: str, reason: str) -> None:
 
 
 async def _body(request: Request, most_bytes: int) -> bytes | None:
-    """Return the body of a request; None if it is larger."""
+    """Return the body of a request; None if it is larger, or if the client disconnects before its end."""
     body = bytearray()
-    async for part in request.stream():
-        body += part
-        if len(body) > most_bytes:
-            return None
-    return bytes(body)
+    with suppress(ClientDisconnect):
+        async for part in request.stream():
+            body += part
+            if len(body) > most_bytes:
+                return None
+        return bytes(body)
+    return None
 
 
 def _host(request: HTTPConnection) -> str:

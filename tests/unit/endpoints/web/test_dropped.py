@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 from typing import Any
 
 import pytest
@@ -117,6 +118,22 @@ def test_users_without_a_role_and_foreign_pages_drop_nothing(segment: Segment, m
         assert server.request("POST", "/layout", b"", Origin="http://evil.example")[0] == 403
         monkeypatch.setattr(app, "MAX_DROPPED", 0)
         assert server.request("POST", "/layout", request(press_db=BLOCK))[0] == 429
+
+
+def test_page_upload_that_ends_early_leaves_room_for_others(
+    segment: Segment, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(app, "MAX_DROPPED", 1)
+    with pages(segment) as server:
+        with socket.create_connection(("127.0.0.1", server.port)) as client:
+            client.sendall(b"POST /layout HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 100\r\n\r\nabc")
+            status = 200
+            while status != 429:  # until the server has the beginning
+                status = server.request("POST", "/layout", b"[]\n")[0]
+        while status == 429:
+            status = server.request("POST", "/layout", b"[]\n")[0]
+        assert status == 200
+    assert not caplog.records
 
 
 def test_page_is_told_if_files_take_too_long(monkeypatch: pytest.MonkeyPatch) -> None:
