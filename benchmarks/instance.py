@@ -27,6 +27,7 @@ _HEAD = """
 [instance]
 name = "{name}"
 clock = "{clock}"
+{settings}
 [grpc]
 listen = ["{grpc}"]
 """
@@ -103,19 +104,28 @@ def instance(period_ms: float, *, more: str = "", priority: int | None = None) -
 
 @contextmanager
 def started(
-    sources: Sequence[Polled], *, more: str = "", clock: str = "wall", until: State = State.RUNNING
+    sources: Sequence[Polled],
+    *,
+    more: str = "",
+    clock: str = "wall",
+    settings: str = "",
+    until: State = State.RUNNING,
 ) -> Iterator[Instance]:
     """Run an instance with these sources until the block ends.
 
-    ``more`` holds further sections of the configuration. The instance is ready when the supervisor is in the state
-    ``until``.
+    ``more`` holds further sections of the configuration, and ``settings`` further keys of ``[instance]``. The instance
+    is ready when the supervisor is in the state ``until``.
     """
     name = f"bench-{os.getpid()}"
     with ExitStack() as stack:
         grpc = stack.enter_context(reserved_port())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         config = folder / "supervisor.toml"
-        parts = [_HEAD.format(name=name, grpc=grpc, clock=clock), *(source.text() for source in sources), more]
+        parts = [
+            _HEAD.format(name=name, grpc=grpc, clock=clock, settings=settings),
+            *(source.text() for source in sources),
+            more,
+        ]
         config.write_text("".join(parts))
         output = stack.enter_context((folder / "output").open("w+"))
         supervisor = subprocess.Popen(

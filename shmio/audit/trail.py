@@ -326,6 +326,7 @@ class Trail:
         while not self._closing.is_set() or self._waiting.qsize():
             batch = [*self._merge(self._batch(self._due_s()))]
             if batch and not self._keep_writing(b"".join(map(self._line, batch))):
+                log.error("%s; %d entries are lost", self.problem, len(batch) + self._waiting.qsize())
                 return
         for one in self._repeated.values():
             if one.last is not None:

@@ -12,6 +12,7 @@ from typing import Final, NamedTuple, NoReturn
 import msgspec
 
 from shmio import worker
+from shmio.audit.trail import close_trail
 from shmio.config import Address, Grpc, load
 from shmio.endpoints.grpc.server import limits
 from shmio.endpoints.grpc.server.access import Listeners
@@ -132,6 +133,7 @@ def _end_now(worker: Worker) -> NoReturn:
     """
     worker.log.error("gRPC stopped serving; this process ends, and the supervisor starts a new one")
     logging.shutdown()
+    close_trail()
     os._exit(1)
 
 
