@@ -211,7 +211,9 @@ def test_each_way_to_change_something_has_its_entry(cell: Cell, addresses: dict[
     whole = (cell.folder / "logs/audit.jsonl").read_text()
     assert not [secret for secret in (TOKEN, PASSWORD, "wrong-0123456789abcdefghij", cookie) if secret in whole]
     assert [one["what"] for one in printed(cell, "--action", "write") if one["endpoint"] == "local"] == [local["what"]]
-    refused = [one["what"] for one in printed(cell, "--who", "tester", "--action", "write") if one["outcome"] == "refused"]
+    refused = [
+        one["what"] for one in printed(cell, "--who", "tester", "--action", "write") if one["outcome"] == "refused"
+    ]
     assert refused == [{"cell/Robot_800/Axs1_Pos": 1}, {"topic": "cell/Outputs/504"}], "each has one entry"
     assert {one["who"] for one in printed(cell, "--who", "tester", "--since", "1h")} == {"tester"}
     assert [one["endpoint"] for one in printed(cell, "cell/Outputs/50[23]", "--action", "write")] == ["mqtt", "opcua"]

@@ -240,3 +240,9 @@ def test_benchmark_of_sixteen_sources() -> None:
     pytest.importorskip("pymodbus")
     found = printed("sixteen_sources")
     assert len(re.findall(r"^1 of (?:s7|opcua|modbus) +\d+\.\d +\d+\.\d+ +\d+ .* 0$", found, re.MULTILINE)) == 3, found
+
+
+def test_benchmark_of_the_audit_log() -> None:
+    found = printed("audit")
+    row = r"^a (?:client of shmio.v1|program on the host), (?:audit log|none)(?: +\d+\.\d{3}){3}(?: +\d+){3}$"
+    assert len(re.findall(row, found, re.MULTILINE)) == 4, found
