@@ -140,6 +140,10 @@ class Session:
         self._timeout_s = options.timeout / 1000
         self._client: Any = None
         self._protocol: Any = None
+        self._newest: _Protocol | None = None
+        """The connection that was made last, which may be one only to ask for the server's certificate."""
+        self._stage = ""
+        """What the server may refuse without a word; empty once the session exists."""
         self._subscriptions: dict[int, Subscription] = {}
         self._publishing = 0
         self._wanted = 0
@@ -173,6 +177,7 @@ class Session:
         if policy is not None:
             client.security_policy = policy
             client.uaclient.set_security(policy)
+            self._stage = f"it may not trust this client's certificate, {options.certificate}"
         if options.username is not None:
             client.set_user(options.username)
             client.set_password(self._credentials.password)
@@ -185,6 +190,7 @@ class Session:
             await client.activate_session(username=client._username, password=client._password)
         except ua.UaStatusCodeError as error:
             raise ConnectorError(_refused_user(error.code, options)) from None
+        self._stage = ""
         client.uaclient.pre_request_hook = None
         self._tasks.append(asyncio.create_task(self._renew()))
         await self._ask_limits()
@@ -209,6 +215,7 @@ class Session:
                 self._timeout_s, low.security_policy, TransportLimits(MAX_CHUNK_BYTES, MAX_CHUNK_BYTES, 0, 0)
             )
             made.on_connection_lost = self._lost
+            self._newest = made
             low.protocol = made
             return made
 
@@ -258,9 +265,18 @@ class Session:
                 return
 
     def _lost(self, error: Exception | None) -> None:
+        if (refusal := self._refusal) is not None:
+            return self.fail(refusal)
         reason = getattr(self._protocol, "reason", "")
         peer = self._options.peer
-        self.fail(ConnectorError(reason or f"{peer} closed the connection{f': {error}' if error else ''}"))
+        why = str(error or self._stage)
+        return self.fail(ConnectorError(reason or f"{peer} closed the connection{f': {why}' if why else ''}"))
+
+    @property
+    def _refusal(self) -> ConnectorError | None:
+        """The error with which the server has closed the connection; None if it gave none."""
+        code = self._newest.refused if self._newest is not None else 0
+        return ConnectorError(_explained_code(code, self._options)) if code else None
 
     def fail(self, error: ConnectorError) -> None:
         """End the session; the first error counts."""
@@ -299,6 +315,8 @@ class Session:
             return ConnectorError(_explained_code(error.code, options)) if isinstance(error, FaultError) else error
         if self.failure.done() and not self.failure.cancelled():
             return self.failure.result()
+        if (refusal := self._refusal) is not None:
+            return refusal
         if reason:
             return ConnectorError(reason)
         if isinstance(error, TimeoutError):
@@ -308,8 +326,10 @@ class Session:
         if isinstance(error, ua.UaStatusCodeError):
             return ConnectorError(_explained_code(error.code, options))
         if isinstance(error, OSError):
-            closed = isinstance(error, ConnectionError)
-            return ConnectorError(f"{peer} closed the connection" if closed else f"{peer} cannot be reached: {error}")
+            closed = f"{peer} closed the connection" + (f": {self._stage}" if self._stage else "")
+            return ConnectorError(
+                closed if isinstance(error, ConnectionError) else f"{peer} cannot be reached: {error}"
+            )
         if isinstance(error, ua.UaError | ValueError | struct.error | TypeError | AttributeError | LookupError):
             return ConnectorError(
                 f"{peer} sent data that is not OPC UA, or not the requested answer: {str(error)[:200]}"
@@ -814,6 +834,14 @@ class _Protocol(UASocketProtocol):
 
     reason = ""
     """Why this client closed the connection."""
+    refused = 0
+    """Status code with which the server has closed the connection; 0: none."""
+
+    def _fail_all_pending(self, exc: BaseException) -> None:
+        """Note the server's error, which the library forgets if it answers the request for a channel."""
+        if isinstance(exc, ua.UaStatusCodeError):
+            self.refused = self.refused or int(exc.code)
+        super()._fail_all_pending(exc)
 
     def data_received(self, data: bytes) -> None:
         """Take bytes; close the connection if a message is too large."""
@@ -874,7 +902,7 @@ def _refused_user(code: int, options: OpcUaOptions) -> str:
 
 def _explained_code(code: int, options: OpcUaOptions) -> str:
     name = describe(code)
-    if code & 0xFFFF0000 in (0x801A0000, 0x80120000, 0x80130000) and options.security != "None":
+    if (0x80120000 <= code < 0x801F0000 or code & 0xFFFF0000 == 0x810D0000) and options.security != "None":
         return f"the server refuses this client's certificate ({name}): let the server trust {options.certificate}"
     if code & 0xFFFF0000 in (0x80560000, 0x80770000, 0x80DB0000):  # sessions, subscriptions, monitored items
         return f"the server has no more room ({name}): close other clients, or read less"

@@ -21,10 +21,11 @@ MISSING = "" if shutil.which("node") and (NODE / "node_modules/node-opcua-server
 class NodeServer:
     """A running server with these nodes; it takes up to 12 s to start."""
 
-    def __init__(self, folder: Path, nodes: list[dict[str, Any]]) -> None:
+    def __init__(self, folder: Path, nodes: list[dict[str, Any]], *, secured: bool = False) -> None:
         if MISSING:
             pytest.skip(MISSING)
         self._folder = folder
+        self._more = ["secured"] if secured else []
         self._file = folder / "nodes.json"
         self._file.write_text(json.dumps(nodes))
         self._stack = ExitStack()
@@ -33,7 +34,8 @@ class NodeServer:
 
     def __enter__(self) -> Self:
         command = [
-            "node", str(NODE / "opcua_server.js"), str(self.address.port), str(self._folder / "pki"), str(self._file)
+            "node", str(NODE / "opcua_server.js"), str(self.address.port), str(self._folder / "pki"), str(self._file),
+            *self._more,
         ]  # fmt: skip
         with (self._folder / "log").open("w") as log:
             self._process = subprocess.Popen(

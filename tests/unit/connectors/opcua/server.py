@@ -184,6 +184,11 @@ class Device:
         """Return how many made up references were sent, and how many continuation points are open."""
         return [self.sent, len(self.points)]
 
+    async def expire(self) -> None:
+        """End all sessions of clients, but not their connections, as if they had timed out."""
+        for session in list(self.server.iserver._external_sessions.values()):
+            await session.close_session(True)
+
     async def clients(self) -> int:
         """Return the number of sessions of clients."""
         return len(self.server.iserver._external_sessions)

@@ -81,6 +81,18 @@ def test_a_killed_server_is_noticed_and_found_again() -> None:
             assert source.value("count") == 8
 
 
+@MODES
+def test_an_expired_session_is_lost_and_another_one_begins(device: Device, mode: str) -> None:
+    with connected(device.url, TAGS, timeout=TIMEOUT_MS, mode=mode) as source:
+        device.ask("expire")
+        assert "BadSession" in lost(source)
+        source.connector.close()
+        source.connector.connect()
+        device.ask("set", "count", "UInt32", 8)
+        until(lambda: source.value("count") == 8, "a change in the new session")
+        device.ask("set", "count", "UInt32", 7)
+
+
 def test_a_lost_publication_ends_the_session(device: Device) -> None:
     """The server's messages are numbered; without one of them, values may be missing."""
     with (

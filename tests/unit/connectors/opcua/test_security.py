@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,13 @@ from shmio.connectors.opcua import trust
 from shmio.connectors.opcua.connector import OpcUaConnector
 from shmio.connectors.opcua.options import OpcUaOptions
 from shmio.errors import ConfigError, ConnectorError
+from shmio.layout.addresses.siemens import NAMESPACE
 from shmio.layout.tags import place_tags
 from shmio.model.statuses import GOOD
 from tests.unit.connectors.opcua.device import Device
-from tests.unit.connectors.opcua.harness import Source, connected
+from tests.unit.connectors.opcua.node_server import NodeServer
+from tests.unit.endpoints.opcua.certificates import self_signed
+from tests.unit.connectors.opcua.harness import Source, connected, until
 
 TAGS = {"level": "REAL"}
 DAY = datetime.timedelta(days=1)
@@ -141,6 +145,37 @@ def test_a_server_of_a_trusted_authority(
         assert source.value("level") == 2.5
     with pytest.raises(ConnectorError, match=r"not for 127\.0\.0\.1"), connected(device.url, TAGS, **keys):
         pass
+
+
+def test_a_server_that_rejects_the_clients_certificate(keys: dict[str, Any], tmp_path: Path) -> None:
+    """The error says whom to ask; once the server trusts the certificate, the same source is good."""
+    folder = tmp_path / "node"
+    folder.mkdir()
+    level = {"id": "level", "type": "Float", "value": 2.5, "writable": False}
+    anonymous = {name: value for name, value in keys.items() if name not in ("username", "password_file")}
+    tags = {"level": {"type": "REAL", "address": f"nsu={NAMESPACE};s=level"}}
+    with NodeServer(folder, [level], secured=True) as server:
+        shown = self_signed(tmp_path, "urn:test:client")
+        source = Source(server.url, tags, **anonymous | {"certificate": str(shown[0]), "key": str(shown[1])})
+        with pytest.raises(ConnectorError, match="not trusted"):
+            source.connector.connect()
+        (stored,) = (tmp_path / "rejected").iterdir()
+        stored.rename(tmp_path / "trusted" / stored.name)
+        with pytest.raises(ConnectorError, match="client's certificate") as raised:
+            source.connector.connect()
+        assert str(shown[0]) in str(raised.value)
+        (rejected,) = (folder / "pki/rejected").iterdir()
+        rejected.rename(folder / "pki/trusted/certs" / rejected.name)
+
+        def trusted() -> bool:
+            with suppress(ConnectorError):
+                source.connector.connect()
+                return True
+            return False
+
+        until(trusted, "the server has noticed the file")
+        assert source.value("level") == 2.5
+        source.connector.close()
 
 
 def test_users(secured: tuple[Device, Path], keys: dict[str, Any], tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 // Serves the nodes that a file describes, as an S7-1500 names them; prints its port, and ends with its standard input.
-// Usage: node opcua_server.js PORT FOLDER NODES.json; a node is {"id", "type", "value", "writable"}.
+// Usage: node opcua_server.js PORT FOLDER NODES.json [secured]; a node is {"id", "type", "value", "writable"}.
+// A secured server also has an encrypted endpoint, and rejects there clients whose certificates are not in its folder.
 'use strict';
 
 const fs = require('fs');
@@ -7,16 +8,16 @@ const opcua = require('node-opcua-server');
 const { DataType, MessageSecurityMode, SecurityPolicy, VariantArrayType } = require('node-opcua-client');
 const { OPCUACertificateManager } = require('node-opcua-certificate-manager');
 
-const [port, folder, file] = process.argv.slice(2);
+const [port, folder, file, secured] = process.argv.slice(2);
 
 async function main() {
-  const certificates = new OPCUACertificateManager({ rootFolder: folder, automaticallyAcceptUnknownCertificate: true });
+  const certificates = new OPCUACertificateManager({ rootFolder: folder, automaticallyAcceptUnknownCertificate: !secured });
   await certificates.initialize();
   const server = new opcua.OPCUAServer({
     port: Number(port),
     hostname: '127.0.0.1',
-    securityModes: [MessageSecurityMode.None],
-    securityPolicies: [SecurityPolicy.None],
+    securityModes: [MessageSecurityMode.None, ...(secured ? [MessageSecurityMode.SignAndEncrypt] : [])],
+    securityPolicies: [SecurityPolicy.None, ...(secured ? [SecurityPolicy.Basic256Sha256] : [])],
     serverCertificateManager: certificates,
     disableDiscovery: true,
   });
