@@ -7,17 +7,14 @@ from collections.abc import Sequence
 from typing import Final
 
 from shmio.config.address import Address
-from shmio.emulators import modbus, opcua
 from shmio.emulators.device import Device, Served
-from shmio.emulators.emulator import Emulator
-from shmio.emulators.modbus import ModbusEmulator
-from shmio.emulators.opcua import OpcUaEmulator
 from shmio.errors import ConfigError
 
 S7: Final = "s7"
 KINDS: Final = (S7, "modbus", "opcua")
 """The kinds; the name of each is that of the connector that reads it."""
-_LIBRARIES: Final = {"modbus": ("pymodbus", modbus.EXTRA), "opcua": ("asyncua", opcua.EXTRA)}
+_LIBRARIES: Final = {"modbus": "pymodbus", "opcua": "asyncua"}
+_EXTRA: Final = "kind: the emulator {kind} needs another library: pip install 'shmio[{kind}]'"
 
 
 def create(
@@ -36,12 +33,18 @@ def create(
         ConfigError: The library is missing, there is no such program, or a layout does not suit it.
 
     """
+    # Each kind is imported where it is used, because a process has only one.
     if kind == S7:
+        from shmio.emulators.emulator import Emulator  # noqa: PLC0415
+
         layouts = [one.layout for one in served]
         return Emulator(layouts[0], program, listen, db_number=db_number, others=layouts[1:])
-    library, remedy = _LIBRARIES[kind]
-    if importlib.util.find_spec(library) is None:
-        raise ConfigError(remedy)
+    if importlib.util.find_spec(_LIBRARIES[kind]) is None:
+        raise ConfigError(_EXTRA.format(kind=kind))
     if kind == "modbus":
+        from shmio.emulators.modbus import ModbusEmulator  # noqa: PLC0415
+
         return ModbusEmulator(served, program, listen)
+    from shmio.emulators.opcua import OpcUaEmulator  # noqa: PLC0415
+
     return OpcUaEmulator(served, program, listen)

@@ -28,7 +28,6 @@ from shmio.layout.values.codec import codec, flatten, nest
 if TYPE_CHECKING:
     from pymodbus.server import ModbusTcpServer
 
-EXTRA: Final = "kind: the emulator modbus needs another library: pip install 'shmio[modbus]'"
 MAX_CLIENTS: Final = 16
 LEAST: Final = 100
 """Minimum number of entries in each table of a unit."""

@@ -24,7 +24,6 @@ from shmio.layout.values.codec import codec, flatten, nest
 if TYPE_CHECKING:
     from asyncua import Server, ua
 
-EXTRA: Final = "kind: the emulator opcua needs another library: pip install 'shmio[opcua]'"
 MAX_CLIENTS: Final = 16
 MAX_NAMESPACE: Final = 100
 """Highest namespace number that the emulator creates."""

@@ -7,11 +7,8 @@ reports.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
-
-from snap7.error import S7_PROTOCOL_ERROR_CODES
-from snap7.s7protocol import S7_RETURN_CODES
 
 from shmio.errors import ConnectorError
 from shmio.layout.topic import shorten
@@ -21,8 +18,6 @@ _MOST_NAMES: Final = 3
 # Return codes of an item.
 ITEM_OK = 0xFF
 ACCESS_DENIED, OUT_OF_RANGE, NO_SUCH_TYPE, OTHER_SIZE, NO_SUCH_OBJECT = 0x03, 0x05, 0x06, 0x07, 0x0A
-
-KNOWN_CODES: Final = frozenset(S7_RETURN_CODES)
 
 _NO_OPTIMIZED = "clear 'Optimized block access' of the block, compile and load, or read it by OPC UA"
 _ACCESS_DENIED = (
@@ -55,6 +50,8 @@ def explain_error(error: int) -> str:
     """Return a message for the error class and code in the header of an answer."""
     if error in _ERRORS:
         return _ERRORS[error].format(where=f"(error 0x{error:04X})")
+    from snap7.error import S7_PROTOCOL_ERROR_CODES  # noqa: PLC0415  a source without errors starts faster
+
     known = S7_PROTOCOL_ERROR_CODES.get(error)
     return f"the controller refused the request: {known or 'no text known'} (error 0x{error:04X})"
 
@@ -131,6 +128,17 @@ def explain_place(code: int, text: str, db_number: int, last: int) -> str:
     return explain_item(code)
 
 
+def is_known(code: int) -> bool:
+    """Return whether a controller may send this return code for an item."""
+    return code == ITEM_OK or code in _item_texts()
+
+
+def _item_texts() -> Mapping[int, str]:
+    from snap7.s7protocol import S7_RETURN_CODES  # noqa: PLC0415  a source without errors starts faster
+
+    return S7_RETURN_CODES
+
+
 def explain_item(code: int) -> str:
     """Return a message for the return code of an item, without saying which item."""
     where = f"(item code 0x{code:02X})"
@@ -145,4 +153,4 @@ def explain_item(code: int) -> str:
         return f"the controller has no such address {where}: correct it; or the block is optimized: {_NO_OPTIMIZED}"
     if code in {NO_SUCH_TYPE, OTHER_SIZE}:
         return f"the controller does not accept data of this type or length {where}"
-    return f"the controller refused the request: {S7_RETURN_CODES.get(code, 'no text known')} {where}"
+    return f"the controller refused the request: {_item_texts().get(code, 'no text known')} {where}"

@@ -19,7 +19,7 @@ import struct
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-from shmio.connectors.s7.explain import ITEM_OK, KNOWN_CODES, RefusedError, explain_error
+from shmio.connectors.s7.explain import ITEM_OK, RefusedError, explain_error, is_known
 from shmio.errors import ConnectorError
 
 FRAME_OVERHEAD = 7  # TPKT 4, COTP DT 3
@@ -304,7 +304,7 @@ def parse_items(frame: memoryview, sizes: Sequence[int]) -> list[ReadAnswer]:
         code, transport, length = _READ_ITEM.unpack_from(frame, at)
         end = at + 4
         if code != ITEM_OK:
-            if length and code not in KNOWN_CODES:  # rather data, after an item that was too short
+            if length and not is_known(code):  # rather data, after an item that was too short
                 raise ConnectorError(
                     f"the controller's answer has an inconsistent item with return code 0x{code:02X} and length "
                     f"{length}"

@@ -22,9 +22,9 @@ from shmio.layout.addresses.siemens import NAMESPACE
 from shmio.layout.tags import place_tags
 from shmio.model.statuses import GOOD
 from tests.unit.connectors.opcua.device import Device
+from tests.unit.connectors.opcua.harness import Source, connected, until
 from tests.unit.connectors.opcua.node_server import NodeServer
 from tests.unit.endpoints.opcua.certificates import self_signed
-from tests.unit.connectors.opcua.harness import Source, connected, until
 
 TAGS = {"level": "REAL"}
 DAY = datetime.timedelta(days=1)
