@@ -23,6 +23,11 @@ from shmio.testing.proxy import FaultProxy
 
 PATIENCE_S = 20.0
 PERIOD_NS = 5_000_000
+SLOW_S = 0.01
+"""Delay of a slow connection in each direction: two periods, and far below the time-out."""
+
+
+_NEVER = threading.Event()
 
 
 class Rig(Protocol):
@@ -77,6 +82,17 @@ class Run:
         """Wait for the next bad frame."""
         return self.until(lambda frame: frame.quality is Quality.BAD)
 
+    def newer(self, generation: int) -> Frame:
+        """Wait for a frame whose image has a higher number."""
+        return self.until(lambda frame: self._rig.generation(frame.raw) > generation)
+
+    def wait_busy(self) -> None:
+        """Wait until the loop is in a call of the connector."""
+        deadline = time.monotonic() + PATIENCE_S
+        while not self.loop.counters.busy_since_ns:
+            assert time.monotonic() < deadline, "the loop has called nothing"
+            _NEVER.wait(0.001)
+
     def stop(self) -> None:
         """Stop the loop. Check the rules that all its frames must obey."""
         self._clock.stop()
@@ -124,6 +140,11 @@ class ConnectorConformance:
                     segment.unlink()
 
     @pytest.fixture
+    def frozen(self, rig: Rig) -> None:
+        """Let the device be silent from before the loop starts."""
+        rig.proxy.freeze()
+
+    @pytest.fixture
     def absent(self, rig: Rig) -> None:
         """Make the device unreachable before the loop starts."""
         rig.proxy.refuse()
@@ -132,6 +153,15 @@ class ConnectorConformance:
         """The source reads a working device in every cycle."""
         first = rig.generation(run.good().raw)
         run.until(lambda frame: rig.generation(frame.raw) > first)
+
+    def test_a_slow_device(self, run: Run, rig: Rig) -> None:
+        """Answers that take several periods, but less than the time-out, are good."""
+        last = rig.generation(run.good().raw)
+        rig.proxy.delay(SLOW_S, SLOW_S)
+        first = len(run.frames)
+        for _ in range(3):
+            last = rig.generation(run.newer(last).raw)
+        assert {frame.quality for frame in run.frames[first:]} == {Quality.GOOD}
 
     def test_absent_at_start(self, absent: None, run: Run, rig: Rig) -> None:
         """The source is bad, with a reason, until the device appears. Then it is good."""
@@ -198,6 +228,10 @@ class ConnectorConformance:
         """
         run.good()
         rig.proxy.freeze()
+
+    def test_a_stop_in_the_middle_of_connecting(self, frozen: None, run: Run) -> None:
+        """Stopping never takes longer than the device's time-out. The fixture ``run`` checks this."""
+        run.wait_busy()
 
     def test_close_may_come_at_any_time(self, rig: Rig) -> None:
         """A program may close the connector before the first connect, and may close it twice."""

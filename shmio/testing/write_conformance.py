@@ -59,10 +59,26 @@ class Writer:
 
         Return the outcome of the first item.
         """
-        number = self._sender.submit(writes, time.monotonic_ns() + round(FAR_S * 1e9))
+        return self.end(self.send(*writes), len(writes))
+
+    def send(self, *writes: Write) -> int:
+        """Send a command; return its number."""
+        return self._sender.submit(writes, time.monotonic_ns() + round(FAR_S * 1e9))
+
+    def accepted(self, number: int) -> None:
+        """Wait until the source has accepted a command. Call it before :meth:`end`."""
+        deadline_s = time.monotonic() + PATIENCE_S
+        while True:
+            event = self._events.next(max(0.0, deadline_s - time.monotonic()))
+            assert event is not None, f"command {number} is not accepted"
+            if (event.command, event.kind) == (number, EventKind.ACCEPTED):
+                return
+
+    def end(self, number: int, items: int = 1) -> Event:
+        """Wait for the outcomes of all items of a command; return that of the first."""
         ends: list[Event] = []
         deadline_s = time.monotonic() + PATIENCE_S
-        while sum(event.items for event in ends) < len(writes):
+        while sum(event.items for event in ends) < items:
             event = self._events.next(max(0.0, deadline_s - time.monotonic()))
             assert event is not None, f"command {number} has no end; so far: {ends}"
             if event.command == number and event.kind == EventKind.REJECTED:
@@ -207,6 +223,19 @@ class WriteConformance(ConnectorConformance):
             for (offset, _, data), outcome in zip(writes, raised.value.outcomes, strict=True):
                 if outcome is not Lost.UNKNOWN:
                     assert (found[offset : offset + 1] == data) == (outcome == ""), (offset, outcome)
+
+    @pytest.mark.parametrize("frozen_first", [False, True])
+    def test_a_stop_in_the_middle_of_a_write(self, run: Run, writer: Writer, rig: WriteRig, frozen_first: bool) -> None:
+        """The loop ends in time, and each command has an outcome."""
+        if frozen_first:
+            rig.proxy.freeze()
+        number = writer.send(Write(rig.spare, 0, b"stop"))
+        writer.accepted(number)
+        rig.proxy.freeze()
+        run.stop()
+        end = writer.end(number)
+        assert end.kind in ENDS
+        assert end.kind != EventKind.WRITTEN or not frozen_first
 
     def test_without_a_connection_nothing_is_sent(self, rig: WriteRig) -> None:
         """A write before the first connect, or after a close, fails and changes nothing."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import ClassVar
 
 import pytest
 
+from shmio.config import Address
 from shmio.connectors.base import Connector
 from shmio.connectors.modbus.connector import ModbusConnector, ModbusOptions
 from shmio.layout.model import Layout
@@ -14,6 +16,7 @@ from shmio.layout.values.codec import codec
 from shmio.segment import EventKind, Quality, Write
 from shmio.testing.conformance import Run
 from shmio.testing.proxy import FaultProxy
+from shmio.testing.table_conformance import TableConformance, Tags
 from shmio.testing.write_conformance import SPARE, WriteConformance, Writer
 from tests.unit.connectors.modbus.device import Device
 
@@ -62,7 +65,46 @@ class ModbusRig:
         return numbers[0]
 
 
-class TestModbus(WriteConformance):
+_WORDS = {
+    "INT": 1, "DINT": 2, "LINT": 4, "UINT": 1, "UDINT": 2, "ULINT": 4, "WORD": 1, "DWORD": 2, "LWORD": 4, "REAL": 2,
+    "LREAL": 4, "TIME": 2, "SINT": 1, "USINT": 1, "BYTE": 1, "STRING[11]": 6,
+}  # fmt: skip
+
+
+class ModbusTable:
+    """Two units of the device, as a tag table names their entries."""
+
+    unknown: ClassVar[Mapping[str, object]] = {"type": "INT", "address": "holding 3000"}
+    many: ClassVar[Tags] = {
+        f"v{at}": {"type": "INT", "address": f"unit {1 + at % 2} holding {1200 + at}"} for at in range(300)
+    }
+
+    def __init__(self, address: Address) -> None:
+        self._address = address
+        types: dict[str, dict[str, object]] = {
+            "coil": {"type": "BOOL", "address": "coil 3"},
+            "coils": {"type": "ARRAY[1..19] OF BOOL", "address": "coil 5"},
+            "bit": {"type": "BOOL", "address": "holding 0.3"},
+        }
+        at = 1
+        for kind, words in _WORDS.items():
+            types[kind.partition("[")[0].lower()] = {"type": kind, "address": f"holding {at}"}
+            types[f"array of {kind.partition('[')[0].lower()}"] = {
+                "type": f"ARRAY[1..3] OF {kind}", "address": f"unit 2 holding {at}",
+            }  # fmt: skip
+            at += 3 * words
+        self.types: Tags = types
+
+    def connector(self, layout: Layout) -> Connector:
+        return ModbusConnector(ModbusOptions(host=self._address.host, port=self._address.port), layout)
+
+
+class TestModbus(TableConformance, WriteConformance):
+    @pytest.fixture
+    def table(self) -> Iterator[ModbusTable]:
+        with Device() as device:
+            yield ModbusTable(device.address)
+
     @pytest.fixture(params=[50, 300], ids=["one request", "several requests"])
     def rig(self, request: pytest.FixtureRequest) -> Iterator[ModbusRig]:
         with Device() as device:

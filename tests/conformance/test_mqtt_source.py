@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import pytest
 
@@ -19,6 +19,7 @@ from shmio.testing.conformance import ConnectorConformance, Rig, Run
 from shmio.testing.mosquitto import Mosquitto, missing
 from shmio.testing.ports import reserved_port
 from shmio.testing.proxy import FaultProxy
+from shmio.testing.table_conformance import TableConformance, Tags
 from shmio.testing.write_conformance import SPARE, WriteConformance, Writer, WriteRig
 from tests.unit.connectors.mqtt.peer import Peer, framing, layout_of
 
@@ -86,7 +87,9 @@ def mosquitto(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Addres
     if reason := missing():
         pytest.skip(reason)
     folder: Path = tmp_path_factory.mktemp("mosquitto")
-    (folder / "acl").write_text("topic readwrite plant/counted\ntopic readwrite plant/spare\ntopic read plant/fixed\n")
+    open_topics = ("plant/counted", "plant/spare", "types/#", "arrays/#", "many/#")
+    rules = [*(f"topic readwrite {topic}" for topic in open_topics), "topic read plant/fixed", ""]
+    (folder / "acl").write_text("\n".join(rules))
     lines = ("allow_anonymous true", f"acl_file {folder / 'acl'}")
     with reserved_port() as address, Peer() as peer:
         broker = Mosquitto(folder, address, *lines)
@@ -106,7 +109,40 @@ def aedes() -> Iterator[Address]:
         yield address
 
 
-class TestMosquitto(Late, WriteConformance):
+_KINDS = (
+    "BOOL", "SINT", "INT", "DINT", "LINT", "USINT", "UINT", "UDINT", "ULINT", "BYTE", "WORD", "DWORD", "LWORD", "REAL",
+    "LREAL", "STRING[20]",
+)  # fmt: skip
+
+
+class MqttTable:
+    """Topics that are written and read: as text, and arrays as JSON."""
+
+    unknown: ClassVar[Mapping[str, object]] = {"type": "INT", "address": "nowhere/at/all"}
+    types: ClassVar[Tags] = {
+        **{kind[:6].lower(): {"type": kind, "address": f"types/{kind[:6]}", "writable": True} for kind in _KINDS},
+        **{
+            f"array of {kind[:6].lower()}": {
+                "type": f"ARRAY[1..3] OF {kind}", "address": f"arrays/{kind[:6]} $ -> arrays/{kind[:6]} $",
+                "writable": True,
+            }
+            for kind in _KINDS
+        },
+    }  # fmt: skip
+    many: ClassVar[Tags] = {f"v{at}": {"type": "INT", "address": f"many/{at}", "writable": True} for at in range(200)}
+
+    def __init__(self, address: Address) -> None:
+        self._options = MqttOptions(url=f"mqtt://{address}", max_age_ms=0)
+
+    def connector(self, layout: Layout) -> Connector:
+        return MqttConnector(self._options, layout)
+
+
+class TestMosquitto(Late, TableConformance, WriteConformance):
+    @pytest.fixture
+    def table(self, mosquitto: tuple[Address, Peer]) -> MqttTable:
+        return MqttTable(mosquitto[0])
+
     @pytest.fixture
     def rig(self, mosquitto: tuple[Address, Peer]) -> Iterator[MqttRig]:
         address, peer = mosquitto

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Literal
+from collections.abc import Iterator, Mapping
+from typing import ClassVar, Literal
 
 import pytest
 
@@ -16,10 +16,13 @@ from shmio.layout.values.codec import codec
 from shmio.segment import Write
 from shmio.testing.conformance import Run
 from shmio.testing.proxy import FaultProxy
+from shmio.testing.table_conformance import TableConformance, Tags
 from shmio.testing.write_conformance import SPARE, WriteConformance, Writer, WriteRig
 from tests.unit.connectors.opcua.device import Device, framing
 
 WORDS = 50
+MANY = 1100
+"""More than the nodes of a request and of a subscription."""
 
 
 def layout() -> Layout:
@@ -67,7 +70,57 @@ def device() -> Iterator[Device]:
         yield device
 
 
-class TestOpcUa(WriteConformance):
+_NODES = {
+    "BOOL": "Boolean", "SINT": "SByte", "INT": "Int16", "DINT": "Int32", "LINT": "Int64", "USINT": "Byte",
+    "UINT": "UInt16", "UDINT": "UInt32", "ULINT": "UInt64", "BYTE": "Byte", "WORD": "UInt16", "DWORD": "UInt32",
+    "LWORD": "UInt64", "REAL": "Float", "LREAL": "Double", "STRING[20]": "String", "TIME": "Int32",
+}  # fmt: skip
+
+
+class OpcUaTable:
+    """The server's nodes, one for each type."""
+
+    unknown: ClassVar[Mapping[str, object]] = {"type": "INT", "address": "ns=2;s=nowhere"}
+    types: ClassVar[Tags] = {
+        f"{what}{kind.partition('[')[0].lower()}": {
+            "type": f"ARRAY[1..3] OF {kind}" if what else kind,
+            "address": f"ns=2;s={what}{kind.partition('[')[0]}",
+        }
+        for kind in _NODES
+        for what in ("", "array of ")
+    }
+    many: ClassVar[Tags] = {f"v{at}": {"type": "INT", "address": f"ns=2;s=many{at}"} for at in range(MANY)}
+
+    def __init__(self, url: str, mode: Literal["subscribe", "poll"]) -> None:
+        self._options = OpcUaOptions(url=url, mode=mode, sampling_ms=5, publishing_ms=10)
+
+    def connector(self, layout: Layout) -> Connector:
+        return OpcUaConnector(self._options, layout)
+
+    @staticmethod
+    def make(device: Device) -> None:
+        for kind, node in _NODES.items():
+            zero = False if kind == "BOOL" else "" if node == "String" else 0
+            name = kind.partition("[")[0]
+            device.ask("add", name, node, zero)
+            device.ask("add", f"array of {name}", node, [zero] * 3)
+        for at in range(MANY):
+            device.ask("add", f"many{at}", "Int16", 0)
+
+
+@pytest.fixture(scope="module")
+def other() -> Iterator[Device]:
+    """A server with many nodes, which would delay the answers that the suite's short time-outs allow."""
+    with Device() as other:
+        OpcUaTable.make(other)
+        yield other
+
+
+class TestOpcUa(TableConformance, WriteConformance):
+    @pytest.fixture(params=["subscribe", "poll"])
+    def table(self, request: pytest.FixtureRequest, other: Device) -> OpcUaTable:
+        return OpcUaTable(other.url, request.param)
+
     @pytest.fixture(params=["subscribe", "poll"])
     def rig(self, request: pytest.FixtureRequest, device: Device) -> Iterator[OpcUaRig]:
         for place in range(SPARE):

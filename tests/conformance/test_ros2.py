@@ -124,6 +124,15 @@ class TestRos2(WriteConformance):
                 break
         return writer
 
+    def test_a_slow_device(self, run: Run, rig: Ros2Rig) -> None:  # type: ignore[override]
+        """A node that publishes more rarely than the source polls, but often enough, is good."""
+        last = rig.generation(run.until(rig.counted).raw)
+        rig.peer.ask("count", COUNTS, 0.05)
+        for _ in range(3):
+            frame = run.newer(last)
+            assert rig.counted(frame)
+            last = rig.generation(frame.raw)
+
     def test_absent_at_start(self, absent: None, run: Run, rig: Rig) -> None:
         """The source is bad with a reason until there is a node, and then good."""
         assert "no publisher or subscriber of any topic" in run.bad().reason

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import ClassVar
 
 import pytest
 
@@ -12,11 +13,13 @@ from shmio.connectors.s7.connector import S7Connector, S7Options
 from shmio.emulators.emulator import Emulator
 from shmio.emulators.programs import generations
 from shmio.emulators.s7 import Traits
+from shmio.layout.model import Layout
 from shmio.layout.tags import place_tags
 from shmio.model.statuses import BAD_OUT_OF_RANGE, GOOD, StatusArea
 from shmio.segment import Quality, Write
 from shmio.testing.conformance import Run
 from shmio.testing.proxy import FaultProxy
+from shmio.testing.table_conformance import TableConformance, Tags
 from shmio.testing.write_conformance import SPARE, WriteConformance
 from tests.conformance.test_s7 import TAIL, Shared
 from tests.conformance.test_s7 import layout as block
@@ -61,7 +64,49 @@ class TableRig:
         return found[0]
 
 
-class TestS7Table(WriteConformance):
+_BYTES = {
+    "SINT": 1, "INT": 2, "DINT": 4, "LINT": 8, "USINT": 1, "UINT": 2, "UDINT": 4, "ULINT": 8, "BYTE": 1, "WORD": 2,
+    "DWORD": 4, "LWORD": 8, "REAL": 4, "LREAL": 8, "TIME": 4, "STRING[10]": 12,
+}  # fmt: skip
+
+
+class S7Types:
+    """Two blocks and the markers of an emulated PLC, as a tag table names them."""
+
+    unknown: ClassVar[Mapping[str, object]] = {"type": "INT", "address": "DB5.DBW60000"}
+    many: ClassVar[Tags] = {
+        f"v{at}": {"type": "INT", "address": f"DB{5 + at % 2}.DBW{2000 + 10 * at}"} for at in range(400)
+    }
+
+    def __init__(self) -> None:
+        types: dict[str, dict[str, object]] = {
+            "bit": {"type": "BOOL", "address": "%M3.7"},
+            "bits": {"type": "ARRAY[1..19] OF BOOL", "address": "DB5.DBX0.0"},
+            "output": {"type": "WORD", "address": "%QW10"},
+        }
+        at = 10
+        for kind, size in _BYTES.items():
+            name = kind.partition("[")[0].lower()
+            types[name] = {"type": kind, "address": f"DB5.DBX{at}.0" if size > 4 else f"DB5.DB{' BW D'[size]}{at}"}
+            types[f"array of {name}"] = {"type": f"ARRAY[1..3] OF {kind}", "address": f"DB6.DBX{at}.0"}
+            at += 3 * size + 1 & ~1
+        self.types: Tags = types
+        self.device = place_tags("plc", {**types, **self.many})
+        self.address = Address("127.0.0.1", 0)
+
+    def connector(self, layout: Layout) -> Connector:
+        options = S7Options(host=self.address.host, port=self.address.port)
+        return S7Connector.for_layout(layout)(options, layout)
+
+
+class TestS7Table(TableConformance, WriteConformance):
+    @pytest.fixture
+    def table(self) -> Iterator[S7Types]:
+        made = S7Types()
+        with Emulator(made.device, "idle", Address("127.0.0.1", 0)) as plc:
+            made.address = plc.address
+            yield made
+
     @pytest.fixture(params=[pytest.param((400, 960), id="one PDU"), pytest.param((1500, 480), id="several PDUs")])
     def rig(self, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[TableRig]:
         size, pdu_size = request.param
