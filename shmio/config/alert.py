@@ -83,7 +83,7 @@ def parse_webhook(url: str) -> SplitResult:
         raise ConfigError("webhook: write other characters than ASCII, and blanks, percent-encoded")
     if parts.username is not None or parts.password is not None:
         raise ConfigError(
-            "webhook: no user and password in the URL: put a line such as Authorization: Basic … into a file, "
+            "webhook: the URL must not contain a password: put a line such as Authorization: Basic … into a file, "
             "and name it in webhook_header_file"
         )
     if parts.fragment:

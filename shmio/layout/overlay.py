@@ -95,7 +95,7 @@ def _over(layout: Layout, register: Register) -> str:
 def _bits(base: Layout, path: str, over: str, named: Register, whole: Register, dims: Dims) -> Register:
     """Return a BOOL, or a row of them, over bytes."""
     if not dims:
-        raise ValueError(f"type: a BOOL is one bit: name it, such as {shorten(over)}.%X0")
+        raise ValueError(f"type: a BOOL needs the address of a bit, such as {shorten(over)}.%X0")
     if len(dims) > 1 or whole.element.size > 1:
         raise ValueError(f"type: a row of BOOLs lies over bytes and has one dimension; {shorten(over)} is {whole.type}")
     first, count = named.bit or 0, math.prod(shape_of(dims))

@@ -93,7 +93,7 @@ class Declaration:
     def members(self) -> Mapping[str, str] | None:
         """The types of a structure's members, by path within the structure.
 
-        None: it is no structure.
+        None if the declaration is not a structure.
         """
         return members(self.type) if isinstance(self.type, str) else self.type
 

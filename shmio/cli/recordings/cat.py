@@ -377,7 +377,7 @@ class Csv:
         self._begun = False
 
     def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
-        """Format a frame: column ``what`` is frame, ``text`` is the reason."""
+        """Format a frame as a row: the column ``what`` contains ``frame``, ``text`` the reason."""
         values = [""] * len(self._columns)
         if frame.source_ns != 0:
             names = self._names[self._views.index(view)]

@@ -298,7 +298,7 @@ class Store:
             return device.command(named, time.time_ns() // 1_000_000)
 
     def requests(self, now_ns: int) -> list[tuple[str, bytes]]:
-        """Return topics and payloads of the commands that are due to ask nodes for their births."""
+        """Return the topics and payloads of the rebirth requests that are due."""
         if not self.host:
             return []
         with self._changed:

@@ -35,7 +35,7 @@ class BlockImage(Protocol):
 
 
 class ShownImage(NamedTuple):
-    """A :class:`BlockImage` that is not a frame: with writes applied, or of an injection."""
+    """A :class:`BlockImage` that is not a frame, such as an image with applied writes or of an injection."""
 
     number: int
     clock_ns: int

@@ -66,7 +66,7 @@ def test_sound_sections(tmp_path: Path, text: str) -> None:
         (f'{WHEN}webhok = "http://127.0.0.1/"\n', "alert[0].webhok: unknown key; did you mean webhook?"),
         (f'{WHEN}webhook = "pager.lan/x"\n', "alert[0].webhook: expected a URL"),
         (f'{WHEN}webhook = "http://127.0.0.1:99999/"\n', "alert[0].webhook: not a URL"),
-        (f'{WHEN}webhook = "https://u:secret@h.example/"\n', "alert[0].webhook: no user and password in the URL"),
+        (f'{WHEN}webhook = "https://u:secret@h.example/"\n', "alert[0].webhook: the URL must not contain a password"),
         (f'{WHEN}webhook = "http://pager.lan/"\n', "alert[0].webhook: pager.lan would get plain text"),
         (f'{WHEN}webhook = "http://127.0.0.1/"\nwebhook_ca = "ca"\n', "alert[0].webhook_ca: this key is only for"),
         (f'{WHEN}webhook_header_file = "x"\n', "alert[0].webhook_header_file: this key is only for an alert with webh"),

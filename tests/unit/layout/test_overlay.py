@@ -137,7 +137,7 @@ REFUSED = {
     'a = { address = "Inputs/7", type = "REAL" }': "a: type: REAL needs 4 bytes, from Inputs/7 on there are 3",
     'a = { address = "Inputs/7..9", type = "REAL" }': "a: type: REAL needs 4 bytes, Inputs/7..9 has 3",
     'a = { address = "Wide", type = "INT" }': "INT needs 2 bytes, Wide has 4; name a part of it, such as Wide.%W0",
-    'a = { address = "Inputs/7", type = "BOOL" }': "a: type: a BOOL is one bit: name it, such as Inputs/7.%X0",
+    'a = { address = "Inputs/7", type = "BOOL" }': "a: type: a BOOL needs the address of a bit, such as Inputs/7.%X0",
     'a = { address = "Inputs/7.%X0", type = "BYTE" }': "a: type: Inputs/7.%X0 is a BOOL, found BYTE",
     'a = { address = "Inputs/9.%X1", type = "ARRAY[0..7] OF BOOL" }': "8 bits are needed, Inputs/9.%X1 has 7",
     'a = { address = "Wide.%X1", type = "ARRAY[0..7] OF BOOL" }': "a row of BOOLs lies over bytes",
