@@ -243,7 +243,7 @@ class Recordings:
         if self.folder is None:
             return
         folder = self.folder
-        names = sorted((name for name, _, _ in await self.in_thread(lambda: _listed(folder))), reverse=True)
+        names = sorted((name for name, _, _ in await self.in_thread(lambda: _listed(folder))), key=_order, reverse=True)
         for name in [name for name in names if name.startswith(f"{instance}-")][:MAX_OF_RUN]:
             try:
                 opened = await self.open(name, since_s)
@@ -311,6 +311,12 @@ class Recordings:
                     self.release(opened, at_once=True)
             took_s = time.monotonic() - started_s
             self._details[name] = state, time.monotonic() + max(FRESH_S, 20 * took_s), details
+
+
+def _order(name: str) -> tuple[str, int]:
+    """Return a key for the order in which a recorder began files: ``a_2.mem`` follows ``a.mem``."""
+    begin, _, number = name.removesuffix(SUFFIX).rpartition("_")
+    return (begin, int(number)) if begin and number.isdecimal() else (name.removesuffix(SUFFIX), 1)
 
 
 def _serves(opened: Opened, state: _State, since_s: float | None) -> bool:

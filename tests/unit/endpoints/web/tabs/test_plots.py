@@ -24,6 +24,7 @@ from shmio.testing.cell import until
 from tests.unit.endpoints.harness import LAYOUT
 from tests.unit.endpoints.web.harness import TIMEOUT_S, processes, spec
 from tests.unit.endpoints.web.test_page import Pages, pages, said
+from tests.unit.recorder.test_recorder_rotation import series, tend
 
 POSITION = "cell/axis/position"
 
@@ -261,3 +262,24 @@ def test_past_of_another_run_is_not_taken(segment: Segment, instance: str, tmp_p
         with pages(other, recordings=tmp_path) as server, server.open() as browser:
             assert recorded(browser, from_s=0, to_s=9e9) == ([], [])
         other.unlink()
+
+
+def test_past_goes_on_in_the_next_file(segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plots, "RECORDED_S", 0.0)
+    work = series(segment, tmp_path, rotate_mb=0.004, rotate_min=0)
+    writer = segment.writer("cell")
+    for turn in range(60):
+        publish(writer, range(10 * turn, 10 * turn + 10), 10 * turn + 1)
+        work.run_once()
+        tend(work)
+    assert work.close() == []
+    assert len(list(tmp_path.glob("*.mem"))) > 10
+    with pages(segment, recordings=tmp_path) as server, server.open() as browser:
+        follow(server, browser, POSITION)
+        times, (values,), _ = course(browser, 400)
+        found_times, found = recorded(browser, from_s=times[50], to_s=times[350])
+        assert found_times == sorted(found_times)
+        live = dict(zip(times, values, strict=True))
+        assert [live[time] for time in found_times if time in live] == [value for value in found if value >= values[0]]
+        assert {259 + 10 * turn for turn in range(30)} <= set(found)  # the last frame of each turn
+        assert not any(map(math.isnan, found))  # no gap between files
