@@ -197,7 +197,7 @@ class BlockCommands:
             else:
                 wanted = True
             if wanted:
-                self._record(events, self._programs.actor(pid, writer), number, missing)
+                self._record_safely(events, self._programs.actor(pid, writer), number, missing)
 
     @staticmethod
     def _is_whole(events: Sequence[Event]) -> bool:
@@ -210,6 +210,17 @@ class BlockCommands:
             return False
         return True
 
+    def _record_safely(self, events: Sequence[Event], who: Acting, number: int, missing: str) -> None:
+        """Make the entry of a command, even if its events cannot be explained."""
+        try:
+            self._record(events, who, number, missing)
+        except Exception as error:
+            log.exception("a command to %s cannot be explained", self.block.source)
+            self._explainer = None
+            reason = f"the command cannot be explained: {type(error).__name__}"
+            outcome = str(EventKind(events[-1].kind))
+            trail.record("command", {"source": self.block.source}, outcome, reason, who=who, command=number)
+
     def _record(self, events: Sequence[Event], who: Acting, number: int, missing: str) -> None:
         found = [self._explain(event) for event in events]
         last, kind = events[-1], EventKind(events[-1].kind)
@@ -219,10 +230,11 @@ class BlockCommands:
             values |= {place.path: place.plain for place in one.places if place.valued}
         outcome, reason = str(kind), last.text
         if kind is EventKind.INJECTED:
-            laid = next((one.laid for one in reversed(found) if one.laid is not None), None) or {}
-            action, what = ("declare" if "target" in laid else "inject"), {
-                "source": self.block.source, "injection": last.injection, **laid, "paths": list(places)[:MAX_NAMED],
-            }  # fmt: skip
+            definition = next((one.definition for one in reversed(found) if one.definition is not None), None) or {}
+            action = "declare" if "target" in definition else "inject"
+            what = {"source": self.block.source, "injection": last.injection, "name": last.text, **definition}
+            if places:
+                what["paths"] = list(places)[:MAX_NAMED]
             reason = ""
         elif kind in (EventKind.LIFTED, EventKind.NOTED):
             action = "lift" if kind is EventKind.LIFTED else "note"
@@ -233,8 +245,10 @@ class BlockCommands:
             action, what = "write", values
             kind, reason = worst([*ends, (EventKind.UNKNOWN, missing)] if missing else ends)
             outcome = str(kind)
+        elif kind is EventKind.SHADOWED:
+            action, what, reason = "feed", values, ""  # its text is the injection's name
         else:
-            action, what = ("feed" if kind is EventKind.SHADOWED else "write" if last.size else "command"), values
+            action, what = ("write" if last.size else "command"), values
         what = what or {"source": self.block.source}
         trail.record(action, what, outcome, reason, who=who, command=number, event=last.number)
 

@@ -139,6 +139,12 @@ def test_each_way_to_change_something_has_its_entry(cell: Cell, addresses: dict[
     )
     assert re.fullmatch(r"pid [0-9]+ shmio", local["from"])
 
+    with shmio.attach(cell.instance, writable=True) as here, here.inject("cell/Robot_800/Axs2_Pos") as shadow:
+        shadow.set({"cell/Robot_800/Axs2_Pos": 1.5})
+    laid = wait_for(cell, endpoint="local", action="inject", who=UID)
+    assert laid["what"]["paths"] == ["cell/Robot_800/Axs2_Pos"]
+    assert wait_for(cell, endpoint="local", action="lift")["what"]["injection"] == laid["command"]
+
     with shmio.connect(address, token=TOKEN) as remote:
         remote.set({"cell/Outputs/501": 2})
         written = wait_for(cell, endpoint="grpc", action="write")
@@ -151,9 +157,9 @@ def test_each_way_to_change_something_has_its_entry(cell: Cell, addresses: dict[
         with remote.inject("cell/Robot_800/Axs1_Pos") as shadow:
             shadow.set({"cell/Robot_800/Axs1_Pos": 4.5})
             laid = wait_for(cell, who="tester", action="inject", outcome="injected")
-            assert laid["what"]["paths"] == ["Robot_800/Axs1_Pos"]
+            assert laid["what"]["paths"] == ["cell/Robot_800/Axs1_Pos"]
             assert wait_for(cell, who="tester", action="feed")["what"] == {"cell/Robot_800/Axs1_Pos": 4.5}
-        assert wait_for(cell, action="lift")["what"]["injection"] == laid["command"]
+        assert wait_for(cell, endpoint="grpc", action="lift")["what"]["injection"] == laid["command"]
         remote.step(0.02)
         assert wait_for(cell, who="tester", action="step", outcome="done")["what"]["dt_s"] == 0.02
         remote.release()

@@ -123,6 +123,31 @@ def test_the_next_supervisor_goes_on_where_the_last_one_ended(case: Case) -> Non
     assert [entry["reason"] for entry in case.entries(known)] == ["first", "by an endpoint", "second"]
 
 
+def test_injections_and_notes_have_what_they_are_about(case: Case) -> None:
+    event = case.writer.event
+    plain = {"direction": "out", "priority": 3, "keep": False, "ranges": [[2, 2, 0]] * 20}
+    document = json.dumps(plain).encode()
+    for at in range(0, len(document), 256):  # a long definition comes in parts
+        part = document[at : at + 256]
+        event(Record(EventKind.INJECTED, "mine", GUEST, case.number, 0, 1, at, 0, 0, part, case.number))
+    event(Record(EventKind.SHADOWED, "mine", GUEST, case.number + 1, 0, 1, 2, 0, 2, b"\0\5", case.number))
+    event(Record(EventKind.LIFTED, "lifted by a program", GUEST, case.number + 2, injection=case.number))
+    declared = json.dumps({"name": "d", "target": "cell/a", "operation": "freeze"}).encode()
+    event(Record(EventKind.INJECTED, "d", GUEST, case.number + 3, 0, 1, 0, 0, 0, declared, case.number + 3))
+    event(Record(EventKind.NOTED, "hello", GUEST, case.number + 4))
+    injected, fed, lifted, declared_one, noted = case.entries()
+    assert (injected["action"], injected["outcome"]) == ("inject", "injected")
+    assert (
+        injected["what"].items()
+        >= {"injection": case.number, "name": "mine", "priority": 3, "paths": ["cell/b"]}.items()
+    )
+    assert (fed["action"], fed["what"], fed["outcome"]) == ("feed", {"cell/b": 5}, "shadowed")
+    assert fed["reason"] == ""
+    assert (lifted["action"], lifted["what"]) == ("lift", {"source": "cell", "injection": case.number})
+    assert (declared_one["action"], declared_one["what"]["operation"]) == ("declare", "freeze")
+    assert (noted["action"], noted["what"]["note"]) == ("note", "hello")
+
+
 def test_a_restart_of_the_source_ends_its_commands(case: Case) -> None:
     case.accepted(0, 7)
     case.segment.writer("cell")  # publishes STARTED

@@ -354,7 +354,7 @@ class CommandClient:
 
 def _described(block: Block, writes: Sequence[Write], options: InjectionOptions) -> Mapping[str, Any]:
     """Describe an injection for the audit log."""
-    paths = paths_of(block.layout, writes, MAX_NAMED)
+    paths = [f"{block.source}/{path}" for path in paths_of(block.layout, writes, MAX_NAMED)]
     return {
         "source": block.source,
         "paths": paths,
