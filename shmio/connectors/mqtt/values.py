@@ -105,14 +105,14 @@ class Fitting:
                 return truth
         else:
             return self._number(found)
-        raise ValueFaultError(BAD_TYPE_MISMATCH, f"found {_show(found)}, which is no {self._register.type}")
+        raise ValueFaultError(BAD_TYPE_MISMATCH, f"found {_show(found)}, which is not a valid {self._register.type}")
 
     def _number(self, found: Any) -> int | float:
         """Return the value of a numeric register."""
         if isinstance(found, str):
             found = _parse_number(found.strip())
         if isinstance(found, bool) or not isinstance(found, int | float):
-            raise ValueFaultError(BAD_TYPE_MISMATCH, f"found {_show(found)}, which is no number")
+            raise ValueFaultError(BAD_TYPE_MISMATCH, f"found {_show(found)}, which is not a number")
         try:
             if self._base in _REALS:
                 return float(found) if self._scale is None else float(found * self._scale[0] + self._scale[1])
@@ -122,7 +122,7 @@ class Fitting:
             raise ValueFaultError(BAD_OUT_OF_RANGE, f"{_show(found)} does not fit a {self._register.type}") from None
         if isinstance(found, float):
             if not found.is_integer() or abs(found) > _EXACT:
-                raise ValueFaultError(BAD_TYPE_MISMATCH, f"found {_show(found)}, which is no whole number")
+                raise ValueFaultError(BAD_TYPE_MISMATCH, f"found {_show(found)}, which is not a whole number")
             return int(found)
         return found
 
@@ -192,7 +192,7 @@ def decode_json(payload: bytes) -> Any:
     except RecursionError:
         raise ValueFaultError(BAD_DECODING_ERROR, "the JSON is nested too deeply") from None
     except (msgspec.MsgspecError, UnicodeDecodeError, ValueError) as error:
-        raise ValueFaultError(BAD_DECODING_ERROR, f"the payload is no JSON: {printable(str(error))[:100]}") from None
+        raise ValueFaultError(BAD_DECODING_ERROR, f"the payload is not JSON: {printable(str(error))[:100]}") from None
 
 
 def is_number(text: bytes) -> bool:
@@ -210,7 +210,7 @@ def _parse_number(text: str) -> int | float:
         return number
     found = _NO_NUMBER.get(text.casefold())
     if found is None:
-        raise ValueFaultError(BAD_DECODING_ERROR, f"{_show(text)} is no number")
+        raise ValueFaultError(BAD_DECODING_ERROR, f"{_show(text)} is not a number")
     return found
 
 

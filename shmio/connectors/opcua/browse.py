@@ -218,7 +218,7 @@ def _type(value: Sample, data_type: Sample) -> tuple[str, str]:
     base = _TYPES.get(kind)
     if base is None:
         name = decode.NAMES[kind] if 0 < kind < len(decode.NAMES) else ""
-        return "", f"a {name} is no register" if name else "it shows no value, and its type is unknown"
+        return "", f"a {name} cannot be a register" if name else "it has no value, and its type is unknown"
     if dims is None:
         return base, ""
     if not all(dims):

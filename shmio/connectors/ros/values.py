@@ -90,7 +90,7 @@ class Fitting:
         elif isinstance(found, int | float) and not isinstance(found, bool) and self._scale is not None:
             number = found * self._scale[0] + self._scale[1]
             if not math.isfinite(number):
-                raise ValueRangeError(f"{number} is no whole number")
+                raise ValueRangeError(f"{number} is not a whole number")
             return round(number)
         raise FieldError(
             BAD_TYPE_MISMATCH, f"found {type(found).__name__}, which does not fit {_named(self._register)}"

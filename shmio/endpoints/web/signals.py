@@ -278,7 +278,7 @@ def check_plottable(register: Register) -> None:
     if register.dims:
         raise PathError(f"{register.path}: this is an array; plot one element, such as {_first(register)}")
     if kind not in "?biufm":
-        raise PathError(f"{register.path}: {register.type} is no number, so it cannot be plotted")
+        raise PathError(f"{register.path}: {register.type} is not a number, so it cannot be plotted")
 
 
 def _kind(register: Register) -> Any:

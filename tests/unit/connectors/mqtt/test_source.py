@@ -75,7 +75,7 @@ def test_the_reason_is_logged_once(plant: Plant, caplog: pytest.LogCaptureFixtur
         for text in ("one", "two", "three"):
             plant.device.publish("plant/pos", text)
             source.until(lambda: source.code("pos") == statuses.BAD_DECODING_ERROR)
-        assert [record.getMessage() for record in caplog.records] == ["pos: 'one' is no number"]
+        assert [record.getMessage() for record in caplog.records] == ["pos: 'one' is not a number"]
 
 
 def test_the_last_message_of_a_period_wins(plant: Plant) -> None:

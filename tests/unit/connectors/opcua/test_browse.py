@@ -20,7 +20,7 @@ TREE = """\
 Device
   open  BOOL  nsu=http://test/device;s=open  writable
   forces  ARRAY[0..2] OF INT  nsu=http://test/device;s=forces  writable
-  raw  (a ByteString is no register)  nsu=http://test/device;s=raw  writable
+  raw  (a ByteString cannot be a register)  nsu=http://test/device;s=raw  writable
   Axis
     speed/now  REAL  nsu=http://test/device;s=speed/now  mm/s
 """
@@ -68,7 +68,7 @@ def test_a_tag_table_is_a_layout_at_once(server: Device, tmp_path: Path, capsys:
         assert browse(server.url, "-o", file, *options) == 0
         said = capsys.readouterr()
         assert (said.out, said.err) == (
-            "", "imported 3 tags from a device\nskipped 1: a ByteString is no register: Device/raw\n"
+            "", "imported 3 tags from a device\nskipped 1: a ByteString cannot be a register: Device/raw\n"
         )  # fmt: skip
         assert sorted(file.read_text().splitlines()) == sorted(
             TABLE.format(url=server.url, writable=writable).splitlines()
