@@ -10,6 +10,7 @@ import { element, notify, replace, setText } from "./dom.js";
  */
 
 const REFRESH_MS = 400;
+const MOVE_MS = 200; // the least time between two moves of a slider that is dragged
 
 export class ReplayPanel {
   /** @param {Context} context */
@@ -124,6 +125,7 @@ class Replay {
       /** @type {number} */
       const next = this.wanted;
       await this.change({ seek: String(next) });
+      await new Promise((done) => setTimeout(done, MOVE_MS));
       if (this.wanted === next) this.wanted = null;
     }
     this.moving = false;
