@@ -17,7 +17,7 @@ from collections.abc import Callable
 from common import tell, wait_for_parent
 
 from shmio.config.address import Address
-from shmio.emulators.s7 import MAX_PDU_SIZE, S7Server, Traits
+from shmio.emulators.s7 import MAX_PDU_SIZE, S7Server, ServerOptions
 
 NUMBER = 201
 SIZE = 2180
@@ -44,7 +44,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=SIZE, help="size of the block, in bytes")
     parser.add_argument("--stamp-ms", type=float)
     arguments = parser.parse_args()
-    server = S7Server(Address("127.0.0.1", 0), traits=Traits(arguments.pdu, arguments.jobs))
+    server = S7Server(Address("127.0.0.1", 0), options=ServerOptions(arguments.pdu, arguments.jobs))
     block = bytearray(still_block(arguments.size))
     server.add_block(NUMBER, block)
     server.start()

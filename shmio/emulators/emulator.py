@@ -12,7 +12,7 @@ from shmio.config.address import Address
 from shmio.emulators.areas import AREAS, Place, TableMemory, is_table, place_name
 from shmio.emulators.cycle import Cycle
 from shmio.emulators.programs import Idle, program
-from shmio.emulators.s7 import S7Server, Traits
+from shmio.emulators.s7 import S7Server, ServerOptions
 from shmio.errors import ConfigError
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
@@ -37,7 +37,7 @@ class Emulator:
         db_number: int | None = None,
         others: Sequence[Layout] = (),
         max_clients: int = 16,
-        traits: Traits | None = None,
+        options: ServerOptions | None = None,
     ) -> None:
         """Prepare the emulator.
 
@@ -48,7 +48,7 @@ class Emulator:
             db_number: The block's number; default: the layout's own.
             others: Blocks without a program, served under their own numbers, and tag tables.
             max_clients: Maximum number of clients at a time.
-            traits: Limits and faults of the server.
+            options: Limits and faults of the server.
 
         Raises:
             ConfigError: There is no such program, the layout does not suit it, a number is missing
@@ -56,7 +56,7 @@ class Emulator:
 
         """
         self._program = program(program_name, layout)
-        self._server = S7Server(listen, max_clients=max_clients, traits=traits)
+        self._server = S7Server(listen, max_clients=max_clients, options=options)
         self._memory: dict[Place, bytearray] = {}
         self._table = TableMemory(layout) if is_table(layout) else None
         self._frame = bytearray(layout.size) if self._table else self._serve(layout, db_number)

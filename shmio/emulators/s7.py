@@ -125,7 +125,7 @@ class Fault(Enum):
 
 
 @dataclass(frozen=True)
-class Traits:
+class ServerOptions:
     """Differences between an emulated controller and a permissive S7-1500."""
 
     max_pdu_size: int = MAX_PDU_SIZE
@@ -165,9 +165,9 @@ class Memory:
         self.lock = threading.Lock()
 
     @staticmethod
-    def size_of(block: bytearray, traits: Traits) -> int:
+    def size_of(block: bytearray, options: ServerOptions) -> int:
         """Return the length of a data block in bytes, as a client sees it."""
-        return len(block) if traits.block_size is None else min(traits.block_size, len(block))
+        return len(block) if options.block_size is None else min(options.block_size, len(block))
 
 
 class Jobs:
@@ -178,9 +178,9 @@ class Jobs:
     the PDU, fails with a header error.
     """
 
-    def __init__(self, memory: Memory, traits: Traits) -> None:
+    def __init__(self, memory: Memory, options: ServerOptions) -> None:
         self._memory = memory
-        self._traits = traits
+        self._options = options
         self.pdu_size = 0  # before the set-up, every job is too large
 
     def answer(self, pdu: memoryview) -> bytes | None:
@@ -194,7 +194,7 @@ class Jobs:
         longest = MAX_PDU_SIZE if function == _SETUP else self.pdu_size
         if len(pdu) != 10 + parameter_size + data_size or parameter_size < 2 or len(pdu) > longest:
             return _refusal(reference, _BAD_JOB)
-        if function != _SETUP and self._traits.fault is Fault.PUT_GET_OFF:
+        if function != _SETUP and self._options.fault is Fault.PUT_GET_OFF:
             return _refusal(reference, _NOT_AVAILABLE)
         parameters, data = pdu[10 : 10 + parameter_size], pdu[10 + parameter_size :]
         try:
@@ -210,8 +210,8 @@ class Jobs:
         if len(parameters) != 8:
             raise _MalformedJobError
         calling, called, pdu_size = struct.unpack_from(">HHH", parameters, 2)
-        self.pdu_size = min(pdu_size, self._traits.max_pdu_size)
-        jobs = self._traits.max_jobs
+        self.pdu_size = min(pdu_size, self._options.max_pdu_size)
+        jobs = self._options.max_jobs
         granted = struct.pack(">BxHHH", _SETUP, min(calling, jobs), min(called, jobs), self.pdu_size)
         return _acknowledgement(reference, granted)
 
@@ -242,7 +242,7 @@ class Jobs:
         if not parameters[1] or len(parameters) != 2 + _ITEM.size * parameters[1]:
             raise _MalformedJobError
         items = [self._item(_ITEM.unpack_from(parameters, at)) for at in range(2, len(parameters), _ITEM.size)]
-        if self._traits.fault in denials:
+        if self._options.fault in denials:
             return [_Item(_DENIED, bytearray(), 0, 0, 0, item.type) for item in items]
         return items
 
@@ -270,7 +270,7 @@ class Jobs:
     def _size(self, kind: S7Area | None, area: bytearray) -> int:
         if kind is not S7Area.DB:
             return len(area)
-        return 0 if self._traits.fault is Fault.OPTIMIZED else self._memory.size_of(area, self._traits)
+        return 0 if self._options.fault is Fault.OPTIMIZED else self._memory.size_of(area, self._options)
 
 
 def _refusal(reference: int, error: int) -> bytes:
@@ -373,9 +373,9 @@ class S7Server(Server):
     Each job takes ``lock``. Take it to change a block between two jobs.
     """
 
-    def __init__(self, address: Address, *, max_clients: int = 16, traits: Traits | None = None) -> None:
+    def __init__(self, address: Address, *, max_clients: int = 16, options: ServerOptions | None = None) -> None:
         super().__init__(log=False, max_clients=max_clients)
-        self._traits = traits or Traits()
+        self._options = options or ServerOptions()
         self.host, self.port = address.host, address.port
         self._memory = Memory(self.memory_areas)
         self.lock = self._memory.lock
@@ -543,7 +543,7 @@ class S7Server(Server):
             return
         client.setblocking(True)  # only sends time out, so a silent client may stay
         client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("@ll", _SEND_TIMEOUT_S, 0))
-        jobs, parts = Jobs(self._memory, self._traits), _Parts()
+        jobs, parts = Jobs(self._memory, self._options), _Parts()
         inbox = memoryview(bytearray(_INBOX_SIZE))
         end = 0
         while received := client.recv_into(inbox[end:]):
@@ -619,15 +619,15 @@ class S7Server(Server):
         userdata_params: dict[str, Any],
         client_address: tuple[str, int],  # noqa: ARG002
     ) -> bytes:
-        """Tell a block's length as the traits have it, and a checksum of the data as they were loaded."""
+        """Tell a block's length as the options say, and a checksum of the data as they were loaded."""
         asked = request.get("data", {}).get("data", b"")
         digits = bytes(asked[2:7])
         number = int(digits) if digits.isdigit() else 0
         area = self.memory_areas.get((S7Area.DB, number))
-        if bytes(asked[:2]) != b"0A" or area is None or self._traits.fault is Fault.OPTIMIZED:
+        if bytes(asked[:2]) != b"0A" or area is None or self._options.fault is Fault.OPTIMIZED:
             error: bytes = self._build_userdata_error_response(request, _NO_SUCH_OBJECT << 8)
             return error
-        size = self._memory.size_of(area, self._traits)
+        size = self._memory.size_of(area, self._options)
         checksum = self._checksums.get(number, 0)
         head = struct.pack(">2s9sBHI16x", b"0A", b"", 0x0A, number, size + _BLOCK_HEAD)
         info = head + struct.pack(">6xH8s8s8sBxH8x", size & 0xFFFF, b"shmio", b"", b"", 1, checksum)

@@ -243,7 +243,7 @@ class All(Outer):
             operand.finish(end_ns)
 
     def decided_ns(self) -> int | None:
-        """Return the first moment at which a part is false; the last moment if all are true."""
+        """Return the first moment at which a part is false, or the last moment if all parts are true."""
         false = [operand.decided_ns() for operand in self._operands if operand.high < 0]
         moments = [moment for moment in false or [one.decided_ns() for one in self._operands] if moment is not None]
         if not moments:

@@ -16,7 +16,7 @@ from shmio.connectors.base import Connector
 from shmio.connectors.s7.connector import S7Connector, S7Options
 from shmio.emulators.emulator import Emulator
 from shmio.emulators.programs import Counter, generations
-from shmio.emulators.s7 import Traits
+from shmio.emulators.s7 import ServerOptions
 from shmio.layout.model import Layout, Register
 from shmio.segment import EventKind, Quality, Write
 from shmio.testing.conformance import Run
@@ -83,16 +83,16 @@ def layout(size: int) -> Layout:
 class TestS7(WriteConformance):
     @pytest.fixture(
         params=[
-            pytest.param((400, Traits(), 0.0), id="one PDU"),
-            pytest.param((2180, Traits(), 0.0), id="several PDUs"),
-            pytest.param((2180, Traits(max_pdu_size=480, max_jobs=24), 0.004), id="several cycles"),
+            pytest.param((400, ServerOptions(), 0.0), id="one PDU"),
+            pytest.param((2180, ServerOptions(), 0.0), id="several PDUs"),
+            pytest.param((2180, ServerOptions(max_pdu_size=480, max_jobs=24), 0.004), id="several cycles"),
         ]
     )
     def rig(self, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[S7Rig]:
-        size, traits, delay_s = request.param
+        size, options, delay_s = request.param
         monkeypatch.setattr("shmio.emulators.programs.PROGRAMS", {"shared": Shared})
         with (
-            Emulator(layout(size), "shared", Address("127.0.0.1", 0), traits=traits) as plc,
+            Emulator(layout(size), "shared", Address("127.0.0.1", 0), options=options) as plc,
             FaultProxy(plc.address, up_s=delay_s, down_s=delay_s) as proxy,
         ):
             yield S7Rig(proxy, plc, size)

@@ -12,7 +12,7 @@ from shmio.connectors.base import Connector
 from shmio.connectors.s7.connector import S7Connector, S7Options
 from shmio.emulators.emulator import Emulator
 from shmio.emulators.programs import generations
-from shmio.emulators.s7 import Traits
+from shmio.emulators.s7 import ServerOptions
 from shmio.layout.model import Layout
 from shmio.layout.tags import place_tags
 from shmio.model.statuses import BAD_OUT_OF_RANGE, GOOD, StatusArea
@@ -111,9 +111,9 @@ class TestS7Table(TableConformance, WriteConformance):
     def rig(self, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[TableRig]:
         size, pdu_size = request.param
         monkeypatch.setattr("shmio.emulators.programs.PROGRAMS", {"shared": Shared})
-        traits = Traits(max_pdu_size=pdu_size)
+        options = ServerOptions(max_pdu_size=pdu_size)
         with (
-            Emulator(block(size), "shared", Address("127.0.0.1", 0), traits=traits) as plc,
+            Emulator(block(size), "shared", Address("127.0.0.1", 0), options=options) as plc,
             FaultProxy(plc.address) as proxy,
         ):
             yield TableRig(proxy, plc, size)

@@ -126,7 +126,7 @@ def _message(store: Store, options: MqttOptions, draft: _Draft) -> Publication:
     target = draft.target
     if isinstance(target, Metric):
         topic, payload = store.command(
-            {index: store.fittings[index].to_value(value) for index, value in draft.values.items()}
+            {index: store.converters[index].to_value(value) for index, value in draft.values.items()}
         )
         return Publication(topic, payload, 0, retain=False)  # as the specification demands
     document: Any = None
@@ -138,9 +138,9 @@ def _message(store: Store, options: MqttOptions, draft: _Draft) -> Publication:
         assert isinstance(place, Place)  # noqa: S101 - as all of a draft
         try:
             if place.steps is None:
-                payload = store.fittings[index].to_text(value)
+                payload = store.converters[index].to_text(value)
             else:
-                document = json_path.assign(document, place.steps, store.fittings[index].to_json(value))
+                document = json_path.assign(document, place.steps, store.converters[index].to_json(value))
         except ValueError as error:
             raise ValueError(f"{store.layout.registers[index].path}: {error}") from None
     if target.steps is not None:

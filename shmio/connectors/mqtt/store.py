@@ -15,7 +15,7 @@ from shmio.connectors.mqtt.json_path import Steps
 from shmio.connectors.mqtt.options import MqttOptions
 from shmio.connectors.mqtt.sparkplug import Device, Host
 from shmio.connectors.mqtt.topic import Message, Origin, Topic
-from shmio.connectors.mqtt.values import Fitting, decode_json
+from shmio.connectors.mqtt.values import ValueConverter, decode_json
 from shmio.connectors.mqtt.watch import Watch
 from shmio.connectors.register_image import RegisterImage
 from shmio.connectors.request_count import counted
@@ -93,7 +93,7 @@ class Store:
         self._changed = threading.Condition()
         """Locks all attributes below, and is notified of each message."""
         self.addresses: list[Address] = []
-        self.fittings: list[Fitting] = []
+        self.converters: list[ValueConverter] = []
         self.host = Host(max_bytes=options.max_payload_bytes)
         """The Sparkplug nodes."""
         self._topics: dict[str, Topic] = {}
@@ -120,7 +120,7 @@ class Store:
         register = self.layout.registers[index]
         try:
             address = parse(register.address)
-            self.fittings.append(Fitting(register, self._options.texts))
+            self.converters.append(ValueConverter(register, self._options.texts))
             for place in (address.source, address.target):
                 if register.dims and isinstance(place, Place) and place.steps is None:
                     raise ValueError(f"an array is read from JSON: write {place.topic} $, or a path such as $.values")
@@ -239,9 +239,9 @@ class Store:
 
         """
         found = origin.find(index)
-        fitting = self.fittings[index]
+        converter = self.converters[index]
         try:
-            value = fitting.from_text(found.value) if found.text else fitting.from_json(found.value)
+            value = converter.from_text(found.value) if found.text else converter.from_json(found.value)
         except ValueFaultError as error:
             error.source_ns = found.source_ns
             raise

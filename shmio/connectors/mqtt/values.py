@@ -34,7 +34,7 @@ SHOWN: Final = 40
 """Largest number of characters that a message shows of a wrong value."""
 
 
-class Fitting:
+class ValueConverter:
     """Converts between values in messages and the values of one register."""
 
     def __init__(self, register: Register, texts: Sequence[str] = ("false", "true")) -> None:

@@ -21,7 +21,7 @@ from shmio.connectors.base import Connector, Lost, WriteLostError
 from shmio.connectors.browsing import Browsed, Wanted
 from shmio.connectors.opcua.decode import Sample
 from shmio.connectors.opcua.options import Credentials, OpcUaOptions
-from shmio.connectors.opcua.values import Fitting, MismatchError
+from shmio.connectors.opcua.values import MismatchError, ValueConverter
 from shmio.connectors.register_image import RegisterImage
 from shmio.connectors.request_count import CycleRequests, Requests, counted
 from shmio.errors import ConfigError, ConnectorError, ValueRangeError
@@ -83,7 +83,7 @@ class OpcUaConnector(Connector):
             )
         self._options, self._layout = options, layout
         self._addresses = [_address(options, layout, register) for register in layout.registers]
-        self._fittings = [Fitting(register) for register in layout.registers]
+        self._converters = [ValueConverter(register) for register in layout.registers]
         self._credentials = _credentials(options)
         self._image = RegisterImage(layout) if layout.status_offset is not None else None
         self._lock = threading.Lock()  # of the image, and of what is known of its values
@@ -208,7 +208,7 @@ class OpcUaConnector(Connector):
             return
         item.last = self._latest[index] = sample
         try:
-            image.put(index, self._fittings[index].value(sample), sample.source_ns, sample.code)
+            image.put(index, self._converters[index].value(sample), sample.source_ns, sample.code)
         except MismatchError as error:
             image.fail(index, BAD_TYPE_MISMATCH, sample.source_ns)
             self._report(index, f"{error}: correct its type in the layout")
@@ -309,14 +309,14 @@ class OpcUaConnector(Connector):
             if item.node is None:
                 raise ValueError(f"{register.path}: the server does not know its node")
             value = codec(register, layout.byte_order).decode(image)
-            like, fitting = self._latest.get(index), self._fittings[index]
+            like, converter = self._latest.get(index), self._converters[index]
             try:
                 if share == wanted:
-                    yield _NodeWrite(number, item, None, fitting.sample(value, like))
+                    yield _NodeWrite(number, item, None, converter.sample(value, like))
                     continue
                 first, count = _elements(register, share)
                 flat: Any = value
-                sample = fitting.elements(flat[first : first + count], like)
+                sample = converter.elements(flat[first : first + count], like)
             except ValueError as error:
                 raise ValueError(f"{register.path}: {error}") from None
             last = first + count - 1

@@ -46,7 +46,7 @@ class MismatchError(ValueError):
     """The type of a node does not fit its register."""
 
 
-class Fitting:
+class ValueConverter:
     """Converts between the values of a node and those of its register."""
 
     def __init__(self, register: Register) -> None:

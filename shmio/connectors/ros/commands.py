@@ -130,7 +130,7 @@ def _touched(topics: Topics, write: Write, open_drafts: Mapping[str, Publication
     """
     for index, value in written_registers(topics.layout, write, lambda index: _present(topics, index, open_drafts)):
         topic = topics.by_name[topics.addresses[index].topic]
-        if not topic.writable or topics.fittings[index].kind is None:
+        if not topic.writable or topics.converters[index].kind is None:
             path = topics.layout.registers[index].path
             raise ValueError(f"{path}: to publish on {topic.name}, set `writable = true` in the tag table")
         yield index, value
@@ -148,7 +148,7 @@ def _present(topics: Topics, index: int, open_drafts: Mapping[str, Publication])
     if draft is not None and index in draft.values:
         return draft.values[index]
     try:
-        return topics.fittings[index].value(extract(topic.message, topics.addresses[index]))
+        return topics.converters[index].value(extract(topic.message, topics.addresses[index]))
     except FieldError as error:
         raise ValueRangeError(str(error)) from None
 
@@ -168,7 +168,7 @@ def _message(topics: Topics, draft: Publication, base: Any) -> Any:
     for index in topic.registers:
         if index in draft.values:
             try:
-                fields[index] = topics.fittings[index].field(draft.values[index])
+                fields[index] = topics.converters[index].field(draft.values[index])
             except ValueError as error:
                 raise ValueError(f"{layout.registers[index].path}: {error}") from None
     missing = [layout.registers[index].path for index in topic.registers if index not in fields]

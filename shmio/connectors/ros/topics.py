@@ -10,7 +10,7 @@ from shmio.connectors.register_image import RegisterImage
 from shmio.connectors.ros.addresses import Address, FieldError, extract, leaf_type, parse
 from shmio.connectors.ros.messages import plain
 from shmio.connectors.ros.options import TopicOptions
-from shmio.connectors.ros.values import Fitting
+from shmio.connectors.ros.values import ValueConverter
 from shmio.errors import ConfigError, ConnectorError, ValueRangeError
 from shmio.layout.model import Layout
 from shmio.model.statuses import (
@@ -74,7 +74,7 @@ class Topics:
         self.layout = layout
         self.by_name: dict[str, Topic] = {}
         self.addresses: list[Address] = []
-        self.fittings: list[Fitting] = []
+        self.converters: list[ValueConverter] = []
         self._max_age_ns = options.max_age * 1_000_000
         self._stamps = options.time == "stamp"
         self._image = RegisterImage(layout) if layout.status_offset is not None else None
@@ -104,7 +104,7 @@ class Topics:
                 raise ValueError(
                     f"another register gives {topic.name} the message type {topic.type}, not {address.type}"
                 )
-            self.fittings.append(Fitting(register, kind))
+            self.converters.append(ValueConverter(register, kind))
         except ValueError as error:
             raise ConfigError(f"layout: {register.path}: {error}") from None
         self.addresses.append(address)
@@ -165,7 +165,7 @@ class Topics:
         source_ns = self._source_ns(topic)
         for index in topic.registers:
             try:
-                image.put(index, self.fittings[index].value(extract(topic.message, self.addresses[index])), source_ns)
+                image.put(index, self.converters[index].value(extract(topic.message, self.addresses[index])), source_ns)
             except FieldError as error:
                 image.fail(index, error.code, source_ns)
                 self.report(index, str(error))

@@ -19,7 +19,7 @@ _TEXTS: Final = frozenset({"STRING", "WSTRING"})
 _FLOAT32_MAX: Final = 3.4028234663852886e38
 
 
-class Fitting:
+class ValueConverter:
     """Converts between the values of a field and those of its register."""
 
     def __init__(self, register: Register, kind: str | None) -> None:

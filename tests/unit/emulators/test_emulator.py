@@ -14,7 +14,7 @@ from shmio.config.address import Address
 from shmio.connectors.s7 import S7Client, S7Options
 from shmio.emulators.emulator import Emulator
 from shmio.emulators.programs import generations
-from shmio.emulators.s7 import Traits
+from shmio.emulators.s7 import ServerOptions
 from shmio.errors import ConfigError, EndpointError
 from shmio.layout.model import Layout
 from shmio.layout.values.write import Write
@@ -149,7 +149,7 @@ def test_a_failing_program_is_reported(db201: Layout, monkeypatch: pytest.Monkey
 def test_traits_reach_the_client_and_commands_reach_the_program(db201: Layout) -> None:
     """A client commands a hold: the cell stops all motion, and reports it."""
     with (
-        Emulator(db201, "a50", LOOPBACK, traits=Traits(max_pdu_size=480, max_jobs=10)) as emulator,
+        Emulator(db201, "a50", LOOPBACK, options=ServerOptions(max_pdu_size=480, max_jobs=10)) as emulator,
         closing(client_of(emulator)) as client,
     ):
         client.connect()

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from snap7.datatypes import S7Area
 
-from shmio.emulators.s7 import Fault, Jobs, Memory, Traits
+from shmio.emulators.s7 import Fault, Jobs, Memory, ServerOptions
 
 BIT, BYTE, CHAR, WORD, INT, DWORD, DINT, REAL = range(1, 9)
 DB = 0x84
@@ -46,7 +46,7 @@ def block() -> bytearray:
 
 @pytest.fixture
 def jobs(block: bytearray) -> Jobs:
-    jobs = Jobs(Memory({(S7Area.DB, 1): block, (S7Area.MK, 0): bytearray(b"flags")}), Traits())
+    jobs = Jobs(Memory({(S7Area.DB, 1): block, (S7Area.MK, 0): bytearray(b"flags")}), ServerOptions())
     assert jobs.answer(SETUP) == bytes.fromhex("32 03 0000 1234 0008 0000 0000 f0 00 0008 0008 03c0")
     return jobs
 
@@ -69,7 +69,7 @@ def error(answer: bytes | None) -> int:
 
 
 def test_grants_no_more_than_asked() -> None:
-    jobs = Jobs(Memory({}), Traits())
+    jobs = Jobs(Memory({}), ServerOptions())
     answer = jobs.answer(job(struct.pack(">BxHHH", 0xF0, 1, 2, 240)))
     assert answer is not None
     assert answer[14:] == struct.pack(">HHH", 1, 2, 240)
@@ -117,7 +117,7 @@ def test_reads_to_the_last_byte_and_not_past_it(jobs: Jobs) -> None:
 
 
 def test_answer_must_fit_the_pdu(block: bytearray) -> None:
-    jobs = Jobs(Memory({(S7Area.DB, 1): block}), Traits())
+    jobs = Jobs(Memory({(S7Area.DB, 1): block}), ServerOptions())
     assert error(jobs.answer(read(item(BYTE, 1, 0)))) == 0x8500  # before set-up
     jobs.answer(job(struct.pack(">BxHHH", 0xF0, 1, 1, 100)))
     assert len(payload(jobs.answer(read(item(BYTE, 82, 0))))) == 86
@@ -127,7 +127,7 @@ def test_answer_must_fit_the_pdu(block: bytearray) -> None:
 
 def test_a_job_must_fit_the_pdu_too(block: bytearray) -> None:
     before = bytes(block)
-    jobs = Jobs(Memory({(S7Area.DB, 1): block}), Traits())
+    jobs = Jobs(Memory({(S7Area.DB, 1): block}), ServerOptions())
     assert error(jobs.answer(write((item(BYTE, 1, 0), 4, b"x")))) == 0x8500  # before set-up
     jobs.answer(job(struct.pack(">BxHHH", 0xF0, 1, 1, 100)))
     assert error(jobs.answer(write((item(BYTE, 73, 0), 4, bytes(73))))) == 0x8500
@@ -138,7 +138,7 @@ def test_a_job_must_fit_the_pdu_too(block: bytearray) -> None:
 
 @pytest.mark.parametrize("size", [0, 65535])
 def test_any_pdu_size_may_be_requested(block: bytearray, size: int) -> None:
-    jobs = Jobs(Memory({(S7Area.DB, 1): block}), Traits())
+    jobs = Jobs(Memory({(S7Area.DB, 1): block}), ServerOptions())
     answer = jobs.answer(job(struct.pack(">BxHHH", 0xF0, 0, 65535, size)))
     assert answer is not None
     assert answer[14:] == struct.pack(">HHH", 0, 8, min(size, 960))
@@ -208,28 +208,28 @@ def test_jobs_of_other_functions_are_not_handled(jobs: Jobs) -> None:
     assert jobs.answer(memoryview(b"\x72" + bytes(SETUP)[1:])) is None
 
 
-# -- traits ------------------------------------------------------------------------------------------------------------
+# -- options -----------------------------------------------------------------------------------------------------------
 
 
-def jobs_of(block: bytearray, traits: Traits) -> Jobs:
-    jobs = Jobs(Memory({(S7Area.DB, 1): block, (S7Area.MK, 0): bytearray(b"flags")}), traits)
+def jobs_of(block: bytearray, options: ServerOptions) -> Jobs:
+    jobs = Jobs(Memory({(S7Area.DB, 1): block, (S7Area.MK, 0): bytearray(b"flags")}), options)
     jobs.answer(SETUP)
     return jobs
 
 
 def test_grants_the_configured_size_and_jobs(block: bytearray) -> None:
-    jobs = Jobs(Memory({}), Traits(max_pdu_size=480, max_jobs=19))
+    jobs = Jobs(Memory({}), ServerOptions(max_pdu_size=480, max_jobs=19))
     answer = jobs.answer(SETUP)
     assert answer is not None
     assert answer[14:] == struct.pack(">HHH", 19, 19, 480)
-    assert len(payload(jobs_of(block, Traits(max_pdu_size=100)).answer(read(item(BYTE, 82, 0))))) == 86
-    assert error(jobs_of(block, Traits(max_pdu_size=100)).answer(read(item(BYTE, 83, 0)))) == 0x8500
+    assert len(payload(jobs_of(block, ServerOptions(max_pdu_size=100)).answer(read(item(BYTE, 82, 0))))) == 86
+    assert error(jobs_of(block, ServerOptions(max_pdu_size=100)).answer(read(item(BYTE, 83, 0)))) == 0x8500
 
 
 @pytest.mark.parametrize("wrong", [{"max_pdu_size": 99}, {"max_pdu_size": 961}, {"max_jobs": 0}, {"max_jobs": 33}])
 def test_refuses_traits_out_of_bounds(wrong: dict[str, int]) -> None:
     with pytest.raises(ValueError, match="a PDU has 100 to 960 bytes"):
-        Traits(**wrong)  # type: ignore[arg-type]
+        ServerOptions(**wrong)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -241,7 +241,7 @@ def test_refuses_traits_out_of_bounds(wrong: dict[str, int]) -> None:
     ],
 )
 def test_faults_of_items(block: bytearray, fault: Fault, reading: str, writing: str) -> None:
-    jobs = jobs_of(block, Traits(fault=fault))
+    jobs = jobs_of(block, ServerOptions(fault=fault))
     assert payload(jobs.answer(read(item(BYTE, 1, 5)))) == bytes.fromhex(reading)
     assert payload(jobs.answer(write((item(BYTE, 1, 5), 4, b"x")))) == bytes.fromhex(writing)
     assert payload(jobs.answer(write((item(BIT, 1, 5, bit=1), 3, b"\1")))) == bytes.fromhex(writing)
@@ -249,19 +249,19 @@ def test_faults_of_items(block: bytearray, fault: Fault, reading: str, writing: 
 
 
 def test_put_get_off_refuses_every_job_but_the_set_up(block: bytearray) -> None:
-    jobs = jobs_of(block, Traits(fault=Fault.PUT_GET_OFF))
+    jobs = jobs_of(block, ServerOptions(fault=Fault.PUT_GET_OFF))
     assert error(jobs.answer(read(item(BYTE, 1, 5)))) == 0x8104
     assert error(jobs.answer(write((item(BYTE, 1, 5), 4, b"x")))) == 0x8104
     assert block == bytes(range(200))
 
 
 def test_only_data_blocks_are_optimized(block: bytearray) -> None:
-    jobs = jobs_of(block, Traits(fault=Fault.OPTIMIZED))
+    jobs = jobs_of(block, ServerOptions(fault=Fault.OPTIMIZED))
     assert payload(jobs.answer(read(item(BYTE, 5, 0, number=0, area=0x83)))) == bytes.fromhex("ff 04 0028") + b"flags"
 
 
 def test_block_shorter_than_its_memory(block: bytearray) -> None:
-    jobs = jobs_of(block, Traits(block_size=100))
+    jobs = jobs_of(block, ServerOptions(block_size=100))
     assert payload(jobs.answer(read(item(BYTE, 1, 99)))) == bytes.fromhex("ff 04 0008 63")
     assert payload(jobs.answer(read(item(BYTE, 2, 99)))) == bytes.fromhex("05 00 0000")
     assert payload(jobs.answer(write((item(BYTE, 1, 100), 4, b"x"), (item(BYTE, 1, 99), 4, b"x")))) == b"\x05\xff"
@@ -281,11 +281,11 @@ VALID = [bytes(frame) for frame in (SETUP, read(item(BYTE, 9, 3)), write((item(B
         st.integers(0, 255),
         st.binary(max_size=4),
     ),
-    st.builds(Traits, fault=st.none() | st.sampled_from(Fault), block_size=st.none() | st.integers(0, 200)),
+    st.builds(ServerOptions, fault=st.none() | st.sampled_from(Fault), block_size=st.none() | st.integers(0, 200)),
 )
-def test_noise_gives_an_answer_or_none(noise: bytes, traits: Traits) -> None:
+def test_noise_gives_an_answer_or_none(noise: bytes, options: ServerOptions) -> None:
     block = bytearray(100)
-    jobs = Jobs(Memory({(S7Area.DB, 1): block}), traits)
+    jobs = Jobs(Memory({(S7Area.DB, 1): block}), options)
     jobs.answer(SETUP)
     answer = jobs.answer(memoryview(noise))
     assert answer is None or 12 <= len(answer) <= 960

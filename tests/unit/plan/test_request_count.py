@@ -15,7 +15,7 @@ from shmio.connectors import registry
 from shmio.connectors.base import Connector
 from shmio.connectors.request_count import CycleRequests, Requests
 from shmio.connectors.s7.request_count import PDU_SIZES
-from shmio.emulators.s7 import S7Server, Traits
+from shmio.emulators.s7 import S7Server, ServerOptions
 from shmio.layout.compiler import Source as SourceFile
 from shmio.layout.compiler import compile_sources
 from shmio.layout.model import Layout
@@ -92,7 +92,7 @@ def test_a_controller_gets_as_many_requests_as_check_says(layout: Layout, pdu_si
             reads.append(frame)
         return frame
 
-    with S7Server(Address("127.0.0.1", 0), traits=Traits(max_pdu_size=pdu_size, max_jobs=1)) as server:
+    with S7Server(Address("127.0.0.1", 0), options=ServerOptions(max_pdu_size=pdu_size, max_jobs=1)) as server:
         for number in (5, 6):
             server.add_block(number, bytearray(5000))
         for area in (SrvArea.PE, SrvArea.PA):

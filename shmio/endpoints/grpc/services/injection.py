@@ -50,7 +50,7 @@ Leave = Callable[[], None]
 """Function that ends a subscription."""
 
 
-class _Tap:
+class _ImageStream:
     """The listeners to one direction of an injection. A value is encoded once for all of them."""
 
     def __init__(self) -> None:
@@ -111,7 +111,7 @@ class Injection(InjectionFollower):
         self._given_image = bytearray(self._base.given)
         self._scan = ChangeScan(shape.registers, feed.block.statuses)
         self._subjects: dict[Subject, None] = {}
-        self._diverted, self._given = _Tap(), _Tap()
+        self._diverted, self._given = _ImageStream(), _ImageStream()
         self._creating = asyncio.get_running_loop().create_task(self._create(name))
         self._creating.add_done_callback(lambda task: task.cancelled() or task.exception())  # see created()
         self._lifting: asyncio.Task[None] | None = None

@@ -36,7 +36,7 @@ from shmio.layout.topic import shorten
 
 STABLE_S: Final = 5.0
 """A connection that has lasted this long, in s, resets the back-off."""
-MOST_TOLD: Final = 300
+MAX_REASON_LENGTH: Final = 300
 """Maximum length of the text with the problems of all brokers, in characters."""
 SUBSCRIBE_S: Final = CONNECT_S
 """Time limit for the broker's SUBACK to the subscription to commands, in s."""
@@ -380,7 +380,7 @@ class BrokerConnection:
         # The status shows the last problem of each broker, because all are tried in turn.
         self._problem_of[self._target] = problem
         self.problems.report(
-            shorten("; ".join(self._problem_of[one] for one in sorted(self._problem_of, key=str)), MOST_TOLD)
+            shorten("; ".join(self._problem_of[one] for one in sorted(self._problem_of, key=str)), MAX_REASON_LENGTH)
         )
         self._retry_s = time.monotonic() + self._policy.wait_s()
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from shmio.connectors.opcua.decode import NAMES, Extension, Sample
-from shmio.connectors.opcua.values import Fitting, MismatchError
+from shmio.connectors.opcua.values import MismatchError, ValueConverter
 from shmio.connectors.register_image import RegisterImage
 from shmio.layout.tags import place_tags
 
@@ -36,7 +36,7 @@ def test_a_value_fits_or_is_refused(element: str) -> None:
     assert VALUES.keys() >= set(range(len(NAMES)))
     for kind in (element, f"ARRAY[0..2] OF {element}", f"ARRAY[0..1, 0..1] OF {element}"):
         layout = place_tags("device", {"it": {"type": kind, "address": "i=1"}}).with_statuses()
-        image, fitting = RegisterImage(layout), Fitting(layout.registers[0])
+        image, converter = RegisterImage(layout), ValueConverter(layout.registers[0])
         for number, values in VALUES.items():
             for value in values:
                 for found, dims in (
@@ -44,5 +44,5 @@ def test_a_value_fits_or_is_refused(element: str) -> None:
                     ([value] * 24, (3, 8)), ([value] * 32, (2, 2, 8)),
                 ):  # fmt: skip
                     with suppress(MismatchError, ValueError, OverflowError):
-                        image.put(0, fitting.value(Sample(number, found, dims, 0, 0)))
+                        image.put(0, converter.value(Sample(number, found, dims, 0, 0)))
                     assert len(bytes(image)) == layout.size

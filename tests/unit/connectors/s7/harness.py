@@ -8,7 +8,7 @@ from typing import Protocol
 import pytest
 
 from shmio.connectors.s7 import S7Client, S7Options
-from shmio.emulators.s7 import S7Server, Traits
+from shmio.emulators.s7 import S7Server, ServerOptions
 from shmio.errors import ConnectorError
 from shmio.testing.proxy import FaultProxy
 
@@ -39,7 +39,7 @@ class Plc:
 
 
 class MakePlc(Protocol):
-    def __call__(self, traits: Traits, kind: type[S7Server] = S7Server) -> Plc: ...
+    def __call__(self, options: ServerOptions, kind: type[S7Server] = S7Server) -> Plc: ...
 
 
 def assert_recovers(plc: Plc, client: S7Client) -> None:

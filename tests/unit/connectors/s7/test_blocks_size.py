@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from snap7.datatypes import S7Area
 
 from shmio.connectors.s7.blocks import SizeProbe, parse_readable
-from shmio.emulators.s7 import Jobs, Memory, Traits
+from shmio.emulators.s7 import Jobs, Memory, ServerOptions
 from shmio.errors import ConnectorError
 from tests.unit.connectors.s7 import noise as frames
 
@@ -23,7 +23,7 @@ ANSWER = bytes.fromhex("03000025 02f080 32 03 0000 0007 0002 0010 0000 04 03 ff0
        pdu_size=st.sampled_from([100, 240, 480, 960]))  # fmt: skip
 def test_finds_the_size(sizes: tuple[int, int], pdu_size: int) -> None:
     wanted, real = sizes
-    jobs = Jobs(Memory({(S7Area.DB, 201): bytearray(wanted)}), Traits(max_pdu_size=pdu_size, block_size=real))
+    jobs = Jobs(Memory({(S7Area.DB, 201): bytearray(wanted)}), ServerOptions(max_pdu_size=pdu_size, block_size=real))
     jobs.answer(memoryview(struct.pack(">BBHHHHBxHHH", 0x32, 1, 0, 0, 8, 0, 0xF0, 8, 8, 960)))
     probe = SizeProbe(201, wanted, pdu_size)
     rounds = 0

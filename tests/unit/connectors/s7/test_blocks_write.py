@@ -13,7 +13,7 @@ from snap7.datatypes import S7Area
 from shmio.connectors.base import Lost
 from shmio.connectors.s7.blocks import bit_item, byte_item, ends, parse_write_answer, waves, write_request
 from shmio.connectors.s7.explain import RefusedError
-from shmio.emulators.s7 import Fault, Jobs, Memory, Traits
+from shmio.emulators.s7 import Fault, Jobs, Memory, ServerOptions
 from shmio.errors import ConnectorError
 from shmio.layout.values.write import Write
 from tests.unit.connectors.s7 import noise as frames
@@ -22,7 +22,7 @@ SIZE = 400
 
 
 def controller(block: bytearray, pdu_size: int, fault: Fault | None = None) -> Jobs:
-    jobs = Jobs(Memory({(S7Area.DB, 201): block}), Traits(max_pdu_size=pdu_size, fault=fault))
+    jobs = Jobs(Memory({(S7Area.DB, 201): block}), ServerOptions(max_pdu_size=pdu_size, fault=fault))
     jobs.answer(memoryview(struct.pack(">BBHHHHBxHHH", 0x32, 1, 0, 0, 8, 0, 0xF0, 8, 8, 960)))
     return jobs
 

@@ -8,7 +8,7 @@ import time
 import pytest
 
 from shmio.connectors.s7.connector import S7Client
-from shmio.emulators.s7 import Traits
+from shmio.emulators.s7 import ServerOptions
 from shmio.errors import ConnectorError
 from shmio.layout.values.write import Write
 from tests.unit.connectors.s7.harness import SIZE, MakePlc, Plc, assert_recovers
@@ -28,7 +28,7 @@ def image(client: S7Client) -> bytes:
 
 @pytest.fixture
 def wide(make_plc: MakePlc) -> Plc:
-    return make_plc(Traits(max_pdu_size=480, max_jobs=24))
+    return make_plc(ServerOptions(max_pdu_size=480, max_jobs=24))
 
 
 class Answers:
@@ -57,7 +57,7 @@ class Answers:
 def test_depth_follows_the_granted_jobs_and_pdu_size(
     make_plc: MakePlc, pdu_size: int, jobs: int, most: int | None, depth: int
 ) -> None:
-    plc = make_plc(Traits(max_pdu_size=pdu_size, max_jobs=jobs))
+    plc = make_plc(ServerOptions(max_pdu_size=pdu_size, max_jobs=jobs))
     client = plc.client(maxJobs=most)
     assert client.depth == 1
     client.connect()

@@ -10,25 +10,31 @@ import pytest
 import snap7
 
 from shmio.connectors.s7 import S7Client, mode
-from shmio.emulators.s7 import Fault, S7Server, Traits
+from shmio.emulators.s7 import Fault, S7Server, ServerOptions
 from shmio.errors import ConnectorError
 from tests.unit.connectors.s7.harness import SIZE, MakePlc, Plc
 
 
 @pytest.mark.parametrize(
-    ("traits", "text"),
+    ("options", "text"),
     [
-        (Traits(fault=Fault.PUT_GET_OFF), r"\(error 0x8104\): enable 'Permit access with PUT/GET"),
-        (Traits(fault=Fault.PROTECTED), r"DB201: access denied \(item code 0x03\): .*'Full access'"),
-        (Traits(fault=Fault.OPTIMIZED), r"DB201 has no byte that can be addressed.*clear 'Optimized block access'"),
-        (Traits(block_size=1), r"DB201 does not have 2180 bytes but 1 bytes .*export it again"),
-        (Traits(block_size=SIZE - 1), r"DB201 does not have 2180 bytes but 2179 bytes"),
-        (Traits(block_size=963, max_pdu_size=240, max_jobs=1), r"DB201 does not have 2180 bytes but 963 bytes"),
-        (Traits(block_size=1234, max_pdu_size=240, max_jobs=24), r"DB201 does not have 2180 bytes but 1234 bytes"),
+        (ServerOptions(fault=Fault.PUT_GET_OFF), r"\(error 0x8104\): enable 'Permit access with PUT/GET"),
+        (ServerOptions(fault=Fault.PROTECTED), r"DB201: access denied \(item code 0x03\): .*'Full access'"),
+        (
+            ServerOptions(fault=Fault.OPTIMIZED),
+            r"DB201 has no byte that can be addressed.*clear 'Optimized block",
+        ),
+        (ServerOptions(block_size=1), r"DB201 does not have 2180 bytes but 1 bytes .*export it again"),
+        (ServerOptions(block_size=SIZE - 1), r"DB201 does not have 2180 bytes but 2179 bytes"),
+        (ServerOptions(block_size=963, max_pdu_size=240, max_jobs=1), r"DB201 does not have 2180 bytes but 963 bytes"),
+        (
+            ServerOptions(block_size=1234, max_pdu_size=240, max_jobs=24),
+            r"DB201 does not have 2180 bytes but 1234",
+        ),
     ],
 )
-def test_refusal_is_reported_with_a_remedy(make_plc: MakePlc, traits: Traits, text: str) -> None:
-    client = make_plc(traits).connected()
+def test_refusal_is_reported_with_a_remedy(make_plc: MakePlc, options: ServerOptions, text: str) -> None:
+    client = make_plc(options).connected()
     for _ in range(client.depth):
         client.submit()
     with pytest.raises(ConnectorError, match=text):
@@ -37,7 +43,7 @@ def test_refusal_is_reported_with_a_remedy(make_plc: MakePlc, traits: Traits, te
 
 
 def test_refusal_is_reported_if_the_size_cannot_be_found(make_plc: MakePlc) -> None:
-    plc = make_plc(Traits(block_size=500))
+    plc = make_plc(ServerOptions(block_size=500))
     client = plc.connected(timeout=300)
     answers = 0
 
@@ -72,7 +78,7 @@ def read_until(client: S7Client, *, doubt: bool) -> str:
 @pytest.mark.usefixtures("often")
 @pytest.mark.parametrize("jobs", [1, 8])
 def test_stop_and_run_are_noticed(make_plc: MakePlc, jobs: int) -> None:
-    plc = make_plc(Traits(max_jobs=jobs))
+    plc = make_plc(ServerOptions(max_jobs=jobs))
     client = plc.connected()
     peer = snap7.Client()
     peer.connect(plc.server.address.host, 0, 1, plc.server.address.port)
@@ -129,7 +135,7 @@ class Touchy(S7Server):
 
 @pytest.mark.usefixtures("often")
 def test_a_controller_without_a_mode(make_plc: MakePlc) -> None:
-    plc = make_plc(Traits(), Ignorant)
+    plc = make_plc(ServerOptions(), Ignorant)
     client = plc.connected()
     for _ in range(5):
         assert client.read() == plc.block
@@ -138,7 +144,7 @@ def test_a_controller_without_a_mode(make_plc: MakePlc) -> None:
 
 @pytest.mark.usefixtures("often")
 def test_a_controller_that_hangs_up_when_asked(make_plc: MakePlc) -> None:
-    plc = make_plc(Traits(), Touchy)
+    plc = make_plc(ServerOptions(), Touchy)
     client = plc.client()
     for _ in range(2):
         with pytest.raises(ConnectorError, match="closed the connection"):

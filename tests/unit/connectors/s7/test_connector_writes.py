@@ -11,7 +11,7 @@ import pytest
 
 from shmio.connectors.base import Lost, WriteLostError
 from shmio.connectors.s7.connector import S7Client, S7Connector, S7Options
-from shmio.emulators.s7 import Fault, Traits
+from shmio.emulators.s7 import Fault, ServerOptions
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout, Register
 from shmio.layout.values.write import Write
@@ -58,7 +58,7 @@ def image(client: S7Client) -> bytes:
 @pytest.mark.parametrize("pdu_size", [240, 480, 960])
 @pytest.mark.parametrize("jobs", [1, 3, 24])
 def test_written_values_are_read_back(make_plc: MakePlc, pdu_size: int, jobs: int) -> None:
-    plc = make_plc(Traits(max_pdu_size=pdu_size, max_jobs=jobs))
+    plc = make_plc(ServerOptions(max_pdu_size=pdu_size, max_jobs=jobs))
     client = plc.connected()
     whole = bytes(range(256)) * 8 + bytes(SIZE - 2048)
     assert client.write([Write(0, 0, whole)]) == [""]
@@ -98,7 +98,7 @@ def test_bit_write_leaves_the_other_bits_to_the_program(plc: Plc) -> None:
 
 
 def test_a_write_passes_between_reads_under_way(make_plc: MakePlc) -> None:
-    plc = make_plc(Traits(max_pdu_size=480, max_jobs=10))
+    plc = make_plc(ServerOptions(max_pdu_size=480, max_jobs=10))
     client = plc.connected()
     before = bytes(plc.block)
     client.submit()
@@ -124,7 +124,7 @@ def test_a_refused_item_among_good_ones(plc: Plc) -> None:
     ("fault", "text"), [(Fault.WRITE_PROTECTED, r"0x03.*'Full access'"), (Fault.PUT_GET_OFF, r"0x8104.*PUT/GET")]
 )
 def test_controller_that_refuses_writes(make_plc: MakePlc, fault: Fault, text: str) -> None:
-    plc = make_plc(Traits(fault=fault))
+    plc = make_plc(ServerOptions(fault=fault))
     before = bytes(plc.block)
     client = plc.connected()
     for outcome in client.write([Write(0, 0, b"one"), Write(9, 2, b"\2")]):
@@ -169,7 +169,7 @@ def test_late_answer_is_never_used_for_the_next_request(plc: Plc) -> None:
 
 @pytest.mark.parametrize("count", [0, 1, 21, 30])
 def test_the_connection_is_lost_in_mid_write(make_plc: MakePlc, count: int) -> None:
-    plc = make_plc(Traits(max_pdu_size=240, max_jobs=3))
+    plc = make_plc(ServerOptions(max_pdu_size=240, max_jobs=3))
     client = plc.connected()
     if count:
         plc.proxy.cut_after(count)
@@ -185,7 +185,7 @@ def test_the_connection_is_lost_in_mid_write(make_plc: MakePlc, count: int) -> N
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_outcome_of_each_write_after_a_lost_connection(make_plc: MakePlc, jobs: int) -> None:
     """Each answer lets the next job be sent. Jobs after those under way were therefore never sent."""
-    plc = make_plc(Traits(max_pdu_size=240, max_jobs=jobs))
+    plc = make_plc(ServerOptions(max_pdu_size=240, max_jobs=jobs))
     client = plc.connected(timeout=300)
     writes = [Write(SIZE, 0, b"?"), *(Write(at, 0, b"\xee" * 200) for at in range(0, 2000, 200))]  # a job each
     before = bytes(plc.block)
@@ -251,7 +251,7 @@ def test_without_a_session_nothing_is_sent(plc: Plc) -> None:
 
 def test_refused_read_does_not_affect_a_write(make_plc: MakePlc) -> None:
     """The outcome of the write is known and returned. The refused read then ends the connection."""
-    plc = make_plc(Traits(block_size=1000))
+    plc = make_plc(ServerOptions(block_size=1000))
     client = plc.connected()
     client.submit()
     assert client.write([Write(0, 0, b"x")]) == [""]
@@ -265,7 +265,7 @@ SCATTERED = [Write(2 * place, 1 << place % 8, b"\xff") for place in range(60)]  
 
 def test_slow_controller_does_not_time_out(make_plc: MakePlc, clock: Clock) -> None:
     """Each answer may take the whole time-out. Reads that wait behind writes do not count as late."""
-    plc = make_plc(Traits(max_jobs=1))
+    plc = make_plc(ServerOptions(max_jobs=1))
     client = plc.connected(timeout=5000)
     clock.slow_down(plc, 4)
     clock.move(2)
@@ -285,7 +285,7 @@ def test_slow_controller_does_not_time_out(make_plc: MakePlc, clock: Clock) -> N
 @pytest.mark.parametrize(("timeout_s", "most_s"), [(5, 20), (30, 30)])
 def test_duration_of_a_batch_is_bounded(make_plc: MakePlc, clock: Clock, timeout_s: int, most_s: int) -> None:
     """Otherwise the supervisor would consider the source's process hung, because a call does not return."""
-    plc = make_plc(Traits(max_jobs=1))
+    plc = make_plc(ServerOptions(max_jobs=1))
     client = plc.connected(timeout=1000 * timeout_s)
     clock.slow_down(plc, 4)
     with pytest.raises(ConnectorError, match=f"has not answered all writes of a cycle within {most_s} s: write fewer"):

@@ -22,7 +22,7 @@ from shmio.connectors.s7 import userdata
 from shmio.connectors.s7.connector import S7Connector, S7Options
 from shmio.connectors.s7.query import MAX_PARTS
 from shmio.connectors.s7.userdata import parse_clock, szl_records
-from shmio.emulators.s7 import S7Server, Traits
+from shmio.emulators.s7 import S7Server, ServerOptions
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.values.codec import Value
 from shmio.model.statuses import BAD_NO_DATA, BAD_NOT_SUPPORTED, BAD_WAITING_FOR_INITIAL_DATA, GOOD, StatusArea
@@ -77,8 +77,8 @@ class Refusing(S7Server):
 
 
 @contextlib.contextmanager
-def serving(plc: Plc, kind: type[S7Server] = S7Server, traits: Traits | None = None) -> Iterator[S7Server]:
-    server = kind(Address("127.0.0.1", 0), traits=traits)
+def serving(plc: Plc, kind: type[S7Server] = S7Server, options: ServerOptions | None = None) -> Iterator[S7Server]:
+    server = kind(Address("127.0.0.1", 0), options=options)
     server.add_block(1, plc.blocks[1])
     server.start()
     try:
@@ -106,7 +106,7 @@ def settled(layout_tags: dict[str, object], port: int) -> tuple[dict[str, Value]
 def test_what_the_cpu_is_does_and_says_of_the_time(pdu_size: int) -> None:
     """With a PDU of 100 bytes, the CPU's names arrive in three parts."""
     before = dt.datetime.now().replace(microsecond=0)
-    with serving(Plc(), traits=Traits(max_pdu_size=pdu_size)) as server:
+    with serving(Plc(), options=ServerOptions(max_pdu_size=pdu_size)) as server:
         found, statuses = settled(CPU, server.address.port)
     assert set(statuses.values()) == {GOOD}
     assert {name: found[name] for name in IDENTITY} == IDENTITY
@@ -131,7 +131,7 @@ def test_python_snap7s_server_is_read_as_far_as_it_answers() -> None:
 @pytest.mark.parametrize("pdu_size", [100, 960])
 def test_python_snap7s_client_reads_what_the_emulator_is(pdu_size: int) -> None:
     client = snap7.Client()
-    with serving(Plc(), traits=Traits(max_pdu_size=pdu_size)) as server:
+    with serving(Plc(), options=ServerOptions(max_pdu_size=pdu_size)) as server:
         client.connect("127.0.0.1", 0, 1, server.address.port)
         try:
             info, code = client.get_cpu_info(), client.get_order_code()

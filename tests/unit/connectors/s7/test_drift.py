@@ -17,7 +17,7 @@ from shmio.connectors.base import Connector
 from shmio.connectors.s7.connector import S7Connector, S7Options
 from shmio.connectors.s7.drift import INTERVAL_NS
 from shmio.connectors.s7.userdata import BlockInfo, parse_block
-from shmio.emulators.s7 import Fault, S7Server, Traits
+from shmio.emulators.s7 import Fault, S7Server, ServerOptions
 from shmio.errors import ConnectorError
 from shmio.layout import compiler
 from shmio.layout.model import Layout
@@ -45,8 +45,8 @@ def press() -> Layout:
 
 
 @contextlib.contextmanager
-def emulated(data: bytearray, traits: Traits | None = None) -> Iterator[S7Server]:
-    server = S7Server(Address("127.0.0.1", 0), traits=traits)
+def emulated(data: bytearray, options: ServerOptions | None = None) -> Iterator[S7Server]:
+    server = S7Server(Address("127.0.0.1", 0), options=options)
     server.add_block(1, data)
     server.start()
     try:
@@ -268,7 +268,7 @@ def test_python_snap7s_server_tells_the_length(caplog: pytest.LogCaptureFixture)
 
 def test_python_snap7s_client_reads_the_emulators_information() -> None:
     client = snap7.Client()
-    with emulated(bytearray(SIZE), Traits(block_size=60)) as server:
+    with emulated(bytearray(SIZE), ServerOptions(block_size=60)) as server:
         client.connect("127.0.0.1", 0, 1, server.address.port)
         try:
             info = client.get_block_info(Block.DB, 1)
@@ -296,7 +296,7 @@ def test_information_about_a_block() -> None:
 
 def test_an_optimized_block_is_not_told_of() -> None:
     with (
-        emulated(bytearray(SIZE), Traits(fault=Fault.OPTIMIZED)) as server,
+        emulated(bytearray(SIZE), ServerOptions(fault=Fault.OPTIMIZED)) as server,
         reading(press(), server.address.port) as connector,
         pytest.raises(ConnectorError, match="optimized"),
     ):

@@ -19,7 +19,7 @@ from shmio.connectors.base import Connector
 from shmio.connectors.s7 import pdu
 from shmio.connectors.s7.connector import S7Connector, S7Options
 from shmio.connectors.s7.table import RETRY_NS
-from shmio.emulators.s7 import Fault, S7Server, Traits
+from shmio.emulators.s7 import Fault, S7Server, ServerOptions
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.model import Layout
 from shmio.layout.tags import place_tags
@@ -64,9 +64,9 @@ class Plc:
 
 
 @contextlib.contextmanager
-def served(plc: Plc, traits: Traits | None = None) -> Iterator[int]:
+def served(plc: Plc, options: ServerOptions | None = None) -> Iterator[int]:
     """Serve the memory with shmio's emulator, and return the port."""
-    server = S7Server(Address("127.0.0.1", 0), traits=traits)
+    server = S7Server(Address("127.0.0.1", 0), options=options)
     for number, data in plc.blocks.items():
         server.add_block(number, data)
     for area, data in plc.areas.items():
@@ -200,7 +200,7 @@ def later(ns: int) -> Callable[[], int]:
 def test_a_controller_that_permits_nothing_is_a_fault_of_the_source() -> None:
     layout = table(TAGS)
     with (
-        served(Plc(), Traits(fault=Fault.PUT_GET_OFF)) as port,
+        served(Plc(), ServerOptions(fault=Fault.PUT_GET_OFF)) as port,
         connected(layout, port) as connector,
         pytest.raises(ConnectorError, match="PUT/GET"),
     ):
@@ -260,7 +260,7 @@ def test_many_registers_in_several_jobs(pdu_size: int) -> None:
     tags: dict[str, object] = {f"r{at}": {"type": "INT", "address": f"DB5.DBW{at}"} for at in range(0, 8000, 40)}
     tags["long"] = {"type": "ARRAY[1..1500] OF BYTE", "address": "DB5.DBB0"}
     layout = table(tags)
-    with served(plc, Traits(max_pdu_size=pdu_size)) as port, connected(layout, port) as connector:
+    with served(plc, ServerOptions(max_pdu_size=pdu_size)) as port, connected(layout, port) as connector:
         found = values(layout, connector.read())
     assert found.pop("long") == list(plc.blocks[5][:1500])
     assert found == {f"r{at}": at // 2 % 251 for at in range(0, 8000, 40)}

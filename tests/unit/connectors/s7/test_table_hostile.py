@@ -20,7 +20,7 @@ from shmio.config import Address
 from shmio.connectors.base import Connector
 from shmio.connectors.s7.connector import S7Connector, S7Options
 from shmio.emulators.areas import AREAS, Place, TableMemory
-from shmio.emulators.s7 import S7Server, Traits
+from shmio.emulators.s7 import S7Server, ServerOptions
 from shmio.errors import ConnectorError
 from shmio.layout.s7.address import Area
 from shmio.layout.values.codec import Value
@@ -198,7 +198,7 @@ class Plc:
 
 @pytest.fixture(scope="module")
 def plc() -> Iterator[Plc]:
-    server = S7Server(Address("127.0.0.1", 0), traits=Traits(max_pdu_size=240, max_jobs=2))
+    server = S7Server(Address("127.0.0.1", 0), options=ServerOptions(max_pdu_size=240, max_jobs=2))
     memory: dict[Place, bytearray] = {}
     for number in (1, 2, 3):
         memory[Area.BLOCK, number] = bytearray(SIZE)
