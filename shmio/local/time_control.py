@@ -24,8 +24,8 @@ MAX_STEP_NS: Final = 3_600_000_000_000
 _TURN_NS: Final = 100_000_000
 """Interval at which a wait for the owner of time checks whether that process has died."""
 MAX_RATE: Final = 1000.0
-_DISPATCHERS: Final = frozenset({"grpc", "mqtt", "recorder"})
-"""Kinds of processes that deliver steps to clients or to a recording. A step may wait for them."""
+_DISPATCHERS: Final = frozenset({"alerts", "grpc", "mqtt", "recorder"})
+"""Kinds of processes that deliver steps: to clients, a recording or alerts. A step may wait for them."""
 _PATIENCE_S: Final = 2.0
 """Time to wait until the owner of time gives up its ownership.
 

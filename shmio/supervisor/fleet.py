@@ -23,6 +23,8 @@ from shmio.supervisor.process import AdoptedProcess, ChildProcess, describe_end
 
 TICK_S: Final = 0.1
 """Interval in s at which heartbeats are checked."""
+_LOST: Final = {"mqtt": ("dropped", "changes"), "alerts": ("failed", "notices")}
+"""Counter of what a process loses while it has a problem, and its name in messages, by kind."""
 
 log = logging.getLogger("shmio.supervisor")
 
@@ -125,7 +127,7 @@ class ManagedProcess:
         """
         running = self.life.state is State.RUNNING
         complaint = complaint_of(self.slot.kind, self.slot.report.note) if running else ""
-        lost = ("dropped", "changes") if self.slot.kind == "mqtt" else ("missed", "frames and events")
+        lost = _LOST.get(self.slot.kind, ("missed", "frames and events"))
         missed = self.slot.counters.get(lost[0], 0) if running else 0  # the process counts from its start
         if self.complaint and running and not complaint:
             log.info("%s has recovered; %d %s were lost", self.name, max(0, missed - self._missed), lost[1])

@@ -32,6 +32,7 @@ LEFT_PX = 70
 """Left margin of a plot."""
 SOFTWARE_GL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 AXIS = "cell/Robot_800/Axs1_Pos"
+ALERT = '[[alert]]\nname = "seven"\nwhen = "cell/Outputs/500 = 7"\nseverity = "critical"\n'
 BIT = "cell/Outputs/500.%X0"
 SCENE = f"""
 [[body]]
@@ -64,7 +65,7 @@ def cell(make_cell: Callable[..., Cell], address: str, scene: str) -> Cell:
     """A running cell with a page."""
     config = CONFIG.replace("timeout = 1000", 'timeout = 1000\nwritable = ["Outputs"]')
     more = 'scene = "scene.toml"\n' if scene else ""
-    cell = make_cell(config=f'{config}[web]\nlisten = "{address}"\n{more}[recorder]\ndirectory = "dumps"\n')
+    cell = make_cell(config=f'{config}[web]\nlisten = "{address}"\n{more}[recorder]\ndirectory = "dumps"\n{ALERT}')
     (cell.folder / "scene.toml").write_text(scene)
     cell.up()
     return cell
@@ -461,6 +462,17 @@ def test_user_sees_the_registers_of_dropped_files(cell: Cell, page: Any) -> None
     files.set_input_files({"name": "x.db", "mimeType": "text/plain", "buffer": b"DATA_BLOCK x STRUCT a : INTT;"})
     expect(page.locator(".drop .messages")).to_contain_text("x.db:1:")
     expect(rows).to_be_hidden()
+
+
+def test_user_sees_active_alerts(cell: Cell, page: Any) -> None:
+    alerts = page.get_by_role("table", name="alerts")
+    expect(page.get_by_role("button", name="Restart cell")).to_be_visible()
+    expect(alerts).to_be_hidden()
+    cell.output("shmio", "set", "cell/Outputs/500", "7")
+    expect(alerts.get_by_role("row", name="seven")).to_contain_text("cell/Outputs/500 = 7")
+    keep(page, "alerts")
+    cell.output("shmio", "set", "cell/Outputs/500", "0")
+    expect(alerts).to_be_hidden()
 
 
 def test_user_filters_the_log(page: Any) -> None:

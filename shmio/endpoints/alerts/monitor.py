@@ -13,7 +13,7 @@ from typing import Final
 from shmio.config import Alert
 from shmio.endpoints.alerts.lifecycle import Change, Lifecycle, Progress
 from shmio.endpoints.alerts.notice import MAX_REASON, Notice
-from shmio.endpoints.alerts.watching import UNKNOWN, ProcessWatch, QualityWatch, Watch, make_watch
+from shmio.endpoints.alerts.watching import Finding, ProcessWatch, QualityWatch, Watch, make_watch
 from shmio.layout.topic import shorten
 from shmio.model.clock import Clock
 from shmio.segment import Block, Frame, Segment
@@ -37,8 +37,12 @@ class WatchedAlert:
     def __init__(self, alert: Alert, progress: Progress, watch: Watch) -> None:
         self.alert = alert
         self.watch = watch
-        self.finding = UNKNOWN
-        """What the alert has last seen."""
+        self.seen: bool | None = None
+        """Whether the alert's condition was true at its last evaluation."""
+        self.holds: bool | None = None
+        """Whether it was true when it was last known."""
+        self.finding = Finding()
+        """What the alert saw when that last changed."""
         self.lifecycle = Lifecycle(round(alert.for_s * 1e9), round(alert.every_s * 1e9), alert.resolved, progress)
 
     @property
@@ -102,7 +106,7 @@ class Monitor:
             notices += self._take(source, frame, self._time_ns(source, frame, clock))
         for source, follower in self._followers.items():
             if follower.became_stale():
-                notices += self._evaluate(self._concerned(source), self._now_ns)
+                notices += self._evaluate(self._concerned[source], self._now_ns)
         notices += self._check_processes()
         if not more:
             self.done = clock.done
@@ -139,6 +143,7 @@ class Monitor:
     def _follow(self) -> None:
         self._blocks = self._segment.blocks
         wanted = {source for one in self.alerts for source in one.watch.sources}
+        self._concerned = {source: [one for one in self.alerts if source in one.watch.sources] for source in wanted}
         for source, follower in list(self._followers.items()):
             if source not in wanted or self._blocks.get(source) is not follower.block:
                 self._missed += self._followers.pop(source).missed
@@ -175,18 +180,18 @@ class Monitor:
         return min(frame.clock_ns, self._now_ns)
 
     def _take(self, source: str, frame: Frame, now_ns: int) -> Iterator[tuple[WatchedAlert, Notice]]:
-        change = self._followers[source].take(frame, aged=False)
-        for one in self._concerned(source):
+        follower = self._followers[source]
+        last, change = follower.frame, follower.take(frame, aged=False)
+        for one in self._concerned[source]:
             if isinstance(one.watch, QualityWatch):
                 if change is not QualityChange.NONE:
                     yield from self._evaluate([one], now_ns)
                 continue
-            if change is QualityChange.GAP:  # the value was stale for some time
-                yield from self._notices(one, one.lifecycle.observe(None, now_ns), now_ns)
+            if change is QualityChange.GAP and last is not None:
+                stale_ns = now_ns - (frame.publish_ns - last.publish_ns) + follower.block.stale_ns
+                one.seen = None
+                yield from self._notices(one, one.lifecycle.observe(None, stale_ns), stale_ns)
             yield from self._evaluate([one], now_ns)
-
-    def _concerned(self, source: str) -> list[WatchedAlert]:
-        return [one for one in self.alerts if source in one.watch.sources]
 
     def _check_processes(self) -> list[tuple[WatchedAlert, Notice]]:
         """Check the process table, and sources that have no frame yet."""
@@ -207,10 +212,13 @@ class Monitor:
 
     def _evaluate(self, alerts: Iterable[WatchedAlert], now_ns: int) -> Iterator[tuple[WatchedAlert, Notice]]:
         for one in alerts:
-            finding = one.watch.evaluate(self._followers)
-            if finding.holds is not None:
-                one.finding = finding
-            yield from self._notices(one, one.lifecycle.observe(finding.holds, now_ns), now_ns)
+            holds = one.watch.evaluate(self._followers)
+            if holds is one.seen and one.lifecycle.due_ns is None:
+                continue  # as at almost every frame
+            one.seen = holds
+            if holds is not None and holds is not one.holds:
+                one.holds, one.finding = holds, one.watch.describe(self._followers)
+            yield from self._notices(one, one.lifecycle.observe(holds, now_ns), now_ns)
 
     def _notices(
         self, one: WatchedAlert, changes: Iterator[Change], now_ns: int

@@ -23,19 +23,12 @@ Followers = Mapping[str, FrameFollower]
 
 
 class Finding(NamedTuple):
-    """What an alert sees at present.
+    """What an alert sees, for its notices. ``reason`` has the rest as text."""
 
-    ``holds`` is None if it is unknown whether the condition is true. ``reason`` says what is seen.
-    """
-
-    holds: bool | None
     reason: str = ""
     values: Mapping[str, Number | None] = {}
     injected: bool = False
     provenance: str = ""
-
-
-UNKNOWN: Final = Finding(None)
 
 
 class Watch(Protocol):
@@ -44,8 +37,14 @@ class Watch(Protocol):
     sources: Collection[str]
     """The sources whose frames matter."""
 
-    def evaluate(self, followers: Followers) -> Finding:
-        """Evaluate the present state. For a condition, call it once for each frame of its sources."""
+    def evaluate(self, followers: Followers) -> bool | None:
+        """Return whether the alert's condition is true; None: unknown.
+
+        For a condition over registers, call it once for each frame of its sources.
+        """
+
+    def describe(self, followers: Followers) -> Finding:
+        """Return what the last :meth:`evaluate` has seen."""
 
 
 class RegisterWatch:
@@ -62,24 +61,32 @@ class RegisterWatch:
             log.warning("an alert is unknown until its registers exist again: %s", error)
         self.sources: Collection[str] = {source for source, _ in self._condition.reads} if self._condition else ()
         self._memory = Memory()
+        self._values: list[Number | None] = []
 
-    def evaluate(self, followers: Followers) -> Finding:
+    def evaluate(self, followers: Followers) -> bool | None:
         """Evaluate the condition."""
         if self._condition is None:
-            return UNKNOWN
-        expression, reads = self._condition.expression, self._condition.reads
-        frames = [_known(followers.get(source)) for source, _ in reads]
+            return None
         values: list[Number | None] = []
-        injected = False
-        for frame, (_, codec) in zip(frames, reads, strict=True):
+        for source, codec in self._condition.reads:
+            frame = _known(followers.get(source))
             value = None if frame is None else codec.decode(frame.image)
             values.append(value if isinstance(value, bool | int | float) else None)
-            injected |= frame is not None and frame.effective is not None and codec.decode(frame.raw) != value
-        holds = expression.evaluate(values, self._memory)
-        named = dict(zip(expression.references, values, strict=True))
-        kinds = sorted({str(frame.provenance) for frame in frames if frame is not None})
+        self._values = values
+        return self._condition.expression.evaluate(values, self._memory)
+
+    def describe(self, followers: Followers) -> Finding:
+        """Return the values in the condition."""
+        if self._condition is None:
+            return Finding()
+        kinds, injected = set(), False
+        for (source, codec), value in zip(self._condition.reads, self._values, strict=True):
+            if (frame := _known(followers.get(source))) is not None:
+                kinds.add(str(frame.provenance))
+                injected |= frame.effective is not None and codec.decode(frame.raw) != value
+        named = dict(zip(self._condition.expression.references, self._values, strict=True))
         reason = ", ".join(f"{path} = {json.dumps(value)}" for path, value in named.items())
-        return Finding(holds, reason, named, injected, ", ".join(kinds))
+        return Finding(reason, named, injected, ", ".join(sorted(kinds)))
 
 
 def _known(follower: FrameFollower | None) -> Frame | None:
@@ -91,29 +98,31 @@ def _known(follower: FrameFollower | None) -> Frame | None:
 
 
 class QualityWatch:
-    """The quality of sources. The finding is true if any of them has one of the given qualities."""
+    """The quality of sources. The condition is true if any of them has one of the given qualities."""
 
     def __init__(self, patterns: Collection[str], qualities: Collection[str], blocks: Mapping[str, Block]) -> None:
         globs = [Glob(pattern) for pattern in patterns]
         self.sources: Collection[str] = [name for name in blocks if any(glob.matches(name) for glob in globs)]
         self._qualities = qualities
 
-    def evaluate(self, followers: Followers) -> Finding:
+    def evaluate(self, followers: Followers) -> bool | None:
         """Compare the present qualities."""
-        if not self.sources:
-            return UNKNOWN
+        return any(self._meets(followers[name]) for name in self.sources) if self.sources else None
+
+    def describe(self, followers: Followers) -> Finding:
+        """Return the qualities that meet the alert's; all, if none does."""
         present = {name: followers[name] for name in self.sources}
-        met = [one for one in present.items() if str(one[1].quality) in self._qualities]
-        texts = [
-            f"{name} is {one.quality}{f': {one.reason}' if one.reason else ''}" for name, one in met or present.items()
-        ]
-        frames = [one.frame for _, one in met or present.items() if one.frame is not None]
-        kinds = sorted({str(frame.provenance) for frame in frames})
-        return Finding(bool(met), "; ".join(texts), {}, injected=False, provenance=", ".join(kinds))
+        met = {name: one for name, one in present.items() if self._meets(one)} or present
+        texts = (f"{name} is {one.quality}{f': {one.reason}' if one.reason else ''}" for name, one in met.items())
+        kinds = {str(one.frame.provenance) for one in met.values() if one.frame is not None}
+        return Finding("; ".join(texts), provenance=", ".join(sorted(kinds)))
+
+    def _meets(self, follower: FrameFollower) -> bool:
+        return str(follower.quality) in self._qualities
 
 
 class ProcessWatch:
-    """The state of processes. The finding is true if any of them is in one of the given states.
+    """The state of processes. The condition is true if any of them is in one of the given states.
 
     A process that has crashed is in ``backoff`` until it runs again, also while it is being started.
     """
@@ -124,11 +133,13 @@ class ProcessWatch:
         self._globs = [Glob(pattern) for pattern in patterns]
         self._states = states
         self._segment = segment
+        self._present: dict[str, tuple[str, str]] = {}
+        """State and note of each process, by name."""
 
-    def evaluate(self, _followers: Followers) -> Finding:
+    def evaluate(self, _followers: Followers) -> bool | None:
         """Compare the present states."""
         supervised = self._segment.supervised
-        states: dict[str, tuple[str, str]] = {}
+        self._present = {}
         for slot in self._segment.processes:
             if slot.kind != "alerts" and any(glob.matches(slot.name) for glob in self._globs):
                 state = slot.supervised
@@ -137,14 +148,15 @@ class ProcessWatch:
                     phase, note = (Phase.RUNNING, "") if slot.alive() else (Phase.STOPPED, "dead, as is the supervisor")
                 elif phase is Phase.STARTING and note and note != RESTARTING:
                     phase = Phase.BACKOFF
-                states[slot.name] = str(phase), note
-        if not states:
-            return UNKNOWN
-        met = {name: one for name, one in states.items() if one[0] in self._states}
-        told_states = (
-            f"{name} is in state {one[0]}{f': {one[1]}' if one[1] else ''}" for name, one in (met or states).items()
+                self._present[slot.name] = str(phase), note
+        return any(phase in self._states for phase, _ in self._present.values()) if self._present else None
+
+    def describe(self, _followers: Followers) -> Finding:
+        """Return the states that are among the alert's; all, if none is."""
+        met = {name: one for name, one in self._present.items() if one[0] in self._states} or self._present
+        return Finding(
+            "; ".join(f"{name} is in state {phase}{f': {note}' if note else ''}" for name, (phase, note) in met.items())
         )
-        return Finding(bool(met), "; ".join(told_states))
 
 
 RESTARTING: Final = "restarting"

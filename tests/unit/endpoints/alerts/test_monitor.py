@@ -76,6 +76,14 @@ def test_a_stale_value_is_unknown(instance: str) -> None:
         assert one.monitor.alerts[0].active, "it is unknown whether it is still hot"
 
 
+def test_a_value_that_was_stale_in_between_interrupts_a_time_limit(instance: str) -> None:
+    with watched(instance, Alert(when="cell/running", for_s=62)) as one:
+        one.publish(1, running=True)
+        one.publish(70, running=True)
+        assert one.until(70) == []
+        assert one.until(129) == []
+
+
 def test_a_source_without_a_frame_is_bad(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(monitor, "LOOK_S", 0.0)
     with watched(instance, Alert(source="cell", for_s=2)) as one:

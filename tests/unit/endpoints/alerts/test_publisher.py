@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import selectors
+import socket
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,7 @@ from tests.unit.endpoints.alerts.harness import notice
 from tests.unit.endpoints.mqtt.harness import listening
 
 ALERT = Alert(name="hot", when="x", mqtt_topic="plant/hot", mqtt_retain=True)
-pytestmark = pytest.mark.skipif(bool(missing()), reason=missing())
+TIMEOUT_S = 30
 
 
 class Running:
@@ -44,6 +46,54 @@ class Running:
         os.close(self._wakeup)
 
 
+def accept(listener: socket.socket) -> socket.socket:
+    """Accept a client of MQTT 5."""
+    client, _ = listener.accept()
+    client.settimeout(TIMEOUT_S)
+    assert client.recv(65536)[0] == 0x10
+    client.sendall(b"\x20\x03\0\0\0")
+    return client
+
+
+def published(client: socket.socket) -> bytes:
+    """Return the identifier of the next PUBLISH with QoS 1."""
+    packet = client.recv(65536)
+    assert packet[0] & 0xF6 == 0x32
+    at = packet.index(b"plant/hot") + len(b"plant/hot")
+    return packet[at : at + 2]
+
+
+def test_a_notice_waits_until_the_broker_acknowledges_it(segment: Segment) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        one = Running(segment, Mqtt(broker="external", host=f"127.0.0.1:{listener.getsockname()[1]}"))
+        got, seen = threading.Event(), threading.Event()
+
+        def serve() -> None:
+            with accept(listener) as first:
+                published(first)
+                got.set()
+                assert seen.wait(TIMEOUT_S)
+            with accept(listener) as second:
+                second.sendall(b"\x40\x02" + published(second))
+                assert second.recv(65536)[:1] in (b"", b"\xe0"), "it disconnects"
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            one.publisher.put(ALERT, notice())
+            one.until(got.is_set)
+            one.publisher.turn()
+            waiting = one.publisher.waiting_count
+            seen.set()
+            one.until(lambda: not one.publisher.waiting_count)
+        finally:
+            one.close()
+            thread.join(TIMEOUT_S)
+        assert waiting == 1
+        assert one.publisher.failed == 0
+
+
+@pytest.mark.skipif(bool(missing()), reason=missing())
 def test_notices_wait_for_the_broker(segment: Segment, tmp_path: Path) -> None:
     with reserved_port() as address:
         broker = Mosquitto(tmp_path, address)
