@@ -82,7 +82,7 @@ def test_a_notice_waits_until_the_broker_acknowledges_it(segment: Segment) -> No
         try:
             one.publisher.put(ALERT, notice())
             one.until(got.is_set)
-            one.publisher.turn()
+            one.publisher.run_once()
             waiting = one.publisher.waiting_count
             seen.set()
             one.until(lambda: not one.publisher.waiting_count)
