@@ -96,12 +96,12 @@ def test_alerts_reach_a_command_a_broker_and_a_server(make_cell: Callable[..., C
 def test_a_failing_action_is_visible_and_harms_no_other(make_cell: Callable[..., Cell], tmp_path: Path) -> None:
     alert = (
         '[[alert]]\nname = "{name}"\nwhen = "cell/Outputs/13.%X0"\nevery_s = 0.1\n'
-        'command_timeout_s = 0.2\ncommand = ["{python}", "-c", "{program}", "{folder}/{name}"]\n'
+        'command_timeout_s = 60\ncommand = ["{python}", "-c", "{program}", "{folder}/{name}"]\n'
     )
     fill = {"python": sys.executable, "folder": tmp_path}
-    hanging = alert.format(name="hangs", program="import time; time.sleep(1000)", **fill)
+    hanging = alert.format(name="hangs", program="import time; time.sleep(1000)", **fill).replace("60", "0.2")
     failing = alert.format(name="fails", program="import sys; print('no printer'); sys.exit(3)", **fill)
-    works = alert.format(name="works", program=COMMAND, **fill).replace("0.2", "60")
+    works = alert.format(name="works", program=COMMAND, **fill)
     with serving(500) as server:
         works += f'webhook = "http://127.0.0.1:{server.port}/s3cret"\n'
         cell = make_cell(config=WRITABLE + hanging + failing + works)

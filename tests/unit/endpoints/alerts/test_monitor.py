@@ -59,6 +59,15 @@ def test_a_time_limit_by_the_instances_clock_without_a_frame(instance: str) -> N
         assert told.alert == "cell/running"
 
 
+def test_a_time_limit_ends_at_a_frame_even_if_it_is_read_late(instance: str) -> None:
+    with watched(instance, Alert(when="cell/running", for_s=3)) as one:
+        one.at(0)
+        one.publish(1, running=True)
+        one.publish(4, running=True)
+        one.publish(5, running=False)
+        assert [told.clock_s for told in one.until(5)] == [4]
+
+
 def test_bad_quality_is_no_edge_of_a_condition_but_one_of_the_source(instance: str) -> None:
     bad = Alert(source="c*", quality=["bad", "uncertain"], every_s=0.1, resolved=True)
     with watched(instance, HOT, Alert(name="cold", when="not (cell/axis/position > 5)"), bad) as one:
