@@ -63,7 +63,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--name", default="", help="the name of the injection in the list")
     how_long.add_argument("--keep", action="store_true", help="keep the injection until it is lifted by its number")
-    parser.add_argument("--lift", metavar="NUMBER", type=int, help="lift one injection, whoever created it")
+    parser.add_argument("--lift", metavar="NUMBER", type=int, help="lift one injection, of any program")
     parser.add_argument("--lift-all", action="store_true", help="lift all injections of all sources")
 
 

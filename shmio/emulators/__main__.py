@@ -25,7 +25,7 @@ def run(worker: Worker) -> None:
     served = [Served(layout, options) for layout, options in zip(layouts, config["options"], strict=True)]
     listen = Address.parse(config["listen"])
     device = create(config["kind"], served, config["program"], listen, db_number=config["dbNumber"])
-    with ThreadPoolExecutor(1) as pool:  # some libraries take seconds, during which the heartbeat goes on
+    with ThreadPoolExecutor(1) as pool:  # some libraries take seconds, during which the heartbeat continues
         starting = pool.submit(device.start)
         while not wait((starting,), BEAT_S).done:
             worker.report()

@@ -283,7 +283,7 @@ class Replays:
 
         All of them take effect at the same time of the clock.
         """
-        clock_ns = self._segment.clock.read().time_ns  # a step under way counts: no source answers before its end
+        clock_ns = self._segment.clock.read().time_ns  # a step in progress counts: no source answers before its end
         asks: dict[str, PlayheadRequest] = {}
         for source, head in heads.items():
             play = head.read()
@@ -330,7 +330,7 @@ class Replays:
     def _state(self, source: str) -> str:
         for slot in self._segment.processes:
             if slot.name == source and slot.alive():
-                return f"pid {slot.report.pid} is busy, or a step of time is under way"
+                return f"pid {slot.report.pid} is busy, or a step of time is in progress"
         return "its process does not run"
 
 

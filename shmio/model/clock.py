@@ -32,7 +32,7 @@ class Clock(NamedTuple):
         step_size_ns: Length of a step whose request names no length, in ns.
         playing: True while the program that owns time steps it continuously.
         rate: Speed of playing, relative to real time.
-        stepping: True while the last requested step is under way.
+        stepping: True while the last requested step is in progress.
         owner: Pid of the program that owns time; 0: no program owns it.
         note: The processes that a step waits for, or the problem of the last step, as text.
         resumed_ns: In wall time: the time of the clock at the last release of time, in ns.

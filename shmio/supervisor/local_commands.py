@@ -177,7 +177,7 @@ class BlockCommands:
             if len(self._open) >= MAX_OPEN:
                 oldest = next(iter(self._open))
                 self._ending.pop(oldest, None)
-                self._end([oldest], "too many commands are under way")
+                self._end([oldest], "too many commands are in flight")
             known = self._open[key] = _OpenCommand()
         if known.add(event):
             self._ending[key] = None

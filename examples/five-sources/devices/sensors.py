@@ -1,4 +1,4 @@
-"""A device with an MQTT client: it publishes its sensors, and switches its lamp when told to.
+"""A device with an MQTT client: it publishes its sensors, and switches its lamp on command.
 
 Usage: sensors.py [HOST:PORT]
 """

@@ -106,7 +106,7 @@ class Store:
         self._ages, self._time = _Ages(options), _time_path(options)
         self._image = RegisterImage(layout) if layout.status_offset is not None else None
         self._codes = [GOOD] * len(layout.registers)
-        self._order = 0  # goes on from one connection to the next
+        self._order = 0  # continues from one connection to the next
         self._expected: dict[str, bytes] = {}
         """Payloads that were published on topics that are also read, and have not come back yet."""
         for index in range(len(layout.registers)):

@@ -599,7 +599,8 @@ class Session:
         keep_alive_s = revised_ms * made.RevisedMaxKeepAliveCount / 1000
         if keep_alive_s > self._timeout_s:
             log.warning(
-                "the server sends signs of life only every %.3g s: a loss may be noticed as late as that", keep_alive_s
+                "the server's keep-alive interval is %.3g s: shmio may need that long to notice a lost subscription",
+                keep_alive_s,
             )
         one = Subscription(
             int(made.SubscriptionId),

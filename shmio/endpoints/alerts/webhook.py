@@ -38,7 +38,7 @@ class Webhook:
         self._stopping = False
 
     def stop(self) -> None:
-        """End a request that is under way."""
+        """End a request in progress."""
         self._stopping = True
         self._shut_down()
 
@@ -51,7 +51,7 @@ class Webhook:
         """
         timeout_s = self._alert.webhook_timeout_s
         self._late = False
-        timer = threading.Timer(timeout_s, self._time_out)  # a time-out of a socket starts anew with each byte
+        timer = threading.Timer(timeout_s, self._time_out)  # a time-out of a socket begins again with each byte
         timer.daemon = True
         timer.start()
         try:

@@ -91,7 +91,7 @@ class CommandClient:
         """
         cost = CommandCost.of(sizes(register))
         if self._pending and self._pending.open_events + cost.events > MAX_OPEN:
-            raise CommandError(f"{self.block.source}: too many commands are under way: wait for their results")
+            raise CommandError(f"{self.block.source}: too many commands are in flight: wait for their results")
         if self.block.retired:
             raise CommandError(RETIRED)
         ticket = self._source_writer.submit({register.path: value})

@@ -239,7 +239,7 @@ class Injection(InjectionFollower):
         if self.inward:
             return self._diverted.listen(wire, encode, EventLane(outbox, path, finish))
         subject = Subject(
-            f"{wire} beneath {id(self)}",
+            f"{wire} originals of {id(self)}",
             self.shape.path,
             self.shape.registers,
             lambda picture: encode(self._original(cast(SourceImage, picture))),

@@ -82,7 +82,7 @@ class Injections(Tab):
 
     @call("inject", Chosen)
     async def lift(self, given: Chosen) -> None:
-        """Lift an injection, whoever created it."""
+        """Lift an injection of any program."""
         await run_in_threadpool(self.page.served.cell.lift, given.source, int(given.number))
 
     @call("inject", Nothing)

@@ -474,7 +474,7 @@ def test_the_number_of_injections_is_limited(segment: Segment, monkeypatch: pyte
     with_plant(segment, test)
 
 
-def test_a_program_can_inject_beneath_a_clients_injection(segment: Segment) -> None:
+def test_a_program_can_add_an_inner_injection(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         originals = await laid(served, "cell/step", "s")
         await value(originals)
