@@ -151,7 +151,7 @@ def test_virtual_time_and_recording_agree_and_repeat(make_cell: Callable[..., Ce
     moments = {verdict["name"]: verdict["moment_s"] for verdict in live["verdicts"]}
     assert moments["stays-too-long"] == 1
     page = (cell.folder / "out.html").read_text()
-    assert page.count("<svg") == page.count("injection offset on cell") == 13, "a plot for each signal"
+    assert page.count("<svg") == page.count("injection offset on cell") == 14, "a plot for each signal"
     assert "failed at 1.000 s" in page
     assert live["command"] in page
     suite = ET.parse(cell.folder / "out.xml").getroot()
