@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
-from shmio.config import load
+from shmio.config import Expectation, load
 from shmio.errors import ConfigError
 from shmio.layout.model import Layout
 
@@ -24,6 +24,13 @@ def of_file(file: Path) -> str:
     except OSError as error:
         return f"not readable: {error.strerror}"
     return hashlib.sha256(data).hexdigest() if len(data) <= MAX_BYTES else f"larger than {MAX_BYTES} bytes"
+
+
+def of_campaign(file: Path, expectations: Iterable[Expectation]) -> Iterator[tuple[str, str]]:
+    """Yield a name and the digest of a campaign file, and of the recordings that it names."""
+    yield "campaign", f"{file}, sha256 {of_file(file)}"
+    for name in dict.fromkeys(one.like for one in expectations if one.like is not None):
+        yield "like", f"{name}, sha256 {of_file(file.parent / name)}"
 
 
 def of_layouts(layouts: Mapping[str, Layout]) -> Iterator[tuple[str, str]]:

@@ -24,6 +24,7 @@ from shmio.recorder.file_output import Output
 from shmio.recorder.instance_follower import BlockEntry, InstanceEntry, InstanceFollower, StartPositions
 from shmio.recorder.recorder import CLOSE_S, AttachedFiles, Recorder, no_attachments
 from shmio.recording.injection_times import InjectionTimes
+from shmio.recording.judge import GoldenRecordings
 from shmio.segment import Block, Event, Frame, Segment
 from shmio.segment.block import Layouts
 
@@ -45,6 +46,7 @@ class Plan:
         injections: The declared injections, with their seeds; their times count from the begin.
         expectations: The expectations.
         duration_s: Duration on the instance's clock.
+        folder: Folder of the campaign; the files that it names are relative to it.
         step_s: Length of a step; None: the shortest period of the sources.
         real_time: Whether to run in real time, even if all sources could be stepped.
         stop: Whether to stop at the first failure.
@@ -54,6 +56,7 @@ class Plan:
     injections: Sequence[Declaration]
     expectations: Sequence[Expectation]
     duration_s: float
+    folder: Path = Path()
     step_s: float | None = None
     real_time: bool = False
     stop: bool = False
@@ -87,7 +90,7 @@ class LiveRun:
         self._seen = seen
         blocks = segment.blocks
         stale_ns = {source: block.stale_ns for source, block in blocks.items()}
-        self.judge = Judge(plan.expectations, Layouts(blocks), stale_ns)
+        self.judge = Judge(plan.expectations, Layouts(blocks), stale_ns, GoldenRecordings(plan.folder))
         self.injections = InjectionTimes()
         """When injections were active."""
         self.virtual = False

@@ -25,14 +25,15 @@ class Formula:
 
     Attributes:
         expectation: The expectation.
-        tree: Its formula, whose truth at the begin of the judged time is the verdict.
+        tree: Its formula, whose truth at the begin of the judged time is the verdict. None: its
+            signals must be like those of a recording.
         trigger: What must become true once, so that the expectation says anything; None: nothing.
         signals: What the formula reads.
         failure: What a failure means, as text.
     """
 
     expectation: Expectation
-    tree: Tree
+    tree: Tree | None
     trigger: Tree | None
     signals: tuple[Signal, ...]
     failure: str
@@ -40,7 +41,7 @@ class Formula:
     @property
     def horizon_ns(self) -> int:
         """How far the formula looks ahead or back within what it demands at each moment, in ns."""
-        return _reach_ns(self.tree)
+        return 0 if self.tree is None else _reach_ns(self.tree)
 
 
 def _reach_ns(tree: Tree) -> int:
@@ -90,8 +91,7 @@ def _made(
     try:
         check(tree)
         found = tuple(signals(tree, registers))
-        if len(found) > MAX_SIGNALS:
-            raise ConfigError(f"an expectation may read at most {MAX_SIGNALS} signals")
+        _check_count(found)
     except ConfigError as error:
         raise ConfigError(f"{key}: {error}") from None
     return Formula(expectation, tree, trigger, found, failure)
@@ -144,6 +144,21 @@ def _max_rate(expectation: Expectation, registers: Registers) -> Formula:
     return _made(expectation, "signal", tree, registers, failure)
 
 
+def _like(expectation: Expectation, registers: Registers) -> Formula:
+    texts = [expectation.signal] if isinstance(expectation.signal, str) else expectation.signal or []
+    try:
+        found = tuple(dict.fromkeys(signal for text in texts for signal in registers.several(text)))
+        _check_count(found)
+    except ConfigError as error:
+        raise ConfigError(f"signal: {error}") from None
+    return Formula(expectation, None, None, found, f"it was not like {expectation.like}")
+
+
+def _check_count(found: Sequence[Signal]) -> None:
+    if len(found) > MAX_SIGNALS:
+        raise ConfigError(f"an expectation may read at most {MAX_SIGNALS} signals, but this one reads {len(found)}")
+
+
 def _always(tree: Tree) -> Tree:
     return Operation("always", (tree,))
 
@@ -155,4 +170,5 @@ _FORMS: Final[Mapping[str, Callable[[Expectation, Registers], Formula]]] = {
     "always": _everywhere,
     "stays": _stays,
     "max_rate": _max_rate,
+    "like": _like,
 }

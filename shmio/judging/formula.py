@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from functools import partial
 from typing import Final
 
@@ -25,13 +26,17 @@ from shmio.judging.operators import (
     Node,
     Not,
     Truth,
+    Tube,
     Until,
     Window,
     from_bool,
     from_number,
+    tube,
 )
+from shmio.judging.pieces import Piece
 from shmio.judging.source import Signal
 from shmio.judging.verdict import All, Opposite, Outer, Start, UntilEnd, Whole
+from shmio.layout.glob import choose
 from shmio.layout.model import Layout, Register
 
 MAX_HORIZON_S: Final = 1_000_000
@@ -68,6 +73,26 @@ class Registers:
         signal = Signal(source, register.path, aspect)
         self.found[signal] = register
         return signal
+
+    def several(self, text: str) -> list[Signal]:
+        """Return the signals of all numbers and BOOLs that a path, a structure or a pattern names.
+
+        Raises:
+            ConfigError: It names none.
+
+        """
+        try:
+            return [self.signal(Reference(text))]
+        except ConfigError as error:
+            with suppress(PathError):
+                found = []
+                for source, register in choose([text], self._layouts):
+                    if not register.dims:
+                        with suppress(ConfigError):
+                            found.append(self.signal(Reference(f"{source}/{register.path}")))
+                if found:
+                    return found
+            raise ConfigError(str(error).partition(": ")[2]) from None
 
 
 def check(tree: Tree) -> None:
@@ -165,6 +190,15 @@ class Network:
             left, right = self._truths(tree)
             return UntilEnd(left, right)
         return Whole(_extremum(tree.name), self.truth(tree.operands[0]), tree.bounds_ns)
+
+    def like(self, signal: Signal, golden: Piece, tolerance: float, tolerance_ns: int) -> Outer:
+        """Return the part that compares a signal with another one, up to the end of that one.
+
+        The times of ``golden`` count from the begin; its last value is unknown.
+        """
+        node = Tube(self._input_of(signal), *tube(golden, tolerance, tolerance_ns))
+        self._nodes["like", node] = node
+        return Whole(np.minimum, node, (0, max(int(golden.time[-1]) - 1, 0)))
 
     def truth(self, tree: Tree) -> Node:
         """Return the node of a truth; a number is true if it is not 0."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Final
 
@@ -15,12 +15,22 @@ from shmio.injection.program import number_register
 from shmio.judging.expectation import Formula, read_expectations
 from shmio.judging.formula import Network
 from shmio.judging.operators import Node
+from shmio.judging.pieces import Piece
 from shmio.judging.source import Frames, Rows, Signal, Source, Trouble
-from shmio.judging.verdict import Outcome, Outer, Verdict, Whole
+from shmio.judging.verdict import All, Outcome, Outer, Verdict, Whole
 from shmio.layout.model import Layout, Register
 
 AROUND: Final = 3
 """Number of values before and after a moment that a verdict has."""
+
+
+Golden = Callable[[str, Sequence[Signal]], Sequence[Piece]]
+"""Reads signals of a recording.
+
+Its arguments are the file, as the campaign names it, and the signals. It returns them from 0 on,
+with a last value that is unknown (NaN), at the end of the recording. It raises ConfigError if the
+recording cannot be read, or does not have a signal.
+"""
 
 
 class Judge:
@@ -32,7 +42,11 @@ class Judge:
     """
 
     def __init__(
-        self, expectations: Sequence[Expectation], layouts: Mapping[str, Layout], stale_ns: Mapping[str, int]
+        self,
+        expectations: Sequence[Expectation],
+        layouts: Mapping[str, Layout],
+        stale_ns: Mapping[str, int],
+        golden: Golden | None = None,
     ) -> None:
         """Read the expectations.
 
@@ -40,6 +54,7 @@ class Judge:
             expectations: The expectations.
             layouts: The layout of each source.
             stale_ns: The age from which a frame of a source is stale, in ns.
+            golden: Reads signals of recordings, for ``like``; None: there are no recordings.
 
         Raises:
             ConfigError: An expectation is invalid; the message starts as ``expect[0].formula: …``.
@@ -59,7 +74,11 @@ class Judge:
         self.registers: Mapping[Signal, Register] = registers.found
         """The register of each signal."""
         self._network = Network(registers, inputs.__getitem__)
-        self._cases = [_Case(formula, self._network) for formula in formulas]
+        self._cases = [
+            _Case(formula, _outer(at, formula, self._network, golden)) for at, formula in enumerate(formulas)
+        ]
+        for case in self._cases:
+            case.watch(self._network)
         horizon_ns = max((formula.horizon_ns for formula in formulas), default=0)
         self._histories = {name: _History(horizon_ns) for name in self._sources}
         self._origin_ns: int | None = None
@@ -205,17 +224,45 @@ class Judge:
         return f"the run ended at {(self.end_ns - 1) / 1e9:.3f} s, before it was decided"
 
 
+def _outer(index: int, formula: Formula, network: Network, golden: Golden | None) -> Outer:
+    """Return the outermost part of an expectation.
+
+    Raises:
+        ConfigError: A recording cannot be read; the message starts as ``expect[0].like: …``.
+
+    """
+    if formula.tree is not None:
+        return network.outer(formula.tree)
+    one = formula.expectation
+    try:
+        if golden is None:
+            raise ConfigError("no recordings can be read here")
+        pieces = golden(one.like or "", formula.signals)
+    except ConfigError as error:
+        raise ConfigError(f'expect[{index}].like: {error} (expect "{one.name}")') from None
+    tolerance_ns = round((one.tolerance_s or 0.0) * 1e9)
+    return All(
+        [
+            network.like(signal, piece, one.tolerance or 0.0, tolerance_ns)
+            for signal, piece in zip(formula.signals, pieces, strict=True)
+        ]
+    )
+
+
 class _Case:
     """The present state of an expectation."""
 
-    def __init__(self, formula: Formula, network: Network) -> None:
+    def __init__(self, formula: Formula, outer: Outer) -> None:
         self.formula = formula
-        self.outer: Outer = network.outer(formula.tree)
-        self._trigger = None
-        if formula.trigger is not None:
-            self._trigger = Whole(np.maximum, network.truth(formula.trigger), None)
+        self.outer = outer
+        self._trigger: Whole | None = None
         self.around: dict[str, list[tuple[int, float | None]]] = {}
         self.around_ns: int | None = None  # the moment to which they belong
+
+    def watch(self, network: Network) -> None:
+        """Watch whether the condition of the expectation becomes true."""
+        if self.formula.trigger is not None:
+            self._trigger = Whole(np.maximum, network.truth(self.formula.trigger), None)
 
     @property
     def failed(self) -> bool:

@@ -426,6 +426,71 @@ def _continue(found: tuple[Values, Values], p: Values, q: Values, begin: Times, 
         level += 1
 
 
+class Tube(Node):
+    """How far a number is inside the band between two other signals; negative outside.
+
+    Args:
+        operand: The number.
+        lower: The lower limit; its times count from the begin of the judged time.
+        upper: The upper limit.
+    """
+
+    def __init__(self, operand: Node, lower: Piece, upper: Piece) -> None:
+        self._operand = operand
+        self._limits = lower, upper
+        self._begun = False
+
+    def turn(self) -> None:
+        """Compare each value with the limits at each moment."""
+        piece = self._operand.out
+        if not len(piece.time):
+            self.out = NOTHING
+            return
+        if not self._begun:
+            self._begun = True
+            begin = int(piece.time[0])
+            self._limits = tuple(limit._replace(time=limit.time + begin) for limit in self._limits)  # type: ignore[assignment]
+        inner = [
+            limit.time[limit.time.searchsorted(piece.time[0], "right") : limit.time.searchsorted(piece.end)]
+            for limit in self._limits
+        ]
+        time = np.unique(np.concatenate((piece.time, *inner)))
+        value = piece.low[piece.time.searchsorted(time, "right") - 1]
+        below, above = (limit.time.searchsorted(time, "right") - 1 for limit in self._limits)
+        lower, upper = self._limits
+        low = _loose(np.minimum(value - lower.high[below], upper.low[above] - value))
+        high = _loose(np.minimum(value - lower.low[below], upper.high[above] - value))
+        unknown = np.isnan(value)
+        low[unknown], high[unknown] = -np.inf, np.inf
+        self.out = Piece(time, low, high, piece.end)
+
+
+def tube(golden: Piece, tolerance: float, tolerance_ns: int) -> tuple[Piece, Piece]:
+    """Return the lower and the upper limit around a signal.
+
+    Before the begin and after the end of the signal, its first and its last value count.
+
+    Args:
+        golden: The signal, up to :data:`FAR_NS`; NaN where it is unknown.
+        tolerance: Tolerance of the value.
+        tolerance_ns: Tolerance in time, in both directions.
+    """
+    unknown = np.isnan(golden.low)
+    time = golden.time.copy()
+    time[-1] += tolerance_ns
+    values = Input()
+    values.out = Piece(
+        time, low=np.where(unknown, -np.inf, golden.low), high=np.where(unknown, np.inf, golden.low), end=golden.end
+    )
+    limits = []
+    for function, more in ((np.minimum, -tolerance), (np.maximum, tolerance)):
+        window = Window(function, values, -tolerance_ns, tolerance_ns)
+        window.turn()
+        found = window.out
+        limits.append(Piece(found.time, found.low + more, found.high + more, found.end))
+    return limits[0], limits[1]
+
+
 # -- functions of numbers ----------------------------------------------------------------------------------------------
 
 

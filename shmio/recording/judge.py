@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Final
 
 import numpy as np
 
 from shmio.config import Expectation
-from shmio.errors import RecordingError
-from shmio.judging.judge import Judge
-from shmio.judging.source import Frames, Rows
-from shmio.recording.dump import Dump
+from shmio.errors import ConfigError, PathError, RecordingError
+from shmio.injection.program import number_register
+from shmio.judging.judge import Golden, Judge
+from shmio.judging.pieces import Piece
+from shmio.judging.source import Frames, Rows, Signal, Source
+from shmio.recording.dump import Dump, open_dump
 from shmio.recording.reading.batch import Batch
 from shmio.recording.reading.part import MAX_NS, DumpBlock
 
+MAX_GOLDEN: Final = 20_000_000
+"""Maximum number of values of a recording with which an expectation compares."""
 
-def recording_judge(dump: Dump, expectations: Sequence[Expectation]) -> Judge:
-    """Return a judge of the sources of a recording.
+
+def recording_judge(dump: Dump, expectations: Sequence[Expectation], golden: Golden | None = None) -> Judge:
+    """Return a judge of the sources of a recording. ``golden`` is as for :class:`Judge`.
 
     Raises:
         ConfigError: An expectation is invalid; the message starts as ``expect[0].formula: …``.
@@ -24,10 +31,8 @@ def recording_judge(dump: Dump, expectations: Sequence[Expectation]) -> Judge:
 
     """
     blocks = _first_blocks(dump)
-    if not blocks:
-        raise RecordingError(f"{dump.files[0]}: it has no source")
     layouts = {source: block.layout for source, block in blocks.items()}
-    return Judge(expectations, layouts, {source: block.stale_ns for source, block in blocks.items()})
+    return Judge(expectations, layouts, {source: block.stale_ns for source, block in blocks.items()}, golden)
 
 
 def judge_recording(
@@ -47,8 +52,97 @@ def judge_recording(
         seen: Called with the values of the signals, by source, in order.
 
     """
-    blocks = _first_blocks(dump)
-    readers = {source: _batches(dump, judge, source, from_ns, to_ns) for source in judge.sources}
+    blocks: dict[str, DumpBlock] = _first_blocks(dump)
+    raws = {source: judge.needs_raw(source) for source in judge.sources}
+    for source, block, frames in _frames_of(dump, raws, from_ns, to_ns):
+        if block is not blocks[source]:
+            judge.follow(source, block.layout, block.stale_ns)
+            blocks[source] = block
+        judge.add(source, frames)
+        seen(judge.turn())
+    seen(judge.finish())
+
+
+class GoldenRecordings:
+    """Reads signals of the recordings that expectations name in ``like``."""
+
+    def __init__(self, folder: Path) -> None:
+        """Create the reader. Names of files are relative to ``folder``."""
+        self._folder = folder
+
+    def __call__(self, name: str, signals: Sequence[Signal]) -> list[Piece]:
+        """Return signals of a recording, from 0 on: see :data:`shmio.judging.judge.Golden`.
+
+        Raises:
+            ConfigError: The recording cannot be read, is too long, or does not have a signal.
+
+        """
+        file = self._folder / name
+        try:
+            with open_dump(file) as dump:
+                return list(self._read(dump, name, signals))
+        except OSError as error:
+            raise ConfigError(f"{file}: {error.strerror}") from None
+        except RecordingError as error:
+            raise ConfigError(str(error)) from None
+
+    def _read(self, dump: Dump, name: str, signals: Sequence[Signal]) -> Iterator[Piece]:
+        sources: dict[str, Source] = {}
+        rows: dict[str, list[Rows]] = {}
+        blocks = _first_blocks(dump)
+        for source in dict.fromkeys(signal.source for signal in signals):
+            if source not in blocks:
+                raise ConfigError(f"{name} has no source {source}")
+            sources[source] = Source(source, [signal for signal in signals if signal.source == source])
+            rows[source] = []
+            _follow(sources[source], blocks[source], name)
+        for source, block, frames in _frames_of(dump, dict.fromkeys(sources, False)):
+            if block is not blocks[source]:
+                _follow(sources[source], block, name)
+                blocks[source] = block
+            sources[source].add(frames)
+            if sum(one.frames * len(one.signals) for one in sources.values()) > MAX_GOLDEN:
+                raise ConfigError(f"{name} is too long: it has more than {MAX_GOLDEN} values of these signals")
+        begins = [one.origin_ns for one in sources.values() if one.origin_ns is not None]
+        if len(begins) < len(sources):
+            raise ConfigError(f"{name} has no frame of a source")
+        begin_ns, end_ns = max(begins), max(one.newest_ns for one in sources.values()) + 1
+        for one in sources.values():
+            one.turn(begin_ns, end_ns)
+        for signal in signals:
+            one = sources[signal.source]
+            found = one.inputs[one.signals.index(signal)].out
+            yield found._replace(time=found.time - begin_ns)
+
+
+def _follow(source: Source, block: DumpBlock, name: str) -> None:
+    found = {}
+    for signal in source.signals:
+        try:
+            found[signal.path] = number_register(f"{source.name}/{signal.path}", {source.name: block.layout})[1]
+        except PathError as error:
+            raise ConfigError(f"{name}: {error}") from None
+    source.follow(block.layout, found, block.stale_ns)
+
+
+def _first_blocks(dump: Dump) -> dict[str, DumpBlock]:
+    """Return the first block of each source. RecordingError: there is none."""
+    blocks: dict[str, DumpBlock] = {}
+    for block in dump.blocks:
+        blocks.setdefault(block.source, block)
+    if not blocks:
+        raise RecordingError(f"{dump.files[0]}: it has no source")
+    return blocks
+
+
+def _frames_of(
+    dump: Dump, raws: Mapping[str, bool], from_ns: int = 0, to_ns: int = MAX_NS
+) -> Iterator[tuple[str, DumpBlock, Frames]]:
+    """Yield the frames of sources, chunk by chunk, with those of one source in order.
+
+    ``raws`` says for each source whether to read what it delivered, too.
+    """
+    readers = {source: _batches(dump, source, from_ns, to_ns, raws=need) for source, need in raws.items()}
     come_to = dict.fromkeys(readers, -1)
     while readers:
         source = min(readers, key=come_to.__getitem__)  # the sources keep step, so that little has to wait
@@ -57,26 +151,14 @@ def judge_recording(
             del readers[source]
             continue
         block, frames = found
-        if block is not blocks[source]:
-            judge.follow(source, block.layout, block.stale_ns)
-            blocks[source] = block
-        judge.add(source, frames)
         come_to[source] = int(frames.clock_ns[-1])
-        seen(judge.turn())
-    seen(judge.finish())
+        yield source, block, frames
 
 
-def _first_blocks(dump: Dump) -> dict[str, DumpBlock]:
-    blocks: dict[str, DumpBlock] = {}
-    for block in dump.blocks:
-        blocks.setdefault(block.source, block)
-    return blocks
-
-
-def _batches(dump: Dump, judge: Judge, source: str, from_ns: int, to_ns: int) -> Iterator[tuple[DumpBlock, Frames]]:
+def _batches(dump: Dump, source: str, from_ns: int, to_ns: int, *, raws: bool) -> Iterator[tuple[DumpBlock, Frames]]:
     """Yield the frames of a source, chunk by chunk."""
     effective = dump.batches(source, from_ns, to_ns)
-    if not judge.needs_raw(source):
+    if not raws:
         for block, batch in effective:
             yield block, _frames(batch, None)
         return

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from shmio import control
-from shmio.campaigns.digests import of_configuration, of_file, of_layouts
+from shmio.campaigns.digests import of_campaign, of_configuration, of_layouts
 from shmio.campaigns.live import LiveRun, Plan
 from shmio.cli.campaigns.reports import Reports
 from shmio.cli.campaigns.verdicts import tell
@@ -50,6 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
         [with_seed(one, seed) for one in campaign.injection],
         campaign.expect,
         duration_s,
+        arguments.campaign.parent,
         None if arguments.step_ms is None else arguments.step_ms / 1000,
         arguments.real_time,
         arguments.stop,
@@ -61,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
         with segment:
             file = _configuration(segment)
             attachments: AttachedFiles = no_attachments if file is None else ConfigFiles(file)
-            facts = [("campaign", f"{arguments.campaign}, sha256 {of_file(arguments.campaign)}"), ("seed", str(seed))]
+            facts = [*of_campaign(arguments.campaign, campaign.expect), ("seed", str(seed))]
             facts += [] if file is None else of_configuration(file)
             facts += of_layouts({source: block.layout for source, block in segment.blocks.items()})
             try:

@@ -72,6 +72,40 @@ def test_two_sources_and_damage_of_values(capsys: pytest.CaptureFixture[str]) ->
     assert [one["outcome"] for one in found["verdicts"]] == ["failed", "failed", "passed"]
 
 
+def test_like_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with build(tmp_path / "golden.mem") as work:
+        work.block("cell")
+        for number in range(101, 121):
+            work.frame(number, image(number - 100, number - 101, on=number > 106))
+    near = "like = 'golden.mem'\nsignal = ['speed', 'on']\ntolerance = 0.5\ntolerance_s = 0.02"
+    campaign(near, near.replace("0.02", "0.01"), "like = 'golden.mem'\nsignal = 'cell'")
+    status, found = judged(capsys, "--to", "0.36")
+    assert status == 1
+    assert [(one["outcome"], one["moment_s"]) for one in found["verdicts"][1:]] == [("failed", 0.02), ("failed", 0.02)]
+    assert "the run ended" in found["verdicts"][0]["reason"], "the recording is shorter"
+    assert set(found["verdicts"][2]["around"]) == {"cell/count", "cell/speed", "cell/on"}
+
+
+@pytest.mark.parametrize(
+    ("table", "error"),
+    [
+        ("like = 'no.mem'\nsignal = 'on'", "expect[0].like: no.mem: No such file or directory"),
+        ("like = 'c.toml'\nsignal = 'on'", "expect[0].like: c.toml"),
+        ("like = 'run.mem'\nsignal = 'no'", "expect[0].signal: no: no such register in DB1"),
+        ("like = 'run.mem'\nsignal = ['row']", "expect[0].signal: row is an array"),
+        ("like = 'run.mem'\nsignal = []", "expect[0].signal: must not be empty"),
+        ("like = 'run.mem'", "expect[0].signal: this key is needed beside like"),
+        ("like = 'run.mem'\nsignal = 'on'\ntolerance = -1", "expect[0].tolerance: expected"),
+    ],
+)
+def test_wrong_recording_has_status_2(table: str, error: str, capsys: pytest.CaptureFixture[str]) -> None:
+    campaign(table)
+    assert main(["judge", "run.mem", "-f", "c.toml"]) == 2
+    told = capsys.readouterr().err
+    assert error in told
+    assert told.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     ("text", "error"),
     [

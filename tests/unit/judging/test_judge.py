@@ -17,7 +17,7 @@ from shmio.errors import ConfigError
 from shmio.judging.judge import Judge
 from shmio.judging.source import Frames
 from shmio.judging.verdict import Outcome, Verdict
-from tests.unit.judging.traces import LAYOUT, PERIOD_NS, STALE_NS, image, judge, portions, some
+from tests.unit.judging.traces import LAYOUT, PERIOD_NS, STALE_NS, golden, image, judge, portions, some
 
 PASSED, FAILED, INCONCLUSIVE = Outcome.PASSED, Outcome.FAILED, Outcome.INCONCLUSIVE
 S = PERIOD_NS
@@ -201,12 +201,44 @@ def test_two_sources_at_their_own_rates() -> None:
     assert found.begin_ns == S // 2
 
 
+@pytest.mark.parametrize(
+    ("recorded", "keys", "outcome", "robustness", "moment_s"),
+    [
+        ((0, 1, 2, 3, 4, 5), {}, PASSED, 0, None),
+        ((0, 1, 2, 3, 4, 5), {"tolerance": 0.5}, PASSED, 0.5, None),
+        ((0, 1, 2, 2, 4, 5), {"tolerance": 0.5}, FAILED, -0.5, 3),
+        ((0, 1, 2, 2, 4, 5), {"tolerance_s": 1}, PASSED, 0, None),
+        ((1, 2, 3, 4, 5, 6), {"tolerance_s": 0.9}, FAILED, -1, 0),
+        ((1, 2, 3, 4, 5, 6), {"tolerance_s": 1}, FAILED, -1, 0),
+        ((0, 0, 1, 2, 3, 4), {"tolerance_s": 1, "tolerance": 0.25}, FAILED, -0.75, 5),
+        ((0, 1, 2, 3), {}, PASSED, 0, None),
+        ((0, 1, 2, 3, 4, 5, 6), {}, INCONCLUSIVE, None, None),
+        ((0, 1, float("nan"), 3, 4, 5), {}, INCONCLUSIVE, None, None),
+        ((0, 1, float("nan"), 3, 4, 4), {}, FAILED, -1, 5),
+    ],
+)
+def test_like_a_recording(
+    recorded: Sequence[float], keys: Mapping[str, Any], outcome: Outcome, robustness: float | None, moment_s: int | None
+) -> None:
+    for most in (1, 6):
+        found = judge(expect(signal="x", like="golden.mem", **keys), golden=golden(*recorded))
+        later = UP._replace(clock_ns=UP.clock_ns + 100 * S)
+        for part in portions(6, np.random.default_rng(1), most):
+            found.add("cell", some(later, part))
+            found.turn()
+        found.finish()
+        one = found.verdicts[0]
+        assert (one.outcome, one.robustness) == (outcome, robustness)
+        assert one.moment_ns == (None if moment_s is None else (100 + moment_s) * S)
+
+
 FORMULAS: list[dict[str, Any]] = [
     {"formula": "always(rise(x > 0) implies eventually[0, 2.5] y >= 0)"},
     {"formula": "always[1, 7](y < 3 or once[0.5, 3] rate(x) > 1)"},
     {"stays": "x > -1", "for_s": 1.5},
     {"when": "changed(n)", "within_s": 3, "then": "x * y >= -4"},
     {"signal": "x + y", "max_rate": 5},
+    {"signal": ["x", "n"], "like": "g.mem", "tolerance": 4, "tolerance_s": 2.2},
     {"formula": "(x < 4 until[0, 4] y > 1) and always(age(x) < 3 and quality(x) >= uncertain)"},
     {"formula": "eventually[0, 6] always[0, 2] (x > 0 and historically[0, 1] y < 9)"},
 ]
@@ -226,7 +258,7 @@ def test_verdicts_do_not_depend_on_portions(seed: int) -> None:
     )
     found = []
     for most in (1, 4, count):
-        one = judge(*(expect(**{"name": f"e{i}", **keys}) for i, keys in enumerate(FORMULAS)))
+        one = judge(*(expect(**{"name": f"e{i}", **keys}) for i, keys in enumerate(FORMULAS)), golden=golden(*range(9)))
         for part in portions(count, random, most):
             one.add("cell", some(whole, part))
             one.turn()

@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from shmio.config import Expectation
-from shmio.judging.judge import Judge
+from shmio.judging.judge import Golden, Judge
+from shmio.judging.pieces import FAR_NS, Piece
 from shmio.judging.source import Frames
 from shmio.layout.model import Layout, Register
 
@@ -44,9 +45,16 @@ def frames(values: npt.NDArray[np.float64], *, begin: int = 0, time: Sequence[in
     )
 
 
-def judge(*expectations: Expectation) -> Judge:
+def judge(*expectations: Expectation, golden: Golden | None = None) -> Judge:
     """Return a judge of the source ``cell``."""
-    return Judge(expectations, {"cell": LAYOUT}, {"cell": STALE_NS})
+    return Judge(expectations, {"cell": LAYOUT}, {"cell": STALE_NS}, golden)
+
+
+def golden(*values: float) -> Golden:
+    """Return a reader of a recording in which each signal has one of these values each second."""
+    time = np.append(np.arange(len(values)) * PERIOD_NS, (len(values) - 1) * PERIOD_NS + 1)
+    numbers = np.array([*values, np.nan])
+    return lambda _file, signals: [Piece(time, numbers, numbers, FAR_NS)] * len(signals)
 
 
 def some(whole: Frames, part: slice) -> Frames:
