@@ -89,6 +89,13 @@ def test_each_table_lists_all_contenders(benchmark: str, row: re.Pattern[str], t
     assert all((ratio == "") == (name == ours) for name, *_, ratio in found if name in (ours, *list(tables)[1:2]))
 
 
+def test_benchmark_of_judging() -> None:
+    found = printed("judging")
+    rows = re.findall(r"^10 expectations, (?:1|8|64|512) frames at once +(\d+\.\d+) +\d+\.\d+$", found, re.MULTILINE)
+    assert len(rows) == 4
+    assert len(re.findall(r"^1 formula, .*? +\d+\.\d+ +\d+\.\d+$", found, re.MULTILINE)) == 5
+
+
 def test_benchmark_of_recording() -> None:
     found = printed("recording")
     sizes = re.findall(
