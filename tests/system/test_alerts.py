@@ -99,7 +99,7 @@ def test_a_failing_action_is_visible_and_harms_no_other(make_cell: Callable[...,
         'command_timeout_s = 60\ncommand = ["{python}", "-c", "{program}", "{folder}/{name}"]\n'
     )
     fill = {"python": sys.executable, "folder": tmp_path}
-    hanging = alert.format(name="hangs", program="import time; time.sleep(1000)", **fill).replace("60", "0.2")
+    hanging = alert.format(name="hangs", program="import time; time.sleep(1000)", **fill).replace("= 60", "= 0.2")
     failing = alert.format(name="fails", program="import sys; print('no printer'); sys.exit(3)", **fill)
     works = alert.format(name="works", program=COMMAND, **fill)
     with serving(500) as server:
