@@ -513,8 +513,9 @@ class ModbusConnector(Connector):
 
     def _most(self, one: _Register) -> int:
         """Return how many elements one request writes at most."""
-        if one.address.bit is not None:
-            return 1
+        kind = one.address.kind
+        if one.address.bit is not None or (kind.size == 1 and kind.base not in ("STRING", "BOOL")):
+            return 1  # the rest of each word belongs to others
         return MAX_WRITE_BITS if one.address.table.of_bits else max(1, MAX_WRITE_WORDS // one.address.width)
 
     def _requests_of(self, one: _Register, number: int, values: list[Any]) -> Iterator[tuple[int, int, bytes]]:

@@ -204,8 +204,9 @@ def test_writes_of_all_kinds(device: Device) -> None:
         "name": tag("STRING[5]", "unit 2 holding 40"),
         "byte": tag("BYTE", "holding 60"),
         "small": tag("SINT", "holding 61"),
+        "bytes": tag("ARRAY[0..2] OF BYTE", "holding 62"),
     }
-    device.set("holding", 60, [0x1234, 0xABCD])
+    device.set("holding", 60, [0x1234, 0xABCD, 0x1111, 0x2222, 0x3333])
     with connected(device, tags) as (connector, layout):
 
         def write(path: str, value: object) -> list[str]:
@@ -229,7 +230,8 @@ def test_writes_of_all_kinds(device: Device) -> None:
         assert write("name", "abc") == [""]
         assert device.get("holding", 40, 3, unit=2) == [0x6162, 0x6300, 0]
         assert write("byte", 7) == write("small", -1) == [""]
-        assert device.get("holding", 60, 2) == [0x1207, 0xABFF]
+        assert write("bytes", [7, 8, 9]) == [""]
+        assert device.get("holding", 60, 5) == [0x1207, 0xABFF, 0x1107, 0x2208, 0x3309]
         assert {call[0] for call in device.calls()} == {5, 6, 15, 16, 22}
 
 
