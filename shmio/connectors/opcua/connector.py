@@ -11,6 +11,7 @@ import time
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Coroutine, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, TypeVar
 
@@ -66,6 +67,36 @@ class _NodeWrite(NamedTuple):
     sample: Sample
 
 
+@dataclass
+class _Sending:
+    """The writes of a cycle."""
+
+    outcomes: list[str | Lost]
+    deadline_ns: int
+    """When to stop waiting for answers, ns of CLOCK_MONOTONIC."""
+    steps: list[_NodeWrite] = field(default_factory=list)
+    begun: int = 0
+    """Number of the steps that may have been sent."""
+    confirmed: int = 0
+    """Number of the steps that have their answers."""
+    future: concurrent.futures.Future[None] | None = None
+
+    def lost(self, reason: str) -> WriteLostError:
+        """Return the error with what is known of each write, if no answer can come any more.
+
+        Those that were sent may have been carried out.
+        """
+        outcomes = [*self.outcomes]
+        for step in self.steps[self.confirmed : self.begun]:
+            if outcomes[step.write] == "":
+                outcomes[step.write] = Lost.UNKNOWN
+        done = {step.write for step in self.steps[: self.begun]}
+        for step in self.steps[self.begun :]:
+            if outcomes[step.write] == "":
+                outcomes[step.write] = Lost.UNKNOWN if step.write in done else Lost.UNSENT
+        return WriteLostError(reason, outcomes)
+
+
 class OpcUaConnector(Connector):
     """Reads the nodes of a layout's registers by subscription, or by polling, and writes to them."""
 
@@ -90,6 +121,7 @@ class OpcUaConnector(Connector):
         self._latest: dict[int, Sample] = {}
         self._reported: set[tuple[int, str]] = set()
         self._link: _Link | None = None
+        self._sending = _Sending([], 0)
 
     @classmethod
     def browse(cls, options: OpcUaOptions, wanted: Wanted) -> Browsed:
@@ -227,69 +259,66 @@ class OpcUaConnector(Connector):
 
     # -- writing -------------------------------------------------------------------------------------------------------
 
-    def write(self, writes: Sequence[Write]) -> list[str]:
-        """Write to the nodes, and read them back, so that the next image has the new values.
+    def send(self, writes: Sequence[Write]) -> None:
+        """Begin to write to the nodes, in the thread of the sessions.
 
         Raises:
-            WriteLostError: A session was lost before all writes had their answers.
+            WriteLostError: A session is lost.
 
         """
         link = self._link
         if link is None or not link.ready:
             raise WriteLostError(f"not connected to {self._options.peer}", [Lost.UNSENT] * len(writes))
-        deadline_ns = time.monotonic_ns() + round(self.timeout_s * 1e9)
-        outcomes: list[str | Lost] = [""] * len(writes)
-        steps: list[_NodeWrite] = []
+        sending = self._sending = _Sending([""] * len(writes), time.monotonic_ns() + round(self.timeout_s * 1e9))
         for number, write in enumerate(writes):
             try:
-                steps += self._steps(link, number, write)
+                sending.steps += self._steps(link, number, write)
             except ValueError as error:
-                outcomes[number] = str(error)
+                sending.outcomes[number] = str(error)
         try:
-            self._refuse_ranges(link, steps, outcomes, deadline_ns)
+            sending.future = link.begin(lambda: self._carry_out(link, sending))
         except ConnectorError as error:
-            raise WriteLostError(str(error), [one or Lost.UNSENT for one in outcomes]) from None
-        steps = [step for step in steps if outcomes[step.write] == ""]
-        begun = link.confirmed = 0
-        try:
-            for batch in _batches(steps, link.per_write):
-                if time.monotonic_ns() > deadline_ns:
-                    raise ConnectorError(f"{self._options.peer} takes too long for the writes of a cycle: write less")
-                begun += len(batch)
-                codes = link.call(lambda batch=batch: link.write(batch), deadline_ns)  # type: ignore[misc]
-                for step, code in zip(batch, codes, strict=True):
-                    if quality_of(code) is Quality.BAD:
-                        path = self._layout.registers[step.item.index].path
-                        outcomes[step.write] = f"{path}: the server refuses it: {describe(code)}"
-            if steps:
-                written = list({step.item.index: step.item for step in steps}.values())
-                link.call(lambda: link.read_back(written), deadline_ns)
-        except ConnectorError as error:
-            self._mark_lost(outcomes, steps, begun, link)
-            raise WriteLostError(str(error), outcomes) from None
-        return [str(outcome) for outcome in outcomes]
+            raise sending.lost(str(error)) from None
 
-    def _refuse_ranges(
-        self, link: _Link, steps: Sequence[_NodeWrite], outcomes: list[str | Lost], deadline_ns: int
-    ) -> None:
-        """Refuse writes of elements that the server would not take as such."""
-        for step in steps:
-            if step.elements is None:
-                continue
-            if not link.call(lambda step=step: link.has_ranges(step), deadline_ns):  # type: ignore[misc]
+    def confirm(self, until_ns: int) -> list[str] | None:
+        """Wait until the nodes are written, and read back, so that the next image has the new values.
+
+        Raises:
+            WriteLostError: A session was lost before all writes had their answers.
+
+        """
+        link, sending = self._link, self._sending
+        if link is None or sending.future is None:
+            raise sending.lost(f"not connected to {self._options.peer}")
+        try:
+            link.result(sending.future, min(until_ns, sending.deadline_ns))
+        except concurrent.futures.TimeoutError:
+            if time.monotonic_ns() < sending.deadline_ns:
+                return None
+            sending.future.cancel()
+            raise sending.lost(f"{self._options.peer} takes too long for the writes of a cycle: write less") from None
+        except ConnectorError as error:
+            raise sending.lost(str(error)) from None
+        return [str(outcome) for outcome in sending.outcomes]
+
+    async def _carry_out(self, link: _Link, sending: _Sending) -> None:
+        """Write in requests, and read back what was written; runs in the thread of the sessions."""
+        outcomes = sending.outcomes
+        for step in sending.steps:
+            if step.elements is not None and not await link.has_ranges(step):
                 path = self._layout.registers[step.item.index].path
                 outcomes[step.write] = f"{path}: the server does not write single elements: write the whole array"
-
-    @staticmethod
-    def _mark_lost(outcomes: list[str | Lost], steps: Sequence[_NodeWrite], begun: int, link: _Link) -> None:
-        """Mark the writes without an answer. Those that were sent may have been carried out."""
-        for step in steps[link.confirmed : begun]:
-            if outcomes[step.write] == "":
-                outcomes[step.write] = Lost.UNKNOWN
-        done = {step.write for step in steps[:begun]}
-        for step in steps[begun:]:
-            if outcomes[step.write] == "":
-                outcomes[step.write] = Lost.UNKNOWN if step.write in done else Lost.UNSENT
+        sending.steps = [step for step in sending.steps if outcomes[step.write] == ""]
+        for batch in _batches(sending.steps, link.per_write):
+            sending.begun += len(batch)
+            codes = await link.write(batch)
+            sending.confirmed += len(batch)
+            for step, code in zip(batch, codes, strict=True):
+                if quality_of(code) is Quality.BAD:
+                    path = self._layout.registers[step.item.index].path
+                    outcomes[step.write] = f"{path}: the server refuses it: {describe(code)}"
+        if sending.steps:
+            await link.read_back(list({step.item.index: step.item for step in sending.steps}.values()))
 
     def _steps(self, link: _Link, number: int, write: Write) -> Iterator[_NodeWrite]:
         """Yield the writes of nodes for a write of bytes. ValueError: the write is impossible."""
@@ -424,8 +453,6 @@ class _Link(threading.Thread):
         self.opened: concurrent.futures.Future[None] = concurrent.futures.Future()
         self.sessions: list[Session] = []
         self.items: list[Item] = []
-        self.confirmed = 0
-        """Values of the present writes whose answers have come."""
 
     # -- for the poll thread -------------------------------------------------------------------------------------------
 
@@ -459,33 +486,54 @@ class _Link(threading.Thread):
                 self._failure = ConnectorError(reason)  # do not send CloseSession to a server that does not answer
                 raise self._failure
 
-    def call(self, work: Callable[[], Coroutine[Any, Any, _Result]], deadline_ns: int | None = None) -> _Result:
+    def call(self, work: Callable[[], Coroutine[Any, Any, _Result]]) -> _Result:
         """Run a coroutine in the loop, and wait for its result.
 
         Args:
             work: Creates the coroutine.
-            deadline_ns: When to stop waiting, ns of CLOCK_MONOTONIC; the time-out of a hook by default.
 
         Raises:
-            ConnectorError: The session is lost, or does not answer.
+            ConnectorError: The session is lost, or does not answer within the time-out of a hook.
+
+        """
+        future = self.begin(work)
+        limit_s = CONNECT_TIMEOUTS * self._options.timeout / 1000
+        try:
+            return self.result(future, time.monotonic_ns() + round(limit_s * 1e9))
+        except concurrent.futures.TimeoutError:
+            future.cancel()
+            raise ConnectorError(f"no answer within {limit_s * 1000:.0f} ms from {self._options.peer}") from None
+
+    def begin(self, work: Callable[[], Coroutine[Any, Any, _Result]]) -> concurrent.futures.Future[_Result]:
+        """Run a coroutine in the loop; return the future with its result, for :meth:`result`.
+
+        Raises:
+            ConnectorError: The session is lost.
 
         """
         if self._failure is not None:
             raise self._failure
-        limit_s = CONNECT_TIMEOUTS * self._options.timeout / 1000
-        if deadline_ns is not None:
-            limit_s = max(0.0, (deadline_ns - time.monotonic_ns()) / 1e9)
         running = self._guarded(work)
         try:
-            future = asyncio.run_coroutine_threadsafe(running, self._loop)
+            return asyncio.run_coroutine_threadsafe(running, self._loop)
         except RuntimeError:  # the loop has just ended
             running.close()
             raise self._failure or ConnectorError(f"the connection to {self._options.peer} was closed") from None
+
+    def result(self, future: concurrent.futures.Future[_Result], until_ns: int) -> _Result:
+        """Wait for the result of a coroutine.
+
+        Args:
+            future: The coroutine's future.
+            until_ns: When to stop waiting, ns of CLOCK_MONOTONIC.
+
+        Raises:
+            TimeoutError: There is no result yet.
+            ConnectorError: The session is lost.
+
+        """
         try:
-            return future.result(limit_s)
-        except concurrent.futures.TimeoutError:
-            future.cancel()
-            raise ConnectorError(f"no answer within {limit_s * 1000:.0f} ms from {self._options.peer}") from None
+            return future.result(max(0.0, (until_ns - time.monotonic_ns()) / 1e9))
         except concurrent.futures.CancelledError:
             raise self._failure or ConnectorError(f"the connection to {self._options.peer} was closed") from None
 
@@ -580,9 +628,7 @@ class _Link(threading.Thread):
     async def write(self, batch: Sequence[_NodeWrite]) -> list[int]:
         """Write a batch of one session, and return the status codes."""
         session = self.sessions[batch[0].item.session]
-        codes = await session.write([(step.item, step.elements, step.sample) for step in batch])
-        self.confirmed += len(batch)
-        return codes
+        return await session.write([(step.item, step.elements, step.sample) for step in batch])
 
     async def has_ranges(self, step: _NodeWrite) -> bool:
         """Return whether the server can write the single elements of a write."""

@@ -25,6 +25,7 @@ from shmio.layout.values.write import encode
 from shmio.model.statuses import BAD_OUT_OF_RANGE, GOOD, status_area
 from shmio.testing.cell import until
 from shmio.testing.ports import reserved_port
+from shmio.testing.write_conformance import write as written
 
 pytest.importorskip("asyncua")
 pytest.importorskip("pymodbus")
@@ -95,7 +96,7 @@ def values(connector: Connector, layout: Layout) -> dict[str, Value]:
 
 def write(connector: Connector, layout: Layout, path: str, value: object) -> list[str]:
     register = next(one for one in layout.registers if one.path == path)
-    return list(connector.write(encode(register, value, layout.byte_order)))
+    return list(written(connector, encode(register, value, layout.byte_order)))
 
 
 def statuses(connector: Connector, layout: Layout) -> dict[str, int]:

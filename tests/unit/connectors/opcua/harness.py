@@ -14,6 +14,7 @@ from shmio.layout.tags import place_tags
 from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.write import encode
 from shmio.model.statuses import RegisterStatus, StatusArea
+from shmio.testing.write_conformance import write
 
 PATIENCE_S = 20.0
 _NEVER = threading.Event()
@@ -49,7 +50,7 @@ class Source:
 
     def write(self, path: str, value: Value) -> str:
         register = self.layout.registers[self.layout.by_path[path]]
-        outcomes = self.connector.write(encode(register, value, self.layout.byte_order))
+        outcomes = write(self.connector, encode(register, value, self.layout.byte_order))
         return "; ".join(outcomes)
 
 

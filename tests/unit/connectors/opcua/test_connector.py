@@ -10,6 +10,7 @@ from shmio.errors import ConnectorError
 from shmio.layout.values.codec import Value
 from shmio.layout.values.write import Write, encode
 from shmio.model.statuses import BAD_NODE_ID_UNKNOWN, BAD_OUT_OF_RANGE, BAD_TYPE_MISMATCH, GOOD
+from shmio.testing.write_conformance import write
 from tests.unit.connectors.opcua.device import Device
 from tests.unit.connectors.opcua.harness import Source, connected, until
 
@@ -220,10 +221,10 @@ def test_the_servers_state_is_a_doubt(device: Device) -> None:
 def test_single_elements_are_not_written_to_a_server_that_would_replace_the_array(device: Device) -> None:
     with connected(device.url, TAGS) as source:
         array = source.layout.registers[source.layout.by_path["array"]]
-        (outcome,) = source.connector.write(encode(source.layout.element(array, (1,)), 50, "little"))
+        (outcome,) = write(source.connector, encode(source.layout.element(array, (1,)), 50, "little"))
         assert "write the whole array" in outcome
         assert device.ask("get", "array") == [1, 2, 3]
-        (outcome,) = source.connector.write([Write(array.offset + 1, 0, b"\1")])
+        (outcome,) = write(source.connector, [Write(array.offset + 1, 0, b"\1")])
         assert "write the whole element" in outcome
 
 

@@ -14,6 +14,7 @@ from shmio.connectors.base import Lost, WriteLostError
 from shmio.errors import ConnectorError
 from shmio.layout.values.write import Write
 from shmio.testing.proxy import FaultProxy
+from shmio.testing.write_conformance import write
 from tests.unit.connectors import hostile
 from tests.unit.connectors.opcua.device import Device, framing
 from tests.unit.connectors.opcua.harness import PATIENCE_S, Source, connected, until
@@ -108,7 +109,7 @@ def test_a_lost_publication_ends_the_session(device: Device) -> None:
 def test_writes_without_a_connection_are_unsent(device: Device) -> None:
     source = Source(device.url, TAGS)
     with pytest.raises(WriteLostError) as raised:
-        source.connector.write([Write(0, 0, bytes(4))])
+        write(source.connector, [Write(0, 0, bytes(4))])
     assert raised.value.outcomes == (Lost.UNSENT,)
 
 

@@ -19,6 +19,7 @@ from shmio.layout.model import Layout
 from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.write import encode
 from shmio.model.statuses import GOOD, status_area
+from shmio.testing.write_conformance import write
 from tests.unit.connectors.opcua.node_server import NodeServer
 
 A50 = Path(__file__).parents[4] / "db201.db"
@@ -168,8 +169,8 @@ def test_every_type_is_written(server: NodeServer) -> None:
     writer = connected(server, layout)
     try:
         for new in (WRITTEN, {path: before[path] for path in WRITTEN}):
-            writes = [write for path, value in new.items() for write in encode(by_path[path], value, "big")]
-            assert writer.write(writes) == [""] * len(writes)
+            writes = [one for path, value in new.items() for one in encode(by_path[path], value, "big")]
+            assert write(writer, writes) == [""] * len(writes)
             reader = connected(server, layout, "poll")
             try:
                 assert values(layout, reader.read()) == before | new
@@ -186,13 +187,13 @@ def test_an_element_is_written_alone(server: NodeServer) -> None:
     connector = connected(server, layout)
     try:
         for place, value in ((13, 200), (1099, 201)):
-            (outcome,) = connector.write(encode(layout.element(outputs, (place,)), value))
+            (outcome,) = write(connector, encode(layout.element(outputs, (place,)), value))
             assert outcome == ""
             found = values(layout, connector.read())["Outputs"]
             assert isinstance(found, list)
             assert found[place] == value
             assert found[:13] == [number % 241 for number in range(13)]
-            assert connector.write(encode(layout.element(outputs, (place,)), place % 241)) == [""]
+            assert write(connector, encode(layout.element(outputs, (place,)), place % 241)) == [""]
     finally:
         connector.close()
 
