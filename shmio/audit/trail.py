@@ -43,8 +43,11 @@ MAX_REASON: Final = 500
 """Maximum number of characters of a reason."""
 MAX_BATCH: Final = 500
 """Maximum number of entries in a write."""
-MERGED: Final = frozenset({"feed", "step"})
-"""Actions that a client repeats many times a second. Repetitions of a second are one entry, with their number."""
+MERGED: Final = frozenset({"feed", "read", "sign in", "step"})
+"""Actions that a client can repeat many times a second. Repetitions of a second are one entry, with their number.
+
+A ``read`` has an entry only if it is denied.
+"""
 MERGE_S: Final = 1.0
 MAX_MERGED: Final = 1000
 """Maximum number of different repetitions at a time. Further ones have an entry each."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -28,7 +28,7 @@ from shmio.segment import Segment
 
 STATIC: Final = Path(__file__).parent / "static"
 MAX_PAGES: Final = 64
-"""Maximum number of open pages."""
+"""Maximum number of open pages. If there are as many, the oldest one without a call is closed for the next."""
 MAX_LOGIN_BYTES: Final = 4096
 MAX_DROPPED: Final = 2
 """Maximum number of requests with dropped files at a time."""
@@ -63,11 +63,17 @@ def metrics_app(
 
 
 def _metrics(
-    segment: Segment, measurements: Measurements, folders: Mapping[str, str], registers: Sequence[str]
+    segment: Segment,
+    measurements: Measurements,
+    folders: Mapping[str, str],
+    registers: Sequence[str],
+    refuse: Callable[[Request], Response | None] = lambda _: None,
 ) -> Route:
     exposition = Exposition(InstanceCollector(segment, measurements, folders, registers))
 
-    async def metrics(_request: Request) -> Response:
+    async def metrics(request: Request) -> Response:
+        if (refused := refuse(request)) is not None:
+            return refused
         return Response(await run_in_threadpool(exposition.answer), media_type=CONTENT_TYPE_LATEST)
 
     return Route("/metrics", metrics)
@@ -92,8 +98,8 @@ class PageApp:
         """
         self._served, self._sessions, self._secure = served, sessions, secure
         self._tabs = [tab for tab in tabs if tab.offered(served)]
-        self.open_pages = 0
-        """Number of open pages."""
+        self._cookie = COOKIE.format(served.segment.instance)
+        self._pages: dict[Page, None] = {}
         self._dropping = 0
         self._files = {
             f"/{file.relative_to(STATIC)}": (file.read_bytes(), _TYPES[file.suffix])
@@ -111,7 +117,7 @@ class PageApp:
 
         """
         routes: list[BaseRoute] = [
-            _metrics(self._served.segment, measurements, self._served.folders, registers),
+            _metrics(self._served.segment, measurements, self._served.folders, registers, self._refuse_metrics),
             Route("/session", self._session, methods=["GET", "POST", "DELETE"]),
             Route("/layout", self._layout, methods=["POST"]),
             WebSocketRoute("/socket", self._socket),
@@ -126,7 +132,24 @@ class PageApp:
         return Response(found[0], media_type=found[1], headers=_POLICY)
 
     def _user(self, request: HTTPConnection) -> User:
-        return self._sessions.user(request.cookies.get(COOKIE), _host(request))
+        return self._sessions.user(request.cookies.get(self._cookie), _host(request))
+
+    def _refuse_metrics(self, request: Request) -> Response | None:
+        """Return an answer to those who may not read the figures: they have neither a session nor a token."""
+        user, host = self._user(request), _host(request)
+        kind, _, token = request.headers.get("authorization", "").partition(" ")
+        if kind.lower() == "bearer":
+            if self._sessions.blocked(host):
+                _record_sign_in(host, "too many wrong tokens")
+                return PlainTextResponse("too many wrong tokens: try again in a minute\n", 429)
+            owner = self._sessions.owner(token, host)
+            if owner is None:
+                _record_sign_in(host, "wrong token")
+            user = owner or user
+        if "read" in user.roles:
+            return None
+        text = "this needs the role read: send a token of [[grpc.token]] as Authorization: Bearer\n"
+        return PlainTextResponse(text, 401, {"www-authenticate": "Bearer"})
 
     async def _session(self, request: Request) -> Response:
         """Tell who the user is; with POST, open a session for a token; with DELETE, close it."""
@@ -134,9 +157,9 @@ class PageApp:
         if request.method == "GET":
             return JSONResponse(self._describe(self._user(request)))
         if request.method == "DELETE":
-            self._sessions.close(request.cookies.get(COOKIE, ""))
+            self._sessions.close(request.cookies.get(self._cookie, ""))
             answer = JSONResponse(self._describe(self._sessions.user(None, host)))
-            answer.delete_cookie(COOKIE, httponly=True, samesite="strict", secure=self._secure)
+            answer.delete_cookie(self._cookie, httponly=True, samesite="strict", secure=self._secure)
             return answer
         if self._sessions.blocked(host):
             _record_sign_in(host, "too many wrong tokens")
@@ -153,10 +176,11 @@ class PageApp:
             _record_sign_in(host, "wrong token")
             return JSONResponse({"error": "this is no token of [[grpc.token]]"}, 403)
         cookie, user = opened
+        self._sessions.close(request.cookies.get(self._cookie, ""))
         trail.record("sign in", {}, "done", who=trail.Acting(user.actor, "web"))
         answer = JSONResponse(self._describe(user))
         answer.set_cookie(
-            COOKIE, cookie, max_age=MAX_AGE_S, httponly=True, samesite="strict", secure=self._secure, path="/"
+            self._cookie, cookie, max_age=MAX_AGE_S, httponly=True, samesite="strict", secure=self._secure, path="/"
         )
         return answer
 
@@ -190,14 +214,28 @@ class PageApp:
         user = self._user(socket)
         if "read" not in user.roles:
             trail.record("read", {}, "denied", "it needs the role read", who=trail.Acting(user.actor, "web"))
-        if "read" not in user.roles or self.open_pages >= MAX_PAGES:
+        if "read" not in user.roles or not self._has_room():
             await socket.close(1008)  # before it is accepted: an answer 403
             return
-        self.open_pages += 1
+        page = Page(self._served, socket, user, self._tabs)
+        cookie, host = socket.cookies.get(self._cookie), _host(socket)
+        forget = self._sessions.on_end(cookie, host, lambda: page.end("the session has ended"))
+        self._pages[page] = None
         try:
-            await Page(self._served, socket, user, self._tabs).run()
+            await page.run(self._sessions.left_s(cookie, host))
         finally:
-            self.open_pages -= 1
+            forget()
+            self._pages.pop(page, None)
+
+    def _has_room(self) -> bool:
+        """Return whether one more page may be opened. If there are many, a silent one is closed for it."""
+        if len(self._pages) >= MAX_PAGES:
+            silent = next((page for page in self._pages if page.silent), None)
+            if silent is None:
+                return False
+            silent.end("there are too many pages")
+            del self._pages[silent]
+        return True
 
 
 def _record_sign_in(host: str, reason: str) -> None:

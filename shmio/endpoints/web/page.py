@@ -31,7 +31,7 @@ MAX_CALLS: Final = 16
 MAX_BATCHES: Final = 32
 """Maximum number of binary messages that may wait for a page. The oldest ones are dropped."""
 FIRST_CALL_S: Final = 10.0
-"""Time in s in which a page must make its first call."""
+"""Time in s in which a page must make its first call. If there are many pages, it has less."""
 
 _log = logging.getLogger("shmio.web")
 
@@ -145,20 +145,30 @@ class Page:
         self._newest: dict[str, bytes] = {}
         self._batches: deque[bytes] = deque(maxlen=MAX_BATCHES)
         self._waiting = asyncio.Event()
+        self.silent = True
+        """True until the page makes its first call."""
+        self._limit = asyncio.timeout(FIRST_CALL_S)
+        self._why = "the page made no call in time"
 
-    async def run(self) -> None:
-        """Serve the page until it is closed."""
-        await self._socket.accept()
+    async def run(self, lasts_s: float | None = None) -> None:
+        """Serve the page until it is closed.
+
+        Args:
+            lasts_s: Time in s after which the user's session ends; None: it does not end.
+
+        """
         sender = self.start(self._send())
         try:
-            async with asyncio.timeout(FIRST_CALL_S):
+            async with self._limit:
+                await self._socket.accept()
                 message = await self._receive()
-            while message is not None:
-                await self._room.acquire()
-                self.start(self._answer(message))
-                message = await self._receive()
+                if message is not None and self.silent:
+                    self.silent, self._why = False, "the session has ended"
+                    self._limit.reschedule(None if lasts_s is None else asyncio.get_running_loop().time() + lasts_s)
+                await self._serve(message)
         except TimeoutError:
-            await self._socket.close(1008, "the page made no call in time")
+            with suppress(RuntimeError):  # the connection is closed
+                await self._socket.close(1008, self._why)
         except (WebSocketDisconnect, RuntimeError):  # starlette raises RuntimeError for a connection that is closed
             pass
         finally:
@@ -168,6 +178,18 @@ class Page:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
+
+    def end(self, why: str) -> None:
+        """Close the page."""
+        self.silent, self._why = False, why
+        with suppress(RuntimeError):  # it has ended, or has not begun
+            self._limit.reschedule(asyncio.get_running_loop().time())
+
+    async def _serve(self, message: str | None) -> None:
+        while message is not None:
+            await self._room.acquire()
+            self.start(self._answer(message))
+            message = await self._receive()
 
     def start(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         """Run work in the background. It is cancelled when the page is closed."""

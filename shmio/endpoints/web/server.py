@@ -20,6 +20,7 @@ from shmio.config import Address
 from shmio.errors import EndpointError
 
 MAX_CONNECTIONS: Final = 128
+"""Maximum number of connections. If there are more, the one is closed that has waited longest for a request."""
 MAX_MESSAGE_BYTES: Final = 64 << 10
 """Maximum size of a message that a page sends over its WebSocket."""
 SEND_BUFFER_BYTES: Final = 64 << 10
@@ -59,16 +60,26 @@ class _Protocol(H11Protocol):
 
     counters: Counters
     _deadline: asyncio.TimerHandle | None = None
+    _quiet_s: float | None = None
+    """Since when no request is processed, as a time of the event loop in s; None while one is."""
 
     def connection_made(self, transport: Any) -> None:
         """Accept the connection, if there are not too many."""
         super().connection_made(transport)
         self.counters.connections = len(self.connections)
+        self._quiet_s = self.loop.time()
+        self._set_deadline()
         if len(self.connections) > MAX_CONNECTIONS:
             self.counters.refused += 1
-            transport.abort()
-            return
-        self._set_deadline()
+            self._longest_quiet().abort()
+
+    def _longest_quiet(self) -> asyncio.Transport:
+        """Return the connection that others miss least: a WebSocket that is being closed, or without a request."""
+        for other in self.connections:
+            if getattr(other, "close_sent", False):
+                return other.transport
+        quiet = [one for one in self.connections if isinstance(one, _Protocol) and one._quiet_s is not None]
+        return min(quiet, key=lambda one: one._quiet_s or 0.0).transport
 
     def handle_websocket_upgrade(self, event: Any) -> None:
         """Leave the connection to a page's WebSocket."""
@@ -87,10 +98,12 @@ class _Protocol(H11Protocol):
             self._set_deadline()
         super().data_received(data)
         if self.cycle is not None and not self.cycle.response_complete and not self.cycle.more_body:
+            self._quiet_s = None
             self._clear_deadline()
 
     def on_response_complete(self) -> None:
         """Wait for the next request."""
+        self._quiet_s = self.loop.time()
         self._clear_deadline()
         super().on_response_complete()
 

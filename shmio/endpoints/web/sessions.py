@@ -12,14 +12,15 @@ import secrets
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from shmio.audit.trail import Actor
 from shmio.config.credentials import Secret, digest
 from shmio.config.model import ROLES
 
-COOKIE: Final = "shmio_session"
+COOKIE: Final = "shmio_session_{}"
+"""Name of the cookie; it has the instance's name. Browsers share cookies among all ports of a host."""
 MAX_SESSIONS: Final = 256
 MAX_AGE_S: Final = 12 * 3600
 """Time in s after which a user must show the token again."""
@@ -48,6 +49,14 @@ class User:
         return [role for role in ROLES if role in self.roles]
 
 
+@dataclass(slots=True)
+class _Session:
+    user: User
+    opened_s: float
+    ends: set[Callable[[], None]] = field(default_factory=set)
+    """Called when the session is closed."""
+
+
 class Sessions:
     """The sessions of all users."""
 
@@ -65,7 +74,7 @@ class Sessions:
         self._tokens = tokens
         self._anonymous = frozenset(anonymous)
         self._now = now
-        self._users: OrderedDict[bytes, tuple[User, float]] = OrderedDict()
+        self._users: OrderedDict[bytes, _Session] = OrderedDict()
         self._failures: OrderedDict[str, list[float]] = OrderedDict()
 
     @property
@@ -75,11 +84,27 @@ class Sessions:
 
     def user(self, cookie: str | None, host: str) -> User:
         """Return the user who sent a cookie, or who sent none, from a host."""
-        if cookie is not None:
-            found = self._users.get(digest(cookie.encode()))
-            if found is not None and found[0].host == host and self._now() - found[1] < MAX_AGE_S:
-                return found[0]
-        return User("", self._anonymous, host)
+        found = self._found(cookie, host)
+        return User("", self._anonymous, host) if found is None else found.user
+
+    def left_s(self, cookie: str | None, host: str) -> float | None:
+        """Return the time in s until a session ends; None if the user has none."""
+        found = self._found(cookie, host)
+        return None if found is None else found.opened_s + MAX_AGE_S - self._now()
+
+    def on_end(self, cookie: str | None, host: str, end: Callable[[], None]) -> Callable[[], None]:
+        """Call ``end`` when a session is closed. Return what takes this back."""
+        found = self._found(cookie, host)
+        if found is None:
+            return lambda: None
+        found.ends.add(end)
+        return lambda: found.ends.discard(end)
+
+    def _found(self, cookie: str | None, host: str) -> _Session | None:
+        found = None if cookie is None else self._users.get(digest(cookie.encode()))
+        if found is not None and found.user.host == host and self._now() - found.opened_s < MAX_AGE_S:
+            return found
+        return None
 
     def open(self, token: str, host: str) -> tuple[str, User] | None:
         """Open a session for the owner of a token.
@@ -88,6 +113,17 @@ class Sessions:
             The cookie and the user; None if there is no such token.
 
         """
+        user = self.owner(token, host)
+        if user is None:
+            return None
+        cookie = secrets.token_urlsafe(32)
+        self._users[digest(cookie.encode())] = _Session(user, self._now())
+        if len(self._users) > MAX_SESSIONS:
+            self._ended(self._users.popitem(last=False)[1])
+        return cookie, user
+
+    def owner(self, token: str, host: str) -> User | None:
+        """Return the owner of a token; None if there is no such token."""
         shown, owner = digest(token.strip().encode()), None
         for secret in self._tokens:
             if hmac.compare_digest(secret.digest, shown):
@@ -95,16 +131,17 @@ class Sessions:
         if owner is None:
             self._failed(host)
             return None
-        cookie = secrets.token_urlsafe(32)
-        user = User(owner.name, owner.roles | self._anonymous, host)
-        self._users[digest(cookie.encode())] = (user, self._now())
-        if len(self._users) > MAX_SESSIONS:
-            self._users.popitem(last=False)
-        return cookie, user
+        return User(owner.name, owner.roles | self._anonymous, host)
 
     def close(self, cookie: str) -> None:
-        """Close the session of a cookie."""
-        self._users.pop(digest(cookie.encode()), None)
+        """Close the session of a cookie, and its pages."""
+        session = self._users.pop(digest(cookie.encode()), None)
+        if session is not None:
+            self._ended(session)
+
+    def _ended(self, session: _Session) -> None:
+        for end in tuple(session.ends):
+            end()
 
     def blocked(self, host: str) -> bool:
         """Return whether a host has shown too many wrong tokens lately."""

@@ -113,8 +113,14 @@ async function askToken() {
 function enter(found) {
   showUser(found);
   connection.close();
-  if (context.may("read")) connection.connect();
-  else replace(byId("main"), element("p", {}, "Sign in to see this cell."));
+  if (context.may("read")) {
+    connection.connect();
+    return;
+  }
+  shown?.close();
+  shown = null;
+  byId("offline").hidden = true;
+  replace(byId("main"), element("p", {}, "Sign in to see this cell."));
 }
 
 function makeTheme() {
@@ -137,6 +143,8 @@ connection.addEventListener("open", async () => {
 });
 connection.addEventListener("lost", async () => {
   byId("offline").hidden = false;
+  const found = await session().catch(() => null); // the session may have ended
+  if (found !== null && !found.roles.includes("read")) enter(found);
 });
 window.addEventListener("hashchange", showTab);
 makeTheme();

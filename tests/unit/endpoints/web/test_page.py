@@ -8,7 +8,7 @@ import json
 import socket
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from websockets.sync.connection import Connection
 
 from shmio.config import Address
 from shmio.config.credentials import Secret, digest
-from shmio.endpoints.web import app, page
+from shmio.endpoints.web import app, page, sessions
 from shmio.endpoints.web.app import PageApp
 from shmio.endpoints.web.measurements import Measurements
 from shmio.endpoints.web.served import Served
@@ -31,14 +31,19 @@ from shmio.segment import Segment
 from tests.unit.endpoints.web.harness import TIMEOUT_S
 
 TOKEN = "a-token-of-thirty-two-characters"
+UPGRADE = (
+    b"GET /socket HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+    b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+)
 SECRETS = (Secret("ann", frozenset({"read"}), digest(TOKEN.encode())),)
 
 
 class Pages:
     """A server of the page, and a browser's requests to it."""
 
-    def __init__(self, server: HttpServer) -> None:
+    def __init__(self, server: HttpServer, instance: str) -> None:
         self.port = server.port
+        self.cookie = COOKIE.format(instance)
 
     def request(
         self, method: str, path: str, body: str | bytes | None = None, **headers: str
@@ -51,8 +56,15 @@ class Pages:
         finally:
             connection.close()
 
+    def sign_in(self, token: str, **headers: str) -> str:
+        """Return the cookie of a new session."""
+        _, answer, _ = self.request("POST", "/session", json.dumps({"token": token}), **headers)
+        name, _, value = answer["set-cookie"].partition(";")[0].partition("=")
+        assert name == self.cookie
+        return value
+
     def open(self, cookie: str | None = None, **more: Any) -> ClientConnection:
-        headers = {} if cookie is None else {"Cookie": f"{COOKIE}={cookie}"}
+        headers = {} if cookie is None else {"Cookie": f"{self.cookie}={cookie}"}
         return connect(f"ws://127.0.0.1:{self.port}/socket", additional_headers=headers, open_timeout=TIMEOUT_S, **more)
 
 
@@ -78,7 +90,7 @@ def pages(
         thread.start()
         try:
             asyncio.run_coroutine_threadsafe(server.start(), loop).result(TIMEOUT_S)
-            yield Pages(server)
+            yield Pages(server, segment.instance)
         finally:
             asyncio.run_coroutine_threadsafe(server.stop(), loop).result(TIMEOUT_S)
             loop.call_soon_threadsafe(loop.stop)
@@ -146,10 +158,45 @@ def test_token_opens_the_page_until_the_user_signs_out(segment: Segment) -> None
         assert "SameSite=strict" in cookie
         value = cookie.partition(";")[0].partition("=")[2]
         with server.open(value) as browser:
-            assert said(browser, "overview.follow")["result"] is None
-        assert server.request("DELETE", "/session", Cookie=f"{COOKIE}={value}")[0] == 200
+            assert said(browser, "registers.rows", first=0, count=0)["result"]["rows"] == []
+            assert server.request("DELETE", "/session", Cookie=f"{server.cookie}={value}")[0] == 200
+            with pytest.raises(ConnectionClosed):  # a stolen cookie's page as well
+                browser.recv(TIMEOUT_S)
         with pytest.raises(InvalidStatus):
             server.open(value)
+
+
+def test_page_ends_with_its_session(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sessions, "MAX_AGE_S", 0.5)
+    with pages(segment, SECRETS, roles=()) as server:
+        cookie = server.sign_in(TOKEN)
+        with server.open(cookie) as browser:
+            assert said(browser, "registers.rows", first=0, count=0)["result"]["rows"] == []
+            with pytest.raises(ConnectionClosed, match="the session has ended"):
+                browser.recv(TIMEOUT_S)
+        with pytest.raises(InvalidStatus):
+            server.open(cookie)
+
+
+def test_second_sign_in_ends_the_first(segment: Segment) -> None:
+    with pages(segment, SECRETS, roles=()) as server:
+        first = server.sign_in(TOKEN)
+        assert server.sign_in(TOKEN, Cookie=f"{server.cookie}={first}") != first
+        with pytest.raises(InvalidStatus):
+            server.open(first)
+
+
+def test_figures_need_the_role_read(segment: Segment) -> None:
+    with pages(segment, SECRETS, roles=()) as server:
+        status, headers, text = server.request("GET", "/metrics")
+        assert (status, headers["www-authenticate"]) == (401, "Bearer")
+        assert "shmio_" not in text
+        assert server.request("GET", "/metrics", Authorization="Bearer wrong")[0] == 401
+        assert server.request("GET", "/metrics", Authorization=f"Bearer {TOKEN}")[0] == 200
+        assert server.request("GET", "/metrics", Cookie=f"{server.cookie}={server.sign_in(TOKEN)}")[0] == 200
+        for _ in range(sessions.ATTEMPTS):
+            server.request("GET", "/metrics", Authorization="Bearer wrong")
+        assert server.request("GET", "/metrics", Authorization=f"Bearer {TOKEN}")[0] == 429
 
 
 @pytest.mark.parametrize(
@@ -189,12 +236,21 @@ def test_number_of_pages_is_bounded_and_silent_ones_are_closed(
 ) -> None:
     monkeypatch.setattr(app, "MAX_PAGES", 1)
     monkeypatch.setattr(page, "FIRST_CALL_S", 0.2)
-    with pages(segment) as server, server.open() as silent:
-        with pytest.raises(InvalidStatus):
-            server.open()
-        with pytest.raises(ConnectionClosed) as closed:
+    with pages(segment) as server:
+        with server.open() as silent, pytest.raises(ConnectionClosed, match="no call in time"):
             silent.recv(TIMEOUT_S)
-        assert closed.value.rcvd is not None
-        assert closed.value.rcvd.code == 1008
         with server.open() as browser:
             assert said(browser, "overview.follow")["result"] is None
+            with pytest.raises(InvalidStatus):
+                server.open()
+
+
+def test_silent_sockets_keep_nobody_out(segment: Segment) -> None:
+    with pages(segment) as server, server.open() as present, ExitStack() as stack:
+        assert said(present, "registers.rows", first=0, count=0)["result"]["rows"] == []
+        for _ in range(500):
+            silent = stack.enter_context(socket.create_connection(("127.0.0.1", server.port), timeout=TIMEOUT_S))
+            silent.sendall(UPGRADE)
+        with server.open() as browser:
+            assert said(browser, "registers.rows", first=0, count=0)["result"]["rows"] == []
+        assert said(present, "registers.rows", first=0, count=0)["result"]["rows"] == []

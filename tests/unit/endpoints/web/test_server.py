@@ -87,13 +87,13 @@ def test_a_next_request_has_the_same_deadline(segment: Segment, monkeypatch: pyt
         assert endpoint.server.counters.refused == 1
 
 
-def test_too_many_connections_are_refused(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_oldest_of_too_many_connections_is_closed(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "MAX_CONNECTIONS", 3)
     with served(segment) as endpoint, ExitStack() as stack:
         clients = [stack.enter_context(connected(endpoint)) for _ in range(4)]
-        assert rest(clients[3]) == b""
-        clients[0].sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        assert b"200 OK" in clients[0].recv(4096)
+        assert rest(clients[0]) == b""  # the one that has waited longest
+        clients[3].sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert b"200 OK" in clients[3].recv(4096)
 
 
 @pytest.mark.parametrize(
