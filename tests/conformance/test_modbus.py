@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import ClassVar
 
 import pytest
@@ -19,6 +22,8 @@ from shmio.testing.proxy import FaultProxy
 from shmio.testing.table_conformance import TableConformance, Tags
 from shmio.testing.write_conformance import SPARE, WriteConformance, Writer
 from tests.unit.connectors.modbus.device import Device
+
+NODE = Path(__file__).parents[1] / "unit/endpoints/node"
 
 
 def framing(data: bytes | bytearray) -> int:
@@ -132,3 +137,18 @@ class TestModbus(TableConformance, WriteConformance):
         run.until(lambda frame: frame.quality is Quality.BAD)
         rig.proxy.pass_all()
         run.good()
+
+
+class TestModbusSerial(TableConformance):
+    """The device is made with modbus-serial. It does not know function 22."""
+
+    @pytest.fixture
+    def table(self) -> Iterator[ModbusTable]:
+        if not shutil.which("node") or not (NODE / "node_modules/modbus-serial").exists():
+            pytest.skip("needs Node's modbus-serial")
+        with subprocess.Popen(
+            ["node", str(NODE / "modbus_server.js")], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        ) as process:
+            assert process.stdout is not None
+            yield ModbusTable(Address("127.0.0.1", int(process.stdout.readline())))
+            process.communicate(timeout=20)
