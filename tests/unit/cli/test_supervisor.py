@@ -511,7 +511,7 @@ def test_check_as_json(example: Edit, instance: str, capsys: pytest.CaptureFixtu
     assert "'Outpts' names nothing" in warning
     found.pop("notes")  # they depend on the host: its users and the ports in use
     assert found == {
-        "config": "supervisor.toml", "instance": instance, "injections": [], "replay": [],
+        "config": "supervisor.toml", "instance": instance, "injections": [], "replay": [], "alerts": [],
         "processes": ["plc", "cell", "grpc", "broker", "mqtt", "recorder"], "segment": f"shmio-{instance}",
     }  # fmt: skip
     example("period_ms = 20", "period_ms = -1")
@@ -897,6 +897,7 @@ def test_status_has_the_documented_keys_in_order(instance: str, capsys: pytest.C
         "mqtt": "mqtt",
         "recorder": "recorder",
         "web": "metrics",
+        "alerts": "alerts",
     }
     with Segment.create(instance, blocks, [ProcessSpec(name, kind) for kind, name in kinds.items()]) as segment:
         assert main(["status", "--json", "--instance", instance]) == 0

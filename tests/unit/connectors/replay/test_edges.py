@@ -204,7 +204,7 @@ def test_request_within_a_step_takes_effect_after_it(tmp_path: Path, instance: s
 
 def test_search_can_be_cancelled(tmp_path: Path, instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
     file = record(tmp_path, instance)
-    monkeypatch.setattr(Search, "go_on", lambda _: None)  # a search that never ends
+    monkeypatch.setattr(Search, "advance", lambda _: None)  # a search that never ends
     with built(instance, stepped=False) as segment, Playing(segment, file), attach(instance, writable=True) as attached:
         asked = []
 

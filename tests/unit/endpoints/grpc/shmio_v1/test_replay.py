@@ -73,7 +73,7 @@ def test_a_search_does_not_block_others_and_ends_with_its_call(
     tmp_path: Path, instance: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun = threading.Event()
-    monkeypatch.setattr(Search, "go_on", lambda _: begun.set())  # a search that never ends
+    monkeypatch.setattr(Search, "advance", lambda _: begun.set())  # a search that never ends
 
     async def test(served: Endpoint, _: Playing) -> None:
         async with connect_aio(f"127.0.0.1:{served.port}") as cell:
