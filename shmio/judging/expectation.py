@@ -73,6 +73,22 @@ def read_expectations(
     return found, registers
 
 
+def check_texts(expectations: Sequence[Expectation]) -> None:
+    """Parse all texts of expectations, without their registers.
+
+    Raises:
+        ConfigError: A text is invalid; the message starts as ``expect[0].formula: …``.
+
+    """
+    for index, expectation in enumerate(expectations):
+        for key in ("formula", "when", "then", "never", "always", "stays", "signal"):
+            if getattr(expectation, key) is not None and (key != "signal" or expectation.max_rate is not None):
+                try:
+                    _parsed(expectation, key)
+                except ConfigError as error:
+                    raise ConfigError(f'expect[{index}].{error} (expect "{expectation.name}")') from None
+
+
 def _parsed(expectation: Expectation, key: str, *, momentary: bool = False) -> Tree:
     """Parse the text of a key. ``momentary``: it must have no temporal operator."""
     try:
@@ -99,7 +115,7 @@ def _made(
 
 def _formula(expectation: Expectation, registers: Registers) -> Formula:
     tree = _parsed(expectation, "formula")
-    if not temporal(tree):
+    if not temporal(tree, ("always", "eventually", "until")):
         raise ConfigError("formula: it says something about the first moment only: write always(…) or eventually(…)")
     trigger = None
     match tree:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
 from functools import partial
 from typing import Final
@@ -41,6 +41,8 @@ from shmio.layout.model import Layout, Register
 
 MAX_HORIZON_S: Final = 1_000_000
 """The longest time for which a formula may look ahead or back, with all its parts."""
+MAX_CHANGES: Final = 64
+"""By how much nested temporal operators may multiply the number of changes of a signal."""
 ASPECTS: Final = ("quality", "age", "raw")
 _LOGIC: Final = frozenset({"and", "or", "not", "implies"})
 _EDGES: Final = frozenset({"rise", "fall", "rising", "falling", "changed"})
@@ -117,6 +119,8 @@ def check(tree: Tree) -> None:
     if constant(tree):
         raise ConfigError("it must read a register")
     _check_bounds(tree, outer=True)
+    if _changes(tree) > MAX_CHANGES:
+        raise ConfigError("temporal operators with bounds are nested too deeply: at most 6 levels")
     if horizon_ns(tree) > MAX_HORIZON_S * _NS:
         raise ConfigError(f"the formula's bounds add up to more than {MAX_HORIZON_S} s")
 
@@ -133,9 +137,19 @@ def _check_bounds(tree: Tree, *, outer: bool) -> None:
         _check_bounds(operand, outer=outer and tree.name in _LOGIC)
 
 
-def temporal(tree: Tree) -> bool:
-    """Return whether a tree has a temporal operator."""
-    return any(isinstance(node, Operation) and node.name in TEMPORAL for node in nodes(tree))
+def _changes(tree: Tree) -> int:
+    """Return how often one change of a register can change the truth of a tree, at most."""
+    if not isinstance(tree, Operation):
+        return 1
+    own = 1
+    if tree.bounds_ns is not None:
+        own = 3 if tree.name == "until" else 1 + (tree.bounds_ns[0] != tree.bounds_ns[1])
+    return own * max(map(_changes, tree.operands))
+
+
+def temporal(tree: Tree, operators: Collection[str] = TEMPORAL) -> bool:
+    """Return whether a tree has a temporal operator, or one of these."""
+    return any(isinstance(node, Operation) and node.name in operators for node in nodes(tree))
 
 
 def constant(tree: Tree) -> bool:

@@ -23,6 +23,7 @@ from shmio.cli.target import Target, target
 from shmio.config.campaign import Campaign, load_campaign
 from shmio.config.declaration import with_seed
 from shmio.errors import ConfigError, ControlError, DeclarationError
+from shmio.judging.expectation import check_texts
 from shmio.recorder.recorder import AttachedFiles, ConfigFiles, no_attachments
 from shmio.segment import Segment, running_instances
 
@@ -45,6 +46,12 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigError(
             f"{arguments.campaign}: duration_s: this key is needed, or --for S: how long the campaign runs"
         )
+    try:  # before an instance is started
+        check_texts(campaign.expect)
+    except ConfigError as error:
+        raise ConfigError(f"{arguments.campaign}: {error}") from None
+    if arguments.record is not None and arguments.record.exists():
+        raise ConfigError(f"--record {arguments.record}: the file exists already; no recording is overwritten")
     seed = secrets.randbits(SEED_BITS) if arguments.seed is None else arguments.seed
     plan = Plan(
         [with_seed(one, seed) for one in campaign.injection],
