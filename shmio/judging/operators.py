@@ -191,7 +191,8 @@ class Moment(Node):
         no = np.full(len(time), -np.inf)
         found = np.stack((low, no), axis=1).reshape(-1)[kept]
         known = high is low and not open_.any()
-        most = found if known else np.stack((high, np.where(open_, high, no)), axis=1).reshape(-1)[kept]
+        later = np.where(open_, np.where(np.isnan(upper), np.inf, upper), no)
+        most = found if known else np.stack((high, later), axis=1).reshape(-1)[kept]
         self.out = Piece(moments[kept], found, most, end)
 
 

@@ -17,6 +17,7 @@ from shmio.errors import ConfigError
 from shmio.judging.judge import Judge
 from shmio.judging.source import Frames
 from shmio.judging.verdict import Outcome, Verdict
+from shmio.model.statuses import BAD_DEVICE_FAILURE, UNCERTAIN, RegisterStatus, status_area
 from tests.unit.judging.traces import LAYOUT, PERIOD_NS, STALE_NS, golden, image, judge, portions, some
 
 PASSED, FAILED, INCONCLUSIVE = Outcome.PASSED, Outcome.FAILED, Outcome.INCONCLUSIVE
@@ -151,6 +152,8 @@ def test_failure_has_the_values_around_it() -> None:
         (trace([1, 9], raw_x=[1, 2]), {"always": "raw(x) < 3"}, PASSED, ""),
         (trace([1, 9], raw_x=[1, 2]), {"always": "x < 3"}, FAILED, ""),
         (trace([1]), {"always": "x > 0"}, PASSED, ""),
+        (trace([1, 2, 3], missed=[2]), {"formula": "always[1.5, 1.9] not rise(x > 9)"}, INCONCLUSIVE, "missed"),
+        (trace([1, 2, 3]), {"formula": "always[1.5, 1.9] not changed(x)"}, PASSED, ""),
     ],
 )
 def test_unknown_values_never_decide(frames: Frames, keys: Mapping[str, Any], outcome: Outcome, reason: str) -> None:
@@ -169,6 +172,55 @@ def test_nothing_is_decided_without_frames() -> None:
     found.turn()
     found.finish()
     assert {(one.outcome, one.reason) for one in found.verdicts} == {(INCONCLUSIVE, "there was no frame of cell")}
+
+
+def test_frame_is_as_old_as_the_device_made_it() -> None:
+    slow = trace([1, 2, 3], time=[0, S, 9 * S])._replace(delay_us=np.full(3, 3_000_000, np.uint32))
+    found = judge(expect(never="quality(x) = bad"), expect(name="age", always="age(x) < 11"))
+    found.add("cell", slow)
+    found.finish()
+    assert [one.moment_ns for one in found.verdicts] == [8 * S + 1, S], (
+        "bad 7 s after the frame of 3 s, and 8 + 3 s old"
+    )
+
+
+def test_status_of_a_register() -> None:
+    layout = LAYOUT.with_statuses()
+    area = status_area(layout)
+    assert area is not None
+    rows = []
+    for at, code in enumerate((0, UNCERTAIN, BAD_DEVICE_FAILURE, 0)):
+        data = bytearray(layout.size)
+        data[: LAYOUT.size] = image((at, at, 0))
+        area.put(data, 0, RegisterStatus(code, 0))
+        rows.append(bytes(data))
+    found = Judge(
+        [
+            expect(always="x < 9"),
+            expect(name="y", always="y < 9"),
+            expect(name="q", never="quality(x) = bad or quality(y) < good"),
+            expect(name="u", formula="eventually[0, 1] quality(x) = uncertain"),
+        ],
+        {"cell": layout},
+        {"cell": STALE_NS},
+    )
+    images = np.frombuffer(b"".join(rows), np.uint8).reshape(4, layout.size)
+    found.add("cell", trace([0, 1, 2, 3])._replace(images=images))
+    found.turn()
+    found.finish()
+    assert [(one.outcome, one.moment_ns) for one in found.verdicts] == [
+        (INCONCLUSIVE, None), (PASSED, None), (FAILED, 2 * S), (PASSED, None),
+    ]  # fmt: skip
+
+
+def test_nothing_has_passed_before_the_end() -> None:
+    found = judge(expect(always="x < 9"), expect(name="b", formula="eventually x > 2"))
+    found.add("cell", UP)
+    found.turn()
+    assert [(one.outcome, one.reason) for one in found.verdicts] == [
+        (INCONCLUSIVE, "the run is not over"),
+        (PASSED, ""),
+    ]
 
 
 def test_failure_is_known_as_soon_as_it_is_certain() -> None:
@@ -265,6 +317,45 @@ def test_verdicts_do_not_depend_on_portions(seed: int) -> None:
         one.finish()
         found.append(one.verdicts)
     assert found[0] == found[1] == found[2]
+
+
+BOUNDED = [
+    "always[0, 20](rise(x > 0) implies eventually[0, 2.5] y >= 0)",
+    "always[0, 20] eventually[0, 3] (rise(x > 0) or falling(x > 1) or changed(y))",
+    "eventually[2, 18] always[0, 1.5] (x > 0 or historically[0, 1] y < 3)",
+    "always[0, 20](fall(x > 0) implies not on until[0, 4] y > -2)",
+    "always[1, 17](once[0.5, 3] rate(x) > 1 or x * y < 9)",
+    "not eventually[0, 20](rising(x > 1 and y > 1) and once changed(x))",
+]
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**32))
+def test_what_is_hidden_may_only_widen_the_robustness(seed: int) -> None:
+    """The robustness of what there really was lies between the bounds for what was seen of it."""
+    random = np.random.default_rng(seed)
+    count = 27
+    time = np.cumsum(random.choice([S // 2, S, 2 * S], count))
+    images = [image(random.integers(-4, 5, 3).tolist(), on=bool(random.integers(2))) for _ in range(count)]
+    whole = trace([0] * count, time=time.tolist())._replace(
+        images=np.frombuffer(b"".join(images), np.uint8).reshape(count, LAYOUT.size)
+    )
+    quality = whole.quality.copy()
+    quality[random.choice(count, 3)] = 0
+    kept = np.sort(random.choice(count, count - 3, replace=False))
+    kept = np.unique(np.concatenate(([0], kept)))  # the judged time begins with the first frame
+    seen = [whole._replace(quality=quality)] if seed % 3 == 0 else [some(whole, kept)]
+    seen += [some(whole, slice(0, int(random.integers(2, count))))]
+    bounds = []
+    for frames in [whole, *seen]:
+        found = judge(*(expect(name=f"e{at}", formula=text) for at, text in enumerate(BOUNDED)))
+        found.add("cell", frames)
+        found.turn()
+        found.finish()
+        bounds.append([(one.low, one.high) for one in found.verdicts])
+    for other in bounds[1:]:
+        for text, (low, high), (least, most) in zip(BOUNDED, bounds[0], other, strict=True):
+            assert least <= low <= high <= most, text
 
 
 @pytest.mark.parametrize(

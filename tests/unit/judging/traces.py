@@ -57,7 +57,7 @@ def golden(*values: float) -> Golden:
     return lambda _file, signals: [Piece(time, numbers, numbers, FAR_NS)] * len(signals)
 
 
-def some(whole: Frames, part: slice) -> Frames:
+def some(whole: Frames, part: slice | npt.NDArray[np.int64]) -> Frames:
     """Return a part of frames."""
     raws = None if whole.raws is None else whole.raws[part]
     number, clock_ns, quality, delay_us, images, _ = whole
