@@ -228,6 +228,13 @@ def test_benchmark_of_reading_modbus() -> None:
     ), found
 
 
+def test_benchmark_of_reading_mqtt() -> None:
+    if reason := missing():
+        pytest.skip(reason)
+    found = printed("mqtt_read")
+    assert len(re.findall(r"^(?:shmio|paho) +[1-9]\d* +\d+\.\d+", found, re.MULTILINE)) == 2, found
+
+
 def test_benchmark_of_the_web_page() -> None:
     pytest.importorskip("uvicorn")
     found = printed("web_page")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final
 
 from shmio.connectors.mqtt import json_path
@@ -37,6 +37,7 @@ from shmio.model.values import Quality
 log = logging.getLogger("shmio.source.mqtt")
 
 _SPARKPLUG: Final = f"{NAMESPACE}/"
+_NEVER_NS: Final = 1 << 63
 _NONE: Final = -1
 """No status has been shown yet."""
 
@@ -102,6 +103,13 @@ class Store:
         for watch in self._watches:
             self._watched.setdefault(watch.place.topic, []).append(watch)
         self._groups: dict[tuple[object, ...], Group] = {}
+        self._of_origin: dict[int, list[Group]] = {}
+        """The groups of each origin, by its ``id``."""
+        self._changed_groups: dict[Group, None] = {}
+        """The groups whose state or values may have changed since the last image."""
+        self._all_changed = True
+        self._expiry_ns = 0
+        """No message becomes too old before this time of CLOCK_MONOTONIC, in ns."""
         self._group_of: list[Group] = []
         self._ages, self._time = _Ages(options), _time_path(options)
         self._image = RegisterImage(layout) if layout.status_offset is not None else None
@@ -136,7 +144,11 @@ class Store:
         origin = self._origin(address, index)
         watches = tuple(watch for watch in self._watches if watch.covers(register.path))
         age_ns = self._ages.of(register.path, needed=not watches and isinstance(address.source, Place))
-        group = self._groups.setdefault((id(origin), age_ns, watches), Group(origin, age_ns, watches))
+        key = id(origin), age_ns, watches
+        if key not in self._groups:
+            self._groups[key] = Group(origin, age_ns, watches)
+            self._of_origin.setdefault(id(origin), []).append(self._groups[key])
+        group = self._groups[key]
         group.registers.append(index)
         self._group_of.append(group)
 
@@ -168,10 +180,13 @@ class Store:
             message = Message(payload, retained, self._order, time.monotonic_ns(), time.time_ns())
             for watch in self._watched.get(topic, ()):
                 watch.take(message)
+                self._all_changed = True
             if (found := self._topics.get(topic)) is not None:
                 found.message = message
+                self._changed_groups.update(dict.fromkeys(self._of_origin[id(found)]))
             elif topic.startswith(_SPARKPLUG):
                 self.host.take(message, topic)
+                self._all_changed = True  # a node's message may concern all of its devices
             if self._expected.get(topic) == payload:
                 del self._expected[topic]
             self._changed.notify_all()
@@ -187,11 +202,13 @@ class Store:
                 watch.reset()
             self.host.reset()
             self._expected.clear()
+            self._all_changed = True
 
     def refuse(self, topic: str) -> None:
         """Note that the broker refuses the subscription to a topic."""
         log.warning("the broker refuses the subscription to %s", topic)
         with self._changed:
+            self._all_changed = True
             if topic in self._topics:
                 self._topics[topic].refused = True
             for watch in self._watched.get(topic, ()):
@@ -203,11 +220,18 @@ class Store:
         if image is None:
             raise ConnectorError("the layout has no status area")
         with self._changed:
-            for group in self._groups.values():
+            groups: Iterable[Group] = self._changed_groups
+            if self._all_changed or now_ns >= self._expiry_ns:
+                groups, self._expiry_ns = self._groups.values(), _NEVER_NS
+            for group in groups:
                 state, message = group.state(now_ns), group.origin.message
+                if group.max_age_ns and message is not None and state != BAD_TIMEOUT:
+                    self._expiry_ns = min(self._expiry_ns, message.monotonic_ns + group.max_age_ns)
                 if state != group.shown or message is not group.seen:
                     self._show(image, group, state)
                     group.shown, group.seen = state, message
+            self._changed_groups.clear()
+            self._all_changed = False
             return bytes(image)
 
     def _show(self, image: RegisterImage, group: Group, state: int) -> None:

@@ -4,21 +4,32 @@ from __future__ import annotations
 
 import contextlib
 import json
+import time
+from types import SimpleNamespace
 from typing import Any, Final
 
 import msgspec
+import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from shmio.connectors.browsing import Wanted
 from shmio.connectors.mqtt import json_path
+from shmio.connectors.mqtt import store as store_module
 from shmio.connectors.mqtt.address import parse
 from shmio.connectors.mqtt.browse import Listener
 from shmio.connectors.mqtt.options import MqttOptions
 from shmio.connectors.mqtt.store import Store
 from shmio.connectors.mqtt.topic import time_ns
 from shmio.layout.values.codec import codec
-from shmio.model.statuses import BAD_OUT_OF_RANGE, BAD_WAITING_FOR_INITIAL_DATA, GOOD, StatusArea, quality_of
+from shmio.model.statuses import (
+    BAD_OUT_OF_RANGE,
+    BAD_TIMEOUT,
+    BAD_WAITING_FOR_INITIAL_DATA,
+    GOOD,
+    StatusArea,
+    quality_of,
+)
 from shmio.model.values import Quality
 from shmio.wire import sparkplug_b_pb2 as wire
 from tests.unit.connectors.mqtt.peer import layout_of
@@ -99,6 +110,23 @@ SPARKPLUG: Final = {
     **{f"d/{kind[:5]}".replace("[", ""): (kind, f"sparkplug G/N/D metric m{at % 4}") for at, kind in enumerate(KINDS)},
     "array": ("ARRAY[1..3] OF INT", "sparkplug G/N/D metric m1"),
 }
+
+
+def test_each_topic_has_an_age_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Messages of other topics do not keep a silent one good, and a new message makes it good again."""
+    now_ns = 1_000_000_000
+    monkeypatch.setattr(store_module, "time", SimpleNamespace(monotonic_ns=lambda: now_ns, time_ns=time.time_ns))
+    store = store_of({"a": ("INT", "a"), "b": ("INT", "b")}, max_age_ms=100)
+    area = StatusArea(store.layout)
+    for step, (topics, codes) in enumerate((
+        ("ab", (GOOD, GOOD)), ("a", (GOOD, GOOD)), ("a", (GOOD, BAD_TIMEOUT)), ("", (GOOD, BAD_TIMEOUT)),
+        ("", (BAD_TIMEOUT, BAD_TIMEOUT)), ("b", (BAD_TIMEOUT, GOOD)), ("", (BAD_TIMEOUT, GOOD)),
+    )):  # fmt: skip
+        for topic in topics:
+            store.take(topic, b"1", retained=False)
+        image = store.image(now_ns)
+        assert (area.get(image, 0).code, area.get(image, 1).code) == codes, step
+        now_ns += 60_000_000
 
 
 def test_a_number_beyond_all_registers_is_bad() -> None:
