@@ -14,7 +14,7 @@ from shmio.errors import ConfigError, PathError
 from shmio.injection.program import number_register
 from shmio.judging.expectation import Formula, read_expectations
 from shmio.judging.formula import Network
-from shmio.judging.operators import Node
+from shmio.judging.operators import UNTIL_SHARE, Node
 from shmio.judging.pieces import Piece
 from shmio.judging.source import Frames, Rows, Signal, Source, Trouble
 from shmio.judging.verdict import All, Outcome, Outer, Verdict, Whole
@@ -80,7 +80,7 @@ class Judge:
         for case in self._cases:
             case.watch(self._network)
         horizon_ns = max((formula.horizon_ns for formula in formulas), default=0)
-        self._histories = {name: _History(horizon_ns) for name in self._sources}
+        self._histories = {name: _History(horizon_ns + 2 * horizon_ns // UNTIL_SHARE) for name in self._sources}
         self._origin_ns: int | None = None
         self.end_ns: int | None = None
         """End of the judged time; None before :meth:`finish`."""

@@ -356,11 +356,16 @@ class History(Node):
         self.out = Piece(time, low, high, end)
 
 
+UNTIL_SHARE: Final = 8
+"""See :class:`Until`."""
+
+
 class Until(Node):
     """At each t: whether ``right`` is true at a moment in [t + begin, t + end], and ``left`` until then.
 
     The value is the greatest, over these moments s, of the least of ``right`` at s and of ``left``
-    from t up to, but not at, s.
+    from t up to, but not at, s. The node computes its whole window anew, so it waits until one in
+    :data:`UNTIL_SHARE` of the values is new.
     """
 
     def __init__(self, left: Node, right: Node, begin_ns: int, end_ns: int) -> None:
@@ -368,17 +373,23 @@ class Until(Node):
         self._alignment = Alignment(2)
         self._begin_ns, self._end_ns = begin_ns, end_ns
         self._kept = (NOTHING, NOTHING)
+        self._fresh = 0  # number of values since the last computation
         self._done_ns: int | None = None
 
     def turn(self) -> None:
-        """Compute the windows that have become known completely."""
+        """Compute the windows that have become known completely, when enough has come."""
         left, right = self._alignment.align([operand.out for operand in self._operands])
         if not len(left.time):
             self.out = NOTHING
             return
         if self._done_ns is None:
             self._done_ns = int(left.time[0])
+        self._fresh += len(left.time)
         left, right = join(self._kept[0], left), join(self._kept[1], right)
+        if self._fresh * UNTIL_SHARE < len(left.time) and left.end < FAR_NS // 2:
+            self._kept, self.out = (left, right), NOTHING
+            return
+        self._fresh = 0
         done, end = self._done_ns, max(self._done_ns, min(left.end - self._end_ns, FAR_NS))
         self.out = NOTHING
         if end > done:

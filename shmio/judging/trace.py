@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -28,19 +28,31 @@ class Plot(NamedTuple):
 class Traces:
     """Collects the signals of a run. It joins neighbouring values when there are too many."""
 
-    def __init__(self, signals: Mapping[str, Sequence[Signal]]) -> None:
-        """Begin to collect. ``signals`` are those of each source, in the order of its rows."""
-        self._traces = {source: (some, _Trace(len(some))) for source, some in signals.items()}
+    def __init__(self, signals: Mapping[str, Sequence[Signal]], chosen: Collection[Signal]) -> None:
+        """Begin to collect.
+
+        Args:
+            signals: The signals of each source, in the order of its rows.
+            chosen: Those to collect.
+        """
+        self._traces: dict[str, _Trace] = {}
+        self._places: dict[str, list[int]] = {}
+        self._index: dict[Signal, int] = {}
+        for source, some in signals.items():
+            places = [place for place, signal in enumerate(some) if signal in chosen]
+            if places:
+                self._places[source], self._traces[source] = places, _Trace(len(places))
+                self._index |= {some[place]: index for index, place in enumerate(places)}
 
     def add(self, rows: Mapping[str, Rows]) -> None:
         """Add the values that :meth:`Judge.turn` returned."""
         for source, some in rows.items():
-            self._traces[source][1].add(some)
+            if source in self._traces:
+                self._traces[source].add(some._replace(values=some.values[self._places[source]]))
 
     def plot(self, signal: Signal) -> Plot:
-        """Return the plot of a signal."""
-        signals, trace = self._traces[signal.source]
-        return trace.plot(signals.index(signal))
+        """Return the plot of a signal that was chosen."""
+        return self._traces[signal.source].plot(self._index[signal])
 
 
 class _Trace:

@@ -5,12 +5,16 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Final
 
 from shmio.errors import RecordingError
 from shmio.judging.judge import Judge
 from shmio.judging.report import Drawn, Report, Span, html, junit
-from shmio.judging.source import Rows
+from shmio.judging.source import Rows, Signal
 from shmio.judging.trace import Traces
+
+MAX_PLOTS: Final = 500
+"""Maximum number of plots in a report; those of further expectations are left out."""
 
 
 class Reports:
@@ -30,7 +34,8 @@ class Reports:
         def seen(rows: Mapping[str, Rows]) -> None:
             if self._traces is None:
                 found = judge()
-                self._traces = Traces({source: found.signals(source) for source in found.sources})
+                signals = {source: found.signals(source) for source in found.sources}
+                self._traces = Traces(signals, {one for _, one in _plotted(found)})
             self._traces.add(rows)
 
         return seen
@@ -54,15 +59,18 @@ class Reports:
         verdicts = judge.verdicts
         drawn: list[list[Drawn]] = [[] for _ in verdicts]
         if self._traces is not None:
-            drawn = [
-                [Drawn(one, self._traces.plot(one), judge.troubles(one.source)) for one in judge.read_by(index)]
-                for index in range(len(verdicts))
-            ]
+            for index, one in _plotted(judge):
+                drawn[index].append(Drawn(one, self._traces.plot(one), judge.troubles(one.source)))
         report = Report(title, facts, command, judge.begin_ns, judge.end_ns or 1, verdicts, drawn, injections)
         if self._html is not None:
             _write(self._html, html(report).encode("utf-8", "replace"))
         if self._junit is not None:
             _write(self._junit, junit(report))
+
+
+def _plotted(judge: Judge) -> list[tuple[int, Signal]]:
+    """Return what a report plots: the index of an expectation, and a signal that it reads."""
+    return [(index, one) for index in range(len(judge.verdicts)) for one in judge.read_by(index)][:MAX_PLOTS]
 
 
 def _write(file: Path, data: bytes) -> None:

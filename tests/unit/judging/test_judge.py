@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -213,6 +214,20 @@ def test_status_of_a_register() -> None:
     ]  # fmt: skip
 
 
+def test_block_that_a_reload_has_replaced() -> None:
+    """Its frames count from 1 again; a register that is gone is unknown."""
+    other = replace(LAYOUT, registers=LAYOUT.registers[1:])
+    found = judge(expect(always="x < 9"), expect(name="y", always="y < 9"), expect(name="q", never="quality(x) = bad"))
+    found.add("cell", UP)
+    found.turn()
+    found.follow("cell", other, STALE_NS)
+    found.add("cell", trace([0, 0], time=[6 * S, 7 * S]))
+    found.finish()
+    assert [(one.outcome, one.moment_ns) for one in found.verdicts] == [
+        (INCONCLUSIVE, None), (PASSED, None), (FAILED, 6 * S),
+    ]  # fmt: skip
+
+
 def test_nothing_has_passed_before_the_end() -> None:
     found = judge(expect(always="x < 9"), expect(name="b", formula="eventually x > 2"))
     found.add("cell", UP)
@@ -292,6 +307,7 @@ FORMULAS: list[dict[str, Any]] = [
     {"signal": "x + y", "max_rate": 5},
     {"signal": ["x", "n"], "like": "g.mem", "tolerance": 4, "tolerance_s": 2.2},
     {"formula": "(x < 4 until[0, 4] y > 1) and always(age(x) < 3 and quality(x) >= uncertain)"},
+    {"formula": "always((eventually[0, 1] x > -3) until[0, 60] y > 3)"},
     {"formula": "eventually[0, 6] always[0, 2] (x > 0 and historically[0, 1] y < 9)"},
 ]
 

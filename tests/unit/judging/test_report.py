@@ -25,7 +25,7 @@ def report() -> Report:
         expect(when="on", within_s=9, then="x > 9", name="open"),
         expect(always="x < 9", name="fine", severity="critical"),
     )
-    traces = Traces({"cell": found.signals("cell")})
+    traces = Traces({"cell": found.signals("cell")}, found.signals("cell"))
     found.add("cell", UP)
     traces.add(found.turn())
     traces.add(found.finish())
@@ -87,8 +87,8 @@ def test_junit(report: Report) -> None:
 
 
 def test_plots_of_long_signals_keep_extrema_within_a_limit() -> None:
-    found = judge(expect(always="x < 1"))
-    traces = Traces({"cell": found.signals("cell")})
+    found = judge(expect(always="y + x < 1"))
+    traces = Traces({"cell": found.signals("cell")}, {found.signals("cell")[1]})
     random = np.random.default_rng(1)
     values = random.normal(0, 1, 50_000)
     values[31_337] = 99
@@ -97,9 +97,9 @@ def test_plots_of_long_signals_keep_extrema_within_a_limit() -> None:
         count = int(random.integers(1, 900))
         part = values[at : at + count]
         time = np.arange(at, at + len(part)) * S
-        traces.add({"cell": Rows(time, part[None, :], (at + len(part)) * S)})
+        traces.add({"cell": Rows(time, np.stack((0 * part, part)), (at + len(part)) * S)})
         at += len(part)
-    plot = traces.plot(found.signals("cell")[0])
+    plot = traces.plot(found.signals("cell")[1])
     assert len(plot.time_ns) <= MAX_POINTS + MAX_POINTS // 2
     assert (plot.least.min(), plot.greatest.max()) == (values.min(), 99)
     assert (np.diff(plot.time_ns) > 0).all()
