@@ -13,6 +13,7 @@ from typing import Any, Final
 import msgspec
 
 from shmio.endpoints.alerts.state_file import alert_states
+from shmio.endpoints.web.clients import clients
 from shmio.endpoints.web.configuration import ConfigurationFile
 from shmio.endpoints.web.measurements import Measurements
 from shmio.endpoints.web.recordings import Recordings
@@ -104,6 +105,7 @@ class Served:
         self._usages = usages
         return msgspec.structs.asdict(status) | {
             "processes": processes,
+            "clients": clients({one.name: (one.kind, one.pid) for one in status.processes if one.pid is not None}),
             "alerts": [
                 {"name": name, "severity": alert.severity, "text": alert.text, "reason": alert.reason}
                 | {"active_s": round(status.clock.time_s - alert.progress.since_ns / 1e9) if status.clock else 0}

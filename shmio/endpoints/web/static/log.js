@@ -9,9 +9,10 @@ const REFRESH_MS = 2000;
 const FILTER_DELAY_MS = 200;
 
 export class LogTab {
-  /** @param {Context} context */
-  constructor(context) {
+  /** @param {Context} context @param {{ count?: number }} [more] `count`: number of lines. */
+  constructor(context, { count = 200 } = {}) {
     this.context = context;
+    this.count = count;
     /** @type {ReturnType<typeof setTimeout> | undefined} */
     this.typing = undefined;
     this.shown = "";
@@ -44,7 +45,7 @@ export class LogTab {
   }
 
   async resume() {
-    const given = { filter: this.filter.value, process: this.process.value };
+    const given = { filter: this.filter.value, process: this.process.value, count: this.count };
     try {
       this.show(await this.context.connection.call("log.lines", given));
       setText(this.problem, "");

@@ -3,6 +3,7 @@
 import { ConfigurationTab } from "./configuration.js";
 import { Connection } from "./connection.js";
 import { byId, element, replace, setText } from "./dom.js";
+import { duration } from "./format.js";
 import { InjectionsTab } from "./injections.js";
 import { LogTab } from "./log.js";
 import { OverviewTab } from "./overview.js";
@@ -87,8 +88,9 @@ function showHead(overview) {
   setText(state, overview.state);
   state.className = `badge ${overview.state}`;
   const { clock } = overview;
+  const time = clock.mode === "wall" ? `real time, since ${duration(clock.time_s)}` : `virtual time ${clock.time_s.toFixed(3)} s`;
   const step = clock.mode === "virtual" ? `, step ${clock.step}${clock.playing ? `, ${clock.rate} times real time` : ""}` : "";
-  setText(byId("clock"), `mode ${overview.mode}, ${clock.mode} time ${clock.time_s.toFixed(1)} s${step}`);
+  setText(byId("clock"), `mode ${overview.mode}, ${time}${step}`);
   setText(byId("note"), overview.note);
 }
 

@@ -2,11 +2,16 @@
 
 import { element, notify, replace, setText } from "./dom.js";
 import { bytes, duration, fixed } from "./format.js";
+import { LogTab } from "./log.js";
 
 /** @typedef {import("./main.js").Context} Context */
 
-const PROCESS = ["Process", "Kind", "State", "pid", "Restarts", "CPU %", "Memory", "Up", "Note", "Counters", ""];
-const SOURCE = ["Source", "Quality", "Reason", "Registers", "Period ms", "Rate Hz", "Cycle", "Overruns", "Round trip ms", "Age", "Lost / recovered in 1, 10, 30 min"];
+const PROCESS = ["Process", "Kind", "State", "pid", "Restarts", "CPU %", "Memory", "Running for", "Note", ""];
+const SOURCE = ["Source", "Quality", "Registers", "Period ms", "Rate Hz", "Overruns", "Round trip ms", "Age", "Disconnected in 1, 10, 30 min", "Connected in 1, 10, 30 min"];
+const CLIENT = ["Endpoint", "Connections", "Clients"];
+/** Kinds of processes in words. @type {Record<string, string>} */
+const KINDS = { source: "source", emulator: "emulator", grpc: "gRPC", mqtt: "MQTT", opcua: "OPC UA", web: "web page", recorder: "recorder", alerts: "alerts" };
+const LOG_LINES = 50;
 const ALERT = ["Alert", "Severity", "Text", "Reason", "Active for"];
 /** The class of each severity. @type {Record<string, string>} */
 const SEVERITY = { warning: "uncertain", critical: "bad" };
@@ -21,15 +26,21 @@ export class OverviewTab {
     this.sources = new Table(SOURCE, "sources");
     this.processes = new Table(PROCESS, "processes");
     this.alerts = new Table(ALERT, "alerts");
+    this.clients = new Table(CLIENT, "clients");
+    this.log = new LogTab(context, { count: LOG_LINES });
     this.alertsPart = element("div", { hidden: true }, element("h2", {}, "Active alerts"), this.alerts.root);
     this.root = element(
       "div",
-      {},
+      { class: "overview" },
       this.alertsPart,
       element("h2", {}, "Sources"),
       this.sources.root,
       element("h2", {}, "Processes"),
       this.processes.root,
+      element("h2", {}, "Clients"),
+      this.clients.root,
+      element("h2", {}, "End of the log"),
+      this.log.root,
     );
     this.stop = context.connection.follow("overview", (data) => this.update(data));
     if (context.overview !== null) this.update(context.overview);
@@ -37,6 +48,11 @@ export class OverviewTab {
 
   close() {
     this.stop();
+    this.log.close();
+  }
+
+  resume() {
+    this.log.resume();
   }
 
   /** @param {any} overview */
@@ -45,18 +61,18 @@ export class OverviewTab {
     this.sources.update(
       sources.map((/** @type {any} */ one) => [
         one.name,
-        [one.quality, one.quality],
-        one.reason,
+        [one.reason ? `${one.quality}: ${one.reason}` : one.quality, one.quality],
         one.registers,
-        fixed(one.period_ms, 1),
-        fixed(one.rate_hz, 1),
-        one.cycle ?? "",
+        [fixed(one.period_ms, 1), "number"],
+        [fixed(one.rate_hz, 1), "number"],
         one.overruns,
-        fixed(one.round_trip_ms, 2),
-        one.age_s === null ? "" : duration(one.age_s),
-        one.lost.map((/** @type {number} */ count, /** @type {number} */ i) => `${count} / ${one.recovered[i]}`).join(", "),
+        [fixed(one.round_trip_ms, 2), "number"],
+        [one.age_s === null ? "" : duration(one.age_s), "number"],
+        [one.lost.join(", "), "number"],
+        [one.recovered.join(", "), "number"],
       ]),
     );
+    this.updateClients(overview);
     this.alertsPart.hidden = overview.alerts.length === 0;
     this.alerts.update(
       overview.alerts.map((/** @type {any} */ one) => [
@@ -69,17 +85,27 @@ export class OverviewTab {
     );
     this.processes.update(
       overview.processes.map((/** @type {any} */ one) => [
-        one.name,
-        one.kind,
+        [one.name, "", counters(one)],
+        KINDS[one.kind] ?? one.kind,
         [one.state, one.state],
         one.pid ?? "",
         one.restarts,
-        fixed(one.cpu_percent, 1),
-        bytes(one.memory_bytes),
-        one.pid === null ? "" : duration(one.uptime_s),
-        one.note,
-        Object.entries(one.counters).map(([name, value]) => `${name.replaceAll("_", " ")} ${value}`).join(", "),
+        [fixed(one.cpu_percent, 1), "number"],
+        [bytes(one.memory_bytes), "number"],
+        [one.pid === null ? "" : duration(one.uptime_s), "number"],
+        [one.note, "note"],
         this.restartButton(one.name),
+      ]),
+    );
+  }
+
+  /** @param {any} overview */
+  updateClients(overview) {
+    this.clients.update(
+      overview.clients.map((/** @type {any} */ one) => [
+        one.endpoint,
+        one.connections,
+        one.clients.map((/** @type {any} */ client) => (client.connections > 1 ? `${client.client} (${client.connections})` : client.client)).join(", "),
       ]),
     );
   }
@@ -111,16 +137,22 @@ export class OverviewTab {
   }
 }
 
+/** @param {any} process @returns {string} What the process has counted. */
+function counters(process) {
+  return Object.entries(process.counters).map(([name, value]) => `${name.replaceAll("_", " ")}: ${value}`).join("\n");
+}
+
 /** A table whose rows are named by their first cell. */
 class Table {
   /** @param {string[]} heads @param {string} name */
   constructor(heads, name) {
     this.body = element("tbody");
-    const head = element("tr", {}, ...heads.map((text) => element("th", { scope: "col" }, text)));
-    this.root = element("table", { "aria-label": name, id: name }, element("thead", {}, head), this.body);
+    this.heads = heads.map((text) => element("th", { scope: "col" }, text));
+    const head = element("tr", {}, ...this.heads);
+    this.root = element("div", { class: "wide" }, element("table", { "aria-label": name, id: name }, element("thead", {}, head), this.body));
   }
 
-  /** @param {(string | number | [string, string] | HTMLElement)[][]} rows A pair is a text and its class. */
+  /** @param {(string | number | [string, string, string?] | HTMLElement)[][]} rows An array is a text, its class, and its tooltip. */
   update(rows) {
     while (this.body.rows.length > rows.length) this.body.deleteRow(-1);
     rows.forEach((cells, index) => {
@@ -131,8 +163,10 @@ class Table {
           if (target.firstChild !== cell) replace(target, cell);
           return;
         }
-        const [text, style] = Array.isArray(cell) ? cell : [String(cell), typeof cell === "number" ? "number" : ""];
+        const [text, style, more = ""] = Array.isArray(cell) ? cell : [String(cell), typeof cell === "number" ? "number" : ""];
         setText(target, text);
+        if (target.title !== more) target.title = more;
+        if (index === 0) this.heads[column].className = style === "number" ? "number" : "";
         if (target.className !== style) target.className = style;
       });
     });

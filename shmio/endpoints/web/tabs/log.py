@@ -47,5 +47,6 @@ class Log(Tab):
 
 def _lines(files: list[Path], given: Wanted) -> list[dict[str, Any]]:
     wanted = given.filter.lower()
-    found = (line.decode(errors="replace")[:MAX_TEXT] for line in last_lines(files, SEARCHED_LINES))
+    most = SEARCHED_LINES if wanted else given.count
+    found = (line.decode(errors="replace")[:MAX_TEXT] for line in last_lines(files, most))
     return [parse_line(line) for line in [line for line in found if wanted in line.lower()][-given.count :]]
