@@ -78,7 +78,7 @@ def _sockets(pid: int) -> Iterator[str]:
         with suppress(OSError), os.scandir(f"/proc/{one}/fd") as files:
             for file in files:
                 with suppress(OSError):
-                    link = os.readlink(file.path)
+                    link = str(Path(file.path).readlink())
                     if link.startswith("socket:["):
                         yield link[8:-1]
 

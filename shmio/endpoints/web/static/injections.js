@@ -3,6 +3,7 @@
 import { clock } from "./chart.js";
 import { element, notify, replace, setText } from "./dom.js";
 import { duration } from "./format.js";
+import { InjectionForm } from "./injection_form.js";
 
 /** @typedef {import("./main.js").Context} Context */
 /**
@@ -59,6 +60,7 @@ export class InjectionsTab {
       ),
       this.result,
     );
+    this.form = new InjectionForm(context, (one) => this.add(one));
     form.addEventListener("submit", (event) => {
       event.preventDefault();
       this.start();
@@ -68,6 +70,8 @@ export class InjectionsTab {
       {},
       element("div", { class: "bar" }, element("h2", {}, "Present injections"), element("span", { class: "grow" }), this.lift),
       table("injections", HEADS, this.body),
+      element("h2", {}, "New injection"),
+      this.form.root,
       element("h2", {}, "Campaign"),
       form,
       element("div", { class: "bar" }, element("h2", {}, "Events"), this.filter),
@@ -84,6 +88,7 @@ export class InjectionsTab {
 
   close() {
     for (const stop of this.stops) stop();
+    this.form.close();
     this.context.connection.call("injections.leave").catch(() => {});
   }
 
@@ -125,6 +130,14 @@ export class InjectionsTab {
       if (cells.join(" ").toLowerCase().includes(wanted)) rows.push(row(...cells));
     }
     replace(this.eventBody, ...rows);
+  }
+
+  /** @param {string} table Add it to the campaign; it replaces the example. */
+  add(table) {
+    const before = this.text.value === EXAMPLE ? "" : this.text.value.trim();
+    this.text.value = before === "" ? table : `${before}\n\n${table}`;
+    sessionStorage.setItem(KEY, this.text.value);
+    this.check();
   }
 
   async load() {

@@ -1,9 +1,10 @@
 // The plots tab: registers over time, live, and their past from the recording of this run.
 
-import { element, notify, replace, setText } from "./dom.js";
+import { element, notify, setText } from "./dom.js";
 import { Feeds, sourceOf } from "./feeds.js";
 import { Lanes } from "./lanes.js";
 import { Course } from "./recorded.js";
+import { suggest } from "./suggest.js";
 
 /** @typedef {import("./main.js").Context} Context */
 /** @typedef {import("./series.js").Series} Series */
@@ -51,7 +52,7 @@ export class PlotsTab {
 
     this.search = element("input", { type: "search", placeholder: "Add a register", "aria-label": "Add a register", list: "plot-paths", maxlength: 200 });
     this.found = element("datalist", { id: "plot-paths" });
-    this.search.addEventListener("input", () => this.suggest());
+    this.search.addEventListener("input", () => suggest(context.connection, this.search, this.found));
     this.lanes = new Lanes({
       series: (path) => this.allSeries(path),
       signal: (path) => this.feeds.signals.get(path),
@@ -169,14 +170,6 @@ export class PlotsTab {
     }
   }
 
-  async suggest() {
-    const filter = this.search.value;
-    const found = await this.context.connection.call("registers.rows", { first: 0, count: 30, filter }).catch(() => ({ rows: [] }));
-    if (filter !== this.search.value) return;
-    const paths = found.rows.filter((/** @type {any} */ row) => row.type !== undefined).map((/** @type {any} */ row) => row.path);
-    replace(this.found, ...paths.map((/** @type {string} */ path) => element("option", { value: path })));
-    this.context.connection.call("registers.rows", { first: 0, count: 0 }).catch(() => {});
-  }
 }
 
 /** @param {number} seconds @returns {string} */

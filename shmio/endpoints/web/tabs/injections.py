@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import tomllib
 from collections.abc import Iterable, Iterator
 from itertools import islice
@@ -16,9 +17,14 @@ from shmio.config import Declaration
 from shmio.config.campaign import parse_campaign
 from shmio.endpoints.web.page import Nothing, Page, Tab, call, release
 from shmio.errors import CommandError, ConfigError
+from shmio.injection.condition import Memory
+from shmio.injection.language import Number
+from shmio.injection.program import compile_condition
+from shmio.layout.values.codec import RegisterCodec
 from shmio.layout.values.write import Write, bits_of, paths_of
 from shmio.local.injection import Campaign, compile_declarations
-from shmio.segment import Block
+from shmio.segment import Block, Quality
+from shmio.segment.block import Layouts
 
 INTERVAL_S: Final = 0.5
 """Interval at which injections and events are sent if they have changed, in s."""
@@ -30,6 +36,8 @@ MAX_COUNTED: Final = 4_096
 """Number of registers above which they are no longer counted."""
 MAX_CAMPAIGNS: Final = 16
 """Maximum number of campaigns that one page may run at a time."""
+MAX_CONDITION: Final = 1_000
+"""Maximum number of characters of a condition."""
 MAX_CAMPAIGN: Final = 60_000
 """Maximum number of characters of a campaign."""
 
@@ -40,6 +48,12 @@ class Given(msgspec.Struct, forbid_unknown_fields=True):
     text: Annotated[str, Meta(max_length=MAX_CAMPAIGN)]
     keep: bool = False
     """True if the injections continue when the page is closed."""
+
+
+class Typed(msgspec.Struct, forbid_unknown_fields=True):
+    """A condition that the user types."""
+
+    when: Annotated[str, Meta(max_length=MAX_CONDITION)]
 
 
 class Chosen(msgspec.Struct, forbid_unknown_fields=True):
@@ -94,6 +108,18 @@ class Injections(Tab):
     async def check(self, given: Given) -> list[dict[str, Any]]:
         """Check a campaign, and return what it would inject. Nothing is started."""
         return await run_in_threadpool(self._preview, given.text)
+
+    @call("read", Typed)
+    async def condition(self, given: Typed) -> dict[str, Any]:
+        """Return whether a condition holds at present (None: unknown), and the values that it reads."""
+        blocks = self.page.served.segment.blocks
+        condition = compile_condition(given.when, Layouts(blocks))
+        values = [_present(blocks[source], codec) for source, codec in condition.reads]
+        shown = zip(condition.expression.references, values, strict=True)
+        return {
+            "holds": condition.expression.evaluate(values, Memory()),
+            "values": [[path, None if value is None else json.dumps(value)] for path, value in shown],
+        }
 
     @call("inject", Given)
     async def start(self, given: Given) -> list[dict[str, Any]]:
@@ -163,6 +189,15 @@ class Injections(Tab):
                     | _first_paths(paths)
                 )
         return found
+
+
+def _present(block: Block, codec: RegisterCodec) -> Number | None:
+    """Return the present value of a register; None if it is unknown, as for the conditions of injections."""
+    frame = block.latest()
+    if frame is None or not frame.source_ns or block.assess(frame)[0] is Quality.BAD:
+        return None
+    value = codec.decode(frame.raw)
+    return value if isinstance(value, bool | int | float) else None
 
 
 def _parse(text: str) -> list[Declaration]:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from typing import Any
 
 import pytest
@@ -55,6 +56,31 @@ def test_check_says_what_a_campaign_would_inject(segment: Segment) -> None:
 def test_wrong_campaign_is_answered(segment: Segment, text: str, error: str) -> None:
     with pages(segment) as server, server.open() as browser:
         assert error in said(browser, "injections.check", text=text)["error"]
+
+
+@pytest.mark.parametrize(
+    ("when", "holds", "values"),
+    [
+        ("cell/step > 3", True, [["cell/step", "5"]]),
+        (
+            "cell/axis/position > 3 or not cell/running",
+            True,
+            [["cell/axis/position", "0.0"], ["cell/running", "false"]],
+        ),
+        ("cell/step < 3", False, [["cell/step", "5"]]),
+    ],
+)
+def test_condition_is_evaluated_with_present_values(
+    segment: Segment, when: str, holds: bool, values: list[list[str]]
+) -> None:
+    image = bytearray(LAYOUT.size)
+    image[12:14] = struct.pack(">h", 5)
+    with pages(segment) as server, server.open() as browser:
+        unknown = {"holds": None, "values": [[path, None] for path, _ in values]}
+        assert said(browser, "injections.condition", when=when)["result"] == unknown
+        segment.writer("cell").publish(bytes(image), cycle=1, quality=Quality.GOOD)
+        assert said(browser, "injections.condition", when=when)["result"] == {"holds": holds, "values": values}
+        assert "at character" in said(browser, "injections.condition", when=f"{when} >")["error"]
 
 
 @pytest.mark.parametrize("name", ["start", "lift", "lift_all"])
