@@ -8,10 +8,13 @@ request                                   answer                                
 ``{"do": "reload"}``                      ``{"ok": true, "done": [lines], …}``               the change is done
 ``{"do": "reload", "dry_run": true}``     ``{"ok": true, "faults": [lines], …}``             the new plan is made
 ``{"do": "where"}``                       ``{"ok": true, "config": …, "read_ns": …, …}``     at once
+``{"do": "disturb", "answers": "ok"}``    ``{"ok": true}``                                   an emulator does so
 anything else                             ``{"error": "…"}``                                 at once
 ========================================  =================================================  =======================
 
 The segment's header contains the socket's path. Only the supervisor's own user and root are served.
+
+An emulator with ``faults = true`` has a socket of its own beside it, for ``disturb`` only.
 """
 
 from __future__ import annotations
@@ -26,7 +29,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Annotated, Any, Final, Literal, NamedTuple, get_args
 
 import msgspec
 
@@ -90,6 +93,15 @@ def socket_path(instance: str) -> str:
     raise ControlError(f"no folder can be used for the control socket ({'; '.join(refused)})")
 
 
+def emulator_socket_path(control: str, name: str) -> str:
+    """Return the path of an emulator's control socket, beside that of its supervisor.
+
+    Names of instances contain no ``+``.
+    """
+    path = Path(control)
+    return str(path.with_name(f"{path.stem}+{name}{path.suffix}"))
+
+
 def _prepare(folder: Path, uid: int) -> str | None:
     """Create a folder that only this user can enter, without following links.
 
@@ -117,6 +129,11 @@ def remove_socket(path: str) -> None:
             Path(path).unlink()
 
 
+Answers = Literal["ok", "delay", "corrupt", "hang", "refuse"]
+"""How an emulator answers its clients."""
+ANSWERS: Final[tuple[Answers, ...]] = get_args(Answers)
+
+
 class _Request(msgspec.Struct, tag_field="do", forbid_unknown_fields=True):
     """Base class of requests."""
 
@@ -142,6 +159,14 @@ class Where(_Request, tag="where"):
 
 
 Request = Stop | Restart | Reload | Where
+
+
+class Disturb(_Request, tag="disturb", omit_defaults=True):
+    """Change how an emulator answers its clients, until the next such request."""
+
+    answers: Answers
+    delay_ms: Annotated[float, msgspec.Meta(ge=0, le=600_000)] = 0.0
+    """Delay of each answer, with ``answers = "delay"``."""
 
 
 class Peer(NamedTuple):
@@ -183,8 +208,9 @@ class ControlServer:
         self,
         path: str,
         selector: selectors.BaseSelector,
-        handle: Callable[[Request, Answer], None],
+        handle: Callable[[Any, Answer], None],
         denied: Callable[[Peer], object] = lambda _: None,
+        requests: Any = Request,
     ) -> None:
         """Bind the socket.
 
@@ -196,6 +222,7 @@ class ControlServer:
             selector: The supervisor's selector.
             handle: Called with each request.
             denied: Called for each connection of a user who may not control the instance.
+            requests: The type of the requests.
 
         Raises:
             ControlError: The socket cannot be created.
@@ -205,6 +232,7 @@ class ControlServer:
         self._selector = selector
         self._handle = handle
         self._denied = denied
+        self._requests = requests
         self._clients: dict[socket.socket, tuple[bytearray, float | None]] = {}
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
         try:
@@ -271,7 +299,7 @@ class ControlServer:
 
     def _decode(self, client: socket.socket, line: bytes) -> None:
         try:
-            request = msgspec.json.decode(line, type=Request)
+            request = msgspec.json.decode(line, type=self._requests)
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             self.answer(client, {"error": f"this is not a request: {error}"})
         else:
@@ -322,7 +350,7 @@ class ControlServer:
 
 
 def request(
-    path: str, message: Request, timeout_s: float, lost: Callable[[], str | None] = lambda: None
+    path: str, message: _Request, timeout_s: float, lost: Callable[[], str | None] = lambda: None
 ) -> dict[str, Any]:
     """Send a request to the supervisor at ``path``, and return its answer.
 

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from shmio.cli.run import add_json, at_least, complete, load, milliseconds, moment, run
+from shmio.control import ANSWERS
 from shmio.version import __version__
 
 PROGRAM = "shmio-supervisor"
@@ -67,6 +68,14 @@ def _parser() -> argparse.ArgumentParser:
     add_json(reload)
     text = "restart one process, as it was configured at the start or the last reload"
     verb("restart", text, target, command="control:restart").add_argument("name", metavar="NAME")
+    text = "change how an emulator answers its clients, to rehearse faults; its section needs faults = true"
+    emulator = verb("emulator", text, target)
+    emulator.add_argument("name", metavar="NAME", help="the name of an [[emulator]]")
+    text = "ok: as usual; delay: later; corrupt: with wrong bytes; hang: not at all; refuse: no connections"
+    emulator.add_argument("answers", choices=ANSWERS, help=text)
+    emulator.add_argument(
+        "--delay-ms", type=milliseconds, metavar="MS", help="with delay: of each answer (default: 100)"
+    )
     check = verb("check", "validate the configuration and its layouts; start nothing", file)
     text = "say of each source whether its period can be met if a request takes this long to be answered"
     check.add_argument("--round-trip-ms", type=milliseconds, metavar="MS", help=text)

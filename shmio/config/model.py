@@ -19,6 +19,7 @@ Seconds = Annotated[float, Meta(ge=0, le=1e9)]
 Operand = bool | int | float | str | list[Any]
 LogFormat = Literal["text", "json"]
 ClockName = Literal["wall", "stepped"]
+EmulatorClockName = Literal["wall", "instance"]
 ReplayedInjections = Literal["keep", "leave out"]
 DistributionName = Literal["uniform", "gaussian"]
 OperationName = Literal["set", "offset", "scale", "clamp", "noise", "random", "freeze", "delay", "drop", "flip"]
@@ -101,6 +102,10 @@ class Emulator(Section):
     listen: Text
     layout: Text | Texts | None = None
     program: Text = "idle"
+    parameters: dict[str, Any] = {}
+    folder: Text = "."
+    clock: EmulatorClockName = "wall"
+    faults: bool = False
     block: Text | None = None
     type_bytes: TypeBytes = {}
     dbNumber: DbNumber | None = None  # noqa: N815 - named as the source's

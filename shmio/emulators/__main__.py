@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import os
+import selectors
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import ExitStack
+from typing import Any
 
 from shmio import worker
 from shmio.config import Address
-from shmio.emulators.device import Served
+from shmio.emulators.device import Device, Served
 from shmio.emulators.kinds import create
+from shmio.emulators.ports import reserved_port
+from shmio.emulators.programs import UserCode
+from shmio.emulators.stepping import InstanceTime
 from shmio.errors import ShmioError
 from shmio.layout.document import load_layout
 from shmio.logs import fields
+from shmio.segment.doorbell import Relay
 from shmio.worker import BEAT_S, Worker
 
 
@@ -20,26 +28,68 @@ def run(worker: Worker) -> None:
     The process description contains the compiled layouts, and the keys of the sources that read
     them.
     """
-    config = worker.config
+    config, program = worker.config, worker.config["program"]
+    listen, faults = Address.parse(config["listen"]), None
+    with ExitStack() as cleanup:
+        selector = cleanup.enter_context(selectors.DefaultSelector())
+        stop = os.eventfd(0, os.EFD_CLOEXEC)
+        cleanup.callback(os.close, stop)
+        cleanup.callback(worker.on_stop, lambda: None)
+        selector.register(stop, selectors.EVENT_READ, lambda: None)
+        if config["faults"]:
+            from shmio.emulators.faults import FaultControl  # noqa: PLC0415  few emulators need it
+
+            with reserved_port() as inner:
+                device = _started(worker, inner, cleanup)
+            faults = FaultControl(worker, selector, config["kind"], inner, listen)
+            cleanup.callback(faults.close)
+        else:
+            device = _started(worker, listen, cleanup)
+        if config["clock"] == "instance":
+            _follow_clock(worker, device, selector, cleanup)
+        worker.log.info("playing %s", program, extra=fields(address=listen))
+        worker.running()
+        worker.on_stop(lambda: os.eventfd_write(stop, 1))
+        while not worker.stopping.is_set():
+            for key, _ in selector.select(BEAT_S):
+                key.data()
+            if faults is not None:
+                faults.expire()
+            cycle = device.cycle
+            if cycle.failure is not None:
+                raise ShmioError(f"program {program} failed: {cycle.failure}") from cycle.failure
+            worker.report((cycle.cycles, cycle.overruns))
+
+
+def _follow_clock(worker: Worker, device: Device, selector: selectors.BaseSelector, cleanup: ExitStack) -> None:
+    """Let the program follow the instance's clock."""
+    page, slot = worker.segment.clock, worker.slot.index
+    relay = Relay(page.slot_bell(slot), "emulator-steps")
+    cleanup.callback(relay.join)
+    time = InstanceTime(page, slot, device.cycle, worker.report)
+    cleanup.callback(time.close)
+
+    def follow() -> None:
+        relay.acknowledge()
+        time.follow()
+
+    selector.register(relay.descriptor, selectors.EVENT_READ, follow)
+
+
+def _started(worker: Worker, listen: Address, cleanup: ExitStack) -> Device:
+    """Start the device, which ``cleanup`` stops."""
+    config: dict[str, Any] = worker.config
     layouts = [load_layout(layout.encode()) for layout in config["layouts"]]
     served = [Served(layout, options) for layout, options in zip(layouts, config["options"], strict=True)]
-    listen = Address.parse(config["listen"])
-    device = create(config["kind"], served, config["program"], listen, db_number=config["dbNumber"])
+    code = UserCode(config["folder"], config["parameters"])
+    device = create(config["kind"], served, config["program"], listen, db_number=config["dbNumber"], code=code)
+    cleanup.callback(device.stop)
     with ThreadPoolExecutor(1) as pool:  # some libraries take seconds, during which the heartbeat continues
         starting = pool.submit(device.start)
         while not wait((starting,), BEAT_S).done:
             worker.report()
-    try:
-        starting.result()
-        worker.log.info("playing %s", config["program"], extra=fields(address=listen))
-        worker.running()
-        while not worker.stopping.wait(BEAT_S):
-            cycle = device.cycle
-            if cycle.failure is not None:
-                raise ShmioError(f"program {config['program']} failed: {cycle.failure}") from cycle.failure
-            worker.report((cycle.cycles, cycle.overruns))
-    finally:
-        device.stop()
+    starting.result()
+    return device
 
 
 if __name__ == "__main__":

@@ -13,6 +13,8 @@ class Cycle:
     The schedule is absolute, so the cycles do not drift; late cycles are skipped and counted. A cycle
     is followed by a pause of at least its own length, so that a slow program leaves the device half
     of the time to answer its clients.
+
+    While the cycle is frozen, the schedule stands still, and :meth:`advance` moves the program's time.
     """
 
     def __init__(
@@ -31,6 +33,11 @@ class Cycle:
         self._period_s, self._step, self._active = period_s, step, active
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._stopping = threading.Event()
+        self._free = threading.Event()  # cleared while the cycle is frozen
+        self._free.set()
+        self._turn = threading.Lock()  # held during a cycle
+        self._number = 0  # of the last cycle, with those that were skipped
+        self._owed_ns = 0  # time since the last cycle of a frozen program
         self.failure: Exception | None = None
         """Error that ended the program, or None; the emulator's process checks it regularly."""
         self.cycles = 0
@@ -50,25 +57,60 @@ class Cycle:
     def stop(self) -> None:
         """Return when the thread has ended."""
         self._stopping.set()
+        self._free.set()
         if self._thread.ident is not None:
             self._thread.join()
 
+    def freeze(self) -> None:
+        """Stop the schedule. The present cycle has ended when this returns."""
+        self._free.clear()
+        with self._turn:
+            self._owed_ns = 0
+
+    def thaw(self) -> None:
+        """Continue the schedule, beginning with a cycle one period from now."""
+        self._free.set()
+
+    def advance(self, dt_ns: int) -> None:
+        """Run the cycles of the next ``dt_ns`` of a frozen program. An error is in ``failure``.
+
+        What remains of a period counts for the next call.
+        """
+        period_ns = round(self._period_s * 1e9)
+        with self._turn:
+            self._owed_ns += dt_ns
+            try:
+                while self._owed_ns >= period_ns and self.failure is None:
+                    self._owed_ns -= period_ns
+                    if self._active():
+                        self._scan(0)
+            except Exception as error:  # noqa: BLE001 - a program's defect is its runner's to report
+                self.failure = error
+
+    def _scan(self, skipped: int) -> None:
+        self._number += skipped + 1
+        self._step(self._number * self._period_s)
+        self.cycles += 1
+
     def _run(self) -> None:
         begun_s = free_s = time.monotonic()
-        tick = cycle = 0
+        tick = 0
         try:
             while True:
+                if not self._free.is_set():
+                    self._free.wait()
+                    begun_s = free_s = time.monotonic()
+                    tick = 0
                 elapsed = int((time.monotonic() - begun_s) / self._period_s)
                 missed = max(0, elapsed - tick - 1)
                 tick += missed + 1
                 if self._stopping.wait(max(begun_s + tick * self._period_s, free_s) - time.monotonic()):
                     return
-                if self._active():
-                    self.overruns += missed
-                    cycle += missed + 1
-                    step_s = time.monotonic()
-                    self._step(cycle * self._period_s)
-                    self.cycles += 1
-                    free_s = 2 * time.monotonic() - step_s
+                with self._turn:
+                    if self._free.is_set() and self._active():
+                        self.overruns += missed
+                        step_s = time.monotonic()
+                        self._scan(missed)
+                        free_s = 2 * time.monotonic() - step_s
         except Exception as error:  # noqa: BLE001 - a program's defect is its runner's to report
             self.failure = error

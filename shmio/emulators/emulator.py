@@ -11,7 +11,7 @@ from snap7.server import CPUState
 from shmio.config.address import Address
 from shmio.emulators.areas import AREAS, Place, TableMemory, is_table, place_name
 from shmio.emulators.cycle import Cycle
-from shmio.emulators.programs import Idle, program
+from shmio.emulators.programs import BUILT_IN, Idle, UserCode, program
 from shmio.emulators.s7 import S7Server, ServerOptions
 from shmio.errors import ConfigError
 from shmio.layout.image import initial_frame
@@ -38,6 +38,7 @@ class Emulator:
         others: Sequence[Layout] = (),
         max_clients: int = 16,
         options: ServerOptions | None = None,
+        code: UserCode = BUILT_IN,
     ) -> None:
         """Prepare the emulator.
 
@@ -49,13 +50,14 @@ class Emulator:
             others: Blocks without a program, served under their own numbers, and tag tables.
             max_clients: Maximum number of clients at a time.
             options: Limits and faults of the server.
+            code: What the program needs if it is a class of the user.
 
         Raises:
             ConfigError: There is no such program, the layout does not suit it, a number is missing
                 or used twice, or a block is too short for a tag table.
 
         """
-        self._program = program(program_name, layout)
+        self._program = program(program_name, layout, code)
         self._server = S7Server(listen, max_clients=max_clients, options=options)
         self._memory: dict[Place, bytearray] = {}
         self._table = TableMemory(layout) if is_table(layout) else None

@@ -8,17 +8,26 @@ from typing import Final
 
 from shmio.config.address import Address
 from shmio.emulators.device import Device, Served
+from shmio.emulators.programs import BUILT_IN, UserCode
 from shmio.errors import ConfigError
 
 S7: Final = "s7"
 KINDS: Final = (S7, "modbus", "opcua")
 """The kinds; the name of each is that of the connector that reads it."""
+FAULTY: Final = (S7, "modbus")
+"""The kinds that can have faults on command."""
 _LIBRARIES: Final = {"modbus": "pymodbus", "opcua": "asyncua"}
 _EXTRA: Final = "kind: the emulator {kind} needs another library: pip install 'shmio[{kind}]'"
 
 
 def create(
-    kind: str, served: Sequence[Served], program: str, listen: Address, *, db_number: int | None = None
+    kind: str,
+    served: Sequence[Served],
+    program: str,
+    listen: Address,
+    *,
+    db_number: int | None = None,
+    code: UserCode = BUILT_IN,
 ) -> Device:
     """Make an emulator; it does nothing until it is started.
 
@@ -28,6 +37,7 @@ def create(
         program: The program to run.
         listen: The address to listen on.
         db_number: Number of the first block, for S7; default: the layout's own.
+        code: What the program needs if it is a class of the user.
 
     Raises:
         ConfigError: The library is missing, there is no such program, or a layout does not suit it.
@@ -38,13 +48,13 @@ def create(
         from shmio.emulators.emulator import Emulator  # noqa: PLC0415
 
         layouts = [one.layout for one in served]
-        return Emulator(layouts[0], program, listen, db_number=db_number, others=layouts[1:])
+        return Emulator(layouts[0], program, listen, db_number=db_number, others=layouts[1:], code=code)
     if importlib.util.find_spec(_LIBRARIES[kind]) is None:
         raise ConfigError(_EXTRA.format(kind=kind))
     if kind == "modbus":
         from shmio.emulators.modbus import ModbusEmulator  # noqa: PLC0415
 
-        return ModbusEmulator(served, program, listen)
+        return ModbusEmulator(served, program, listen, code=code)
     from shmio.emulators.opcua import OpcUaEmulator  # noqa: PLC0415
 
-    return OpcUaEmulator(served, program, listen)
+    return OpcUaEmulator(served, program, listen, code=code)

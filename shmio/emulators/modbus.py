@@ -17,7 +17,7 @@ from shmio.config.address import Address
 from shmio.emulators.cycle import Cycle
 from shmio.emulators.device import Served
 from shmio.emulators.loop_thread import LoopThread
-from shmio.emulators.programs import Idle, program
+from shmio.emulators.programs import BUILT_IN, Idle, UserCode, program
 from shmio.errors import ConfigError, EndpointError, ValueRangeError
 from shmio.layout.addresses.modbus import MAX_ADDRESS, Order, Table, WordCodec, parse
 from shmio.layout.addresses.modbus import Address as Place
@@ -130,13 +130,16 @@ class ModbusEmulator:
     You can start an emulator only once.
     """
 
-    def __init__(self, served: Sequence[Served], program_name: str, listen: Address) -> None:
+    def __init__(
+        self, served: Sequence[Served], program_name: str, listen: Address, *, code: UserCode = BUILT_IN
+    ) -> None:
         """Prepare the emulator.
 
         Args:
             served: The tag tables; the program runs on the first.
             program_name: The program to run.
             listen: The address to listen on.
+            code: What the program needs if it is a class of the user.
 
         Raises:
             ConfigError: There is no such program, the table does not suit it, or an address is wrong.
@@ -145,7 +148,7 @@ class ModbusEmulator:
         self.address = listen
         self._images = [_TableImage(one) for one in served]
         self._layout: Layout = served[0].layout
-        self._program = program(program_name, self._layout)
+        self._program = program(program_name, self._layout, code)
         self._words: Words = {}
         for image in self._images:
             for place in image.places:

@@ -12,7 +12,7 @@ from shmio.config.address import Address
 from shmio.emulators.cycle import Cycle
 from shmio.emulators.device import Served
 from shmio.emulators.loop_thread import LoopThread
-from shmio.emulators.programs import Idle, program
+from shmio.emulators.programs import BUILT_IN, Idle, UserCode, program
 from shmio.errors import ConfigError, EndpointError, ValueRangeError
 from shmio.layout.addresses import siemens
 from shmio.layout.addresses.opcua import BrowsePath, NodeAddress, parse
@@ -95,7 +95,9 @@ class OpcUaEmulator:
     Clients may write all nodes. You can start an emulator only once.
     """
 
-    def __init__(self, served: Sequence[Served], program_name: str, listen: Address) -> None:
+    def __init__(
+        self, served: Sequence[Served], program_name: str, listen: Address, *, code: UserCode = BUILT_IN
+    ) -> None:
         """Prepare the emulator.
 
         Args:
@@ -103,6 +105,7 @@ class OpcUaEmulator:
                 first.
             program_name: The program to run.
             listen: The address to listen on.
+            code: What the program needs if it is a class of the user.
 
         Raises:
             ConfigError: There is no such program, the layout does not suit it, or an address is
@@ -110,7 +113,7 @@ class OpcUaEmulator:
 
         """
         self.address = listen
-        self._program = program(program_name, served[0].layout)
+        self._program = program(program_name, served[0].layout, code)
         self._tables = [list(_variables(one)) for one in served]
         self._frames = [bytearray(initial_frame(one.layout)[0]) for one in served]
         self._loop = LoopThread("opcua-server")

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
-from typing import Protocol
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, Protocol
 
 import msgspec
 import numpy as np
 
 from shmio.config.faults import meant
-from shmio.errors import ConfigError
+from shmio.errors import ConfigError, ModelError
 from shmio.layout.model import NUMBERS, Layout
 from shmio.layout.values.codec import Value, codec
 from shmio.simulation import ModelRunner
 from shmio.simulation.a50 import A50Cell
+from shmio.simulation.model import load
 
 
 class A50:
@@ -127,36 +128,84 @@ class Idle:
         """Change nothing."""
 
 
+@dataclass(frozen=True)
+class UserCode:
+    """What a program needs that is a class of the user."""
+
+    folder: str | None = None
+    """Where modules that are not installed are searched for."""
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+
+
+BUILT_IN: Final = UserCode()
+
+
+class UserProgram:
+    """Runs a class of the user: a ``shmio.plc.Program``, or any other model."""
+
+    def __init__(self, name: str, layout: Layout, code: UserCode) -> None:
+        """Import the class, and find its registers.
+
+        Raises:
+            ConfigError: There is no such class, or the layout or the parameters do not suit it.
+
+        """
+        try:
+            model = load(name, code.folder)
+        except (ConfigError, ModelError) as error:
+            raise ConfigError(f"program: {error}") from None
+        self._runner = ModelRunner(model, layout, code.parameters)
+        self.period_ms: float = getattr(model, "period_ms", MODEL_PERIOD_MS)
+        self._time_ns = 0
+
+    def step(self, time_s: float, frame: bytearray) -> None:
+        """Run a scan on the frame. ModelError: the user's code failed."""
+        time_ns = round(time_s * 1e9)
+        self._runner.resume(bytes(frame))  # clients may have written any register, also outputs
+        frame[:] = self._runner.step(time_ns, time_ns - self._time_ns)
+        self._time_ns = time_ns
+
+
 class Program(Protocol):
     """A controller's user program, with the plant it controls."""
 
     @property
-    def period_ms(self) -> int:
+    def period_ms(self) -> float:
         """Time between two cycles, in ms."""
 
     def step(self, time_s: float, frame: bytearray) -> None:
         """Run the cycle at ``time_s`` after the program's start, and change the block in place.
 
-        The result depends only on the time and the frame. Registers that the program does not set
-        keep what clients wrote; the program may read them. ``frame`` keeps its length.
+        Registers that the program does not set keep what clients wrote; the program may read them.
+        ``frame`` keeps its length.
         """
 
 
+MODEL_PERIOD_MS: Final = 10.0
+"""Time between two cycles of a model that is not a ``shmio.plc.Program``, in ms."""
 IDLE = "idle"
 PROGRAMS: Mapping[str, Callable[[Layout], Program]] = {"a50": A50, "counter": Counter, IDLE: Idle, "wave": Wave}
 
 
-def program(name: str, layout: Layout) -> Program:
+def is_user_code(name: str) -> bool:
+    """Return whether a program is a class of the user, ``package.module:Class``."""
+    return ":" in name
+
+
+def program(name: str, layout: Layout, code: UserCode = BUILT_IN) -> Program:
     """Create the program of this name for a block of this layout.
 
     Raises:
         ConfigError: There is no such program, or the layout lacks a register.
 
     """
+    if is_user_code(name):
+        return UserProgram(name, layout, code)
     try:
         build = PROGRAMS[name]
     except KeyError:
         raise ConfigError(
-            f"program: {name!r} is unknown; valid: {', '.join(sorted(PROGRAMS))}{meant(name, PROGRAMS)}"
+            f"program: {name!r} is unknown; valid: {', '.join(sorted(PROGRAMS))}, and a class of your own as "
+            f"package.module:Class{meant(name, PROGRAMS)}"
         ) from None
     return build(layout)

@@ -24,8 +24,8 @@ MAX_STEP_NS: Final = 3_600_000_000_000
 _TURN_NS: Final = 100_000_000
 """Interval at which a wait for the owner of time checks whether that process has died."""
 MAX_RATE: Final = 1000.0
-_DISPATCHERS: Final = frozenset({"alerts", "grpc", "mqtt", "recorder"})
-"""Kinds of processes that deliver steps: to clients, a recording or alerts. A step may wait for them."""
+_DISPATCHERS: Final = frozenset({"alerts", "emulator", "grpc", "mqtt", "recorder"})
+"""Kinds of processes that act when a step is done: for clients, a recording or alerts. Steps may wait for them."""
 _PATIENCE_S: Final = 2.0
 """Time to wait until the owner of time gives up its ownership.
 
@@ -136,7 +136,9 @@ class Coordinator:
                 # A free-running source reads the page before each cycle, so none starts a cycle after this
                 # write. The present cycle, determined again afterwards, is therefore the last one.
                 self._write(self._frozen(state))
-                state = self._frozen(state._replace(note="" if steps else _take_over_note(self._participants())))
+                state = self._frozen(
+                    state._replace(note="" if steps else _take_over_note(self._segment, self._participants()))
+                )
             self._write(state)
             self._ring_all()
 
@@ -523,14 +525,21 @@ def _describe_silence(segment: Segment, block: Block, hard_ns: int) -> str:
     return what
 
 
-def _take_over_note(participants: Sequence[Block]) -> str:
+def _moves(segment: Segment, participants: Sequence[Block]) -> bool:
+    """Return whether a step moves anything: a source, or the program of an emulated controller."""
+    return bool(participants) or any(
+        slot.kind == "emulator" and segment.clock.delivered(slot.index) is not None for slot in segment.processes
+    )
+
+
+def _take_over_note(segment: Segment, participants: Sequence[Block]) -> str:
     """Return the clock's note for the time between the take-over and the first step."""
-    return _PAUSED if participants else f"{_NOBODY}{_REAL}"
+    return _PAUSED if _moves(segment, participants) else f"{_NOBODY}{_REAL}"
 
 
 def _unmoved_note(segment: Segment, participants: Sequence[Block]) -> str:
     """Return a note about sources on which a step has no effect, with the remedy; empty: none."""
-    if not participants:
+    if not _moves(segment, participants):
         return _NOBODY if segment.clock.stepped else f"{_NOBODY}{_REAL}"
     found: dict[str, list[str]] = {"paused": [], "over": []}
     for block in participants:

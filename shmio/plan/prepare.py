@@ -16,10 +16,11 @@ from shmio.config.credentials import read_accounts
 from shmio.config.faults import Faults, meant
 from shmio.config.read import examine
 from shmio.config.web import http_sections
+from shmio.connectors.models.simulation import Simulation
 from shmio.emulators.areas import TableMemory, is_table, place_name
 from shmio.emulators.device import Served
-from shmio.emulators.kinds import KINDS, S7, create
-from shmio.emulators.programs import IDLE
+from shmio.emulators.kinds import FAULTY, KINDS, S7, create
+from shmio.emulators.programs import IDLE, is_user_code
 from shmio.errors import ConfigError, PathError
 from shmio.injection.program import compile_condition
 from shmio.layout.glob import Glob
@@ -35,7 +36,7 @@ from shmio.plan.ports import check_listening
 from shmio.plan.processes import ALERTS, Plan, make_plan, process_names
 from shmio.plan.replay import Recordings, replayed
 from shmio.plan.scene import check_scene
-from shmio.plan.sources import check_sources, note_options
+from shmio.plan.sources import check_sources, describe, note_options
 from shmio.recording.selection import Selection
 
 DEVICE_KEYS = ("nodes", "unit", "word_order", "byte_order")
@@ -239,17 +240,17 @@ def _check_emulator(index: int, emulator: Emulator, config: Config, files: Layou
             f"{key}.kind: {emulator.kind!r} is unknown; valid: {', '.join(KINDS)}{meant(emulator.kind, KINDS)}"
         )
     if emulator.layout is None:
-        return _check_served(key, emulator, _read_from(key, emulator, config, files))
+        return _check_served(key, emulator, _read_from(key, emulator, config, files), config)
     if emulator.kind != S7 and emulator.dbNumber is not None:
         raise ConfigError(f"{key}.dbNumber: only an emulator of S7 has numbers of blocks")
     if emulator.program == IDLE and emulator.block is None and emulator.dbNumber is None:
         layouts = files.all(key, emulator)
     else:
         layouts = (files.get(key, emulator, emulator.dbNumber),)
-    return _check_served(key, emulator, [Served(layout) for layout in layouts])
+    return _check_served(key, emulator, [Served(layout) for layout in layouts], config)
 
 
-def _check_served(key: str, emulator: Emulator, served: Sequence[Served]) -> tuple[Served, ...]:
+def _check_served(key: str, emulator: Emulator, served: Sequence[Served], config: Config) -> tuple[Served, ...]:
     """Check that an emulator can serve these layouts; return them."""
     served = [one._replace(layout=one.layout.base) for one in served]
     blocks = [one.layout for one in served if not is_table(one.layout)] if emulator.kind == S7 else []
@@ -259,8 +260,17 @@ def _check_served(key: str, emulator: Emulator, served: Sequence[Served]) -> tup
         _check_numbers(key, blocks)
     elif not blocks:
         raise ConfigError(f"{key}.dbNumber: leave it out: each address of a tag table names its block")
+    program = emulator.program
+    if is_user_code(program):
+        options = Simulation.Options(program, emulator.parameters, folder=str(config.path(emulator.folder)))
+        describe(key, options, served[0].layout, "program")
+        program = IDLE  # the user's code stays out of this process
+    elif emulator.parameters:
+        raise ConfigError(f"{key}.parameters: program {program} has none; leave out this key")
+    if emulator.faults and emulator.kind not in FAULTY:
+        raise ConfigError(f"{key}.faults: only emulators of kind {' or '.join(FAULTY)} can have faults")
     try:
-        create(emulator.kind, served, emulator.program, Address("", 0), db_number=emulator.dbNumber)
+        create(emulator.kind, served, program, Address("", 0), db_number=emulator.dbNumber)
     except ConfigError as error:
         raise ConfigError(f"{key}.{error}") from None
     return tuple(served)

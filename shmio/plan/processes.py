@@ -229,6 +229,7 @@ def make_plan(
         for layout, options in emulated[emulator.name]:
             more["layouts"].append(layout.to_json().decode())
             more["options"].append(dict(options))
+        more["folder"] = str(config.path(emulator.folder))
         sections.append((emulator.name, "emulator", msgspec.to_builtins(emulator) | more))
     sections += [(source.name, "source", msgspec.to_builtins(source)) for source in config.source]
     if config.grpc and mode != "log":

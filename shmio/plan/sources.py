@@ -199,13 +199,21 @@ def _model(key: str, source: Source, config: Config, files: LayoutFiles) -> tupl
     """
     source.options["folder"] = str(config.path(source.options["folder"]))
     layout = None if source.layout is None else files.get(key, source, None)
-    return _describe(key, msgspec.convert(source.options, Simulation.Options), layout)
+    return describe(key, msgspec.convert(source.options, Simulation.Options), layout)
 
 
-def _describe(key: str, options: Simulation.Options, layout: Layout | None) -> tuple[Layout, tuple[str, ...]]:
+def describe(
+    key: str, options: Simulation.Options, layout: Layout | None, name: str = "model"
+) -> tuple[Layout, tuple[str, ...]]:
     """Return the layout of a model's block, and the paths of its inputs.
 
     A separate process imports the model.
+
+    Args:
+        key: The section.
+        options: What the process needs.
+        layout: The layout; None: that of the model's declarations.
+        name: The key in the section that names the model.
 
     Raises:
         ConfigError: The model cannot be imported or described; the message begins with ``key``.
@@ -218,16 +226,17 @@ def _describe(key: str, options: Simulation.Options, layout: Layout | None) -> t
             command, input=msgspec.json.encode(request), capture_output=True, timeout=PATIENCE_S, check=False
         )
     except subprocess.TimeoutExpired:
-        raise ConfigError(f"{key}.model: importing {options.model} takes more than {PATIENCE_S:g} s") from None
+        raise ConfigError(f"{key}.{name}: importing {options.model} takes more than {PATIENCE_S:g} s") from None
     try:
         answer = msgspec.json.decode(done.stdout, type=Answer)
     except msgspec.MsgspecError:
         last = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
         raise ConfigError(
-            f"{key}.model: the process that imports {options.model} ended with status {done.returncode}: {last}"
+            f"{key}.{name}: the process that imports {options.model} ended with status {done.returncode}: {last}"
         ) from None
     if answer.error:
-        raise ConfigError(f"{key}.{answer.error}")
+        text = f"{name}: {answer.error[7:]}" if answer.error.startswith("model: ") else answer.error
+        raise ConfigError(f"{key}.{text}")
     return load_layout(answer.layout.encode()), answer.inputs
 
 

@@ -309,7 +309,7 @@ def load(text: str, folder: str | Path | None = None) -> type[Model]:
     if not _is_model(found):
         raise ConfigError(f"{text} is not a subclass of shmio.simulation.Model")
     if inspect.isabstract(found):
-        raise ConfigError(f"{text} has no method step(self, time_s, dt_s)")
+        raise ConfigError(f"{text} has no method {min(found.__abstractmethods__)}(self, time_s, dt_s)")
     return found
 
 

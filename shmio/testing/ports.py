@@ -1,24 +1,5 @@
 """TCP ports for tests. The kernel chooses them, so that tests contain no port numbers."""
 
-from __future__ import annotations
+from shmio.emulators.ports import reserved_port
 
-import socket
-from collections.abc import Iterator
-from contextlib import contextmanager
-
-from shmio.config.address import Address
-
-
-@contextmanager
-def reserved_port(host: str = "127.0.0.1") -> Iterator[Address]:
-    """Reserve a free port for the length of a ``with`` block.
-
-    The port is bound, but nothing listens. So the kernel refuses connections to it, and does not
-    choose it for other programs. A server that binds it with SO_REUSEADDR, as all servers here do,
-    gets it.
-    """
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family, socket.SOCK_STREAM) as keeper:
-        keeper.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        keeper.bind((host, 0))
-        yield Address(host, keeper.getsockname()[1])
+__all__ = ["reserved_port"]

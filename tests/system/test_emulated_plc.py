@@ -26,7 +26,9 @@ class Reader:
 
     def __init__(self, page: str, folder: Path, instance: str, port: int) -> None:
         text = (PAGES / page).read_text().replace("127.0.0.1:1102", f"127.0.0.1:{port}").replace(" 1102", f" {port}")
-        text = re.sub('^name = "press(-plc)?"\n(?!connector)', rf'name = "{instance}\1"\n', text, flags=re.MULTILINE)
+        text = re.sub(
+            '^name = "(?:press|door)(-plc)?"\n(?!connector)', rf'name = "{instance}\1"\n', text, flags=re.MULTILINE
+        )
         self.blocks = [(match[1], match[2]) for match in BLOCK.finditer(text)]
         self.folder, self.instance = folder, instance
 
@@ -104,3 +106,13 @@ def test_the_page_on_emulated_tag_tables_runs_as_shown(reader: Reader) -> None:
             assert view["Speed"] == 12.5
             if len(seen) > 5:
                 break
+
+
+@pytest.mark.parametrize("reader", ["write-a-plc-program.md"], indirect=True)
+def test_the_page_on_plc_programs_runs_as_shown(reader: Reader) -> None:
+    (program,), (block,), (configuration,) = reader.all("python"), reader.all("scl"), reader.all("toml")
+    reader.write("interlock.py", program)
+    reader.write("door.db", block)
+    reader.write("supervisor.toml", configuration)
+    for commands, shown in reader.steps():
+        reader.follow(commands, shown)
