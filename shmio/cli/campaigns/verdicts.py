@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import isfinite
 from typing import Any, Final
 
 import msgspec
@@ -54,7 +55,7 @@ def as_table(verdict: Verdict) -> dict[str, Any]:
         "moment_s": _seconds(verdict.moment_ns),
         "closest_s": _seconds(verdict.extreme_ns),
         "around": {
-            name: [{"time_s": _seconds(time_ns), "value": value} for time_ns, value in pairs]
+            name: [{"time_s": _seconds(time_ns), "value": _value(value)} for time_ns, value in pairs]
             for name, pairs in verdict.around.items()
         },
         "severity": verdict.expectation.severity,
@@ -77,6 +78,11 @@ def _lines(verdict: Verdict, width: int) -> list[str]:
         )
         lines.append(f"{'':<14}{name}  {values}")
     return lines
+
+
+def _value(value: float | None) -> float | str | None:
+    """Return a value for JSON, which has no infinity."""
+    return value if value is None or isfinite(value) else f"{'-' if value < 0 else ''}Infinity"
 
 
 def _seconds(time_ns: int | None) -> float | None:
