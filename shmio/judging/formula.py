@@ -205,14 +205,14 @@ class Network:
             return UntilEnd(left, right)
         return Whole(_extremum(tree.name), self.truth(tree.operands[0]), tree.bounds_ns)
 
-    def like(self, signal: Signal, golden: Piece, tolerance: float, tolerance_ns: int) -> Outer:
+    def like(self, signal: Signal, golden: Piece, tolerance: float, tolerance_ns: int) -> tuple[Outer, Tube]:
         """Return the part that compares a signal with another one, up to the end of that one.
 
         The times of ``golden`` count from the begin; its last value is unknown.
         """
         node = Tube(self._input_of(signal), *tube(golden, tolerance, tolerance_ns))
         self._nodes["like", node] = node
-        return Whole(np.minimum, node, (0, max(int(golden.time[-1]) - 1, 0)))
+        return Whole(np.minimum, node, (0, max(int(golden.time[-1]) - 1, 0))), node
 
     def truth(self, tree: Tree) -> Node:
         """Return the node of a truth; a number is true if it is not 0."""

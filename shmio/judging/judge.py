@@ -14,7 +14,7 @@ from shmio.errors import ConfigError, PathError
 from shmio.injection.program import number_register
 from shmio.judging.expectation import Formula, read_expectations
 from shmio.judging.formula import Network
-from shmio.judging.operators import UNTIL_SHARE, Node
+from shmio.judging.operators import UNTIL_SHARE, Node, Tube
 from shmio.judging.pieces import Piece
 from shmio.judging.source import Frames, Rows, Signal, Source, Trouble
 from shmio.judging.verdict import All, Outcome, Outer, Verdict, Whole
@@ -74,11 +74,7 @@ class Judge:
         self.registers: Mapping[Signal, Register] = registers.found
         """The register of each signal."""
         self._network = Network(registers, inputs.__getitem__)
-        self._cases = [
-            _Case(formula, _outer(at, formula, self._network, golden)) for at, formula in enumerate(formulas)
-        ]
-        for case in self._cases:
-            case.watch(self._network)
+        self._cases = [_Case(at, formula, self._network, golden) for at, formula in enumerate(formulas)]
         horizon_ns = max((formula.horizon_ns for formula in formulas), default=0)
         self._histories = {name: _History(horizon_ns + 2 * horizon_ns // UNTIL_SHARE) for name in self._sources}
         self._origin_ns: int | None = None
@@ -108,6 +104,11 @@ class Judge:
     def read_by(self, index: int) -> tuple[Signal, ...]:
         """Return the signals that an expectation reads, by its index."""
         return self._cases[index].formula.signals
+
+    def limits(self, index: int, signal: Signal) -> tuple[Piece, Piece] | None:
+        """Return the lower and the upper limit of a signal of an expectation with ``like``, else None."""
+        case = self._cases[index]
+        return case.tubes[case.formula.signals.index(signal)].limits if case.tubes else None
 
     def troubles(self, source: str) -> Sequence[Trouble]:
         """Return the times in which values of a source were unknown, and why."""
@@ -224,15 +225,13 @@ class Judge:
         return f"the run ended at {(self.end_ns - 1) / 1e9:.3f} s, before it was decided"
 
 
-def _outer(index: int, formula: Formula, network: Network, golden: Golden | None) -> Outer:
-    """Return the outermost part of an expectation.
+def _tubes(index: int, formula: Formula, network: Network, golden: Golden | None) -> list[tuple[Outer, Tube]]:
+    """Return the parts that compare the signals of an expectation with those of a recording.
 
     Raises:
-        ConfigError: A recording cannot be read; the message starts as ``expect[0].like: …``.
+        ConfigError: The recording cannot be read; the message starts as ``expect[0].like: …``.
 
     """
-    if formula.tree is not None:
-        return network.outer(formula.tree)
     one = formula.expectation
     try:
         if golden is None:
@@ -241,28 +240,30 @@ def _outer(index: int, formula: Formula, network: Network, golden: Golden | None
     except ConfigError as error:
         raise ConfigError(f'expect[{index}].like: {error} (expect "{one.name}")') from None
     tolerance_ns = round((one.tolerance_s or 0.0) * 1e9)
-    return All(
-        [
-            network.like(signal, piece, one.tolerance or 0.0, tolerance_ns)
-            for signal, piece in zip(formula.signals, pieces, strict=True)
-        ]
-    )
+    return [
+        network.like(signal, piece, one.tolerance or 0.0, tolerance_ns)
+        for signal, piece in zip(formula.signals, pieces, strict=True)
+    ]
 
 
 class _Case:
     """The present state of an expectation."""
 
-    def __init__(self, formula: Formula, outer: Outer) -> None:
+    def __init__(self, index: int, formula: Formula, network: Network, golden: Golden | None) -> None:
         self.formula = formula
-        self.outer = outer
+        self.tubes: list[Tube] = []
+        """For ``like``: the comparison of each signal."""
+        if formula.tree is None:
+            parts = _tubes(index, formula, network, golden)
+            self.tubes = [tube for _, tube in parts]
+            self.outer: Outer = All([outer for outer, _ in parts])
+        else:
+            self.outer = network.outer(formula.tree)
         self._trigger: Whole | None = None
+        if formula.trigger is not None:
+            self._trigger = Whole(np.maximum, network.truth(formula.trigger), None)
         self.around: dict[str, list[tuple[int, float | None]]] = {}
         self.around_ns: int | None = None  # the moment to which they belong
-
-    def watch(self, network: Network) -> None:
-        """Watch whether the condition of the expectation becomes true."""
-        if self.formula.trigger is not None:
-            self._trigger = Whole(np.maximum, network.truth(self.formula.trigger), None)
 
     @property
     def failed(self) -> bool:

@@ -449,7 +449,8 @@ class Tube(Node):
 
     def __init__(self, operand: Node, lower: Piece, upper: Piece) -> None:
         self._operand = operand
-        self._limits = lower, upper
+        self.limits = lower, upper
+        """The limits; once the judged time has begun, with times of the instance's clock."""
         self._begun = False
 
     def turn(self) -> None:
@@ -461,15 +462,15 @@ class Tube(Node):
         if not self._begun:
             self._begun = True
             begin = int(piece.time[0])
-            self._limits = tuple(limit._replace(time=limit.time + begin) for limit in self._limits)  # type: ignore[assignment]
+            self.limits = tuple(limit._replace(time=limit.time + begin) for limit in self.limits)  # type: ignore[assignment]
         inner = [
             limit.time[limit.time.searchsorted(piece.time[0], "right") : limit.time.searchsorted(piece.end)]
-            for limit in self._limits
+            for limit in self.limits
         ]
         time = np.unique(np.concatenate((piece.time, *inner)))
         value = piece.low[piece.time.searchsorted(time, "right") - 1]
-        below, above = (limit.time.searchsorted(time, "right") - 1 for limit in self._limits)
-        lower, upper = self._limits
+        below, above = (limit.time.searchsorted(time, "right") - 1 for limit in self.limits)
+        lower, upper = self.limits
         low = _loose(np.minimum(value - lower.high[below], upper.low[above] - value))
         high = _loose(np.minimum(value - lower.low[below], upper.high[above] - value))
         unknown = np.isnan(value)

@@ -10,11 +10,11 @@ from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from shmio.config import Expectation
+from shmio.judging.pieces import Piece, head
 from shmio.judging.source import Signal, Trouble
-from shmio.judging.trace import Plot
+from shmio.judging.trace import Plot, compressed
 from shmio.judging.verdict import Outcome, Verdict, distance
 
 _Place = Callable[[float], float]
@@ -53,6 +53,8 @@ class Drawn:
     signal: Signal
     plot: Plot
     troubles: Sequence[Trouble] = ()
+    limits: tuple[Piece, Piece] | None = None
+    """The lower and the upper limit, if the signal has to be like that of a recording."""
 
 
 @dataclass(frozen=True)
@@ -162,9 +164,11 @@ def _svg(report: Report, verdict: Verdict, drawn: Drawn) -> str:
     begin = report.begin_ns or 0
     end = max(report.end_ns, begin + 1)
     plot = drawn.plot
-    known = np.isfinite(plot.least) & np.isfinite(plot.greatest)
-    least = float(plot.least[known].min()) if known.any() else 0.0
-    greatest = float(plot.greatest[known].max()) if known.any() else 1.0
+    lines = [(plot, "#1f6feb")]
+    within = [head(limit, end) for limit in drawn.limits or ()]
+    lines += [(compressed(limit.time, limit.low, limit.high), "#2da44e") for limit in within]
+    shown = np.concatenate([side[np.isfinite(side)] for line, _ in lines for side in (line.least, line.greatest)])
+    least, greatest = (float(shown.min()), float(shown.max())) if len(shown) else (0.0, 1.0)
     if least == greatest:
         least, greatest = least - 0.5, greatest + 0.5
     middle, half = least / 2 + greatest / 2, greatest / 2 - least / 2
@@ -183,7 +187,10 @@ def _svg(report: Report, verdict: Verdict, drawn: Drawn) -> str:
         for span in report.injections
     )  # fmt: skip
     parts += (_band(x(trouble.begin_ns), x(trouble.end_ns), "#77777755", trouble.reason) for trouble in drawn.troubles)
-    parts.append(f'<path d="{_steps(plot, known, x, y, end)}" fill="none" stroke="#1f6feb" stroke-width="1.2"/>')
+    parts += (
+        f'<path d="{_steps(line, x, y, end)}" fill="none" stroke="{colour}" stroke-width="1.2"/>'
+        for line, colour in reversed(lines)
+    )
     if verdict.moment_ns is not None:
         at = x(verdict.moment_ns)
         parts.append(
@@ -208,8 +215,9 @@ def _band(left: float, right: float, colour: str, title: str) -> str:
     )
 
 
-def _steps(plot: Plot, known: npt.NDArray[np.bool_], x: _Place, y: _Place, end: int) -> str:
+def _steps(plot: Plot, x: _Place, y: _Place, end: int) -> str:
     """Return the line as an SVG path, with a gap where values are unknown."""
+    known = np.isfinite(plot.least) & np.isfinite(plot.greatest)
     following = np.append(plot.time_ns[1:], end).tolist()
     path: list[str] = []
     drawing = False

@@ -101,3 +101,10 @@ def _joined(points: _Points, count: int) -> _Points:
         return points
     begin = np.arange(0, len(time), count)
     return time[begin], np.fmin.reduceat(least, begin, axis=1), np.fmax.reduceat(greatest, begin, axis=1)
+
+
+def compressed(time_ns: Times, least: Values, greatest: Values) -> Plot:
+    """Return a plot of a whole signal."""
+    count = -(-len(time_ns) // MAX_POINTS)
+    time, low, high = _joined((time_ns, least[None, :], greatest[None, :]), count)
+    return Plot(time, low[0], high[0])

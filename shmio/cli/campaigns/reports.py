@@ -60,7 +60,8 @@ class Reports:
         drawn: list[list[Drawn]] = [[] for _ in verdicts]
         if self._traces is not None:
             for index, one in _plotted(judge):
-                drawn[index].append(Drawn(one, self._traces.plot(one), judge.troubles(one.source)))
+                plot, limits = self._traces.plot(one), judge.limits(index, one)
+                drawn[index].append(Drawn(one, plot, judge.troubles(one.source), limits))
         report = Report(title, facts, command, judge.begin_ns, judge.end_ns or 1, verdicts, drawn, injections)
         if self._html is not None:
             _write(self._html, html(report).encode("utf-8", "replace"))

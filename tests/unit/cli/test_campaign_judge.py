@@ -83,6 +83,9 @@ def test_like_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert status == 1
     assert [(one["outcome"], one["moment_s"]) for one in found["verdicts"][1:]] == [("failed", 0.02), ("failed", 0.02)]
     assert "the run ended" in found["verdicts"][0]["reason"], "the recording is shorter"
+    assert main(["judge", "run.mem", "-f", "c.toml", "--report", "out.html"]) == 1
+    page = Path("out.html").read_text()
+    assert (page.count("<svg"), page.count("#2da44e")) == (7, 14), "a plot for each signal, with two limits"
     assert set(found["verdicts"][2]["around"]) == {"cell/count", "cell/speed", "cell/on"}
 
 
