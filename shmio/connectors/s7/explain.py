@@ -19,6 +19,11 @@ _MOST_NAMES: Final = 3
 ITEM_OK = 0xFF
 ACCESS_DENIED, OUT_OF_RANGE, NO_SUCH_TYPE, OTHER_SIZE, NO_SUCH_OBJECT = 0x03, 0x05, 0x06, 0x07, 0x0A
 
+KNOWN_CODES: Final = frozenset(
+    {ITEM_OK, *range(0x02), 0x03, *range(0x05, 0x08), 0x0A, *range(0x10, 0x15), *range(0x19, 0x1F), 0x20, 0x21}
+)
+"""The codes of which python-snap7 knows the texts. It is imported for a rare text only, because that takes long."""
+
 _NO_OPTIMIZED = "clear 'Optimized block access' of the block, compile and load, or read it by OPC UA"
 _ACCESS_DENIED = (
     "access denied {where}: enable 'Permit access with PUT/GET communication' and 'Full access' in the CPU's "
@@ -130,7 +135,7 @@ def explain_place(code: int, text: str, db_number: int, last: int) -> str:
 
 def is_known(code: int) -> bool:
     """Return whether a controller may send this return code for an item."""
-    return code == ITEM_OK or code in _item_texts()
+    return code in KNOWN_CODES
 
 
 def _item_texts() -> Mapping[int, str]:

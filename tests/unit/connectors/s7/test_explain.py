@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 
 import pytest
+from snap7.s7protocol import S7_RETURN_CODES
 
 from shmio.connectors.s7 import explain
 from shmio.segment._atomics import REASON_SIZE
@@ -57,3 +58,7 @@ def test_every_text_fits_into_the_reason_of_a_frame() -> None:
         texts += [explain.explain_read(code, 65535, 65536), explain.explain_write(code, 65535, 65535)]
     texts += [explain.explain_size(65535, 65536, found) for found in (0, 65535)]
     assert max(len(text.encode()) for text in texts) <= REASON_SIZE
+
+
+def test_the_known_codes_are_those_of_the_library() -> None:
+    assert set(S7_RETURN_CODES) == explain.KNOWN_CODES
