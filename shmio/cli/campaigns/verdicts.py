@@ -35,7 +35,7 @@ def tell(judge: Judge, found: dict[str, Any], *, as_json: bool) -> int:
         return exit_status(verdicts)
     width = max((len(verdict.expectation.name) for verdict in verdicts), default=0)
     for verdict in verdicts:
-        for line in _lines(verdict, width):
+        for line in lines(verdict, width):
             say(line)
     counts = [f"{sum(one.outcome is outcome for one in verdicts)} {outcome}" for outcome in Outcome]
     say(", ".join(counts))
@@ -65,7 +65,8 @@ def as_table(verdict: Verdict) -> dict[str, Any]:
     }
 
 
-def _lines(verdict: Verdict, width: int) -> list[str]:
+def lines(verdict: Verdict, width: int = 0) -> list[str]:
+    """Return what to print about a verdict; ``width`` is that of the names."""
     expectation = verdict.expectation
     of = f" [{expectation.requirement}]" if expectation.requirement else ""
     robustness = "" if verdict.robustness is None else f"  robustness {verdict.robustness:.6g}"
