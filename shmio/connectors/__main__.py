@@ -59,6 +59,7 @@ def run(worker: Worker) -> None:
         if busy_s > part.timeout_s + HANG_MARGIN_S:
             continue  # without a heartbeat the supervisor replaces the process
         counters = loop.counters
+        note = f"a cycle takes longer than {part.timeout_s:g} s" if busy_s > part.timeout_s else loop.note
         worker.report(
             (
                 counters.polls,
@@ -68,7 +69,7 @@ def run(worker: Worker) -> None:
                 counters.round_trip_us,
                 rate.update_mhz(counters.polls),
             ),
-            note=loop.note,
+            note=note,
         )
     part.stop()
     thread.join(timeout=min(part.timeout_s + 0.5, LAST_WORDS_S))
@@ -103,7 +104,7 @@ def _loop_of(worker: Worker) -> _LoopHandle:
     inputs = _inputs(source, writer, segment)
     stepped = SteppedLoop(
         source, writer, schedule, page_clock, writable,
-        allow_nonfinite=allow, inputs=inputs, owner_of=owner_of, blocks=blocks,
+        allow_nonfinite=allow, inputs=inputs, owner_of=owner_of, blocks=blocks, crash=worker.slot.supervised.note,
     )  # fmt: skip
 
     def stop() -> None:

@@ -340,6 +340,9 @@ class Computed(ABC):
     def interrupt(self) -> None:  # noqa: B027  most never wait
         """End a :meth:`step` that is waiting. Any thread may call this."""
 
+    def close(self) -> None:  # noqa: B027  most hold nothing
+        """Release what the source holds. The loop calls it last."""
+
     @abstractmethod
     def write(self, writes: Sequence[Write]) -> list[str]:
         """Set bytes and bits; return for each write "" or the reason why the source refuses it."""

@@ -16,7 +16,7 @@ from shmio.layout.model import NUMBERS, Layout
 from shmio.layout.values.codec import Value, codec
 from shmio.simulation import ModelRunner
 from shmio.simulation.a50 import A50Cell
-from shmio.simulation.model import load
+from shmio.simulation.loading import load
 
 
 class A50:

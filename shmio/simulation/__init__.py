@@ -6,7 +6,8 @@ runs a model in a client, for an instance on another host.
 """
 
 from shmio.simulation.images import Ends
-from shmio.simulation.model import InOut, Input, Model, Output, Parameter, layout_of, load
+from shmio.simulation.loading import load
+from shmio.simulation.model import InOut, Input, Model, Output, Parameter, layout_of
 from shmio.simulation.runner import ModelRunner, ServedModel
 
 __all__ = [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from operator import itemgetter
 from typing import Any, Final, NamedTuple, Protocol
@@ -12,7 +13,7 @@ import numpy.typing as npt
 
 from shmio.errors import LayoutError, ValueRangeError
 from shmio.layout.image import initial_frame
-from shmio.layout.model import ByteOrder, Layout, Register
+from shmio.layout.model import NUMBERS, ByteOrder, Layout, Register
 from shmio.layout.values.codec import brief, codec, scalar_codec
 from shmio.layout.values.write import Write, apply, covering
 
@@ -43,6 +44,8 @@ class Images:
         self.commanded, self.shown = bytearray(initial), initial
         self._outputs = tuple(outputs)
         self._computed = covering(outputs, layout.size)
+        self.limited: Sequence[RegisterPort] = ()
+        """The ports of commanded registers with limits. A write outside the limits is refused."""
         self._given = ~_array(covering((*outputs, *inouts), layout.size))
         self._all_computed = not self._given.any()
 
@@ -79,7 +82,12 @@ class Images:
         if self._computed[offset] & mask if mask else any(self._computed[offset:stop]):
             hit = [r.path for r in self._outputs if r.offset < stop and offset < r.offset + r.size]
             return f"the model computes {hit[0]}: outputs cannot be written; shmio inject can show another value"
+        before = bytes(self.commanded[offset:stop])
         apply(write, self.commanded)
+        for port in self.limited:
+            if port.overlaps(offset, stop) and (fault := port.fault(port.read())):
+                self.commanded[offset:stop] = before
+                return fault
         return ""
 
 
@@ -126,24 +134,38 @@ class Port(Protocol):
         """
 
 
-def port_of(path: str, registers: Mapping[str, Register], byte_order: ByteOrder, image: bytearray) -> Port:
+Limits = tuple[float, float]
+"""The lowest and the highest value that may be given to a model."""
+
+
+def port_of(
+    path: str,
+    registers: Mapping[str, Register],
+    byte_order: ByteOrder,
+    image: bytearray,
+    limits: Limits | None = None,
+) -> Port:
     """Return the port of a declaration.
 
     ``registers`` are the members of a structure by path, or a single register under ``""``.
     """
-    ports = {member: RegisterPort(register, byte_order, image) for member, register in registers.items()}
+    ports = {member: RegisterPort(register, byte_order, image, limits) for member, register in registers.items()}
     return ports.get("") or _StructurePort(path, ports, _StructureCodec.of(registers, byte_order), image)
 
 
 class RegisterPort:
     """Reads and writes the value of a register or an array."""
 
-    def __init__(self, register: Register, byte_order: ByteOrder, image: bytearray) -> None:
+    def __init__(
+        self, register: Register, byte_order: ByteOrder, image: bytearray, limits: Limits | None = None
+    ) -> None:
         self._path = register.path
+        self._limits = limits
         self._codec = codec(register, byte_order)
         self._image = image
         self._start, self._stop = register.offset, register.offset + register.size
         self._is_row = register.type == "BYTE" and len(register.dims) == 1
+        self._is_native = register.element.base in NUMBERS and byte_order == sys.byteorder
 
     def read(self) -> Any:
         """Return the value.
@@ -159,9 +181,12 @@ class RegisterPort:
         """Write a Python or numpy value into the image.
 
         Raises:
-            ValueRangeError: The value does not fit. The image is unchanged.
+            ValueRangeError: The value does not fit, or is outside the limits. The image is
+                unchanged.
 
         """
+        if self._limits is not None and (fault := self.fault(value)):
+            raise ValueRangeError(f"{self._path}: {fault}")
         if self._is_row and isinstance(value, _BYTES) and len(value) == self._stop - self._start:
             self._image[self._start : self._stop] = value
             return
@@ -170,6 +195,25 @@ class RegisterPort:
         except ValueRangeError as error:
             text = str(error)
             raise ValueRangeError(text if text.startswith(f"{self._path}:") else f"{self._path}: {text}") from None
+
+    @property
+    def native(self) -> memoryview | None:
+        """The register's bytes in the image, if they are as C has them on this machine; else None."""
+        return memoryview(self._image)[self._start : self._stop] if self._is_native else None
+
+    def overlaps(self, start: int, stop: int) -> bool:
+        """Return whether the register has bytes in a range of the image."""
+        return self._start < stop and start < self._stop
+
+    def fault(self, value: object) -> str:
+        """Return how a value is outside the limits; "" if it is not, or if it is no number."""
+        if self._limits is None:
+            return ""
+        low, high = self._limits
+        for one in _flat(value):
+            if isinstance(one, int | float | np.number) and not low <= one <= high:  # NaN too
+                return f"{one:g} is outside the limits of {low:g} to {high:g}"
+        return ""
 
 
 class _StructurePort:
@@ -269,6 +313,17 @@ def _runs(registers: Sequence[Register], codes: Sequence[str], order: str) -> It
             packing = struct.Struct(order + "".join(codes[begun:place]))
             yield _Run(slice(registers[begun].offset, end), packing, slice(begun, place))
             begun = place
+
+
+def _flat(value: object) -> Iterator[object]:
+    """Yield the elements of an array of any dimensions, or the single value."""
+    if isinstance(value, list | tuple):
+        for one in value:
+            yield from _flat(one)
+    elif isinstance(value, np.ndarray):
+        yield from value.flat
+    else:
+        yield value
 
 
 def _frozen(value: object) -> object:

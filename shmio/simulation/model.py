@@ -1,24 +1,21 @@
-"""The base class of models, their declarations, and a function that loads a model by name."""
+"""The base class of models, and their declarations."""
 
 from __future__ import annotations
 
-import importlib
-import inspect
-import sys
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from functools import cached_property, lru_cache
 from pathlib import Path
-from types import ModuleType
-from typing import Any, ClassVar, Final, Protocol, TypeGuard, final
+from typing import Any, ClassVar, Final, Protocol, Self, final
 
 import numpy as np
 
-from shmio.errors import ConfigError, LayoutError, ModelError, ShmioError
-from shmio.layout.model import Layout
+from shmio.errors import LayoutError, ModelError, ShmioError
+from shmio.layout.model import NUMBERS, Layout
 from shmio.layout.simlog_structures import members
-from shmio.layout.tags import place_tags
+from shmio.layout.tags import parse_type, place_tags
 from shmio.layout.topic import canonical_path, shorten
 from shmio.logs import printable
 from shmio.simulation.images import Ends, Port
@@ -57,6 +54,7 @@ class Declaration:
         path: str = "",
         unit: str = "",
         comment: str = "",
+        limits: tuple[float, float] | None = None,
     ) -> None:
         """Declare a value.
 
@@ -70,6 +68,8 @@ class Declaration:
             path: The path of the register. Default: the name of the attribute.
             unit: The unit in the layout.
             comment: The comment in the layout.
+            limits: The lowest and the highest value that may be given to the model: written by a
+                client, by a connection, or as a parameter. Not for outputs.
 
         """
         self.type = type
@@ -77,6 +77,7 @@ class Declaration:
         self.path = path
         self.unit = unit
         self.comment = comment
+        self.limits = limits
         self.name = ""
 
     def __set_name__(self, owner: type, name: str) -> None:
@@ -111,6 +112,8 @@ class Declaration:
             ValueRangeError: The type is invalid.
 
         """
+        if self.limits is not None:
+            self._check_limits(self.limits)
         if self.members is None:
             return {self.path: self._tag(self.type, self.initial)}
         initial = self.initial or {}
@@ -120,7 +123,17 @@ class Declaration:
 
     def _tag(self, kind: object, initial: object) -> Mapping[str, object]:
         comment = f"{self.comment} [{self.unit}]" if self.unit else self.comment
-        return {"type": kind, "initial": list(initial) if isinstance(initial, tuple) else initial, "comment": comment}
+        initial = list(initial) if isinstance(initial, tuple) else initial
+        return {"type": kind, "initial": initial, "comment": comment, "unit": self.unit}
+
+    def _check_limits(self, limits: tuple[float, float]) -> None:
+        if isinstance(self, Output):
+            raise ModelError("limits: an output has none; the model computes it")
+        with suppress(ValueError):  # an invalid type is reported when it is placed
+            if self.members is not None or parse_type(str(self.type))[0].base not in NUMBERS:
+                raise ModelError("limits: only a number or an array of numbers can have limits")
+        if not limits[0] <= limits[1]:
+            raise ModelError(f"limits: expected the lowest and the highest value, found {limits!r}")
 
 
 class Input(Declaration):
@@ -137,8 +150,16 @@ class Parameter(Declaration):
 
     kind = "a parameter"
 
-    def __init__(self, type: str, initial: object = None, *, unit: str = "", comment: str = "") -> None:  # noqa: A002
-        super().__init__(type, initial, unit=unit, comment=comment)
+    def __init__(
+        self,
+        type: str,  # noqa: A002
+        initial: object = None,
+        *,
+        unit: str = "",
+        comment: str = "",
+        limits: tuple[float, float] | None = None,
+    ) -> None:
+        super().__init__(type, initial, unit=unit, comment=comment, limits=limits)
 
 
 class Output(Declaration):
@@ -205,6 +226,9 @@ class Model(ABC):
     declarations: ClassVar[Mapping[str, Declaration]] = {}
     """All declarations of this class and its base classes, by attribute name."""
 
+    reference: ClassVar[str] = ""
+    """The model's name in messages: ``package.module:Class``, or the name of the file of an FMU."""
+
     random: np.random.Generator
     """The model's only source of randomness, seeded with the ``seed`` of its source."""
 
@@ -216,6 +240,7 @@ class Model(ABC):
 
         """
         super().__init_subclass__(**keywords)
+        cls.reference = f"{cls.__module__}:{cls.__qualname__}"
         if "__init__" in cls.__dict__:
             raise ModelError(f"model {cls.__qualname__}: a model cannot have its own __init__; use start()")
         found = {name: value for base in reversed(cls.__mro__) for name, value in vars(base).items()}
@@ -223,8 +248,30 @@ class Model(ABC):
         for name in cls.declarations:
             if name in _OWN or name.startswith("_"):
                 raise ModelError(f"model {cls.__qualname__}: {name}: this name is reserved: rename it, and set path")
-        for kinds in ((Input, Output, InOut), (Parameter,)):
-            place_declarations(cls.__qualname__, declared(cls, *kinds))
+        _check(cls)
+
+    @classmethod
+    def with_declarations(
+        cls, reference: str, declarations: Mapping[str, Declaration], **attributes: object
+    ) -> type[Self]:
+        """Create a subclass for a model whose values are not attributes, such as an FMU.
+
+        Args:
+            reference: The model's name in messages.
+            declarations: Declarations by name. A name may be any text.
+            attributes: Attributes of the class.
+
+        Raises:
+            ModelError: A declaration is invalid. The message names the model.
+
+        """
+        made: type[Self] = type(reference, (cls,), {"__module__": cls.__module__, **attributes})
+        made.reference = reference
+        made.declarations = declarations
+        for name, declaration in made.declarations.items():
+            declaration.__set_name__(made, name)
+        _check(made)
+        return made
 
     @final
     def __init__(self, ports: Mapping[str, Port], ends: Mapping[str, Ends], seed: int) -> None:
@@ -257,6 +304,20 @@ class Model(ABC):
 
         """
 
+    def _close(self) -> None:  # noqa: B027  the garbage collector suffices for most models
+        """Release what :meth:`start` has acquired. ``ModelRunner`` calls this after the last step."""
+
+
+def _check(model: type[Model]) -> None:
+    """Check all declarations of a model.
+
+    Raises:
+        ModelError: A declaration is invalid.
+
+    """
+    for kinds in ((Input, Output, InOut), (Parameter,)):
+        place_declarations(model.__qualname__, declared(model, *kinds))
+
 
 def declared(model: type[Model], *kinds: type[Declaration]) -> list[Declaration]:
     """Return the model's declarations of these kinds, in the order of declaration."""
@@ -278,57 +339,6 @@ def layout_of(model: type[Model]) -> Layout:
     if not registers:
         raise ModelError(f"model {model.__qualname__} declares no register: give it an Input, an Output or an InOut")
     return place_declarations(model.__qualname__, registers)
-
-
-# -- loading -------------------------------------------------------------------------------------------------
-
-
-def load(text: str, folder: str | Path | None = None) -> type[Model]:
-    """Import a model's class.
-
-    Args:
-        text: ``package.module:Class``.
-        folder: A folder to search for modules that are not installed, such as the configuration's
-            folder.
-
-    Raises:
-        ConfigError: The text is malformed, the module or class does not exist, its import fails, or
-            the class is not a model.
-
-    """
-    name, colon, attribute = text.partition(":")
-    if not (colon and attribute.isidentifier() and all(part.isidentifier() for part in name.split("."))):
-        raise ConfigError(f"expected package.module:Class, found {text!r}")
-    module = _module(name, folder)
-    found: Any = getattr(module, attribute, None)
-    if found is None:
-        there = [
-            name for name, value in vars(module).items() if _is_model(value) and value.__module__ == module.__name__
-        ]
-        raise ConfigError(f"{name} has no {attribute}; its models are: {', '.join(there) or 'none'}")
-    if not _is_model(found):
-        raise ConfigError(f"{text} is not a subclass of shmio.simulation.Model")
-    if inspect.isabstract(found):
-        raise ConfigError(f"{text} has no method {min(found.__abstractmethods__)}(self, time_s, dt_s)")
-    return found
-
-
-def _is_model(value: object) -> TypeGuard[type[Model]]:
-    return isinstance(value, type) and issubclass(value, Model)
-
-
-def _module(name: str, folder: str | Path | None) -> ModuleType:
-    if folder is not None and str(folder) not in sys.path:
-        sys.path.append(str(folder))  # last, so that no file in the folder hides an installed module
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        if error.name is not None and f"{name}.".startswith(f"{error.name}."):
-            where = "installed" if folder is None else f"installed or in {folder}"
-            raise ConfigError(f"there is no module {error.name} that is {where}") from None
-        raise ConfigError(f"{name} cannot be imported: {explain(error, name)}") from error
-    except (Exception, SystemExit) as error:
-        raise ConfigError(f"{name} cannot be imported: {explain(error, name)}") from error
 
 
 def explain(error: BaseException, module: str) -> str:

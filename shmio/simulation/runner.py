@@ -59,7 +59,7 @@ class ModelRunner:
                 fit. The message begins with the key.
 
         """
-        self.name = f"{model.__module__}:{model.__qualname__}"
+        self.name = model.reference
         self.layout = layout_of(model) if layout is None else layout
         found = {declaration: self._find(model, declaration) for declaration in declared(model, Input, Output, InOut)}
         outputs = [r for declaration in found if isinstance(declaration, Output) for r in found[declaration].values()]
@@ -70,20 +70,25 @@ class ModelRunner:
         self._inputs: dict[str, RegisterPort] = {}
         ports: dict[str, Port] = _parameters(model, parameters)
         ends: dict[str, Ends] = {}
+        limited: list[RegisterPort] = []
         order = self.layout.byte_order
         for declaration, registers in found.items():
-            commanded, shown = (
-                port_of(declaration.path, registers, order, image)
-                for image in (self._images.commanded, self._images.shown)
-            )
+            commanded = port_of(declaration.path, registers, order, self._images.commanded, declaration.limits)
+            shown = port_of(declaration.path, registers, order, self._images.shown)
             if isinstance(declaration, Output):
                 ports[declaration.name] = shown
                 continue
-            self._inputs |= {r.path: RegisterPort(r, order, self._images.commanded) for r in registers.values()}
+            own = {
+                r.path: RegisterPort(r, order, self._images.commanded, declaration.limits) for r in registers.values()
+            }
+            self._inputs |= own
+            if declaration.limits is not None:
+                limited += own.values()
             if isinstance(declaration, InOut):
                 ends[declaration.name] = Ends(commanded, shown)
             else:
                 ports[declaration.name] = commanded
+        self._images.limited = limited
         self._model = model(ports, ends, seed)
         self._started = False
 
@@ -105,7 +110,7 @@ class ModelRunner:
 
         Returns:
             For each write "", or the reason if it is refused: it would change an output, or lies
-            outside the block.
+            outside the block, or the value is outside the register's limits.
 
         """
         return self._images.write(writes)
@@ -176,11 +181,18 @@ class ModelRunner:
         except LayoutError as error:
             raise LayoutError(f"model {self.name}: {error}") from None
 
+    def close(self) -> None:
+        """Release what the model holds, such as the library of an FMU. It cannot step any more."""
+        self._model._close()
+
     def _run(self, call: Callable[..., None], *arguments: float, instead: bytes | None = None) -> None:
         """Call the model's code. If it fails, restore the shown image."""
         before = self.image if instead is None else instead
         try:
             call(*arguments)
+        except ModelError as error:  # it says by itself what has failed, and where
+            self._images.shown[:] = before
+            raise ModelError(f"model {self.name}: {error}") from error
         except (Exception, SystemExit) as error:
             self._images.shown[:] = before
             raise ModelError(f"model {self.name}: {explain(error, self._model.__module__)}") from error
@@ -220,7 +232,7 @@ def _parameters(model: type[Model], given: Mapping[str, object]) -> dict[str, Po
     ports: dict[str, Port] = {}
     for declaration in declared(model, Parameter):
         registers = {member: find(layout, path) for member, path in declaration.paths.items()}
-        ports[declaration.name] = port_of(declaration.name, registers, layout.byte_order, values)
+        ports[declaration.name] = port_of(declaration.name, registers, layout.byte_order, values, declaration.limits)
     for name, value in given.items():
         if name not in ports:
             there = ", ".join(ports) or "none"

@@ -20,7 +20,8 @@ from shmio.layout.document import load_layout
 from shmio.layout.model import Layout
 from shmio.layout.values.codec import Value
 from shmio.layout.values.write import Write
-from shmio.simulation.model import layout_of, load
+from shmio.simulation.loading import load
+from shmio.simulation.model import layout_of
 from shmio.simulation.runner import ModelRunner
 
 
@@ -30,8 +31,8 @@ class Simulation(Computed):
     class Options(msgspec.Struct, forbid_unknown_fields=True):
         """Keys of the source.
 
-        ``model`` is ``package.module:Class``. Modules that are not installed are searched for in
-        ``folder``.
+        ``model`` is ``package.module:Class``, or the file of an FMU. Modules that are not installed
+        and FMUs are searched for in ``folder``.
         """
 
         model: str
@@ -82,6 +83,10 @@ class Simulation(Computed):
     def step(self, time_ns: int, dt_ns: int) -> bytes:
         """Let the model compute a step, and return the new image."""
         return self._runner.step(time_ns, dt_ns)
+
+    def close(self) -> None:
+        """Release what the model holds."""
+        self._runner.close()
 
 
 def make(options: Simulation.Options, layout: Layout | None) -> ModelRunner:

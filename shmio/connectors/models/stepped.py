@@ -171,6 +171,7 @@ class SteppedLoop:
         inputs: Inputs | None = None,
         owner_of: OwnerOf = lambda _: None,
         blocks: Blocks | None = None,
+        crash: str = "",
     ) -> None:
         """Create the loop.
 
@@ -184,9 +185,11 @@ class SteppedLoop:
             inputs: Reads the source's connected inputs; None if no input is connected.
             owner_of: Returns the process that uses a command queue.
             blocks: Returns the blocks of all sources.
+            crash: How the source's previous process ended, if it crashed.
 
         """
         self._source = source
+        self._crash = crash
         source.attach(writer)
         self._writer = writer
         self._page = writer.block.clock
@@ -227,6 +230,7 @@ class SteppedLoop:
             self.commands.close(reason)
             self._fail(self._writer.cycle, reason)
             self._writer.event(Record(EventKind.STOPPED))
+            self._source.close()
 
     def _begin(self) -> None:
         """Continue from the last image of the source's previous process, if there is one."""
@@ -237,6 +241,8 @@ class SteppedLoop:
         self.counters.connects += 1
         state = self._page.read()
         if not state.virtual:
+            if self._crash:  # if this process also crashes, readers then know more than that the frame is old
+                self._fail(self._writer.cycle, f"the source's process was restarted: {self._crash}")
             return
         self._writer.cycle, self._handled = state.step, state.step
         self._writer.at_ns = self._page.monotonic_ns(state.time_ns)
@@ -244,7 +250,7 @@ class SteppedLoop:
         if state.stepping and last is None:
             self._handled -= 1  # it takes part in the present step
         elif state.stepping and last is not None and last.cycle < state.step:
-            self._fail(state.step, RESTARTED)
+            self._fail(state.step, f"{RESTARTED} ({self._crash})" if self._crash else RESTARTED)
         else:
             self._show(state.step)
 

@@ -52,7 +52,7 @@ def test_an_installed_module_comes_first(folder: Path) -> None:
     "text", ["", "Belt", "plant:", ":Belt", "plant.belt.Belt", "plant:Belt()", "../x:Belt", "a..b:C"]
 )
 def test_invalid_names_are_refused(text: str) -> None:
-    with pytest.raises(ConfigError, match=r"^expected package\.module:Class, found "):
+    with pytest.raises(ConfigError, match=r"^expected package\.module:Class or the file of an FMU \(\.fmu\), found "):
         load(text)
 
 

@@ -1,0 +1,165 @@
+"""An FMU as a model."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import ClassVar, Final
+
+from shmio.errors import ModelError, ShmioError
+from shmio.simulation.fmu.archive import Archive, Extracted
+from shmio.simulation.fmu.description import Description, describe
+from shmio.simulation.fmu.instance import FmuError, Group, Instance
+from shmio.simulation.model import Model
+
+SUFFIX: Final = ".fmu"
+REMEDY: Final = "; the FMU starts again when its source is restarted"
+MAX_CALLS: Final = 10_000
+"""Limit of the calls of ``doStep`` in one step."""
+MAX_TRIES: Final = 4
+"""How often a step of one size is tried before a smaller one is."""
+MAX_HALVINGS: Final = 30
+MAX_REPEATS: Final = 1000
+"""How often a discarded step is tried if the FMU does not allow a smaller one."""
+
+
+def is_fmu(text: str) -> bool:
+    """Return whether the name of a model is that of the file of an FMU."""
+    return text.lower().endswith(SUFFIX)
+
+
+def load_fmu(file: Path) -> type[FmuModel]:
+    """Read an FMU, and return a model of it. This runs nothing of the FMU.
+
+    Raises:
+        ModelError: The file is not an FMU that shmio can run on this machine.
+
+    """
+    try:
+        archive = Archive(file)
+        description = describe(archive)
+    except ModelError as error:
+        raise ModelError(f"{file}: {error}") from None
+    return FmuModel.with_declarations(file.name, description.declarations, archive=archive, description=description)
+
+
+class FmuModel(Model):
+    """Steps an FMU. :func:`load_fmu` makes a subclass for each FMU.
+
+    The FMU's own time begins with the first step. A call that fails ends the FMU: all further steps
+    fail with the same reason.
+    """
+
+    archive: ClassVar[Archive]
+    description: ClassVar[Description]
+
+    _instance: Instance | None = None
+    _folder: Extracted | None = None
+    _failure = ""
+    _inputs: list[Group]
+    _outputs: list[Group]
+    _begun_ns: int | None = None  # instance time at the FMU's start
+    _done_ns = 0  # time since then that the FMU has computed
+    _fixed_ns = 0  # length of all steps, if the FMU needs that
+    _now_s = 0.0  # the FMU's own time
+
+    def start(self) -> None:
+        """Load and initialise the FMU."""
+        if self._failure:
+            raise ModelError(self._failure)
+        try:
+            self._folder = self.archive.extract()
+            self._instance = instance = Instance(self.description, self._folder.path)
+            self._inputs, self._outputs, parameters = (
+                instance.group([one for one in self.description.variables if one.causality == causality], self._ports)
+                for causality in ("input", "output", "parameter")
+            )
+            self._now_s = self.description.start_s
+            instance.initialise(parameters, self._inputs)
+            instance.get(self._outputs)
+        except ShmioError as error:
+            raise self._fail(error) from None
+
+    def step(self, time_s: float, dt_s: float) -> None:
+        """Let the FMU compute a step."""
+        if self._failure or self._instance is None:
+            raise ModelError(self._failure)
+        time_ns, dt_ns = round(time_s * 1e9), round(dt_s * 1e9)
+        if self._begun_ns is None:
+            self._begun_ns = time_ns - dt_ns
+        passed_ns = time_ns - self._begun_ns
+        try:
+            self._instance.set(self._inputs)
+            if self.description.varies_step:
+                self._advance(self._instance, _point_s(passed_ns, dt_ns))
+                self._done_ns = passed_ns
+            else:
+                self._advance_evenly(self._instance, passed_ns, dt_ns)
+            self._instance.get(self._outputs)
+        except FmuError as error:
+            raise self._fail(error) from None
+        except ShmioError as error:
+            raise ModelError(str(error)) from None
+
+    def _advance_evenly(self, instance: Instance, passed_ns: int, dt_ns: int) -> None:
+        """Make steps of one length until a time.
+
+        Raises:
+            ModelError: The time is not a multiple of the steps' length.
+
+        """
+        self._fixed_ns = self._fixed_ns or dt_ns
+        if (passed_ns - self._done_ns) % self._fixed_ns:
+            raise ModelError(
+                f"the FMU makes steps of one length only, which is {self._fixed_ns / 1e6:g} ms since its first step; "
+                f"{(passed_ns - self._done_ns) / 1e6:g} ms are not a multiple of it"
+            )
+        while self._done_ns < passed_ns:
+            self._advance(instance, _point_s(self._done_ns + self._fixed_ns, self._fixed_ns))
+            self._done_ns += self._fixed_ns
+
+    def _advance(self, instance: Instance, passed_s: float) -> None:
+        """Make a step until a time since the FMU's start, in parts if the FMU does not make it at once."""
+        target_s = self.description.start_s + passed_s
+        size_s = target_s - self._now_s
+        tries = halvings = 0
+        for _ in range(MAX_CALLS):
+            if self._now_s >= target_s or math.isclose(self._now_s, target_s):
+                return
+            is_last = target_s - self._now_s <= size_s * (1 + 1e-9)
+            end_s = target_s if is_last else self._now_s + size_s
+            reached_s = instance.do_step(self._now_s, end_s - self._now_s)
+            if reached_s is not None and reached_s > self._now_s:
+                self._now_s = min(reached_s, end_s)
+                tries = halvings = 0
+                continue
+            tries += 1
+            if self.description.varies_step and tries >= MAX_TRIES:
+                size_s, tries, halvings = size_s / 2, 0, halvings + 1
+            if tries >= MAX_REPEATS or halvings >= MAX_HALVINGS:
+                break
+        raise FmuError(f"it has discarded its step at {self._now_s:g} s again and again")
+
+    def _fail(self, error: ShmioError) -> ModelError:
+        self._failure = f"{error}{REMEDY}"
+        return ModelError(self._failure)
+
+    def _close(self) -> None:
+        """End the FMU, and remove its files."""
+        if self._instance is not None:
+            self._instance.close()
+            self._instance = None
+            self._failure = self._failure or "the FMU has ended"
+        if self._folder is not None:
+            self._folder.remove()
+            self._folder = None
+
+
+def _point_s(passed_ns: int, dt_ns: int) -> float:
+    """Return a time in s.
+
+    For steps of one length this is the product that FMPy computes, so that the FMU gets the same
+    numbers to the last bit.
+    """
+    count, rest = divmod(passed_ns, dt_ns) if dt_ns else (0, 1)
+    return passed_ns / 1e9 if rest else count * (dt_ns / 1e9)
