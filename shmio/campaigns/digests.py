@@ -11,6 +11,7 @@ from typing import Final
 from shmio.config import Expectation, load
 from shmio.errors import ConfigError
 from shmio.layout.model import Layout
+from shmio.simulation.fmu import is_fmu
 
 MAX_BYTES: Final = 64 << 20
 """Files larger than this have no digest."""
@@ -49,8 +50,13 @@ def of_configuration(file: Path) -> Iterator[tuple[str, str]]:
     for source in sources:
         model = source.options.get("model")
         if isinstance(model, str):
-            found = _module(model.partition(":")[0], file.resolve().parent)
+            found = _file_of(model, file.resolve().parent)
             yield f"model of {source.name}", model if found is None else f"{model}, sha256 {of_file(found)}"
+
+
+def _file_of(model: str, folder: Path) -> Path | None:
+    """Return the file of a model: that of an FMU, or that of its Python module."""
+    return folder / model if is_fmu(model) else _module(model.partition(":")[0], folder)
 
 
 def _module(name: str, folder: Path) -> Path | None:

@@ -1,4 +1,4 @@
-"""Simulation models: classes that compute a source's registers step by step. They do no I/O.
+"""Simulation models: classes that compute a source's registers step by step.
 
 A model declares its inputs and outputs, and computes the outputs in ``step``: see
 docs/how-to/write-a-model.md. ``ModelRunner`` runs a model on the image of a block. ``ServedModel``

@@ -302,7 +302,7 @@ def test_a_model_killed_during_a_step_fails_it_and_the_next_step_works(line: Cel
         assert command.returncode == 1
         assert error == (
             f"step {number}: belt: the source's process was restarted during this step; "
-            "it continues with the next step\n"
+            "it continues with the next step (killed by SIGKILL)\n"
         )
         cell.write({"belt/speed": 1.0})
         assert cell.step().step == number + 1

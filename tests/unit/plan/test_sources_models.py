@@ -9,6 +9,7 @@ import pytest
 
 from shmio.errors import ConfigError
 from shmio.plan.prepare import prepare
+from tests.fmus import build
 
 CONFIG = """
 [instance]
@@ -100,6 +101,29 @@ def test_changed_model_is_read_again(folder: Path) -> None:
     (folder / "line.py").write_text(MODELS.replace('speed = Input("LREAL", 1.0)', 'speed = Input("REAL")'))
     prepared = prepare(folder / "supervisor.toml")
     assert prepared.layouts["belt"].registers[0].type == "REAL"
+
+
+def test_an_fmu_declares_its_registers_and_its_faults_are_reported(folder: Path) -> None:
+    (folder / "models").mkdir()
+    build("tank2", folder / "models")
+    (folder / "models/bad.fmu").write_text("no archive")
+    file = folder / "supervisor.toml"
+
+    def tank(keys: str) -> Path:
+        file.write_text(f'[instance]\nname = "line"\n[[source]]\nname = "tank"\nconnector = "simulation"\n{keys}\n')
+        return file
+
+    prepared = prepare(tank('model = "models/tank2.fmu"\nparameters = { area = 2.5 }'))
+    assert [register.path for register in prepared.layouts["tank"].registers][:2] == ["pump.inflow", "level"]
+    for keys, message in (
+        ('model = "models/bad.fmu"', f"source[0].model: {folder}/models/bad.fmu: the archive is damaged"),
+        ('model = "tank2.fmu"', f"source[0].model: {folder}/tank2.fmu: No such file or directory"),
+        ('model = "models/tank2.fmu"\nparameters = { area = 0 }', "source[0].parameters.area: 0 is outside"),
+        ('model = "models/tank2.fmu"\nconnections = { level = "tank/level" }', "there are: pump.inflow, pulses"),
+    ):
+        with pytest.raises(ConfigError) as caught:
+            prepare(tank(keys))
+        assert message in str(caught.value)
 
 
 REMOTE = """

@@ -86,6 +86,11 @@ def test_a_subclass_has_the_registers_of_the_class_above() -> None:
         (lambda: Input({"a": "INT"}, {"b": 1}), "speed: initial: expected a dict with some of a, found {'b': 1}"),
         (lambda: InOut("JointTrajectory[6]"), "speed: expected JointTrajectory[joints, points] with at most 64 joints"),
         (lambda: Parameter("RAEL"), "speed: there is no type 'RAEL'"),
+        (lambda: Input("RAEL", limits=(0, 1)), "speed: there is no type 'RAEL'"),
+        (lambda: Output("INT", limits=(0, 1)), "speed: limits: an output has none"),
+        (lambda: Input("BOOL", limits=(0, 1)), "speed: limits: only a number or an array of numbers"),
+        (lambda: InOut({"a": "INT"}, limits=(0, 1)), "speed: limits: only a number or an array of numbers"),
+        (lambda: Input("INT", limits=(2, 1)), "speed: limits: expected the lowest and the highest value"),
     ],
 )
 def test_an_invalid_declaration_is_refused_and_named(make: Callable[[], Declaration], message: str) -> None:

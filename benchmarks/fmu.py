@@ -1,0 +1,104 @@
+"""Steps of an FMU a second: by FMPy alone, by shmio's model runner, and in an instance.
+
+FMPy simulates with its own loop and records the outputs. The runner makes the same steps, and has the outputs in its
+image. In the instance, a program on the host steps, and each step has a frame in the shared memory. The FMUs of the
+tests are compiled from C: a tank (FMI 2.0, 4 inputs and 5 outputs) and two axes (FMI 3.0, arrays, 6 inputs and 7
+outputs).
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+from common import ROOT, begin, interleave, report
+from instance import started
+from step import local
+
+from shmio.simulation import ModelRunner, load
+
+sys.path.insert(0, str(ROOT))
+from tests.fmus import build
+
+DT_NS = 20_000_000
+OURS = "shmio, the runner alone"
+OUTPUTS = {
+    "tank2": ["level", "runs", "a/b caption", "phase", "calls"],
+    "plant3": ["position", "small_out", "bits_out", "text_out", "big_out", "byte", "mode"],
+}
+SOURCE = """
+[[source]]
+name = "sim"
+connector = "simulation"
+model = "{file.name}"
+folder = "{file.parent}"
+"""
+
+
+def alone(file: Path, outputs: list[str], count: int) -> Callable[[], float]:
+    """Make a sampler of the steps a second of FMPy, without the extraction."""
+    import fmpy  # noqa: PLC0415
+
+    folder = fmpy.extract(str(file), str(file.with_suffix("")))
+    description = fmpy.read_model_description(folder)
+
+    def sample() -> float:
+        fmu = fmpy.instantiate_fmu(folder, description, "CoSimulation")
+        begun_s = time.perf_counter()
+        results = fmpy.simulate_fmu(
+            folder,
+            stop_time=count * DT_NS / 1e9,
+            output_interval=DT_NS / 1e9,
+            output=outputs,
+            model_description=description,
+            fmu_instance=fmu,
+            validate=False,
+        )
+        taken_s = time.perf_counter() - begun_s
+        fmu.freeInstance()
+        return (len(results) - 1) / taken_s
+
+    return sample
+
+
+def by_runner(file: Path, count: int) -> Callable[[], float]:
+    """Make a sampler of the steps a second of the model runner."""
+
+    def sample() -> float:
+        runner = ModelRunner(load(file.name, file.parent))
+        runner.begin()
+        begun_s = time.perf_counter()
+        for number in range(1, count + 1):
+            runner.step(number * DT_NS, DT_NS)
+        taken_s = time.perf_counter() - begun_s
+        runner.close()
+        return count / taken_s
+
+    return sample
+
+
+def main() -> None:
+    quick = begin("FMUs: steps a second, next to FMPy alone")
+    count, duration_s, rounds = (200, 0.2, 1) if quick else (20_000, 2.0, 7)
+    with tempfile.TemporaryDirectory() as folder:
+        for name, outputs in OUTPUTS.items():
+            file = build(name, Path(folder))
+            with ExitStack() as stack:
+                running = stack.enter_context(started([], more=SOURCE.format(file=file), clock="stepped"))
+                samples = interleave(
+                    {
+                        OURS: by_runner(file, count),
+                        "FMPy alone": alone(file, outputs, count),
+                        "shmio, an instance": local(running.segment.instance, duration_s),
+                    },
+                    rounds,
+                )
+            report(f"{name}.fmu: steps a second", samples, OURS, "more")
+
+
+if __name__ == "__main__":
+    main()
