@@ -241,16 +241,15 @@ class SteppedLoop:
         self.counters.connects += 1
         state = self._page.read()
         if not state.virtual:
-            if self._crash:  # if this process also crashes, readers then know more than that the frame is old
-                self._fail(self._writer.cycle, f"the source's process was restarted: {self._crash}")
             return
+        crash, self._crash = self._crash, ""
         self._writer.cycle, self._handled = state.step, state.step
         self._writer.at_ns = self._page.monotonic_ns(state.time_ns)
         self._time_ns = state.time_ns
         if state.stepping and last is None:
             self._handled -= 1  # it takes part in the present step
         elif state.stepping and last is not None and last.cycle < state.step:
-            self._fail(state.step, f"{RESTARTED} ({self._crash})" if self._crash else RESTARTED)
+            self._fail(state.step, f"{RESTARTED} ({crash})" if crash else RESTARTED)
         else:
             self._show(state.step)
 
@@ -269,6 +268,10 @@ class SteppedLoop:
         self._writer.at_ns = None
         due = self._schedule.next(self._clock.now_ns())
         self.counters.overruns += due.skipped
+        if self._crash:  # if this process also crashes, readers then know more than that the frame is old
+            self._writer.cycle = max(0, due.cycle - 1)
+            self._fail(self._writer.cycle, f"the source's process was restarted: {self._crash}")
+            self._crash = ""
         while (now_ns := self._clock.now_ns()) < due.due_ns:
             wait_ns = due.due_ns - now_ns
             if self._source.prompt and self.commands.waiting:
