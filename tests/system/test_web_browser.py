@@ -34,6 +34,8 @@ SOFTWARE_GL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swi
 AXIS = "cell/Robot_800/Axs1_Pos"
 ALERT = '[[alert]]\nname = "seven"\nwhen = "cell/Outputs/500 = 7"\nseverity = "critical"\n'
 BIT = "cell/Outputs/500.%X0"
+HOSTILE = '<img src=x onerror="document.title=1"><script>document.title=1</script>'
+"""Comment of a register and line of a log."""
 SCENE = f"""
 [[body]]
 name = "flag"
@@ -67,6 +69,8 @@ def cell(make_cell: Callable[..., Cell], address: str, scene: str) -> Cell:
     more = 'scene = "scene.toml"\n' if scene else ""
     cell = make_cell(config=f'{config}[web]\nlisten = "{address}"\n{more}[recorder]\ndirectory = "dumps"\n{ALERT}')
     (cell.folder / "scene.toml").write_text(scene)
+    layout = cell.folder / "db201.db"
+    layout.write_text(layout.read_text().replace("Axs1_Pos : Real;", f"Axs1_Pos : Real;  // {HOSTILE}"))
     cell.up()
     return cell
 
@@ -83,6 +87,7 @@ def page(cell: Cell, address: str) -> Iterator[Any]:
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.goto(f"http://{address}/")
         yield page
+        assert not page.locator("img, main script").count()
         browser.close()
     assert not errors
 
@@ -117,6 +122,7 @@ def test_user_writes_a_register_and_overrides_it(cell: Cell, page: Any) -> None:
     row = page.locator(f'.tree-row[data-path="{AXIS}"]')
     row.click()
     expect(page.get_by_role("button", name="Write")).to_be_disabled()
+    expect(row).to_contain_text(HOSTILE)
     page.get_by_label("New value").fill("12.5")
     page.get_by_role("button", name="Override").click()
     expect(row.locator(".origin")).to_have_text("injected")
@@ -483,11 +489,14 @@ def test_user_sees_active_alerts(cell: Cell, page: Any) -> None:
     expect(alerts).to_be_hidden()
 
 
-def test_user_filters_the_log(page: Any) -> None:
+def test_user_filters_the_log(cell: Cell, page: Any) -> None:
+    with (cell.folder / "logs" / "cell.log").open("a") as log_file:
+        log_file.write(f"{HOSTILE}\n")
     expect(page.get_by_role("tab", name="3D")).to_be_hidden()  # this cell has no scene
     open_tab(page, "Log")
     log = page.get_by_label("Log", exact=True).last
     expect(log).to_contain_text("supervisor: supervising")
+    expect(log).to_contain_text(HOSTILE)
     keep(page, "log")
     page.get_by_label("Filter").fill("connected")
     expect(log).not_to_contain_text("supervising")

@@ -287,7 +287,7 @@ def _kind(register: Register) -> Any:
 
 
 def _first(register: Register) -> str:
-    return f"{register.path}[{','.join(str(low) for low, _ in register.dims)}]"
+    return "/".join([register.path, *(str(low) for low, _ in register.dims)])
 
 
 def numbers(values: npt.NDArray[Any]) -> npt.NDArray[np.float64]:

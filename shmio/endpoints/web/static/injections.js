@@ -2,13 +2,12 @@
 
 import { clock } from "./chart.js";
 import { element, notify, replace, setText } from "./dom.js";
-import { duration } from "./format.js";
 import { InjectionForm } from "./injection_form.js";
 
 /** @typedef {import("./main.js").Context} Context */
 /**
  * @typedef {{ source: string, number: string, name: string, direction: string, priority: number, keep: boolean, by: string,
- *   state: string, since_s: number | null, seed: string | null, operation?: string, when?: string | null,
+ *   state: string, since_s: number | null, utc_s: number | null, seed: string | null, operation?: string, when?: string | null,
  *   registers: string[], count: number }} Injection
  */
 /**
@@ -101,7 +100,7 @@ export class InjectionsTab {
     const rows = injections.map((one) => {
       const more = one.count > one.registers.length ? ` and ${one.count - one.registers.length} more` : "";
       const what = one.operation ? `${one.operation}${one.when ? ` when ${one.when}` : ""}` : "values of a program";
-      const since = one.state === "active" && one.since_s !== null ? ` since ${duration(one.since_s)}` : "";
+      const since = one.state === "active" && one.since_s !== null ? ` since ${one.utc_s === null ? `${one.since_s.toFixed(3)} s of virtual time` : clock(one.utc_s)}` : "";
       const lift = element(
         "button",
         { type: "button", disabled: !this.context.may("inject"), click: () => this.act("lift", { source: one.source, number: one.number }) },

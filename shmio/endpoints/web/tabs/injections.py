@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 import tomllib
 from collections.abc import Iterable, Iterator
 from itertools import islice
@@ -23,6 +24,7 @@ from shmio.injection.program import compile_condition
 from shmio.layout.values.codec import RegisterCodec
 from shmio.layout.values.write import Write, bits_of, paths_of
 from shmio.local.injection import Campaign, compile_declarations
+from shmio.model.clock import ClockMode
 from shmio.segment import Block, Quality
 from shmio.segment.block import Layouts
 
@@ -165,6 +167,8 @@ class Injections(Tab):
     def _describe(self, present: dict[str, tuple[Any, ...]], names: dict[int, str]) -> list[dict[str, Any]]:
         """Describe injections, with the names of the instance's processes by pid."""
         blocks = self.page.served.segment.blocks
+        clock = self.page.served.cell.clock
+        utc_s = time.time() - clock.present_ns / 1e9 if clock.mode is ClockMode.WALL else None
         found: list[dict[str, Any]] = []
         for source, injections in present.items():
             layout = blocks[source].layout
@@ -183,6 +187,7 @@ class Injections(Tab):
                         "by": "configuration" if one.configured else names.get(one.pid) or f"process {one.pid}",
                         "state": "active" if running is None else running.state,
                         "since_s": running.time_ns / 1e9 if running is not None and running.time_ns else None,
+                        "utc_s": None if utc_s is None or running is None else utc_s + running.time_ns / 1e9,
                         "seed": None if running is None else str(running.seed),
                     }
                     | ({} if running is None else _described_declaration(running.declaration))

@@ -19,6 +19,7 @@ from websockets.sync.connection import Connection
 
 from shmio.config import Address
 from shmio.config.credentials import Secret, digest
+from shmio.endpoints.grpc.server.access import NEEDS
 from shmio.endpoints.web import app, page, sessions
 from shmio.endpoints.web.app import PageApp
 from shmio.endpoints.web.measurements import Measurements
@@ -220,6 +221,34 @@ def test_role_is_needed(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(TABS[0], "calls", {"overview.follow": call})
     with pages(segment) as server, server.open() as browser:
         assert "needs the role control" in said(browser, "overview.follow")["error"]
+
+
+BY_GRPC = {
+    "registers.set": "Write",
+    "registers.override": "Inject",
+    "registers.lift": "Lift",
+    "injections.start": "Declare",
+    "injections.lift": "Lift",
+    "injections.lift_all": "LiftAll",
+    "time.step": "Step",
+    "time.play": "Play",
+    "time.pause": "Pause",
+    "time.release": "Release",
+    "recordings.replay": "Replay",
+}
+"""The calls of a page that change something, and the calls of gRPC that do the same."""
+ONLY_HERE = {"overview.restart": "control", "configuration.reload": "control"}
+
+
+def test_calls_need_the_roles_of_grpc() -> None:
+    needed = {name: call.role for tab in TABS for name, call in tab.calls.items()}
+    changing = {name: role for name, role in needed.items() if role != "read"}
+    assert changing == {name: NEEDS[f"/shmio.v1.Shmio/{call}"] for name, call in BY_GRPC.items()} | ONLY_HERE
+    reading = {name.partition(".")[2] for name, role in needed.items() if role == "read"}
+    assert reading == {
+        "check", "condition", "describe", "files", "follow", "get", "leave", "lines", "more", "past", "plot",
+        "registers", "replays", "rows", "state", "stop", "verify",
+    }  # fmt: skip
 
 
 def test_large_message_ends_only_its_own_page(segment: Segment) -> None:

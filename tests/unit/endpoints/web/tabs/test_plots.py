@@ -164,6 +164,30 @@ def test_long_past_comes_at_equal_distances(segment: Segment, monkeypatch: pytes
         assert len({later - earlier for earlier, later in pairwise(found)}) == 1
 
 
+def test_page_that_stalls_gets_the_newest_data(segment: Segment) -> None:
+    """A page that does not read for 100 batches of 180 kB gets a few of them, a gap, and the newest."""
+    bursts, frames = 100, 100
+    paths = [f"cell/long/{number}" for number in range(1, 201)]
+    writer = segment.writer("cell")
+    with pages(segment) as server, server.open(max_queue=1) as stalled, server.open() as other:
+        for browser in (stalled, other):
+            follow(server, browser, *paths)
+        for burst in range(bursts):
+            publish(writer, [0] * frames, 1 + frames * burst)
+            course(other, frames, len(paths))  # nothing is late for the other page
+        publish(writer, [0], 1 + frames * bursts)
+        newest = next(batches(other, len(paths))).times[-1]
+        received, gaps, last = 0, 0, math.nan
+        for batch in batches(stalled, len(paths)):
+            received += len(batch.times)
+            gaps += batch.before != last
+            last = batch.times[-1]
+            if last == newest:
+                break
+        assert received < frames * bursts / 2
+        assert gaps > 1  # the first is the beginning
+
+
 def test_empty_list_ends_the_course(segment: Segment) -> None:
     writer = segment.writer("cell")
     with pages(segment) as server, server.open() as browser:
