@@ -155,7 +155,8 @@ def paint(running: Instance, address: str, signals: int, duration_s: float) -> l
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         page.add_init_script(f"({_WATCH})({json.dumps([f'cell/Inputs/{number}' for number in range(signals)])})")
         page.goto(f"http://{address}/")
-        page.wait_for_function("window.delays.length > 0", timeout=60_000)
+        while not page.evaluate("window.delays.length"):
+            page.wait_for_timeout(100)
         page.evaluate("window.delays = []; window.drawings = 0")
         usage = Usage({"web": [running.pids["web"]]})
         page.wait_for_timeout(1000 * duration_s)
@@ -171,6 +172,7 @@ def paint(running: Instance, address: str, signals: int, duration_s: float) -> l
 
 def main() -> None:
     quick = begin("Plots of the web page at 50 Hz: CPU, bytes and delay")
+    titles = ["", "web, % of a core", "kB/s a page", "frame to page, ms", "p99", "overruns", "others, % of a core"]
     with (
         reserved_port() as address,
         instance(PERIOD_MS, more=f'[web]\nlisten = "{address}"\n') as running,
@@ -181,11 +183,10 @@ def main() -> None:
             for signals in (20, 200)
         ]
         rows.append(asyncio.run(measure(running, str(address), 1, 20, 2.0 if quick else 20.0, SILENT)))
+        table(titles, rows)
         painted = []
         if shutil.which("chromium") is not None:
             painted = [paint(running, str(address), signals, 2.0 if quick else PAINT_S) for signals in (20, 200)]
-    titles = ["", "web, % of a core", "kB/s a page", "frame to page, ms", "p99", "overruns", "others, % of a core"]
-    table(titles, rows)
     if painted:
         table(["", "web, % of a core", "paint, ms", "p99", "fps", "overruns", "others, % of a core"], painted)
 

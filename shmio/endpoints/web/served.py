@@ -17,6 +17,7 @@ from shmio.endpoints.web.clients import clients
 from shmio.endpoints.web.configuration import ConfigurationFile
 from shmio.endpoints.web.measurements import Measurements
 from shmio.endpoints.web.recordings import Recordings
+from shmio.endpoints.web.register_tree import Trees
 from shmio.endpoints.web.signals import Feeds
 from shmio.endpoints.web.supervisor import Supervisor
 from shmio.endpoints.web.timeline import Timeline
@@ -72,6 +73,8 @@ class Served:
         self.configuration = ConfigurationFile(config_file, self.supervisor)
         self.feeds = Feeds()
         """The signals that pages plot."""
+        self.trees = Trees()
+        """The trees of the registers."""
         self.timeline = Timeline(segment)
         """The newest events."""
         self.recordings = Recordings(recordings)

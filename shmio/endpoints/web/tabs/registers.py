@@ -12,7 +12,7 @@ from msgspec import Meta
 from starlette.concurrency import run_in_threadpool
 
 from shmio.endpoints.web.page import Page, Tab, call, release
-from shmio.endpoints.web.tabs.register_tree import Node, Row, matching, rows, tree, window
+from shmio.endpoints.web.register_tree import Node, Row, matching, rows, window
 from shmio.errors import CommandError, PathError
 from shmio.layout.model import MAX_PATH, Register
 from shmio.layout.values.text import to_text
@@ -76,7 +76,6 @@ class Registers(Tab):
     def __init__(self, page: Page) -> None:
         super().__init__(page)
         self._cell: Attachment = page.served.cell
-        self._trees: dict[int, Node] = {}
         self._allowed: dict[int, bytes] = {}
         self._visible: list[tuple[str, Register]] = []
         self._sent: dict[str, list[Any]] = {}
@@ -155,10 +154,7 @@ class Registers(Tab):
         return window(visible, given.first, given.count, MAX_COUNTED)
 
     def _tree(self, block: Block) -> Node:
-        node = self._trees.get(block.section)
-        if node is None:
-            node = self._trees[block.section] = tree(block.source, block.layout)
-        return node
+        return self.page.served.trees.of(block, self.page.served.segment.blocks.values())
 
     def _describe(self, row: Row) -> dict[str, Any]:
         described: dict[str, Any] = {

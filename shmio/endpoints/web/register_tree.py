@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+import threading
+from collections.abc import Collection, Iterable, Iterator
 from itertools import islice
 from typing import NamedTuple
 
 from shmio.layout.model import Layout, Register
+from shmio.segment import Block
 
 
 class Row(NamedTuple):
@@ -56,6 +58,24 @@ def rows(root: Node, layout: Layout, expanded: Collection[str]) -> Iterator[Row]
         if array and node.register is not None:
             yield from _elements(node, depth + 1, layout, node.register)
         pending += [(child, depth + 1) for child in reversed(node.children.values())]
+
+
+class Trees:
+    """The trees of all sources, which all pages share: a tree of 100,000 registers takes tens of MB."""
+
+    def __init__(self) -> None:
+        self._trees: dict[int, Node] = {}
+        self._making = threading.Lock()
+
+    def of(self, block: Block, blocks: Iterable[Block]) -> Node:
+        """Return the tree of a block. Trees of blocks that are none of ``blocks`` are forgotten."""
+        with self._making:
+            node = self._trees.get(block.section)
+            if node is None:
+                present = {one.section for one in blocks}
+                self._trees = {section: one for section, one in self._trees.items() if section in present}
+                node = self._trees[block.section] = tree(block.source, block.layout)
+            return node
 
 
 def matching(root: Node, layout: Layout, text: str) -> Iterator[Row]:

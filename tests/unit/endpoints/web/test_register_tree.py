@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from shmio.endpoints.web.tabs.register_tree import Row, matching, rows, tree, window
+from shmio.endpoints.web.register_tree import Row, matching, rows, tree, window
 from shmio.layout.model import Layout, Register
 
 LAYOUT = Layout(
