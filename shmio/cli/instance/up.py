@@ -18,6 +18,7 @@ from shmio import logs
 from shmio.cli.instance.detach import Configured, Failed, Started, StartMessage, headline, replay_keys
 from shmio.cli.run import say
 from shmio.cli.target import config_file
+from shmio.config import Address
 from shmio.connectors.request_count import counted
 from shmio.errors import ShmioError
 from shmio.logs import printable
@@ -122,6 +123,9 @@ def _processes(prepared: Prepared) -> Iterator[str]:
     for job in sorted(jobs, key=lambda job: job.rank):
         yield f"  {job.name:<{width}}  {job.kind:<8}  {_describe(job, prepared)}"
     yield from prepared.notes
+    for job in jobs:
+        if job.name == "web" and Address.parse(job.config["listen"]).host not in ("0.0.0.0", "::"):  # noqa: S104
+            yield f"open {_describe(job, prepared)} in a browser to see the cell"
 
 
 def _describe(job: Job, prepared: Prepared) -> str:
