@@ -28,7 +28,9 @@ from shmio.segment import Segment
 
 STATIC: Final = Path(__file__).parent / "static"
 MAX_PAGES: Final = 64
-"""Maximum number of open pages. If there are as many, the oldest one without a call is closed for the next."""
+"""Maximum number of open pages that have made a call."""
+MAX_SILENT: Final = 256
+"""Maximum number of WebSockets without a call. If there are more, the oldest is closed."""
 MAX_LOGIN_BYTES: Final = 4096
 MAX_DROPPED: Final = 2
 """Maximum number of requests with dropped files at a time."""
@@ -99,7 +101,9 @@ class PageApp:
         self._served, self._sessions, self._secure = served, sessions, secure
         self._tabs = [tab for tab in tabs if tab.offered(served)]
         self._cookie = COOKIE.format(served.segment.instance)
-        self._pages: dict[Page, None] = {}
+        self._pages: set[Page] = set()
+        self._silent: dict[Page, None] = {}
+        """The pages without a call, the oldest first."""
         self._dropping = 0
         self._files = {
             f"/{file.relative_to(STATIC)}": (file.read_bytes(), _TYPES[file.suffix])
@@ -214,28 +218,30 @@ class PageApp:
         user = self._user(socket)
         if "read" not in user.roles:
             trail.record("read", {}, "denied", "it needs the role read", who=trail.Acting(user.actor, "web"))
-        if "read" not in user.roles or not self._has_room():
             await socket.close(1008)  # before it is accepted: an answer 403
             return
         page = Page(self._served, socket, user, self._tabs)
         cookie, host = socket.cookies.get(self._cookie), _host(socket)
         forget = self._sessions.on_end(cookie, host, lambda: page.end("the session has ended"))
-        self._pages[page] = None
+        self._silent[page] = None
+        if len(self._silent) > MAX_SILENT:
+            oldest = next(iter(self._silent))
+            oldest.end("the page made no call, and there are too many such pages")
+            del self._silent[oldest]
         try:
-            await page.run(self._sessions.left_s(cookie, host))
+            await page.run(lambda: self._admit(page), self._sessions.left_s(cookie, host))
         finally:
             forget()
-            self._pages.pop(page, None)
+            self._silent.pop(page, None)
+            self._pages.discard(page)
 
-    def _has_room(self) -> bool:
-        """Return whether one more page may be opened. If there are many, a silent one is closed for it."""
+    def _admit(self, page: Page) -> str:
+        """Count a page that makes its first call. Return why it is to be closed; empty: it is not."""
+        self._silent.pop(page, None)
         if len(self._pages) >= MAX_PAGES:
-            silent = next((page for page in self._pages if page.silent), None)
-            if silent is None:
-                return False
-            silent.end("there are too many pages")
-            del self._pages[silent]
-        return True
+            return f"{MAX_PAGES} pages are open: close one of them"
+        self._pages.add(page)
+        return ""
 
 
 def _record_sign_in(host: str, reason: str) -> None:

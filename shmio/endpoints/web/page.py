@@ -150,10 +150,11 @@ class Page:
         self._limit = asyncio.timeout(FIRST_CALL_S)
         self._why = "the page made no call in time"
 
-    async def run(self, lasts_s: float | None = None) -> None:
+    async def run(self, admit: Callable[[], str], lasts_s: float | None = None) -> None:
         """Serve the page until it is closed.
 
         Args:
+            admit: Called at the page's first call. Returns why the page is to be closed; empty: it is not.
             lasts_s: Time in s after which the user's session ends; None: it does not end.
 
         """
@@ -163,8 +164,12 @@ class Page:
                 await self._socket.accept()
                 message = await self._receive()
                 if message is not None and self.silent:
-                    self.silent, self._why = False, "the session has ended"
-                    self._limit.reschedule(None if lasts_s is None else asyncio.get_running_loop().time() + lasts_s)
+                    self.silent = False
+                    if refusal := admit():
+                        self.end(refusal)
+                    else:
+                        self._why = "the session has ended"
+                        self._limit.reschedule(None if lasts_s is None else asyncio.get_running_loop().time() + lasts_s)
                 await self._serve(message)
         except TimeoutError:
             with suppress(RuntimeError):  # the connection is closed

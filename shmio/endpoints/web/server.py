@@ -19,7 +19,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from shmio.config import Address
 from shmio.errors import EndpointError
 
-MAX_CONNECTIONS: Final = 128
+MAX_CONNECTIONS: Final = 512
 """Maximum number of connections. If there are more, the one is closed that has waited longest for a request."""
 MAX_MESSAGE_BYTES: Final = 64 << 10
 """Maximum size of a message that a page sends over its WebSocket."""
