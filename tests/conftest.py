@@ -68,6 +68,8 @@ START_PROCESSES = (
     "tests/unit/endpoints/web/test_dropped.py::test_page_",
     "tests/unit/plan/test_emulated_programs.py",
     "tests/unit/plan/test_sources_models.py",
+    "tests/unit/simulation/fmu/test_fmu_model.py",
+    "tests/unit/simulation/fmu/test_howto.py",
     "tests/unit/simulation/test_a50.py::test_runs_as_a_source_on_db201",
     "tests/unit/simulation/test_howto.py",
 )

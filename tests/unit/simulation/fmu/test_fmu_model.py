@@ -6,12 +6,15 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import fmpy
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from shmio.errors import ConfigError, ModelError, ValueRangeError
 from shmio.layout.topic import find
@@ -319,6 +322,41 @@ def test_descriptions_that_do_not_work_are_refused(
     with pytest.raises(ModelError, match=message) as caught:
         load("x.fmu", tmp_path)
     assert str(caught.value).startswith(f"{file}: ")
+
+
+@settings(max_examples=60)
+@given(st.data())
+def test_damaged_descriptions_and_archives_are_refused(fuzzed: tuple[Path, bytes, bytes], data: st.DataObject) -> None:
+    """Whatever is in the file: it is an FMU, or it is refused."""
+    file, whole, xml = fuzzed
+    if data.draw(st.booleans(), "damage the archive"):
+        content = bytearray(whole)
+        for place in data.draw(st.lists(st.integers(0, len(content) - 1), min_size=1, max_size=6)):
+            content[place] = data.draw(st.integers(0, 255))
+        file.write_bytes(content)
+    else:
+        text = bytearray(xml)
+        for _ in range(data.draw(st.integers(1, 4))):
+            start = data.draw(st.integers(0, len(text) - 1))
+            odd = st.sampled_from([b"", b"99999999999", b"-1", b"1e999", b"nan", b"\x00", b"&lt;", b"<a/>"])
+            text[start : start + data.draw(st.integers(0, 30))] = data.draw(odd | st.binary(max_size=4))
+        with zipfile.ZipFile(file, "w") as archive:
+            archive.writestr(XML, bytes(text))
+            archive.writestr(f"binaries/{fmpy.platform_tuple}/plant3.so", b"")
+    with suppress(ModelError, ConfigError):
+        ModelRunner(load(str(file)))
+
+
+@pytest.fixture(scope="module")
+def fuzzed(folder: Path) -> tuple[Path, bytes, bytes]:
+    """Return a file to overwrite, a small FMU, and its description."""
+    with zipfile.ZipFile(folder / "plant3.fmu") as archive:
+        xml = archive.read(XML)
+    small = folder / "small.fmu"
+    with zipfile.ZipFile(small, "w") as archive:
+        archive.writestr(XML, xml)
+        archive.writestr(f"binaries/{fmpy.platform_tuple}/plant3.so", b"")
+    return folder / "fuzzed.fmu", small.read_bytes(), xml
 
 
 def test_loading_runs_nothing_of_the_fmu(folder: Path, tmp_path: Path) -> None:
