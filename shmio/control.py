@@ -395,7 +395,7 @@ def _connect(client: socket.socket, path: str, deadline: float, lost: Callable[[
     """Connect as soon as the supervisor accepts another client.
 
     Raises:
-        TimeoutError: It did not accept one until the deadline.
+        TimeoutError: It did not accept one by the deadline.
         ControlError: ``lost`` returned a reason.
 
     """
@@ -417,7 +417,7 @@ def _wait(client: socket.socket, deadline: float, lost: Callable[[], str | None]
     """Return the next bytes of the answer.
 
     Raises:
-        TimeoutError: None came until the deadline.
+        TimeoutError: None came by the deadline.
         ControlError: ``lost`` returned a reason.
 
     """

@@ -85,7 +85,7 @@ SLOW = (
     "tests/unit/cli/test_dump_hostile.py",
     "tests/unit/cli/test_dump_rewriting.py::test_a_flipped_bit_anywhere",
     "tests/unit/cli/test_dump_rewriting.py::test_recover_of_a_file_cut_off_at_every_byte",
-    "tests/unit/cli/test_run_signals.py",
+    "tests/unit/cli/test_common_signals.py",
     "tests/unit/config/test_faults.py::test_hostile_files",
     "tests/unit/connectors/replay/test_recording.py::test_damaged_chunk_is_bad",
     "tests/unit/connectors/s7/test_connector.py::test_references_wrap_around",

@@ -31,7 +31,7 @@ from shmio.segment.block import Layouts
 MAX_STEPS: Final = 64
 """Maximum number of steps of virtual time between two turns of the judge."""
 GOOD_S: Final = 10.0
-"""Time in s to wait at the begin until the sources that the expectations read are good."""
+"""Time in s to wait at the start until the sources that the expectations read are good."""
 LOOK_S: Final = 0.02
 BUFFER_BYTES: Final = 256 << 20
 """Maximum number of bytes of the recording that may wait for the disk."""
@@ -43,7 +43,7 @@ class Plan:
     """What a run does.
 
     Attributes:
-        injections: The declared injections, with their seeds; their times count from the begin.
+        injections: The declared injections, with their seeds; their times count from the start.
         expectations: The expectations.
         duration_s: Duration on the instance's clock.
         folder: Folder of the campaign; the files that it names are relative to it.

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from shmio.cli.run import add_json, complete, exit_on_signals, load, milliseconds, run, seconds, seed_number
+from shmio.cli.common import add_json, complete, exit_on_signals, load, milliseconds, run, seconds, seed_number
 from shmio.errors import ConfigError, LayoutError, PathError, ValueRangeError
 from shmio.version import __version__
 

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from shmio.cli.run import add_full, add_json, complete, exit_on_signals, load, run
+from shmio.cli.common import add_full, add_json, complete, exit_on_signals, load, run
 from shmio.version import __version__
 
 PROGRAM = "shmio-dump"

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import msgspec
 
-from shmio.cli.run import dumps, seconds, seed_number, stop_on_signals
+from shmio.cli.common import dumps, seconds, seed_number, stop_on_signals
 from shmio.cli.set import Pairs
 from shmio.config import Declaration
 from shmio.config.campaign import read_campaign

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from shmio.cli import layout_import
-from shmio.cli.run import add_json, complete, dumps, run
+from shmio.cli.common import add_json, complete, dumps, run
 from shmio.errors import ConfigError, LayoutError
 from shmio.layout.compiler import Program, Source
 from shmio.layout.image import initial_value_warnings

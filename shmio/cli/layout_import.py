@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from shmio.cli.run import run
+from shmio.cli.common import run
 from shmio.layout.importing.found import ImportingError
 from shmio.layout.importing.importer import FORMATS, MAX_BYTES, import_tags
 from shmio.logs import printable

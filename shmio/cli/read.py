@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from shmio.cli.run import add_full, at_least, dumps, ended_by_interrupt, room, seconds
+from shmio.cli.common import add_full, at_least, dumps, ended_by_interrupt, room, seconds
 from shmio.errors import NotRunningError, PathError
 from shmio.layout.glob import choose
 from shmio.layout.model import Register

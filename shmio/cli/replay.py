@@ -9,7 +9,7 @@ from typing import Final
 
 import msgspec
 
-from shmio.cli.run import dumps
+from shmio.cli.common import dumps
 from shmio.logs import printable
 from shmio.model.cell import Cell
 from shmio.model.replay import ReplayChanges, ReplayStatus

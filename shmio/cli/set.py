@@ -7,7 +7,7 @@ import re
 import shlex
 from collections.abc import Mapping, Sequence
 
-from shmio.cli.run import PartlyDoneError, dumps, seconds
+from shmio.cli.common import PartlyDoneError, dumps, seconds
 from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
 from shmio.layout.glob import select
 from shmio.layout.model import Layout, Register

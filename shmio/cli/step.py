@@ -8,8 +8,8 @@ import sys
 
 import msgspec
 
+from shmio.cli.common import at_least, dumps, stop_on_signals
 from shmio.cli.instance.status import clock_line
-from shmio.cli.run import at_least, dumps, stop_on_signals
 from shmio.errors import CommandError, ValueRangeError
 from shmio.local.status import clock_status
 from shmio.local.time_control import MAX_RATE, MAX_STEP_NS, MIN_STEP_NS, check_step

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from shmio.cli.run import add_json, at_least, complete, load, milliseconds, moment, run
+from shmio.cli.common import add_json, at_least, complete, load, milliseconds, moment, run
 from shmio.control import ANSWERS
 from shmio.version import __version__
 
@@ -83,14 +83,15 @@ def _parser() -> argparse.ArgumentParser:
     logs = verb("logs", "print the end of the log files", target)
     logs.add_argument("name", metavar="NAME", nargs="?", help="a process, or supervisor (default: all)")
     logs.add_argument("-f", "--follow", action="store_true", help="continue to print new lines until Ctrl-C")
-    logs.add_argument("-n", "--lines", type=at_least(0), default=20, metavar="LINES", help="default: 20")
+    text = "number of lines to print, of all processes together (default: 20)"
+    logs.add_argument("-n", "--lines", type=at_least(0), default=20, metavar="LINES", help=text)
     add_json(logs, "print one JSON object per line")
     audit = verb("audit", "print who did what to the instance, from where, and with what outcome", target)
     audit.add_argument(
         "pattern", metavar="PATTERN", nargs="?", help="only about this register or name; * is a wildcard"
     )
     audit.add_argument("-f", "--follow", action="store_true", help="continue to print new entries until Ctrl-C")
-    text = "most entries to print (default: 50, or all with --since)"
+    text = "maximum number of entries to print (default: 50, or all with --since)"
     audit.add_argument("-n", "--lines", type=at_least(0), metavar="LINES", help=text)
     text = "only entries from then on: 30s, 10m, 2h or 7d before now, or a date and time"
     audit.add_argument("--since", type=moment, metavar="TIME", help=text)
@@ -130,8 +131,10 @@ def _add_browse(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--writable", action="store_true", help="with -o: commands may write what the device permits")
     text = "a key of the source, such as security=SignAndEncrypt or username=operator; repeatable"
     parser.add_argument("--set", dest="keys", action="append", default=[], metavar="KEY=VALUE", help=text)
-    parser.add_argument("--depth", type=at_least(1), default=32, metavar="LEVELS", help="default: 32")
-    text = "the most nodes to look at (default: 100000)"
+    parser.add_argument(
+        "--depth", type=at_least(1), default=32, metavar="LEVELS", help="levels to search (default: 32)"
+    )
+    text = "maximum number of nodes to look at (default: 100000)"
     parser.add_argument("--limit", type=at_least(1), default=100_000, metavar="NODES", help=text)
 
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from shmio.cli import completion, inject, read, replay, step
 from shmio.cli import set as set_verb
-from shmio.cli.run import add_json, complete, ended_by_interrupt, run
+from shmio.cli.common import add_json, complete, ended_by_interrupt, run
 from shmio.cli.target import target
 from shmio.config.address import UNIX, Address
 from shmio.errors import ConfigError, UnknownClientError

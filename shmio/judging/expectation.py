@@ -25,7 +25,7 @@ class Formula:
 
     Attributes:
         expectation: The expectation.
-        tree: Its formula, whose truth at the begin of the judged time is the verdict. None: its
+        tree: Its formula, whose truth at the start of the judged time is the verdict. None: its
             signals must be like those of a recording.
         trigger: What must become true once, so that the expectation says anything; None: nothing.
         signals: What the formula reads.

@@ -35,7 +35,7 @@ from shmio.judging.operators import (
 )
 from shmio.judging.pieces import Piece
 from shmio.judging.source import Signal
-from shmio.judging.verdict import All, Opposite, Outer, Start, UntilEnd, Whole
+from shmio.judging.verdict import All, Opposite, TopLevel, TopLevelExtremum, TopLevelInitial, UntilEnd
 from shmio.layout.glob import choose
 from shmio.layout.model import Layout, Register
 
@@ -110,7 +110,7 @@ def check(tree: Tree) -> None:
         if node.name in _TRUTH and constant(node):
             raise ConfigError(f"at character {node.at}: {node.name!r} is always the same here, as it reads no register")
         if node.name in ASPECTS and not isinstance(node.operands[0], Reference):
-            raise ConfigError(f"at character {node.at}: {node.name}( ) needs a register")
+            raise ConfigError(f"at character {node.at}: {node.name}( ) takes one register, not an expression")
         if node.name in _EDGES | {"rate"} and temporal(node.operands[0]):
             raise ConfigError(
                 f"at character {node.at}: {node.name}( ) compares a frame with the one before, so it takes no temporal "
@@ -184,35 +184,35 @@ class Network:
         for node in self._nodes.values():
             node.turn()
 
-    def outer(self, tree: Tree) -> Outer:
-        """Return the outermost part of a formula, whose truth at the begin is the verdict."""
+    def top_level(self, tree: Tree) -> TopLevel:
+        """Return the top level of a formula, whose truth at the start is the verdict."""
         if not isinstance(tree, Operation) or tree.name not in {*_LOGIC, "always", "eventually", "until"}:
-            return Start(self.truth(tree))
+            return TopLevelInitial(self.truth(tree))
         if tree.name == "not":
-            return Opposite(self.outer(tree.operands[0]))
+            return Opposite(self.top_level(tree.operands[0]))
         if tree.name in _LOGIC:
             if not temporal(tree):
-                return Start(self.truth(tree))
-            first, second = map(self.outer, tree.operands)
+                return TopLevelInitial(self.truth(tree))
+            first, second = map(self.top_level, tree.operands)
             if tree.name == "and":
                 return All((first, second))
             first = first if tree.name == "implies" else Opposite(first)
             return Opposite(All((first, Opposite(second))))
         if tree.name == "until":
             if tree.bounds_ns is not None:
-                return Start(self.truth(tree))
+                return TopLevelInitial(self.truth(tree))
             left, right = self._truths(tree)
             return UntilEnd(left, right)
-        return Whole(_extremum(tree.name), self.truth(tree.operands[0]), tree.bounds_ns)
+        return TopLevelExtremum(_extremum(tree.name), self.truth(tree.operands[0]), tree.bounds_ns)
 
-    def like(self, signal: Signal, golden: Piece, tolerance: float, tolerance_ns: int) -> tuple[Outer, Tube]:
+    def like(self, signal: Signal, golden: Piece, tolerance: float, tolerance_ns: int) -> tuple[TopLevel, Tube]:
         """Return the part that compares a signal with another one, up to the end of that one.
 
-        The times of ``golden`` count from the begin; its last value is unknown.
+        The times of ``golden`` count from the start; its last value is unknown.
         """
         node = Tube(self._input_of(signal), *tube(golden, tolerance, tolerance_ns))
         self._nodes["like", node] = node
-        return Whole(np.minimum, node, (0, max(int(golden.time[-1]) - 1, 0))), node
+        return TopLevelExtremum(np.minimum, node, (0, max(int(golden.time[-1]) - 1, 0))), node
 
     def truth(self, tree: Tree) -> Node:
         """Return the node of a truth; a number is true if it is not 0."""

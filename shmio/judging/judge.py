@@ -17,7 +17,7 @@ from shmio.judging.formula import Network
 from shmio.judging.operators import UNTIL_SHARE, Node, Tube
 from shmio.judging.pieces import Piece
 from shmio.judging.source import Frames, Rows, Signal, Source, Trouble
-from shmio.judging.verdict import All, Outcome, Outer, Verdict, Whole
+from shmio.judging.verdict import All, Outcome, TopLevel, TopLevelExtremum, Verdict
 from shmio.layout.model import Layout, Register
 
 AROUND: Final = 3
@@ -157,15 +157,15 @@ class Judge:
         self._network.turn()
         for case in self._cases:
             case.turn()
-            if case.failed and case.around_ns != case.outer.decided_ns():
+            if case.failed and case.around_ns != case.top_level.decided_ns():
                 found = self._around(case, final=end_ns is not None)
                 if found is not None:
-                    case.around, case.around_ns = found, case.outer.decided_ns()
+                    case.around, case.around_ns = found, case.top_level.decided_ns()
         return rows
 
     def _around(self, case: _Case, *, final: bool) -> dict[str, list[tuple[int, float | None]]] | None:
         """Return the values around the moment of a failure; None if some will follow."""
-        moment_ns = case.outer.decided_ns()
+        moment_ns = case.top_level.decided_ns()
         found: dict[str, list[tuple[int, float | None]]] = {}
         for signal in case.formula.signals if moment_ns is not None else ():
             source, history = self._sources[signal.source], self._histories[signal.source]
@@ -186,7 +186,7 @@ class Judge:
         return [self._verdict(case) for case in self._cases]
 
     def _verdict(self, case: _Case) -> Verdict:
-        outer, formula = case.outer, case.formula
+        outer, formula = case.top_level, case.formula
         outcome, reason, moment_ns = Outcome.INCONCLUSIVE, "", None
         if case.failed:
             outcome, reason, moment_ns = Outcome.FAILED, formula.failure, outer.decided_ns()
@@ -208,7 +208,7 @@ class Judge:
                 return f"there was no frame of {name}"
         if self.end_ns is None:
             return "the run is not over"
-        unknown_ns = case.outer.unknown_ns()
+        unknown_ns = case.top_level.unknown_ns()
         if unknown_ns is not None:
             reach_ns = case.formula.horizon_ns
             troubles = [
@@ -225,7 +225,7 @@ class Judge:
         return f"the run ended at {(self.end_ns - 1) / 1e9:.3f} s, before it was decided"
 
 
-def _tubes(index: int, formula: Formula, network: Network, golden: Golden | None) -> list[tuple[Outer, Tube]]:
+def _tubes(index: int, formula: Formula, network: Network, golden: Golden | None) -> list[tuple[TopLevel, Tube]]:
     """Return the parts that compare the signals of an expectation with those of a recording.
 
     Raises:
@@ -256,19 +256,19 @@ class _Case:
         if formula.tree is None:
             parts = _tubes(index, formula, network, golden)
             self.tubes = [tube for _, tube in parts]
-            self.outer: Outer = All([outer for outer, _ in parts])
+            self.top_level: TopLevel = All([outer for outer, _ in parts])
         else:
-            self.outer = network.outer(formula.tree)
-        self._trigger: Whole | None = None
+            self.top_level = network.top_level(formula.tree)
+        self._trigger: TopLevelExtremum | None = None
         if formula.trigger is not None:
-            self._trigger = Whole(np.maximum, network.truth(formula.trigger), None)
+            self._trigger = TopLevelExtremum(np.maximum, network.truth(formula.trigger), None)
         self.around: dict[str, list[tuple[int, float | None]]] = {}
         self.around_ns: int | None = None  # the moment to which they belong
 
     @property
     def failed(self) -> bool:
         """True if the expectation has failed, whatever follows."""
-        return self.outer.high < 0
+        return self.top_level.high < 0
 
     @property
     def idle(self) -> bool:
@@ -283,13 +283,13 @@ class _Case:
 
     def turn(self) -> None:
         """Take what has become known."""
-        self.outer.turn()
+        self.top_level.turn()
         if self._trigger is not None:
             self._trigger.turn()
 
     def finish(self, end_ns: int) -> None:
         """Set the end of the judged time."""
-        self.outer.finish(end_ns)
+        self.top_level.finish(end_ns)
         if self._trigger is not None:
             self._trigger.finish(end_ns)
 

@@ -238,6 +238,9 @@ def _shifted(values: Values, before: float) -> Values:
 class Window(Node):
     """The greatest or the least value of a signal between ``t + begin`` and ``t + end``, at each t.
 
+    This is a temporal operator within another operator; ``verdict.TopLevelExtremum`` computes one at
+    the top level of a formula.
+
     A window reaches into the future (``begin`` and ``end`` from 0 on: eventually, always) or into
     the past (both up to 0: once, historically). In a window that ends before the judged time
     begins, ``once`` is false, and ``historically`` is true.
@@ -249,7 +252,7 @@ class Window(Node):
     Args:
         function: ``np.maximum`` or ``np.minimum``.
         operand: The signal.
-        begin_ns: Begin of the window relative to t.
+        begin_ns: Start of the window relative to t.
         end_ns: End of the window relative to t; it belongs to the window.
     """
 
@@ -296,7 +299,7 @@ class Window(Node):
     def _extrema(self, values: Values, kept: int, first: Times, last: Times) -> Values:
         """Return the extremum of ``values[first : last + 1]`` for each pair.
 
-        The first ``kept`` values are already the extremum from their place up to the last of them.
+        Of the first ``kept`` values, each is already the extremum of itself and the kept values after it.
         """
         fresh = values[kept:]
         begin = np.maximum(first - kept, 0)
@@ -335,7 +338,7 @@ class Window(Node):
 
 
 class History(Node):
-    """The greatest or the least value of a signal from the begin up to each moment."""
+    """The greatest or the least value of a signal from the start up to each moment."""
 
     def __init__(self, function: np.ufunc, operand: Node) -> None:
         self._function = function
@@ -443,7 +446,7 @@ class Tube(Node):
 
     Args:
         operand: The number.
-        lower: The lower limit; its times count from the begin of the judged time.
+        lower: The lower limit; its times count from the start of the judged time.
         upper: The upper limit.
     """
 
@@ -481,7 +484,7 @@ class Tube(Node):
 def tube(golden: Piece, tolerance: float, tolerance_ns: int) -> tuple[Piece, Piece]:
     """Return the lower and the upper limit around a signal.
 
-    Before the begin and after the end of the signal, its first and its last value count.
+    Before the start and after the end of the signal, its first and its last value count.
 
     Args:
         golden: The signal, up to :data:`FAR_NS`; NaN where it is unknown.

@@ -57,7 +57,7 @@ def join(first: Piece, second: Piece) -> Piece:
 
 
 def cut(piece: Piece, at_ns: int) -> Piece:
-    """Return the part of a piece from a moment on, which is not before its begin."""
+    """Return the part of a piece from a moment on, which is not before its start."""
     if at_ns >= piece.end:
         return NOTHING
     first = int(piece.time.searchsorted(at_ns, "right")) - 1

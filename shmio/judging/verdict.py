@@ -1,4 +1,4 @@
-"""Verdicts: what the truth of a formula at the begin of the judged time says about an expectation."""
+"""Verdicts: what the truth of a formula at the start of the judged time says about an expectation."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class Outcome(StrEnum):
     INCONCLUSIVE = "inconclusive"
 
 
-class Outer:
-    """An outermost part of a formula, which is evaluated only at the begin of the judged time.
+class TopLevel:
+    """An outermost part of a formula, which is evaluated only at the start of the judged time.
 
     ``low`` and ``high`` bound its truth, with what is known up to now.
     """
@@ -49,8 +49,8 @@ class Outer:
         raise NotImplementedError
 
 
-class Start(Outer):
-    """The truth of a signal at the begin."""
+class TopLevelInitial(TopLevel):
+    """The truth of a signal at the start."""
 
     def __init__(self, operand: Node) -> None:
         self._operand = operand
@@ -64,21 +64,21 @@ class Start(Outer):
             self.low, self.high = float(piece.low[0]), float(piece.high[0])
 
     def decided_ns(self) -> int | None:
-        """Return the begin."""
+        """Return the start."""
         return self._at_ns
 
     def unknown_ns(self) -> int | None:
-        """Return the begin."""
+        """Return the start."""
         return self._at_ns
 
 
-class Whole(Outer):
+class TopLevelExtremum(TopLevel):
     """The least or the greatest value of a signal over a time: always, or eventually.
 
     Args:
         function: ``np.minimum`` for always, ``np.maximum`` for eventually.
         operand: The signal.
-        bounds_ns: The time, relative to the begin; None: up to the end.
+        bounds_ns: The time, relative to the start; None: up to the end.
     """
 
     def __init__(self, function: np.ufunc, operand: Node, bounds_ns: tuple[int, int] | None) -> None:
@@ -150,7 +150,7 @@ class Whole(Outer):
         return self._unknown_ns
 
 
-class UntilEnd(Outer):
+class UntilEnd(TopLevel):
     """Whether ``left`` is true until ``right`` is, within the judged time."""
 
     def __init__(self, left: Node, right: Node) -> None:
@@ -200,10 +200,10 @@ class UntilEnd(Outer):
         return self._unknown_ns
 
 
-class Opposite(Outer):
+class Opposite(TopLevel):
     """The opposite of another part."""
 
-    def __init__(self, operand: Outer) -> None:
+    def __init__(self, operand: TopLevel) -> None:
         self._operand = operand
 
     def turn(self) -> None:
@@ -224,10 +224,10 @@ class Opposite(Outer):
         return self._operand.unknown_ns()
 
 
-class All(Outer):
+class All(TopLevel):
     """Whether several parts are all true."""
 
-    def __init__(self, operands: Sequence[Outer]) -> None:
+    def __init__(self, operands: Sequence[TopLevel]) -> None:
         self._operands = operands
 
     def turn(self) -> None:

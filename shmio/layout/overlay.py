@@ -50,7 +50,7 @@ def overlay_register(base: Layout, path: str, over: str, kind: tuple[ElementType
             "read as another type"
         )
     if named.type == "BOOL" and element.base != "BOOL":
-        raise ValueError(f"type: {shorten(over)} is a BOOL, found {_written(element.name, dims)}")
+        raise ValueError(f"type: {shorten(over)} is a BOOL, so it cannot be read as {_written(element.name, dims)}")
     if element.base == "BOOL":
         return _bits(base, path, over, named, whole, dims)
     size = array_size(element, shape_of(dims))

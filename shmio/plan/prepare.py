@@ -427,7 +427,7 @@ def _odd_accounts(mqtt: Mqtt, address: Address) -> Iterator[str]:
 def _odd_recorder(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
     """Yield warnings about patterns of ``recorder.registers`` that match nothing."""
     if config.recorder is not None:
-        for text in Selection(registers=config.recorder.registers).nothing(layouts):
+        for text in Selection(registers=config.recorder.registers).unmatched(layouts):
             yield f"recorder.registers: {text}"
 
 

@@ -198,7 +198,7 @@ def _moved(joint: Joint, layouts: Mapping[str, Layout]) -> dict[str, Any]:
     """Return a joint with its register's whole path.
 
     Raises:
-        PathError: There is no such register, or it is no number.
+        PathError: There is no such register, or it is not a number.
 
     """
     topic = parse_topic(joint.register, layouts, next(iter(layouts)) if len(layouts) == 1 else None)
@@ -211,6 +211,6 @@ def _moved(joint: Joint, layouts: Mapping[str, Layout]) -> dict[str, Any]:
     if register.dims:
         raise PathError(f"{path}: this is an array; name one element, such as {path}/{register.dims[0][0]}")
     if register.type not in _TYPES:
-        raise PathError(f"{path}: {register.type} is no number, so it cannot move a body")
+        raise PathError(f"{path}: {register.type} is not a number, so it cannot move a body")
     drawn: dict[str, Any] = msgspec.to_builtins(joint)
     return drawn | {"register": path, "unit": unit(joint)}

@@ -34,7 +34,7 @@ def run(worker: Worker) -> None:
     elsewhere = _elsewhere(worker.before, directory)
     start = StartPositions(known, reason=Reason.ELSEWHERE if elsewhere else Reason.NOT_RUNNING)
     selection = Selection(settings.sources or None, settings.registers)
-    for missing in selection.nothing({name: block.layout for name, block in segment.blocks.items()}):
+    for missing in selection.unmatched({name: block.layout for name, block in segment.blocks.items()}):
         worker.log.warning("recorder.registers: %s", missing)
     tap, attachments = InstanceFollower(segment, start, selection), ConfigFiles(Path(worker.config["config_file"]))
     series: RotatingRecorder | TriggeredRecorder

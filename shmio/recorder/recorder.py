@@ -651,4 +651,9 @@ class RotatingRecorder:
 
 
 def _unclosed(output: Output) -> str:
-    return f"{output.problem or output.path}{'' if output.doubt else '; it was not closed'}"
+    if output.doubt:
+        return output.problem or str(output.path)
+    return (
+        f"{output.problem or output.path}: not all data was written, so the recording has no proper end; the next "
+        "recorder closes it"
+    )

@@ -94,7 +94,7 @@ class Selection:
             return RecordedRegisters(block.layout)
         return RecordedRegisters(block.layout, registers) if registers else None
 
-    def nothing(self, layouts: Mapping[str, Layout]) -> list[str]:
+    def unmatched(self, layouts: Mapping[str, Layout]) -> list[str]:
         """Return a message for each selected source or pattern that does not exist.
 
         ``layouts`` are the layouts of all sources, by name.

@@ -16,9 +16,9 @@ from shmio.campaigns.digests import of_campaign, of_configuration, of_layouts
 from shmio.campaigns.live import LiveRun, Plan
 from shmio.cli.campaigns.reports import Reports
 from shmio.cli.campaigns.verdicts import tell
+from shmio.cli.common import say, stop_on_signals
 from shmio.cli.instance.control import stop
 from shmio.cli.instance.detach import start
-from shmio.cli.run import say, stop_on_signals
 from shmio.cli.target import Target, target
 from shmio.config.campaign import Campaign, load_campaign
 from shmio.config.declaration import with_seed

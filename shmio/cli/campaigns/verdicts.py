@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import msgspec
 
-from shmio.cli.run import say, say_json
+from shmio.cli.common import say, say_json
 from shmio.judging.judge import Judge
 from shmio.judging.verdict import Outcome, Verdict, distance
 

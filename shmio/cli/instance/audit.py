@@ -14,7 +14,7 @@ import msgspec
 from shmio import control
 from shmio.audit.reading import EntryFilter, entries, parse_entry, present_files
 from shmio.audit.trail import Entry
-from shmio.cli.run import dumps
+from shmio.cli.common import dumps
 from shmio.cli.target import target
 from shmio.config import load
 from shmio.errors import ConfigError

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from shmio.cli.run import dumps
+from shmio.cli.common import dumps
 from shmio.cli.target import config_file
 from shmio.config import Address, Alert, Source
 from shmio.connectors.request_count import Requests, counted

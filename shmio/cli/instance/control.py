@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from shmio import control
-from shmio.cli.run import dumps
+from shmio.cli.common import dumps
 from shmio.cli.target import target
 from shmio.control import remove_socket, socket_path
 from shmio.errors import FormatError, NotRunningError, UnfinishedError

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import msgspec
 
-from shmio.cli.run import say
+from shmio.cli.common import say
 from shmio.cli.target import config_file, option_for
 from shmio.errors import ConfigError, ControlError
 from shmio.local.status import InstanceStatus, SourceStatus, read_status

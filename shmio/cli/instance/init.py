@@ -204,7 +204,7 @@ def _compile(program: Program, name: str | None, number: str) -> tuple[list[Layo
     """Return the data blocks to use as sources, and warnings.
 
     If ``name`` is given, use only this block. Otherwise use the block with ``number`` or, if there
-    is no number, all blocks that can be compiled.
+    is not a number, all blocks that can be compiled.
     """
     held = ", ".join(block.name for block in program.blocks)
     if name is not None:

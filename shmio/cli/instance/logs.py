@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from shmio import control
-from shmio.cli.run import dumps
+from shmio.cli.common import dumps
 from shmio.cli.target import Target, target
 from shmio.config import load
 from shmio.errors import ConfigError, SegmentError

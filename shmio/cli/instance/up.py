@@ -15,8 +15,8 @@ from typing import Any
 import msgspec
 
 from shmio import logs
+from shmio.cli.common import say
 from shmio.cli.instance.detach import Configured, Failed, Started, StartMessage, headline, replay_keys
-from shmio.cli.run import say
 from shmio.cli.target import config_file
 from shmio.config import Address
 from shmio.connectors.request_count import counted

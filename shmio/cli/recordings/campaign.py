@@ -9,8 +9,8 @@ from typing import Any
 
 import msgspec
 
+from shmio.cli.common import say
 from shmio.cli.recordings.common import DamageReport
-from shmio.cli.run import say
 from shmio.config.declaration import check_declarations
 from shmio.errors import ConfigError, RecordingError
 from shmio.logs import printable

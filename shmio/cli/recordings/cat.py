@@ -14,9 +14,9 @@ from typing import Any, Final, Protocol
 
 import msgspec
 
+from shmio.cli.common import dumps, room
 from shmio.cli.read import shown
 from shmio.cli.recordings.common import DamageReport, Progress, not_closed, time_range
-from shmio.cli.run import dumps, room
 from shmio.errors import PathError, RecordingError
 from shmio.layout.glob import named
 from shmio.layout.model import Layout, Register

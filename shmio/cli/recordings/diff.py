@@ -6,8 +6,8 @@ import argparse
 from collections.abc import Iterator
 from typing import Any
 
+from shmio.cli.common import dumps
 from shmio.cli.recordings.common import Progress
-from shmio.cli.run import dumps
 from shmio.errors import RecordingError
 from shmio.layout.values.codec import Value
 from shmio.logs import printable

@@ -9,8 +9,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+from shmio.cli.common import dumps
 from shmio.cli.recordings.common import Progress, not_closed
-from shmio.cli.run import dumps
 from shmio.errors import RecordingError
 from shmio.logs import printable
 from shmio.recording.check import check

@@ -8,8 +8,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
+from shmio.cli.common import dumps, say
 from shmio.cli.recordings.common import DamageReport, Progress, time_range
-from shmio.cli.run import dumps, say
 from shmio.errors import PathError, RecordingError
 from shmio.recording.dump import Chosen, Dump
 from shmio.recording.export import TABLES, BlockTables, export_events, export_mcap, pieces

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from shmio import control
-from shmio.cli.run import say, say_json, stop_on_signals
+from shmio.cli.common import say, say_json, stop_on_signals
 from shmio.cli.target import target
 from shmio.config import Recorder as Settings
 from shmio.config import Trigger
@@ -34,7 +34,7 @@ def record(arguments: argparse.Namespace) -> int:
     with target(arguments).open() as segment, stop_on_signals() as stopping:
         sources = arguments.sources
         selection = Selection(sources, arguments.registers or ())
-        for missing in selection.nothing({name: block.layout for name, block in segment.blocks.items()}):
+        for missing in selection.unmatched({name: block.layout for name, block in segment.blocks.items()}):
             raise PathError(missing)
         tap = InstanceFollower(segment, StartPositions(first=False), selection)
         reporter = Reporter(as_json=arguments.json)

@@ -6,9 +6,9 @@ import argparse
 from collections.abc import Iterable
 from pathlib import Path
 
+from shmio.cli.common import dumps, say
 from shmio.cli.recordings.common import DamageReport, Progress, not_closed, time_range
 from shmio.cli.recordings.examine import checked, checked_lines
-from shmio.cli.run import dumps, say
 from shmio.errors import RecordingError
 from shmio.recording import rewriting
 from shmio.recording.dump import Dump, open_dump

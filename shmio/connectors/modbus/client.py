@@ -109,12 +109,14 @@ class ModbusClient:
             table: The table.
             start: First entry.
             count: Number of entries.
-            until_ns: Time at which to stop waiting and keep the connection, in ns of CLOCK_MONOTONIC.
+            until_ns: When to give up with SilentError, in ns of CLOCK_MONOTONIC; the connection then stays
+                open. None: wait for the time-out, which closes it.
 
         Raises:
             RefusedError: The device refuses the request. The connection stays open.
-            SilentError: There is no answer until ``until_ns``. The connection stays open.
-            ConnectorError: The connection is lost.
+            SilentError: There is no answer by ``until_ns``. The connection stays open.
+            ConnectorError: The connection is lost, the answer is wrong, or none came within the time-out.
+                The connection is closed.
 
         """
         size = -(-count // 8) if table.of_bits else 2 * count

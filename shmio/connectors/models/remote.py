@@ -56,7 +56,7 @@ class Remote(Computed):
         """
         if not options.outputs and not options.inouts:
             raise ConfigError(
-                'outputs: this key is needed: patterns of the registers that the model computes, such as ["axes/**"]'
+                'outputs: name the registers that the model computes, such as ["axes/**"], here or in inouts'
             )
         ends = model_ports(layout, options.outputs, options.inouts)
         inputs = {register.path for register in ends.inputs}

@@ -181,7 +181,10 @@ class Node:
 
     @property
     def filters(self) -> list[str]:
-        """The topic filters for all messages of the node. A gap may be in messages of any kind."""
+        """The topic filters for all messages of the node.
+
+        All kinds share one sequence of numbers, so a kind that is left out would look like a loss.
+        """
         return [self.topic(kind, "+" if kind.startswith("D") else "") for kind in KINDS]
 
     @property

@@ -839,7 +839,7 @@ class _Protocol(UASocketProtocol):
     """Status code with which the server has closed the connection; 0: none."""
 
     def _fail_all_pending(self, exc: BaseException) -> None:
-        """Note the server's error, which the library forgets if it answers the request for a channel."""
+        """Remember the server's error: the library loses one that answers the request for a secure channel."""
         if isinstance(exc, ua.UaStatusCodeError):
             self.refused = self.refused or int(exc.code)
         super()._fail_all_pending(exc)

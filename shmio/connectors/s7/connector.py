@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from shmio.connectors.base import Connector
 from shmio.connectors.request_count import CycleRequests
 from shmio.connectors.s7 import pdu
+from shmio.connectors.s7.block_check import BlockChangeMonitor, ExpectedBlock
 from shmio.connectors.s7.blocks import BlockRead, BlockWrite, SizeProbe, waves
-from shmio.connectors.s7.drift import BlockWatch, Described
 from shmio.connectors.s7.explain import OUT_OF_RANGE, RefusedError, explain_size
 from shmio.connectors.s7.request_count import NOTE, by_pdu_size
 from shmio.connectors.s7.session import MAX_DEPTH, Read, S7Options, S7Session
@@ -102,8 +102,8 @@ class S7Connector(S7Client, Connector):
             raise ConfigError(f"layout: {layout.name!r} is little-endian, but a controller's block is big-endian")
         super().__init__(options, number, layout.size)
         ends = [(register.offset + register.size, register.path) for register in layout.registers]
-        self._described = Described(number, layout.name, layout.size, ends, whole=True)
-        self._watch = BlockWatch([self._described])
+        self._described = ExpectedBlock(number, layout.name, layout.size, ends, whole=True)
+        self._watch = BlockChangeMonitor([self._described])
         self._add_query(self._watch)
 
     @property

@@ -18,8 +18,8 @@ from shmio.connectors.base import Connector
 from shmio.connectors.register_image import RegisterImage
 from shmio.connectors.request_count import CycleRequests, counted
 from shmio.connectors.s7 import cpu, pdu
+from shmio.connectors.s7.block_check import BlockChangeMonitor, ExpectedBlock
 from shmio.connectors.s7.blocks import ITEM_OVERHEAD, JOB_OVERHEAD, BlockWrite, WriteItem, bit_item, byte_item, touches
-from shmio.connectors.s7.drift import BlockWatch, Described
 from shmio.connectors.s7.explain import (
     ACCESS_DENIED,
     ITEM_OK,
@@ -398,7 +398,7 @@ class S7TableConnector(S7Session, Connector):
             )
         self._of_cpu = of_cpu
         self._cpu = cpu.CpuValues(of_cpu, self._mode)
-        self._watch = BlockWatch(_described(self._tags.values()))
+        self._watch = BlockChangeMonitor(_described(self._tags.values()))
         self._uncertain: frozenset[int] = frozenset()  # numbers of blocks that no longer fit
         for query in (*self._cpu.queries, self._watch):
             self._add_query(query)
@@ -577,7 +577,7 @@ class S7TableConnector(S7Session, Connector):
             yield tag, start + at, None, data
 
 
-def _described(tags: Iterable[Tag]) -> Iterator[Described]:
+def _described(tags: Iterable[Tag]) -> Iterator[ExpectedBlock]:
     """Yield a description of each data block that contains registers of these tags."""
     fields: dict[int, list[tuple[int, int, str]]] = {}
     for tag in tags:
@@ -588,7 +588,7 @@ def _described(tags: Iterable[Tag]) -> Iterator[Described]:
             )
     for db_number, found in sorted(fields.items()):
         ends = [(end, name) for _, end, name in sorted(found)]
-        yield Described(db_number, "", max(end for end, _ in ends), ends, whole=False)
+        yield ExpectedBlock(db_number, "", max(end for end, _ in ends), ends, whole=False)
 
 
 def _rates(every: dict[str, int], layout: Layout) -> list[tuple[Glob, int]]:

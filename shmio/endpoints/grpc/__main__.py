@@ -123,7 +123,7 @@ async def _follow(worker: Worker, feeds: Feeds, services: Services) -> None:
     """
     if changed := await feeds.follow():
         worker.log.info("a reload added, changed or removed %s", ", ".join(changed))
-        services.move(changed)
+        services.on_sources_replaced(changed)
 
 
 def _end_now(worker: Worker) -> NoReturn:

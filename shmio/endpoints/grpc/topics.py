@@ -92,7 +92,7 @@ class Topics:
         return self._feeds[source]
 
     def blocks(self, sources: Collection[str]) -> list[Block]:
-        """Return the blocks of these sources, or of all sources.
+        """Return the blocks of these sources; of all sources if ``sources`` is empty.
 
         Raises:
             PathError: There is no such source.

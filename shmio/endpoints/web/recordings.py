@@ -189,7 +189,7 @@ class Recordings:
         """Return the path of a file.
 
         Raises:
-            RecordingError: This is no name of a recording in the recorder's directory.
+            RecordingError: This is not the name of a recording in the recorder's directory.
 
         """
         if self.folder is None:

@@ -284,7 +284,7 @@ class _Parser:
 
     @contextmanager
     def collecting(self, *, resume: bool = True) -> Iterator[Report]:
-        """Collect the errors of one declaration separately, because it may remain unused.
+        """Collect the errors of one declaration separately: they count only if the declaration is used.
 
         With ``resume``, skip to the next declaration after a syntax error.
         """

@@ -387,7 +387,7 @@ def test_what_is_hidden_may_only_widen_the_robustness(seed: int) -> None:
         ({"formula": "always[2, 1] x"}, "formula: at character 8: the first bound is above the second one"),
         ({"formula": "always[0, 1e9] x"}, "formula: at character 11: a bound is at most 1000000 s"),
         ({"formula": "always[0 1] x"}, "at character 10: expected ',', found '1'"),
-        ({"formula": "always quality(x + 1) = good"}, "at character 8: quality( ) needs a register"),
+        ({"formula": "always quality(x + 1) = good"}, "at character 8: quality( ) takes one register"),
         ({"formula": "always q > 1"}, "expect[0].formula: at character 8: q: no such register in DB1"),
         ({"formula": "always true"}, "expect[0].formula: at character 1: 'always' is always the same"),
         ({"formula": "always(1 > 2 or x)"}, "at character 10: '>' is always the same here"),

@@ -138,7 +138,7 @@ REFUSED = {
     'a = { address = "Inputs/7..9", type = "REAL" }': "a: type: REAL needs 4 bytes, Inputs/7..9 has 3",
     'a = { address = "Wide", type = "INT" }': "INT needs 2 bytes, Wide has 4; name a part of it, such as Wide.%W0",
     'a = { address = "Inputs/7", type = "BOOL" }': "a: type: a BOOL needs the address of a bit, such as Inputs/7.%X0",
-    'a = { address = "Inputs/7.%X0", type = "BYTE" }': "a: type: Inputs/7.%X0 is a BOOL, found BYTE",
+    'a = { address = "Inputs/7.%X0", type = "BYTE" }': "a: type: Inputs/7.%X0 is a BOOL, so it cannot be read as BYTE",
     'a = { address = "Inputs/9.%X1", type = "ARRAY[0..7] OF BOOL" }': "8 bits are needed, Inputs/9.%X1 has 7",
     'a = { address = "Wide.%X1", type = "ARRAY[0..7] OF BOOL" }': "a row of BOOLs lies over bytes",
     'a = { address = "Level", type = "DWORD" }': "only bytes and integers can be read as another type",

@@ -404,7 +404,7 @@ class Shadows:
             if not users:
                 injection.end("no client uses the injection any more")
 
-    def move(self, sources: Collection[str]) -> None:
+    def on_sources_replaced(self, sources: Collection[str]) -> None:
         """End the injections on sources whose blocks a reload has replaced."""
         for injection in list(self._users):
             if injection.target.source in sources:

@@ -89,9 +89,9 @@ class Services:
         """Size of all messages that wait for clients, in bytes."""
         return self._outboxes.waiting_bytes
 
-    def move(self, sources: Collection[str]) -> None:
+    def on_sources_replaced(self, sources: Collection[str]) -> None:
         """Switch the streams of these sources to their new feeds, after a reload."""
-        self._shadows.move(sources)
+        self._shadows.on_sources_replaced(sources)
         for service in self._services:
             if not isinstance(service, SimServer):
-                service.move(sources)
+                service.on_sources_replaced(sources)

@@ -445,7 +445,7 @@ class SimlogV1:
                 yield message
             await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, outbox.failure)
 
-    def move(self, sources: Collection[str]) -> None:
+    def on_sources_replaced(self, sources: Collection[str]) -> None:
         """Switch the streams of these sources to their new feeds, after a reload."""
         for outbox, source in self._streams.items():
             if source in sources:

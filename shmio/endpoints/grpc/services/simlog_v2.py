@@ -388,7 +388,7 @@ class Subscriber:
         self._join(subscription)
         self._subscriptions[path] = subscription
 
-    def move(self, sources: Collection[str]) -> None:
+    def on_sources_replaced(self, sources: Collection[str]) -> None:
         """Switch to the new feeds of these sources.
 
         A topic that no longer exists waits until it exists again.
@@ -525,10 +525,10 @@ class Subscribers:
             )
         subscriber.add(path)
 
-    def move(self, sources: Collection[str]) -> None:
+    def on_sources_replaced(self, sources: Collection[str]) -> None:
         """Switch all subscribers to the new feeds of these sources."""
         for subscriber in self._open.values():
-            subscriber.move(sources)
+            subscriber.on_sources_replaced(sources)
 
 
 class SimlogV2:
@@ -689,9 +689,9 @@ class SimlogV2:
         except ShmioError as error:
             await refuse(context, error)
 
-    def move(self, sources: Collection[str]) -> None:
+    def on_sources_replaced(self, sources: Collection[str]) -> None:
         """Switch the subscriptions of these sources to their new feeds, after a reload."""
-        self._subscribers.move(sources)
+        self._subscribers.on_sources_replaced(sources)
 
     def _find(self, path: str) -> tuple[Topic, Shape]:
         """Return the topic and the registers that a path names.

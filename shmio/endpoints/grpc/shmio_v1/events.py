@@ -244,7 +244,7 @@ class EventsCall:
         self._places.clear()
         self._moved.clear()
 
-    def move(self, sources: Collection[str]) -> None:
+    def on_sources_replaced(self, sources: Collection[str]) -> None:
         """Prepare to follow the new blocks of these sources, after a reload."""
         for source in self._places.keys() & sources:
             feed, before = self._feeds.get(source), self._moved.get(source)
@@ -353,7 +353,7 @@ class EventCalls:
                 self._open.discard(call)
                 call.close()
 
-    def move(self, sources: Collection[str]) -> None:
+    def on_sources_replaced(self, sources: Collection[str]) -> None:
         """Switch the streams of these sources to their new blocks, after a reload."""
         for call in self._open:
-            call.move(sources)
+            call.on_sources_replaced(sources)

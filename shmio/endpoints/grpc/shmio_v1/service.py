@@ -126,11 +126,11 @@ class ShmioV1:
         except ShmioError as error:
             await refuse(context, error)
 
-    def move(self, sources: Collection[str]) -> None:
+    def on_sources_replaced(self, sources: Collection[str]) -> None:
         """Switch the streams of these sources to their new blocks, after a reload."""
-        self._simulate_calls.move()
-        self._event_calls.move(sources)
-        self.subscribe_calls.move(sources)
+        self._simulate_calls.on_sources_replaced()
+        self._event_calls.on_sources_replaced(sources)
+        self.subscribe_calls.on_sources_replaced(sources)
 
 
 def _reading(view: View, *, originals: bool) -> bytes:

@@ -233,7 +233,7 @@ class SimulateCalls:
             if slot.name == block.source:
                 self._segment.clock.slot_bell(slot.index).ring()
 
-    def move(self) -> None:
+    def on_sources_replaced(self) -> None:
         """End the calls whose blocks a reload has ended."""
         for simulation in self._open.values():
             if simulation.block.retired:

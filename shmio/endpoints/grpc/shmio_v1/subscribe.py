@@ -282,7 +282,7 @@ class SubscribeCall:
         """Wake the stream, so that it checks for updates."""
         self._wake.set()
 
-    def move(self, sources: Collection[str]) -> None:
+    def on_sources_replaced(self, sources: Collection[str]) -> None:
         """Switch these sources to their new blocks, after a reload."""
         self._moved |= dict.fromkeys(place for place in self._wanted if place.source in sources)
         self._wake.set()
@@ -506,7 +506,7 @@ class SubscribeCalls:
         for subscription in self._open:
             subscription.wake()
 
-    def move(self, sources: Collection[str]) -> None:
+    def on_sources_replaced(self, sources: Collection[str]) -> None:
         """Switch the streams of these sources to their new blocks, after a reload."""
         for subscription in self._open:
-            subscription.move(sources)
+            subscription.on_sources_replaced(sources)

@@ -57,7 +57,7 @@ class Given(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Named(msgspec.Struct, forbid_unknown_fields=True):
-    """A register."""
+    """The arguments of a call about one register: its path."""
 
     path: _Path
 

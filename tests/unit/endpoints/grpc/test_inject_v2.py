@@ -408,7 +408,7 @@ def test_a_reload_ends_the_injections_of_changed_sources(segment: Segment) -> No
         originals = await laid(served, "cell/running/in", "s")
         _, path_out = await shadow(served, "cell/step/in")
         await served.add("injector", path_out)
-        served.service.move(["cell"])
+        served.service.on_sources_replaced(["cell"])
         status, text = await refusal(originals.read())
         assert status is Status.ABORTED
         assert text.endswith("the source was changed or removed by a reload")

@@ -40,7 +40,7 @@ SILENT_MS = sum(value for name, value in server.OPTIONS if name.startswith("grpc
         ("characters of a subscriber's name or uuid", simlog_v2.MAX_NAME),
         ("elements of a value of version 2, or of one `Read`", simlog_v2.MAX_ELEMENTS),
         ("registers of a value of version 2, or of one `Read`", simlog_v2.MAX_MEMBERS),
-        ("events of a source under way for what clients write", commands_in_flight.MAX_OPEN),
+        ("events in flight for the clients' writes to a source", commands_in_flight.MAX_OPEN),
         ("a client whose host is silent", SILENT_MS // 1000),
     ],
 )

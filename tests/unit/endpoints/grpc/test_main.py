@@ -40,7 +40,7 @@ def test_no_call_starts_between_new_feeds_and_the_move_of_open_calls() -> None:
 
     async def test() -> None:
         feeds: Any = ReloadedFeeds()
-        services: Any = SimpleNamespace(move=lambda sources: done.append(f"move {sources}"))
+        services: Any = SimpleNamespace(on_sources_replaced=lambda sources: done.append(f"move {sources}"))
         worker: Any = SimpleNamespace(log=logging.getLogger("test"))
         await asyncio.create_task(_follow(worker, feeds, services))
         await asyncio.sleep(0)

@@ -387,7 +387,7 @@ def test_topics_survive_a_reload_and_removed_registers_resume_when_they_return(s
         old = served.feeds["cell"]
         served.feeds["cell"] = type(old)(segment.blocks["cell"], 4, served.wake_ups, lambda *_: None)
         served.feeds["cell"].start()
-        served.service.move(["cell"])
+        served.service.on_sources_replaced(["cell"])
         assert not old._channels
         old.stop()
         served.writer = segment.writer("cell")

@@ -63,7 +63,7 @@ def reload(served: Endpoint, layout: Layout | None) -> None:
         feed = served.feeds["cell"] = Feed(served.segment.blocks["cell"], WRITER, served.wake_ups, lambda *_: None)
         feed.start()
         served.writer = served.segment.writer("cell")
-    served.service.move(["cell"])
+    served.service.on_sources_replaced(["cell"])
 
 
 def test_what_a_program_does_is_seen_with_its_values(segment: Segment) -> None:
@@ -236,7 +236,7 @@ def test_a_call_that_began_with_the_new_block_stays_there(segment: Segment) -> N
         stream = Stream(served)
         await stream.begin()
         (call,) = served.service._shmio_v1._event_calls._open
-        call.move(["cell"])
+        call.on_sources_replaced(["cell"])
         assert not call._moved
         for _ in range(3):
             served.writer.event(NOTE)

@@ -334,7 +334,7 @@ def test_a_reload_ends_a_model_which_may_join_the_new_block(instance: str) -> No
             model = Raw(served)
             await model.join()
             segment.change(add=[spec("drive", 10_000_000)], retire=["drive"])
-            served.service.move(["drive"])
+            served.service.on_sources_replaced(["drive"])
             code, text = await refusal(model.read())
             assert (code, text) == (Status.UNAVAILABLE, "drive: a reload changed or removed this source: join again")
 

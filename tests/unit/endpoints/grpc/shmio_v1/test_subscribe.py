@@ -300,7 +300,7 @@ def reload(served: Endpoint, layout: Layout | None) -> None:
         feed = served.feeds["cell"] = Feed(served.segment.blocks["cell"], WRITER, served.wake_ups, lambda *_: None)
         feed.start()
         served.writer = served.segment.writer("cell")
-    served.service.move(["cell"])
+    served.service.on_sources_replaced(["cell"])
 
 
 @pytest.mark.parametrize("mode", [wire.MODE_LATEST, wire.MODE_EVERY_FRAME])

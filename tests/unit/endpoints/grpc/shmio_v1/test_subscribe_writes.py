@@ -127,7 +127,7 @@ def test_a_reload_is_followed(segment: Segment) -> None:
         tables = [await stream.next(), await stream.next()]
         assert {table.direction for table in tables} == {wire.DIRECTION_IN, wire.DIRECTION_OUT}
         feed = served.feeds.pop("cell")
-        served.service.move(["cell"])
+        served.service.on_sources_replaced(["cell"])
         ends: list[Any] = []
         while len(ends) < 2:
             if isinstance(found := await stream.next(), wire.Ended):
@@ -135,7 +135,7 @@ def test_a_reload_is_followed(segment: Segment) -> None:
         assert {(end.source, end.direction) for end in ends} == {("cell", 0), ("cell", 1)}
         assert not feed.commands.followers.busy
         served.feeds["cell"] = feed
-        served.service.move(["cell"])
+        served.service.on_sources_replaced(["cell"])
         while not isinstance(await stream.next(), wire.Table):
             pass
         await write(served, {"cell/step": 8})

@@ -14,8 +14,8 @@ from snap7.type import Block
 
 from shmio.config import Address
 from shmio.connectors.base import Connector
+from shmio.connectors.s7.block_check import INTERVAL_NS
 from shmio.connectors.s7.connector import S7Connector, S7Options
-from shmio.connectors.s7.drift import INTERVAL_NS
 from shmio.connectors.s7.userdata import BlockInfo, parse_block
 from shmio.emulators.s7 import Fault, S7Server, ServerOptions
 from shmio.errors import ConnectorError

@@ -6,7 +6,7 @@ import signal
 
 import pytest
 
-from shmio.cli.run import stop_on_signals
+from shmio.cli.common import stop_on_signals
 
 
 @pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])

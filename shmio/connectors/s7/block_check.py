@@ -26,7 +26,7 @@ _MOST_CHANGES: Final = 5  # of a checksum alone, which are reported
 log = logging.getLogger("shmio.source")
 
 
-class Described(NamedTuple):
+class ExpectedBlock(NamedTuple):
     """A data block as a layout or a tag table describes it."""
 
     db_number: int
@@ -44,16 +44,16 @@ class Described(NamedTuple):
         return [name for end, name in self.ends if end > size]
 
 
-class BlockWatch(Query):
+class BlockChangeMonitor(Query):
     """Asks for information about each block in turn, and reports blocks that were changed."""
 
     optional = True
 
-    def __init__(self, blocks: Iterable[Described]) -> None:
+    def __init__(self, blocks: Iterable[ExpectedBlock]) -> None:
         """Create the watch for these blocks; only the first ``MAX_BLOCKS`` are watched."""
         super().__init__(BLOCK_INFO, INTERVAL_NS)
         self._blocks = list(blocks)[:MAX_BLOCKS]
-        self._round: list[Described] = []  # blocks that are still to be asked for, the next one last
+        self._round: list[ExpectedBlock] = []  # blocks that are still to be asked for, the next one last
         self._refused: set[int] = set()  # numbers of blocks, in this session
         self._last: dict[int, tuple[BlockInfo, float]] = {}
         self._changes: dict[int, int] = {}
@@ -99,7 +99,7 @@ class BlockWatch(Query):
         elif len(self._refused) == len(self._blocks):
             self.skip()
 
-    def _compare(self, block: Described, info: BlockInfo) -> None:
+    def _compare(self, block: ExpectedBlock, info: BlockInfo) -> None:
         known = self._last.get(block.db_number)
         self._last[block.db_number] = info, time.time()
         if known is None:
@@ -132,7 +132,7 @@ class BlockWatch(Query):
             block_name(block.db_number, block.name), since, text,
         )  # fmt: skip
 
-    def _compare_first(self, block: Described, info: BlockInfo) -> None:
+    def _compare_first(self, block: ExpectedBlock, info: BlockInfo) -> None:
         """Report a wrong length at the first information about a block.
 
         A block may be longer than a tag table needs, but not longer than a layout.
@@ -144,7 +144,7 @@ class BlockWatch(Query):
             )  # fmt: skip
 
 
-def _fits(block: Described, size: int) -> bool:
+def _fits(block: ExpectedBlock, size: int) -> bool:
     """Return whether a block of ``size`` bytes has the described length.
 
     A block that is described as a whole may be padded by one byte.
@@ -152,7 +152,7 @@ def _fits(block: Described, size: int) -> bool:
     return block.size <= size <= block.size + 1 if block.whole else block.size <= size
 
 
-def _misfit(block: Described, size: int) -> str:
+def _misfit(block: ExpectedBlock, size: int) -> str:
     what = "its layout has" if block.whole else "its registers need"
     gone = block.beyond(size)
     return f", {what} {block.size}" + (f"; beyond its end: {names_of(gone)}" if gone else "")
