@@ -72,6 +72,7 @@ class LiveRun:
         plan: Plan,
         attachments: AttachedFiles = no_attachments,
         seen: Callable[[Mapping[str, Rows]], None] = lambda _rows: None,
+        attach: Callable[[Segment], Attachment] = Attachment,
     ) -> None:
         """Prepare a run.
 
@@ -80,6 +81,7 @@ class LiveRun:
             plan: What to do.
             attachments: Returns the files to attach to the recording.
             seen: Called with the values of the signals, by source, in order.
+            attach: Attaches to the instance by its segment.
 
         Raises:
             ConfigError: An expectation is invalid.
@@ -88,6 +90,7 @@ class LiveRun:
         self._plan = plan
         self._attachments = attachments
         self._seen = seen
+        self._attach = attach
         blocks = segment.blocks
         stale_ns = {source: block.stale_ns for source, block in blocks.items()}
         self.judge = Judge(plan.expectations, Layouts(blocks), stale_ns, GoldenRecordings(plan.folder))
@@ -116,7 +119,7 @@ class LiveRun:
         """
         plan = self._plan
         with ExitStack() as stack:
-            cell = stack.enter_context(Attachment(self._segment))
+            cell = stack.enter_context(self._attach(self._segment))
             was_virtual = cell.clock.virtual
             self.virtual = not plan.real_time and (was_virtual or not cell.real_sources())
             if plan.real_time and was_virtual:
@@ -150,9 +153,11 @@ class LiveRun:
     def _await_good(self, over: threading.Event) -> None:
         """Wait until the judged sources are good. If they are not in time, the verdicts will say so."""
         until_s = time.monotonic() + GOOD_S
-        while time.monotonic() < until_s and not over.wait(LOOK_S):
+        while True:
             frames = [(block, block.latest()) for block in self._blocks.values()]
             if all(frame is not None and block.assess(frame)[0] for block, frame in frames):
+                return
+            if over.wait(LOOK_S) or time.monotonic() > until_s:
                 return
 
     @contextmanager

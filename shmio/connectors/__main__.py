@@ -6,19 +6,18 @@ import logging
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from shmio import worker
 from shmio.connectors import registry
 from shmio.connectors.base import Computed, Connector, Replayed
-from shmio.connectors.injection_layers import Owner
-from shmio.connectors.models.stepped import Inputs, PageClock, SteppedLoop
+from shmio.connectors.injections import blocks_of, owner_of
+from shmio.connectors.models.stepped import PageClock, SteppedLoop, connected_inputs
 from shmio.connectors.poll_loop import Schedule, SourceLoop, WallClock
 from shmio.errors import ConfigError, ConnectorError
-from shmio.layout.topic import parse_topic
-from shmio.segment import Block, BlockWriter, Segment
+from shmio.segment import Segment
 from shmio.worker import BEAT_S, Worker
 
 if TYPE_CHECKING:
@@ -90,21 +89,21 @@ def _loop_of(worker: Worker) -> _LoopHandle:
     source = found(options, layout)
     writer = segment.writer(worker.name)  # after the source: a configuration error must not change the segment
     schedule = Schedule(segment.header.started_ns, writer.block.period_ns)
-    owner_of, blocks = partial(_owner_of, segment), partial(_blocks, segment)
+    owners, blocks = partial(owner_of, segment), partial(blocks_of, segment)
     writable, allow = worker.config["writable"], worker.config["allow_nonfinite"]
     if isinstance(source, Connector):
         clock = WallClock()
         armed = writer.block.attributes.armed
         loop = SourceLoop(
             source, writer, schedule, clock, writable,
-            allow_nonfinite=allow, armed=armed, owner_of=owner_of, blocks=blocks,
+            allow_nonfinite=allow, armed=armed, owner_of=owners, blocks=blocks,
         )  # fmt: skip
         return _LoopHandle(loop, clock.stop, source.timeout_s)
     page_clock = PageClock(segment.clock, worker.slot.index)
-    inputs = _inputs(source, writer, segment)
+    inputs = connected_inputs(source, writer.block, lambda: Segment.open(segment.instance))
     stepped = SteppedLoop(
         source, writer, schedule, page_clock, writable,
-        allow_nonfinite=allow, inputs=inputs, owner_of=owner_of, blocks=blocks, crash=worker.slot.supervised.note,
+        allow_nonfinite=allow, inputs=inputs, owner_of=owners, blocks=blocks, crash=worker.slot.supervised.note,
     )  # fmt: skip
 
     def stop() -> None:
@@ -135,41 +134,10 @@ def _replay_loop(worker: Worker, options: Any) -> _LoopHandle:
         clock,
         worker.config["writable"],
         allow_nonfinite=worker.config["allow_nonfinite"],
-        owner_of=partial(_owner_of, segment),
-        blocks=partial(_blocks, segment),
+        owner_of=partial(owner_of, segment),
+        blocks=partial(blocks_of, segment),
     )
     return _LoopHandle(loop, clock.stop, REPLAY_TIMEOUT_S)
-
-
-def _inputs(source: Computed, writer: BlockWriter, segment: Segment) -> Inputs | None:
-    """Return a reader of the values for the source's connected inputs.
-
-    None if no input is connected.
-
-    The reader opens the segment a second time. It must notice reloads independently of the rest of
-    this process.
-    """
-    own, sources = writer.block.source, segment.blocks
-    topics = {path: parse_topic(topic, sources, own) for path, topic in source.connections.items()}
-    return Inputs(Segment.open(segment.instance), topics) if topics else None
-
-
-def _owner_of(segment: Segment, writer: int) -> Owner | None:
-    """Return the process that uses the command queue ``writer`` at present.
-
-    None if no live process does.
-    """
-    segment.refresh()
-    for slot in (*segment.processes, *segment.processes.external):
-        if slot.writer == writer and slot.alive():
-            return Owner(writer, slot.report.pid)
-    return None
-
-
-def _blocks(segment: Segment) -> Mapping[str, Block]:
-    """Return the present blocks of all sources by source name."""
-    segment.refresh()
-    return segment.blocks
 
 
 def _guarded(run: Callable[[], None]) -> None:

@@ -39,7 +39,7 @@ from shmio.injection.language import Number
 from shmio.injection.program import NEVER, compile_condition
 from shmio.layout.values.write import Write, apply
 from shmio.model.injection import Running
-from shmio.segment import NO_WRITER, Block, Command, CommandKind, Direction, EventKind, Frame, Quality, Record
+from shmio.segment import NO_WRITER, Block, Command, CommandKind, Direction, EventKind, Frame, Quality, Record, Segment
 from shmio.segment.block import Layouts
 from shmio.segment.events import EVENT_SLOTS
 from shmio.segment.injection_list import InjectionEntry
@@ -59,6 +59,24 @@ OwnerOf = Callable[[int], Owner | None]
 _DECODER: Final = msgspec.json.Decoder(Declaration)
 
 log = logging.getLogger("shmio.source")
+
+
+def owner_of(segment: Segment, writer: int) -> Owner | None:
+    """Return the process that uses the command queue ``writer`` at present.
+
+    None if no live process does.
+    """
+    segment.refresh()
+    for slot in (*segment.processes, *segment.processes.external):
+        if slot.writer == writer and slot.alive():
+            return Owner(writer, slot.report.pid)
+    return None
+
+
+def blocks_of(segment: Segment) -> Mapping[str, Block]:
+    """Return the present blocks of all sources by source name."""
+    segment.refresh()
+    return segment.blocks
 
 
 # -- declared injections -----------------------------------------------------------------------------------------------

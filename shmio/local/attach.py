@@ -38,7 +38,7 @@ from shmio.local.injection import Campaign, ObservedWrite, Shadow, as_given, by_
 from shmio.local.reading import View, reading
 from shmio.local.replays import Replays
 from shmio.local.subscription import Following, Subscription
-from shmio.local.time_control import Timekeeper, check_step
+from shmio.local.time_control import Coordinator, Timekeeper, check_step
 from shmio.local.writer import SourceWriter
 from shmio.model.clock import Clock
 from shmio.model.injection import Injection, Lifted, Running
@@ -59,9 +59,9 @@ class Attachment:
     Use it as a context manager, or call :meth:`close`. :func:`attach` creates it.
     """
 
-    def __init__(self, segment: Segment) -> None:
+    def __init__(self, segment: Segment, coordinator: Coordinator | None = None) -> None:
         self._segment = segment
-        self._time = Timekeeper(segment)
+        self._time = Timekeeper(segment, coordinator)
         self.replay = Replays(segment)
         """The instance's replays. Call it as ``replay`` of :class:`shmio.Cell`, or use its methods.
 

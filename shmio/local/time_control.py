@@ -401,10 +401,15 @@ class Timekeeper:
     another thread.
     """
 
-    def __init__(self, segment: Segment) -> None:
-        """Create the timekeeper. ``segment`` must be writable."""
+    def __init__(self, segment: Segment, coordinator: Coordinator | None = None) -> None:
+        """Create the timekeeper.
+
+        Args:
+            segment: The instance's segment, writable.
+            coordinator: Moves the time; None: a new one of this segment.
+        """
         self._segment = segment
-        self._coordinator = Coordinator(segment)
+        self._coordinator = coordinator or Coordinator(segment)
         self._paused = threading.Event()
         self._player: threading.Thread | None = None
         self._failure: ShmioError | None = None

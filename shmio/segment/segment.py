@@ -381,6 +381,33 @@ class Segment:
             raise
 
     @classmethod
+    def private(
+        cls, instance: str, blocks: Sequence[BlockSpec], processes: Sequence[ProcessSpec], *, mode: str = "live"
+    ) -> Segment:
+        """Create a segment that only this process can use; its time is virtual from the start.
+
+        Raises:
+            SegmentError: There is not enough memory.
+        """
+        shared = SharedObject.private(PREFIX + instance)
+        try:
+            shared.try_lock(SUPERVISOR_LOCK)
+            _build_segment(shared, instance, blocks, processes, mode, "", stepped=True)
+            return cls(shared, instance)
+        except BaseException:
+            shared.close()
+            raise
+
+    def again(self) -> Segment:
+        """Open a private segment once more, as another process would open a shared one."""
+        shared = self.shared.again()
+        try:
+            return Segment(shared, self.instance)
+        except BaseException:
+            shared.close()
+            raise
+
+    @classmethod
     def open(cls, instance: str, *, writable: bool = False, config: Path | None = None) -> Segment:
         """Open the segment of a running instance.
 

@@ -31,9 +31,10 @@ class SharedObject:
     one process exclude each other.
     """
 
-    def __init__(self, name: str, fd: int, *, writable: bool) -> None:
+    def __init__(self, name: str, fd: int, *, writable: bool, private: bool = False) -> None:
         self.name = name
         self.writable = writable
+        self._private = private
         self.inode = os.fstat(fd).st_ino
         self._fd = fd
         self._held: set[int] = set()
@@ -65,6 +66,11 @@ class SharedObject:
         return shared
 
     @classmethod
+    def private(cls, name: str) -> SharedObject:
+        """Create an empty object that no other program can open; it ends with the last use of it."""
+        return cls(name, os.memfd_create(name, os.MFD_CLOEXEC), writable=True, private=True)
+
+    @classmethod
     def open(cls, name: str, *, writable: bool = False) -> SharedObject:
         """Open an existing object.
 
@@ -83,6 +89,11 @@ class SharedObject:
         except (posix_ipc.Error, OSError, ValueError) as error:
             raise SegmentError(f"cannot open shared memory {name}: {error}") from None
         return cls(name, memory.fd, writable=writable)
+
+    def again(self) -> SharedObject:
+        """Open a private object once more, with locks of its own."""
+        fd = os.open(f"/proc/self/fd/{self._fd}", os.O_RDWR | os.O_CLOEXEC)
+        return SharedObject(self.name, fd, writable=True, private=True)
 
     def allocate(self, size: int) -> None:
         """Reserve memory for the first ``size`` bytes, so that no process gets SIGBUS later.
@@ -148,8 +159,10 @@ class SharedObject:
     def current(self) -> bool:
         """Return whether the name still refers to this object.
 
-        False: the name was removed or reused.
+        False: the name was removed or reused. A private object has no name, and is always current.
         """
+        if self._private:
+            return True
         try:
             return (DIRECTORY / self.name).stat().st_ino == self.inode
         except FileNotFoundError:

@@ -7,7 +7,7 @@ each step that is requested.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Final, Protocol
 
 from shmio.connectors.base import Computed
@@ -16,7 +16,7 @@ from shmio.connectors.injections import Blocks, OwnerOf, newest
 from shmio.connectors.output import Image, Output
 from shmio.connectors.poll_loop import Counters, QualityLog, Schedule
 from shmio.errors import PathError, SegmentError, ShmioError
-from shmio.layout.topic import Topic, find
+from shmio.layout.topic import Topic, find, parse_topic
 from shmio.layout.values.codec import RegisterCodec, Value
 from shmio.layout.values.write import Write
 from shmio.local.reading import holds_none, status_of
@@ -85,6 +85,21 @@ class Inputs:
                 raise PathError(f"there is no source {topic.source!r} any more")
             self._found[path] = block, trusted_codec(find(block.layout, topic.path), block.layout)
         return self._found[path]
+
+
+def connected_inputs(source: Computed, block: Block, opened: Callable[[], Segment]) -> Inputs | None:
+    """Return a reader of the values for a source's connected inputs; None if none is connected.
+
+    ``opened`` opens the segment a second time, because the reader must notice reloads independently
+    of the rest of the process.
+    """
+    if not source.connections:
+        return None
+    segment = opened()
+    return Inputs(
+        segment,
+        {path: parse_topic(topic, segment.blocks, block.source) for path, topic in source.connections.items()},
+    )
 
 
 def _why_none(block: Block, topic: Topic, frame: Frame | None) -> str:
@@ -221,7 +236,7 @@ class SteppedLoop:
         Then publish a bad frame.
         """
         try:
-            self._begin()
+            self.begin()
             while not (self._live() if self._page.read().virtual else self._free_run()):
                 pass
         finally:
@@ -232,7 +247,7 @@ class SteppedLoop:
             self._writer.event(Record(EventKind.STOPPED))
             self._source.close()
 
-    def _begin(self) -> None:
+    def begin(self) -> None:
         """Continue from the last image of the source's previous process, if there is one."""
         last = self._writer.block.latest()
         if self._output.source_ns:
@@ -314,9 +329,7 @@ class SteppedLoop:
         if not state.virtual:
             return False
         if state.stepping and state.step != self._handled:
-            self._handled = state.step
-            self._writer.at_ns = self._page.monotonic_ns(state.time_ns)
-            self._compute(state.step, state.time_ns, state.dt_ns)
+            self.step(state)
         elif not state.stepping:
             self._handled = self._writer.cycle = state.step
             self._writer.at_ns = self._page.monotonic_ns(state.time_ns)
@@ -329,25 +342,37 @@ class SteppedLoop:
                 self._carry_out()
         return self._clock.wait_ns(wait_ns)
 
+    def step(self, state: Clock) -> str:
+        """Compute a step that was requested; return why it failed, or ""."""
+        self._handled = state.step
+        self._writer.at_ns = self._page.monotonic_ns(state.time_ns)
+        return self._compute(state.step, state.time_ns, state.dt_ns)
+
+    def write_now(self) -> None:
+        """Carry out the commands that wait, between two steps."""
+        if self.commands.waiting:
+            self._carry_out()
+
     # ---- wall time and virtual time ------------------------------------------------------------------------------
 
-    def _compute(self, cycle: int, time_ns: int, dt_ns: int) -> None:
-        """Compute and publish one cycle or step."""
+    def _compute(self, cycle: int, time_ns: int, dt_ns: int) -> str:
+        """Compute and publish one cycle or step; return why it failed, or ""."""
         self._writer.cycle, self._time_ns = cycle, time_ns
         self._published = False
         self.commands.release(cycle)
         self._carry_out()
         if self._published:
-            return  # a prompt source published the frame when it was written
+            return ""  # a prompt source published the frame when it was written
         begun_ns, asked_ns = self._clock.now_ns(), self._writer.now_ns()
         try:
             raw, doubt = self.counters.watch(self._clock.now_ns, lambda: self._step(time_ns, dt_ns))
         except ShmioError as error:
             self.counters.failures += 1
             self._fail(cycle, str(error))
-        else:
-            self.counters.round_trip_us = (self._clock.now_ns() - begun_ns) // 1000
-            self._publish(raw, asked_ns, doubt)
+            return str(error) or "it gave no reason"
+        self.counters.round_trip_us = (self._clock.now_ns() - begun_ns) // 1000
+        self._publish(raw, asked_ns, doubt)
+        return ""
 
     def _step(self, time_ns: int, dt_ns: int) -> tuple[bytes, str]:
         doubt = ""

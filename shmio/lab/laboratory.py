@@ -1,0 +1,254 @@
+"""Runs the sources of an instance in this process, in virtual time, without a supervisor.
+
+It uses the code of an instance: the loop, the commands and the injections of each source work on a
+segment, which only this process has. So a recording is the same as that of an instance whose
+configuration says ``clock = "stepped"``.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, Final, Self
+
+from shmio.campaigns.live import LiveRun
+from shmio.campaigns.live import Plan as RunPlan
+from shmio.connectors import registry
+from shmio.connectors.base import Computed
+from shmio.connectors.injections import blocks_of, owner_of
+from shmio.connectors.models.stepped import SteppedLoop, connected_inputs
+from shmio.connectors.poll_loop import Schedule
+from shmio.errors import ConfigError, TimeError
+from shmio.judging.source import Rows
+from shmio.local.attach import Attachment
+from shmio.local.time_control import Coordinator, Step, check_step
+from shmio.plan.prepare import prepare
+from shmio.plan.processes import Job, Plan
+from shmio.recorder.recorder import AttachedFiles, ConfigFiles
+from shmio.segment import Segment
+
+COMMANDS_S: Final = 2.0
+"""Maximum time in s that the end of a laboratory waits for each of its threads."""
+
+
+def prepare_laboratory(file: Path) -> Plan:
+    """Read a configuration for laboratories. One plan serves any number of them.
+
+    Args:
+        file: The ``supervisor.toml``. Only its sources and injections are used: emulators, endpoints
+            and the recorder are not started.
+
+    Returns:
+        The plan, for :class:`Laboratory`.
+
+    Raises:
+        ConfigError: The configuration has faults, or a source that is not computed here.
+        LayoutError: A layout cannot be compiled.
+
+    """
+    plan = prepare(file).plan
+    if not plan.blocks:
+        raise ConfigError(f"{file}: the configuration has no [[source]]")
+    for index, job in enumerate(job for job in plan.jobs if job.kind == "source"):
+        name = job.config["connector"]
+        if name == "remote" or not issubclass(registry.load(name), Computed):
+            raise ConfigError(
+                f'{file}: source[{index}].connector: source {job.name!r} has connector = "{name}", but a laboratory '
+                "has only sources that are computed in its process, such as simulation and memory: "
+                "use shmio-campaign run, which takes a whole instance"
+            )
+    return plan
+
+
+class Laboratory:
+    """An instance in this process, whose time is virtual from the start. Close it after use.
+
+    Its time begins at 0, and moves only by the steps of a cell from :meth:`attach`.
+    """
+
+    def __init__(self, plan: Plan, parameters: Mapping[str, Mapping[str, object]] | None = None) -> None:
+        """Create the instance, and its models.
+
+        Args:
+            plan: The plan from :func:`prepare_laboratory`.
+            parameters: Parameters of models in place of those of the configuration, by source and
+                name.
+
+        Raises:
+            ConfigError: A model cannot be created, or a parameter does not exist.
+            SegmentError: There is not enough memory.
+
+        """
+        self.plan = plan
+        self.moving = threading.RLock()
+        """Held while a source's loop runs."""
+        self.stepping = False
+        """True while a step is computed."""
+        self._segment = Segment.private(plan.instance, plan.blocks, plan.processes, mode=plan.mode)
+        self._others: list[Segment] = []
+        self._threads: list[threading.Thread] = []
+        self.loops: dict[str, SteppedLoop] = {}
+        """The loop of each source."""
+        try:
+            jobs = [job for job in plan.jobs if job.kind == "source"]
+            for source in parameters or ():
+                if all(job.name != source for job in jobs):
+                    raise ConfigError(f"there is no source {source!r}; there are: {', '.join(job.name for job in jobs)}")
+            for job in jobs:
+                self.loops[job.name] = self._loop(job, (parameters or {}).get(job.name))
+            for loop in self.loops.values():
+                loop.begin()
+        except BaseException:
+            self.close()
+            raise
+
+    def _loop(self, job: Job, parameters: Mapping[str, object] | None) -> SteppedLoop:
+        """Create a source as its own process would, and start the thread of its commands."""
+        segment, section = self._segment, job.config
+        options: dict[str, Any] = section["options"]
+        if parameters is not None:
+            options = options | {"parameters": options.get("parameters", {}) | dict(parameters)}
+        found = registry.load(section["connector"])
+        source: Computed = found(
+            registry.convert_options(section["connector"], options), segment.blocks[job.name].layout
+        )
+        writer = segment.writer(job.name)
+        loop = SteppedLoop(
+            source,
+            writer,
+            Schedule(segment.header.started_ns, writer.block.period_ns),
+            _LabClock(self, lambda: loop.write_now()),
+            section["writable"],
+            allow_nonfinite=section["allow_nonfinite"],
+            inputs=connected_inputs(source, writer.block, self.open),
+            owner_of=partial(owner_of, segment),
+            blocks=partial(blocks_of, segment),
+        )
+        thread = threading.Thread(target=loop.commands.run, name=f"commands of {job.name}", daemon=True)
+        self._threads.append(thread)
+        thread.start()
+        return loop
+
+    def open(self) -> Segment:
+        """Open the segment once more, writable, as another process would. The laboratory closes it."""
+        segment = self._segment.again()
+        self._others.append(segment)
+        return segment
+
+    def attach(self, segment: Segment | None = None) -> Attachment:
+        """Attach to the laboratory: a cell as :func:`shmio.attach` returns it for an instance.
+
+        Args:
+            segment: A segment from :meth:`open`; None: a new one.
+
+        """
+        segment = segment or self.open()
+        return Attachment(segment, _LabCoordinator(self, segment))
+
+    def run(
+        self,
+        plan: RunPlan,
+        over: threading.Event | None = None,
+        seen: Callable[[Mapping[str, Rows]], None] = lambda _rows: None,
+    ) -> LiveRun:
+        """Run a campaign, judge it and record it, as ``shmio-campaign run`` does on an instance.
+
+        Args:
+            plan: What to do.
+            over: Ends the run when it is set.
+            seen: Called with the values of the signals, by source, in order.
+
+        Returns:
+            The run, with its verdicts.
+
+        Raises:
+            ConfigError: An expectation or an injection is invalid.
+            CommandError: A source refuses an injection.
+            RecordingError: The file of the recording cannot be created.
+
+        """
+        attachments: AttachedFiles = ConfigFiles(self.plan.config_file)
+        work = LiveRun(self.open(), plan, attachments, seen, self.attach)
+        work.run(over or threading.Event())
+        return work
+
+    def close(self) -> None:
+        """End the sources, and release the memory."""
+        for loop in self.loops.values():
+            loop.commands.stop()
+        for thread in self._threads:
+            thread.join(COMMANDS_S)
+        for segment in self._others:
+            segment.close()
+        self._segment.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class _LabClock:
+    """The clock of a loop that nobody runs: the laboratory calls what is due."""
+
+    def __init__(self, lab: Laboratory, write: Callable[[], None]) -> None:
+        self._lab = lab
+        self._write = write
+
+    def now_ns(self) -> int:
+        """Return the time of CLOCK_MONOTONIC in ns."""
+        return time.monotonic_ns()
+
+    def wait_ns(self, duration_ns: int | None) -> bool:  # noqa: ARG002
+        """Return True, because nothing follows by itself."""
+        return True
+
+    def nudge(self) -> None:
+        """Carry out accepted commands; if a step is in progress, after it."""
+        with self._lab.moving:
+            if not self._lab.stepping:
+                self._write()
+
+
+class _LabCoordinator(Coordinator):
+    """Moves the time of a laboratory: each step runs the loops of the sources, one after another."""
+
+    def __init__(self, lab: Laboratory, segment: Segment) -> None:
+        super().__init__(segment)
+        self._lab = lab
+        self._page = segment.clock
+
+    def step(self, dt_ns: int | None = None) -> Step:
+        """Compute a step.
+
+        Raises:
+            TimeError: A source failed, or another program owns time.
+            ValueRangeError: The length is not within 1 us and 1 h.
+
+        """
+        lab, page = self._lab, self._page
+        with lab.moving:
+            self.take_over(steps=True)
+            before = page.last_written()
+            dt_ns = before.step_size_ns if dt_ns is None else dt_ns
+            check_step(dt_ns)
+            step = Step(before.step + 1, before.time_ns + dt_ns, dt_ns)
+            asked = before._replace(step=step.number, time_ns=step.time_ns, dt_ns=dt_ns, stepping=True, note="")
+            problems = ["it was cancelled"]
+            lab.stepping = True
+            try:
+                page.write(asked, ring=False)
+                problems = [f"{name}: {why}" for name, loop in lab.loops.items() if (why := loop.step(asked))]
+            finally:
+                lab.stepping = False
+                problem = "; ".join(problems)
+                note = f"step {step.number} failed: {problem}" if problem else ""
+                done = before.done if problem else step.number
+                page.write(asked._replace(done=done, stepping=False, note=note), ring=False)
+            if problem:
+                raise TimeError(f"step {step.number}: {problem}")
+            return step
