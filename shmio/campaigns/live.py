@@ -28,8 +28,10 @@ from shmio.recording.judge import GoldenRecordings
 from shmio.segment import Block, Event, Frame, Segment
 from shmio.segment.block import Layouts
 
-MAX_STEPS: Final = 64
+MAX_STEPS: Final = 256
 """Maximum number of steps of virtual time between two turns of the judge."""
+STOP_STEPS: Final = 64
+"""The same, if the run stops at the first failure: after it there may be so many steps."""
 GOOD_S: Final = 10.0
 """Time in s to wait at the start until the sources that the expectations read are good."""
 LOOK_S: Final = 0.02
@@ -184,9 +186,10 @@ class LiveRun:
     def _steps(self, cell: Attachment, over: threading.Event) -> Iterator[None]:
         """Step time, several steps at once."""
         left = ceil(self._plan.duration_s / self.step_s - 1e-9)
-        room = min(block.ring.slot_count for block in self._segment.blocks.values()) // 4
+        room = min(block.ring.slot_count for block in self._segment.blocks.values()) // 2
+        most = STOP_STEPS if self._plan.stop else MAX_STEPS
         while left and not over.is_set():
-            count = max(1, min(left, MAX_STEPS, room))
+            count = max(1, min(left, most, room))
             cell.step(self.step_s, count)
             left -= count
             yield

@@ -359,6 +359,9 @@ class DeclaredLayer(Layer):
         if not self._happens(at):
             self.operation.passed(image, at)
             return
+        if self.operation.exact:
+            self.operation.apply(image, at)
+            return
         changed = image.copy()
         self.operation.apply(changed, at)
         image ^= (image ^ changed) & self.cover

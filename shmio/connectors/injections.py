@@ -38,6 +38,7 @@ from shmio.injection.activation import State
 from shmio.injection.language import Number
 from shmio.injection.program import NEVER, compile_condition
 from shmio.layout.values.write import Write, apply
+from shmio.model.clock import Clock
 from shmio.model.injection import Running
 from shmio.segment import NO_WRITER, Block, Command, CommandKind, Direction, EventKind, Frame, Quality, Record, Segment
 from shmio.segment.block import Layouts
@@ -316,25 +317,30 @@ class DeclaredInjections:
         many images follow it depends on timing, which must not influence the result.
         """
         looked = self._publisher.injections.now.cycle
-        time_ns = image.at.clock_ns if image.at else self._time_ns(image.cycle)
+        state = self._own.clock.last_written()
+        time_ns = image.at.clock_ns if image.at else self._time_of(image.cycle, state)
         now = self._publisher.injections.now = CycleImage(image.cycle, time_ns, image.raw)
         if image.cycle == looked:
             return []
-        state = self._own.clock.read()
         step = state.step if self._own.attributes.stepped and state.virtual else None
         readings = ConditionValues(self._own.source, image, self._blocks, step)
-        before = {layer.id: layer.active for layer in self._layers}
-        changed = [layer for layer in self._layers if layer.advance(now, readings.of(layer.program))]
+        changed = []
+        turned = []
+        for layer in self._layers:
+            before = layer.active
+            if layer.advance(now, readings.of(layer.program)):
+                changed.append(layer)
+                if layer.active is not before:
+                    turned.append(_activation_event(layer))
         if changed:
             self._publisher.publish()
-        turned = [_activation_event(layer) for layer in changed if layer.active is not before[layer.id]]
         return [*self._publisher.computed(image.base), *turned, *self._lift_finished()]
 
     def _lift_finished(self) -> list[Record]:
         """Lift the injections that are over, and return the events about them."""
-        over = {layer.id for layer in self._layers if _finished(layer)}
-        if not over:
+        if not any(map(_finished, self._layers)):
             return []
+        over = {layer.id for layer in self._layers if _finished(layer)}
         records = self._publisher.removed(lambda layer: layer.id in over, "over")
         self._settle()
         return records
@@ -357,7 +363,10 @@ class DeclaredInjections:
 
     def _time_ns(self, cycle: int) -> int:
         """Return the instance time of a cycle in ns; in wall time, its scheduled time."""
-        state = self._own.clock.read()
+        return self._time_of(cycle, self._own.clock.last_written())
+
+    def _time_of(self, cycle: int, state: Clock) -> int:
+        """Return the instance time of a cycle in ns, by the state of the clock page."""
         if state.virtual:
             return state.time_ns
         period_ns = self._own.period_ns

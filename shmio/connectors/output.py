@@ -276,7 +276,9 @@ class LayerPublisher:
         them: their command number is 0, and ``item`` and ``items`` count them.
         """
         for layer in self.injections.layers:
-            inner = self.injections.inner(layer) if layer.given else []
+            if not layer.given:
+                continue
+            inner = self.injections.inner(layer)
             declared = any(isinstance(one, DeclaredLayer) and (one.cover & layer.cover).any() for one in inner)
             before = self._computed.pop(layer.id, None)
             if not declared and before is None:

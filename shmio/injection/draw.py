@@ -77,6 +77,15 @@ class SeededRandom:
         normal: Floats = radius * np.cos(math.tau * angle)
         return normal
 
+    def one_uniform(self, run: int, place: int, purpose: Purpose = Purpose.VALUE) -> float:
+        """Return the number that :meth:`uniform` returns for a count of 1."""
+        return (_mix_word(self._base(run, place, purpose) + _GOLDEN & _MASK) >> 11) * 2.0**-53
+
+    def one_gaussian(self, run: int, place: int) -> float:
+        """Return the number that :meth:`gaussian` returns for a count of 1."""
+        radius = 1 - self.one_uniform(run, place)
+        return math.sqrt(-2 * math.log(radius)) * math.cos(math.tau * self.one_uniform(run, place, Purpose.ANGLE))
+
     def _base(self, run: int, place: int, purpose: Purpose) -> int:
         return _mix(_mix(_mix(self._key + run & _MASK) + place & _MASK) + purpose & _MASK)
 
@@ -91,7 +100,7 @@ class SeededRandom:
 
     def happens(self, probability: float, run: int, place: int) -> bool:
         """Return True with this probability, from 0 to 1."""
-        return probability >= 1 or bool(self.uniform(run, place, 1, Purpose.CHANCE)[0] < probability)
+        return probability >= 1 or self.one_uniform(run, place, Purpose.CHANCE) < probability
 
 
 def _mix(word: int) -> int:

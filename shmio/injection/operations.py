@@ -7,12 +7,13 @@ the operation's state. If an operation is applied twice in a cycle, both results
 
 from __future__ import annotations
 
+import struct
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final, NamedTuple
+from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -58,6 +59,13 @@ class ValueGroup:
         return len(self.index)
 
     @cached_property
+    def span(self) -> slice | None:
+        """The bytes of the values if they follow one another, else None."""
+        flat = self.index.ravel()
+        first = int(flat[0])
+        return slice(first, first + len(flat)) if (np.diff(flat) == 1).all() else None
+
+    @cached_property
     def limits(self) -> tuple[Any, Any]:
         """The smallest and the largest number of the type, as numbers for calculations."""
         if self.dtype.kind == "f":
@@ -72,6 +80,8 @@ class ValueGroup:
         For 64-bit integers, the type is long double, because a double would lose digits.
         """
         exact = np.longdouble if self.dtype.kind in "iu" and self.dtype.itemsize == 8 else np.float64
+        if self.span is not None:
+            return image[self.span].view(self.dtype).astype(exact)
         return np.ascontiguousarray(image[self.index]).view(self.dtype)[:, 0].astype(exact)
 
     def put_numbers(self, image: Bytes, values: Values) -> None:
@@ -85,7 +95,43 @@ class ValueGroup:
             if self.dtype.itemsize == 8:  # a double cannot represent the limits exactly
                 values = values.astype(np.longdouble)
         fitting = np.minimum(np.maximum(values, least), most).astype(self.dtype)
+        if self.span is not None:
+            image[self.span] = fitting.view(np.uint8)
+            return
         image[self.index] = fitting.view(np.uint8).reshape(self.index.shape)
+
+    @cached_property
+    def single(self) -> struct.Struct | None:
+        """The packing of the value if there is only one number and a double can represent it, else None.
+
+        Plain Python is faster than numpy for one number, and gives the same bytes.
+        """
+        kind, size = self.dtype.kind, self.dtype.itemsize
+        if len(self) > 1 or not (kind == "f" or (kind in "iu" and size <= 4)):
+            return None
+        code = next(code for code, name in _NUMPY.items() if name == f"{kind}{size}")
+        return struct.Struct(("<" if self.dtype.newbyteorder("<") == self.dtype else ">") + code)
+
+    def change_single(self, packing: struct.Struct, image: Bytes, change: Callable[[float], float]) -> None:
+        """Change the only value: the same as :meth:`numbers` and :meth:`put_numbers`, but faster."""
+        at = self._at
+        value = change(float(packing.unpack_from(image, at)[0]))
+        least, most = self._range
+        if self.dtype.kind != "f":
+            packing.pack_into(image, at, int(min(max(round(value), least), most)))
+        elif value == value:  # noqa: PLR0124  NaN stays NaN
+            packing.pack_into(image, at, min(max(value, least), most))
+        else:
+            packing.pack_into(image, at, value)
+
+    @cached_property
+    def _at(self) -> int:
+        return int(self.index.ravel()[0])
+
+    @cached_property
+    def _range(self) -> tuple[float, float]:
+        least, most = self.limits
+        return (float(least), float(most)) if self.dtype.kind == "f" else (int(least), int(most))
 
     def put(self, image: Bytes, table: Bytes, choice: npt.NDArray[np.intp]) -> None:
         """Write encoded values into an image.
@@ -167,6 +213,9 @@ class OperationContext(NamedTuple):
 class Operation(ABC):
     """Base class of operations. Each object belongs to one injection, and has its state."""
 
+    exact: ClassVar[bool] = False
+    """True if :meth:`apply` changes no bits but those that the injection covers."""
+
     def begin(self) -> None:  # noqa: B027  most operations have no state
         """Reset the operation's state at the start of an activation."""
 
@@ -198,11 +247,28 @@ class Fixed(Operation):
 class Arithmetic(Operation):
     """``offset``, ``scale``, ``clamp``: computes a new number from each number."""
 
-    def __init__(self, places: Sequence[ValueGroup], change: _Change) -> None:
+    exact = True
+
+    def __init__(
+        self, places: Sequence[ValueGroup], change: _Change, single: Callable[[float], float] | None = None
+    ) -> None:
+        """Create the operation.
+
+        Args:
+            places: The values.
+            change: Computes new numbers of a group.
+            single: Computes the same for one number; None: only ``change`` does.
+
+        """
         self._places = places
         self._change = change
+        self._single = single
 
     def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: ARG002, D102
+        only = self._places[0]
+        if len(self._places) == 1 and self._single is not None and only.single is not None:
+            only.change_single(only.single, image, self._single)
+            return
         with np.errstate(all="ignore"):
             for group in self._places:
                 group.put_numbers(image, self._change(group, group.numbers(image)))
@@ -210,6 +276,8 @@ class Arithmetic(Operation):
 
 class Noise(Operation):
     """``noise``: adds a random number to each number."""
+
+    exact = True
 
     def __init__(self, places: Sequence[ValueGroup], draw: SeededRandom, amplitude: float, *, gaussian: bool) -> None:
         self._places = places
@@ -219,6 +287,13 @@ class Noise(Operation):
 
     def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: D102
         count = self._places[-1].first + len(self._places[-1])
+        only = self._places[0]
+        if count == 1 and only.single is not None:
+            draw = self._draw.one_gaussian if self._gaussian else self._draw.one_uniform
+            number = draw(at.run, at.place)
+            own = (number if self._gaussian else 2 * number - 1) * self._amplitude
+            only.change_single(only.single, image, own.__add__)
+            return
         if self._gaussian:
             noise = self._draw.gaussian(at.run, at.place, count) * self._amplitude
         else:

@@ -276,12 +276,12 @@ def _encode(value: Any, key: str, register: Register, layout: Layout, image: byt
 
 def _offset(declaration: Declaration, target: Target, layout: Layout, _period_ns: int) -> _Operate:
     groups, by = _numbers(declaration, target, layout), _number(declaration.value, "value")
-    return lambda _draw: Arithmetic(groups, lambda _places, values: values + by)
+    return lambda _draw: Arithmetic(groups, lambda _places, values: values + by, lambda value: value + by)
 
 
 def _scale(declaration: Declaration, target: Target, layout: Layout, _period_ns: int) -> _Operate:
     groups, by = _numbers(declaration, target, layout), _number(declaration.value, "value")
-    return lambda _draw: Arithmetic(groups, lambda _places, values: values * by)
+    return lambda _draw: Arithmetic(groups, lambda _places, values: values * by, lambda value: value * by)
 
 
 def _clamp(declaration: Declaration, target: Target, layout: Layout, _period_ns: int) -> _Operate:

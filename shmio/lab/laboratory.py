@@ -88,6 +88,8 @@ class Laboratory:
         self.stepping = False
         """True while a step is computed."""
         self._segment = Segment.private(plan.instance, plan.blocks, plan.processes, mode=plan.mode)
+        self.page = self._segment.clock
+        """The clock page, as the loops read it."""
         self._others: list[Segment] = []
         self._threads: list[threading.Thread] = []
         self.loops: dict[str, SteppedLoop] = {}
@@ -220,7 +222,6 @@ class _LabCoordinator(Coordinator):
     def __init__(self, lab: Laboratory, segment: Segment) -> None:
         super().__init__(segment)
         self._lab = lab
-        self._page = segment.clock
 
     def step(self, dt_ns: int | None = None) -> Step:
         """Compute a step.
@@ -230,7 +231,7 @@ class _LabCoordinator(Coordinator):
             ValueRangeError: The length is not within 1 us and 1 h.
 
         """
-        lab, page = self._lab, self._page
+        lab, page = self._lab, self._lab.page
         with lab.moving:
             self.take_over(steps=True)
             before = page.last_written()

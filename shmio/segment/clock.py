@@ -159,7 +159,9 @@ class ClockPage:
 
         Pass ``ring=False`` if no waiting process has to act on the change yet.
         """
-        self._state.write(_pack(state))
+        data = _pack(state)
+        self._state.write(data)
+        self._last = data, _unpack(data) if state.note else state  # a long note is cut
         if ring:
             self.bell.ring()
 
