@@ -66,6 +66,7 @@ START_PROCESSES = (
     "tests/unit/endpoints/alerts/test_command.py",
     "tests/unit/endpoints/mqtt/broker/",
     "tests/unit/endpoints/web/test_dropped.py::test_page_",
+    "tests/unit/lab/",
     "tests/unit/plan/test_emulated_programs.py",
     "tests/unit/plan/test_sources_models.py",
     "tests/unit/simulation/fmu/test_fmu_model.py",

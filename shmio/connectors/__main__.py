@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from shmio import worker
 from shmio.connectors import registry
-from shmio.connectors.base import Computed, Connector, Replayed
+from shmio.connectors.base import Connector, Replayed
 from shmio.connectors.injections import blocks_of, owner_of
 from shmio.connectors.models.stepped import PageClock, SteppedLoop, connected_inputs
 from shmio.connectors.poll_loop import Schedule, SourceLoop, WallClock

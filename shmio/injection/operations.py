@@ -115,14 +115,14 @@ class ValueGroup:
     def change_single(self, packing: struct.Struct, image: Bytes, change: Callable[[float], float]) -> None:
         """Change the only value: the same as :meth:`numbers` and :meth:`put_numbers`, but faster."""
         at = self._at
-        value = change(float(packing.unpack_from(image, at)[0]))
+        value = change(float(packing.unpack_from(image.data, at)[0]))
         least, most = self._range
         if self.dtype.kind != "f":
-            packing.pack_into(image, at, int(min(max(round(value), least), most)))
+            packing.pack_into(image.data, at, round(min(max(value, least), most)))
         elif value == value:  # noqa: PLR0124  NaN stays NaN
-            packing.pack_into(image, at, min(max(value, least), most))
+            packing.pack_into(image.data, at, min(max(value, least), most))
         else:
-            packing.pack_into(image, at, value)
+            packing.pack_into(image.data, at, value)
 
     @cached_property
     def _at(self) -> int:
@@ -291,8 +291,8 @@ class Noise(Operation):
         if count == 1 and only.single is not None:
             draw = self._draw.one_gaussian if self._gaussian else self._draw.one_uniform
             number = draw(at.run, at.place)
-            own = (number if self._gaussian else 2 * number - 1) * self._amplitude
-            only.change_single(only.single, image, own.__add__)
+            by = (number if self._gaussian else 2 * number - 1) * self._amplitude
+            only.change_single(only.single, image, lambda value: value + by)
             return
         if self._gaussian:
             noise = self._draw.gaussian(at.run, at.place, count) * self._amplitude

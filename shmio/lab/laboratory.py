@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, Self, cast
 
 from shmio.campaigns.live import LiveRun
 from shmio.campaigns.live import Plan as RunPlan
@@ -98,7 +98,9 @@ class Laboratory:
             jobs = [job for job in plan.jobs if job.kind == "source"]
             for source in parameters or ():
                 if all(job.name != source for job in jobs):
-                    raise ConfigError(f"there is no source {source!r}; there are: {', '.join(job.name for job in jobs)}")
+                    raise ConfigError(
+                        f"there is no source {source!r}; there are: {', '.join(job.name for job in jobs)}"
+                    )
             for job in jobs:
                 self.loops[job.name] = self._loop(job, (parameters or {}).get(job.name))
             for loop in self.loops.values():
@@ -113,16 +115,17 @@ class Laboratory:
         options: dict[str, Any] = section["options"]
         if parameters is not None:
             options = options | {"parameters": options.get("parameters", {}) | dict(parameters)}
-        found = registry.load(section["connector"])
-        source: Computed = found(
+        made = registry.load(section["connector"])(
             registry.convert_options(section["connector"], options), segment.blocks[job.name].layout
         )
+        source = cast("Computed", made)  # prepare_laboratory has checked it
         writer = segment.writer(job.name)
-        loop = SteppedLoop(
+        clock = _LabClock(self)
+        loop = clock.loop = SteppedLoop(
             source,
             writer,
             Schedule(segment.header.started_ns, writer.block.period_ns),
-            _LabClock(self, lambda: loop.write_now()),
+            clock,
             section["writable"],
             allow_nonfinite=section["allow_nonfinite"],
             inputs=connected_inputs(source, writer.block, self.open),
@@ -197,9 +200,10 @@ class Laboratory:
 class _LabClock:
     """The clock of a loop that nobody runs: the laboratory calls what is due."""
 
-    def __init__(self, lab: Laboratory, write: Callable[[], None]) -> None:
+    loop: SteppedLoop
+
+    def __init__(self, lab: Laboratory) -> None:
         self._lab = lab
-        self._write = write
 
     def now_ns(self) -> int:
         """Return the time of CLOCK_MONOTONIC in ns."""
@@ -213,7 +217,7 @@ class _LabClock:
         """Carry out accepted commands; if a step is in progress, after it."""
         with self._lab.moving:
             if not self._lab.stepping:
-                self._write()
+                self.loop.write_now()
 
 
 class _LabCoordinator(Coordinator):
