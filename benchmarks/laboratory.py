@@ -23,7 +23,7 @@ from shmio.config import Declaration, Expectation
 from shmio.lab import Laboratory, prepare_laboratory
 from shmio.layout.model import Layout
 from shmio.simulation import ModelRunner
-from shmio.simulation.model import load
+from shmio.simulation.loading import load
 
 STEP_S = 0.02
 CONFIG = """

@@ -92,6 +92,7 @@ class Laboratory:
         """The clock page, as the loops read it."""
         self._others: list[Segment] = []
         self._threads: list[threading.Thread] = []
+        self._sources: list[Computed] = []
         self.loops: dict[str, SteppedLoop] = {}
         """The loop of each source."""
         try:
@@ -119,6 +120,7 @@ class Laboratory:
             registry.convert_options(section["connector"], options), segment.blocks[job.name].layout
         )
         source = cast("Computed", made)  # prepare_laboratory has checked it
+        self._sources.append(source)
         writer = segment.writer(job.name)
         clock = _LabClock(self)
         loop = clock.loop = SteppedLoop(
@@ -186,6 +188,8 @@ class Laboratory:
             loop.commands.stop()
         for thread in self._threads:
             thread.join(COMMANDS_S)
+        for source in self._sources:
+            source.close()
         for segment in self._others:
             segment.close()
         self._segment.close()
