@@ -7,6 +7,7 @@ once, so loops of references end. It does not list the parts of a variable that 
 from __future__ import annotations
 
 import asyncio
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -17,10 +18,13 @@ from asyncua.ua import ua_binary
 
 from shmio.connectors.browsing import Browsed, Offer, Wanted
 from shmio.connectors.opcua import decode
+from shmio.connectors.opcua.data_types import DataTypes
 from shmio.connectors.opcua.decode import Extension, Sample
 from shmio.connectors.opcua.options import Credentials, OpcUaOptions
 from shmio.connectors.opcua.session import Session
-from shmio.layout.addresses.opcua import escaped_uri
+from shmio.connectors.opcua.structures import AbsentError, Listed, members_of, read_value
+from shmio.connectors.opcua.values import MismatchError
+from shmio.layout.addresses.opcua import escaped_uri, member_text, node_text
 from shmio.layout.topic import shorten
 
 _OBJECTS: Final = ua.NodeId(85)
@@ -34,6 +38,8 @@ REFERENCES_PER_NODE: Final = 30
 """Maximum number of references per node of the limit. Some lead to properties or known nodes."""
 MAX_CHARACTERS: Final = 1 << 26
 """Maximum number of characters of all names, identifiers and comments together."""
+MAX_MEMBERS: Final = 1000
+"""Maximum number of members of a structure that are listed."""
 _MAX_COMMENT: Final = 1000
 _WRITE: Final = 2
 """The bit of CurrentWrite in an access level."""
@@ -89,6 +95,7 @@ class _Search:
     def __init__(self, session: Session, wanted: Wanted) -> None:
         self._session, self._wanted = session, wanted
         self._seen = {_OBJECTS}
+        self._types = DataTypes(session)
         self._found = Browsed()
         self._uris: list[str] = []
         self._references = self._characters = 0
@@ -174,6 +181,10 @@ class _Search:
             dict(zip(variables, await self._session.read(ids, attribute), strict=True))
             for attribute in (names.Value, names.DataType, names.Description, names.UserAccessLevel)
         ] if ids else [{}, {}, {}, {}]  # fmt: skip
+        # A structure whose parts are nodes is listed by these, since they can be written.
+        structures = [one for one in variables if not one.children and details[0][one].kind == decode.EXTENSION]
+        if structures:
+            await self._types.learn([node.id for node in structures])
         with_units = [node for node in variables if node.unit is not None]
         read = await self._session.read([node.unit for node in with_units], names.Value) if with_units else []
         units = {node: _unit(sample) for node, sample in zip(with_units, read, strict=True)}
@@ -185,6 +196,9 @@ class _Search:
                     self._found.offers.append(Offer(node.names))
                 continue
             value, data_type, description, access = (one[node] for one in details)
+            if node in structures:
+                self._list_members(node, value)
+                continue
             kind, refused = _type(value, data_type)
             node.is_whole = bool(kind)
             comment = shorten(description.value, _MAX_COMMENT) if isinstance(description.value, str) else ""
@@ -198,9 +212,36 @@ class _Search:
             if self._wanted.takes(node.names):
                 self._found.offers.append(Offer(node.names, kind, columns, refused))
 
+    def _list_members(self, node: _Node, value: Sample) -> None:
+        """Add the members of a structure to what was found."""
+        kept: list[Listed] = []
+        try:
+            kept += itertools.islice(members_of(read_value(self._types.structures, value)), MAX_MEMBERS + 1)
+            problem = f"a structure with more than {MAX_MEMBERS} members: write those you need into the tag table"
+        except (MismatchError, AbsentError) as error:
+            problem = str(error)
+        if not 0 < len(kept) <= MAX_MEMBERS:
+            if self._wanted.takes(node.names):
+                self._found.offers.append(Offer(node.names, refused=problem))
+            return
+        node.is_whole = True
+        address = self._address(node.id)
+        for one in kept:
+            steps = [[step] if isinstance(step, str) else map(str, step) for step in one.member]
+            names = (*node.names, *itertools.chain.from_iterable(steps))
+            if not self._wanted.takes(names):
+                continue
+            kind, refused = ("", one.refused) if one.refused else _type(one.sample, one.sample)
+            columns = {"address": f"{address}{member_text(one.member)}"}
+            self._count(*names, columns["address"])
+            if self._characters > MAX_CHARACTERS:
+                self._stop("the names of the server's members are too long: name a part of it by a PATTERN")
+                return
+            self._found.offers.append(Offer(names, kind, columns, refused))
+
     def _address(self, node: Any) -> str:
         """Return a node's address, with the URI of its namespace, whose number may change."""
-        text = ua.NodeId(node.Identifier).to_string()
+        text = node_text(ua.NodeId(node.Identifier).to_string())
         number = node.NamespaceIndex
         if not number:
             return text

@@ -22,16 +22,18 @@ from shmio.connectors.base import Connector, Lost, WriteLostError
 from shmio.connectors.browsing import Browsed, Wanted
 from shmio.connectors.opcua.decode import Sample
 from shmio.connectors.opcua.options import Credentials, OpcUaOptions
+from shmio.connectors.opcua.structures import AbsentError, find, read_value
 from shmio.connectors.opcua.values import MismatchError, ValueConverter
 from shmio.connectors.register_image import RegisterImage
 from shmio.connectors.request_count import CycleRequests, Requests, counted
 from shmio.errors import ConfigError, ConnectorError, ValueRangeError
 from shmio.layout.addresses import siemens
-from shmio.layout.addresses.opcua import Address, parse
+from shmio.layout.addresses.opcua import Address, Member, parse_member
 from shmio.layout.model import Layout, Register, bit_positions
 from shmio.layout.values.codec import codec
 from shmio.layout.values.write import Write, apply, bits_of
 from shmio.model.statuses import (
+    BAD_DECODING_ERROR,
     BAD_NO_DATA,
     BAD_NODE_ID_UNKNOWN,
     BAD_OUT_OF_RANGE,
@@ -52,9 +54,25 @@ CLOSE_S: Final = 0.5
 MAX_REPORTED: Final = 20
 """Maximum number of faulty registers that the log names per connection."""
 
+_WRITES_WHOLE: Final = (
+    "a member of a structure cannot be written: OPC UA writes only whole structures, which would undo what others "
+    "write to their members at the same time"
+)
+_NO_DEADBAND: Final = "a member of a structure has no dead-band: the server sends each change of the structure"
+
 _Result = TypeVar("_Result")
 
 log = logging.getLogger("shmio.source")
+
+
+class _Node(NamedTuple):
+    """A node that is read, with the registers that get its value or members of it."""
+
+    address: Address
+    is_structure: bool
+    deadband: float
+    """Dead-band in the numbers of the node, before scaling; 0: none."""
+    registers: list[int]
 
 
 class _NodeWrite(NamedTuple):
@@ -113,7 +131,8 @@ class OpcUaConnector(Connector):
                 f'layout: the block {layout.name} has optimized access: set nodes = "siemens" to read it by names'
             )
         self._options, self._layout = options, layout
-        self._addresses = [_address(options, layout, register) for register in layout.registers]
+        self._nodes, self._members = _nodes(options, layout)
+        self._node_of = {index: number for number, node in enumerate(self._nodes) for index in node.registers}
         self._converters = [ValueConverter(register) for register in layout.registers]
         self._credentials = _credentials(options)
         self._image = RegisterImage(layout) if layout.status_offset is not None else None
@@ -149,11 +168,11 @@ class OpcUaConnector(Connector):
         sessions = self._link.sessions if self._link is not None else []
         subscribed = sum(session.subscriptions for session in sessions)
         mode = f"{subscribed} subscriptions" if options.mode == "subscribe" else "polling"
-        return f"to {options.peer}, {len(self._addresses)} nodes, {mode}, sessions={len(sessions)}, {how}"
+        return f"to {options.peer}, {len(self._nodes)} nodes, {mode}, sessions={len(sessions)}, {how}"
 
     def cycle_requests(self) -> CycleRequests:
         """Return the requests that a cycle makes. In mode ``subscribe`` there are none."""
-        options, nodes = self._options, len(self._addresses)
+        options, nodes = self._options, len(self._nodes)
         reads = counted(nodes, "node")
         if options.mode == "subscribe":
             return CycleRequests(
@@ -178,10 +197,10 @@ class OpcUaConnector(Connector):
             raise ConnectorError("the layout has no status area")
         with self._lock:
             self._latest.clear()
-            for index in range(len(self._addresses)):
+            for index in range(len(self._layout.registers)):
                 self._image.fail(index, BAD_WAITING_FOR_INITIAL_DATA)
         self._reported.clear()
-        link = self._link = _Link(self._options, self._credentials, self._addresses, self._deadbands(), self._deliver)
+        link = self._link = _Link(self._options, self._credentials, self._nodes, self._deliver)
         link.start()
         try:
             link.opened.result(self.timeout_s)
@@ -216,12 +235,6 @@ class OpcUaConnector(Connector):
 
     # -- values --------------------------------------------------------------------------------------------------------
 
-    def _deadbands(self) -> list[float]:
-        return [
-            one.deadband / abs(one.scale[0]) if one.scale is not None else one.deadband
-            for one in self._layout.registers
-        ]
-
     def _deliver(self, samples: list[tuple[Item, Sample]]) -> None:
         """Store samples; the thread of the sessions calls it."""
         assert self._image is not None  # noqa: S101 - for the type checker
@@ -230,15 +243,50 @@ class OpcUaConnector(Connector):
                 self._store(self._image, item, sample)
 
     def _store(self, image: RegisterImage, item: Item, sample: Sample) -> None:
-        index = item.index
-        item.code, item.seen = sample.code, sample
+        node = self._nodes[item.index]
+        item.code, item.seen, item.unread = sample.code, sample, False
         if quality_of(sample.code) is Quality.BAD or not sample.kind:
             code = sample.code or BAD_NO_DATA
-            image.fail(index, code, sample.source_ns)
-            if code & 0xFFFF0000 == BAD_NODE_ID_UNKNOWN:
-                self._report(index, f"the server reports {describe(code)}")
+            for index in node.registers:
+                image.fail(index, code, sample.source_ns)
+                if code & 0xFFFF0000 == BAD_NODE_ID_UNKNOWN:
+                    self._report(index, f"the server reports {describe(code)}")
             return
-        item.last = self._latest[index] = sample
+        item.last = sample
+        if not item.is_structure:
+            (index,) = node.registers
+            self._latest[index] = sample
+            self._put(image, index, sample)
+            return
+        try:
+            found = read_value(item.structures, sample)
+        except AbsentError:
+            for index in node.registers:
+                image.fail(index, BAD_NO_DATA, sample.source_ns)
+            return
+        except MismatchError as error:
+            item.unread = True
+            for index in node.registers:
+                image.fail(index, BAD_DECODING_ERROR, sample.source_ns)
+            self._report(node.registers[0], f"{error}: list its members with shmio-supervisor browse")
+            return
+        for index in node.registers:
+            try:
+                member = find(found, self._members[index])
+            except AbsentError:
+                image.fail(index, BAD_NO_DATA, sample.source_ns)
+            except MismatchError as error:
+                image.fail(index, BAD_TYPE_MISMATCH, sample.source_ns)
+                self._report(index, f"{error}: correct its address in the layout")
+            else:
+                code = member.code if quality_of(member.code) is Quality.BAD else sample.code
+                source_ns = member.source_ns or sample.source_ns
+                if quality_of(code) is Quality.BAD or not member.kind:
+                    image.fail(index, code or BAD_NO_DATA, source_ns)
+                else:
+                    self._put(image, index, member._replace(code=code, source_ns=source_ns))
+
+    def _put(self, image: RegisterImage, index: int, sample: Sample) -> None:
         try:
             image.put(index, self._converters[index].value(sample), sample.source_ns, sample.code)
         except MismatchError as error:
@@ -306,7 +354,7 @@ class OpcUaConnector(Connector):
         outcomes = sending.outcomes
         for step in sending.steps:
             if step.elements is not None and not await link.has_ranges(step):
-                path = self._layout.registers[step.item.index].path
+                path = self._path(step)
                 outcomes[step.write] = f"{path}: the server does not write single elements: write the whole array"
         sending.steps = [step for step in sending.steps if outcomes[step.write] == ""]
         for batch in _batches(sending.steps, link.per_write):
@@ -315,10 +363,14 @@ class OpcUaConnector(Connector):
             sending.confirmed += len(batch)
             for step, code in zip(batch, codes, strict=True):
                 if quality_of(code) is Quality.BAD:
-                    path = self._layout.registers[step.item.index].path
+                    path = self._path(step)
                     outcomes[step.write] = f"{path}: the server refuses it: {describe(code)}"
         if sending.steps:
             await link.read_back(list({step.item.index: step.item for step in sending.steps}.values()))
+
+    def _path(self, step: _NodeWrite) -> str:
+        """Return the path of the register that is written."""
+        return self._layout.registers[self._nodes[step.item.index].registers[0]].path
 
     def _steps(self, link: _Link, number: int, write: Write) -> Iterator[_NodeWrite]:
         """Yield the writes of nodes for a write of bytes. ValueError: the write is impossible."""
@@ -334,7 +386,9 @@ class OpcUaConnector(Connector):
             if not any(share):
                 continue
             found = True
-            item = link.items[index]
+            item = link.items[self._node_of[index]]
+            if item.is_structure:
+                raise ValueError(f"{register.path}: {_WRITES_WHOLE}")
             if item.node is None:
                 raise ValueError(f"{register.path}: the server does not know its node")
             value = codec(register, layout.byte_order).decode(image)
@@ -359,14 +413,41 @@ def _need_library() -> None:
         raise ConfigError(EXTRA)
 
 
-def _address(options: OpcUaOptions, layout: Layout, register: Register) -> Address:
-    """Return the node of a register. ConfigError: its address is wrong."""
-    try:
-        if options.nodes == "siemens" and not register.address:
-            return siemens.node_address(layout, register)
-        return parse(register.address)
-    except ValueError as error:
-        raise ConfigError(f"layout: {register.path}: {error}") from None
+def _nodes(options: OpcUaOptions, layout: Layout) -> tuple[list[_Node], list[Member]]:
+    """Return the nodes of a layout, and for each register the way to its value in the node's.
+
+    Members of the same structure share a node. Other registers have nodes of their own.
+
+    Raises:
+        ConfigError: An address is wrong.
+
+    """
+    nodes: list[_Node] = []
+    members: list[Member] = []
+    structures: dict[Address, _Node] = {}
+    for index, register in enumerate(layout.registers):
+        try:
+            address, member = _address(options, layout, register)
+            if member and (register.deadband or register.writable):
+                raise ValueError(_WRITES_WHOLE if register.writable else _NO_DEADBAND)
+        except ValueError as error:
+            raise ConfigError(f"layout: {register.path}: {error}") from None
+        members.append(member)
+        if member and address in structures:
+            structures[address].registers.append(index)
+            continue
+        factor = 1.0 if register.scale is None else abs(register.scale[0])
+        nodes.append(_Node(address, bool(member), register.deadband / factor, [index]))
+        if member:
+            structures[address] = nodes[-1]
+    return nodes, members
+
+
+def _address(options: OpcUaOptions, layout: Layout, register: Register) -> tuple[Address, Member]:
+    """Return the node of a register, and the way to a member. ValueError: its address is wrong."""
+    if options.nodes == "siemens" and not register.address:
+        return siemens.node_address(layout, register), ()
+    return parse_member(register.address)
 
 
 def _credentials(options: OpcUaOptions) -> Credentials:
@@ -439,13 +520,12 @@ class _Link(threading.Thread):
         self,
         options: OpcUaOptions,
         credentials: Credentials,
-        addresses: Sequence[Address],
-        deadbands: Sequence[float],
+        nodes: Sequence[_Node],
         deliver: Callable[[list[tuple[Item, Sample]]], None],
     ) -> None:
         super().__init__(name="opcua", daemon=True)
         self._options, self._credentials, self._deliver = options, credentials, deliver
-        self._addresses, self._deadbands = addresses, deadbands
+        self._nodes = nodes
         self._loop = asyncio.new_event_loop()
         self._stopping = asyncio.Event()
         self._closed = False
@@ -563,8 +643,8 @@ class _Link(threading.Thread):
 
         options = self._options
         self.items = [
-            Item(index, address, deadband, index // options.session_items)
-            for index, (address, deadband) in enumerate(zip(self._addresses, self._deadbands, strict=True))
+            Item(index, one.address, one.deadband, index // options.session_items, is_structure=one.is_structure)
+            for index, one in enumerate(self._nodes)
         ]
         parts = [self.items[at : at + options.session_items] for at in range(0, len(self.items), options.session_items)]
         sessions = [Session(options, self._credentials, part, self._deliver) for part in parts]

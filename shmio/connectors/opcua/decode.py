@@ -95,19 +95,19 @@ class Publication(NamedTuple):
 
 def check_fault(data: bytes) -> None:
     """Raise FaultError if the server refuses the request, MalformedError if the response is malformed."""
-    _Reader(data).header(None)
+    Reader(data).header(None)
 
 
 def read_response(data: bytes) -> list[Sample]:
     """Return the values of a read response. Raise FaultError or MalformedError."""
-    reader = _Reader(data)
+    reader = Reader(data)
     reader.header(_READ_RESPONSE)
     return [reader.data_value(0) for _ in range(reader.count())]
 
 
 def publish_response(data: bytes) -> Publication:
     """Return the content of a publish response. Raise FaultError or MalformedError."""
-    reader = _Reader(data)
+    reader = Reader(data)
     reader.header(_PUBLISH_RESPONSE)
     subscription = reader.u32()
     reader.skip(4 * reader.count(4))
@@ -120,15 +120,25 @@ def publish_response(data: bytes) -> Publication:
     for _ in range(count):
         kind, body = reader.extension_parts()
         if kind == _DATA_CHANGE:
-            inner = _Reader(body)
+            inner = Reader(body)
             values += inner.monitored(inner.count(5))
         elif kind == _STATUS_CHANGE:
-            closed = _Reader(body).u32() or 0x80000000
+            closed = Reader(body).u32() or 0x80000000
     return Publication(subscription, sequence, not count, values, closed)
 
 
-class _Reader:
-    """Reads a message from its beginning. Each method reads the item that its name says."""
+NodeKey = tuple[int, int, int | str | bytes]
+"""A node id, to compare: the type of its identifier (2 for a number), its namespace and the identifier."""
+
+
+def node_key(found: tuple[int, int, int | str | bytes]) -> NodeKey:
+    """Return a node id in the one form that can be compared."""
+    form, namespace, identifier = found
+    return max(form, 2), namespace, identifier
+
+
+class Reader:
+    """Reads a message, or a part of one, from its beginning. Each method reads the item that its name says."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
@@ -148,23 +158,37 @@ class _Reader:
         if expected is not None and kind != expected:
             raise MalformedError
 
+    @property
+    def left(self) -> int:
+        """Number of bytes that were not read yet."""
+        return len(self._data) - self._at
+
     def skip(self, size: int) -> None:
+        """Pass over bytes."""
         self._at += size
         if self._at > len(self._data):
             raise MalformedError
 
     def take(self, size: int) -> bytes:
+        """Read bytes."""
         start = self._at
         self.skip(size)
         return self._data[start : self._at]
 
     def u8(self) -> int:
+        """Read a Byte."""
         self.skip(1)
         return self._data[self._at - 1]
 
     def u32(self) -> int:
+        """Read a UInt32."""
         self.skip(4)
         return int(_UINT.unpack_from(self._data, self._at - 4)[0])
+
+    def i32(self) -> int:
+        """Read an Int32."""
+        self.skip(4)
+        return int(_INT.unpack_from(self._data, self._at - 4)[0])
 
     def count(self, least: int = 1) -> int:
         """Return the length of an array whose elements take at least this many bytes; 0: no array."""
@@ -183,6 +207,7 @@ class _Reader:
         return None if size < 0 else self.take(size)
 
     def text(self) -> str:
+        """Read a String; a null is empty."""
         return (self.chunk() or b"").decode("utf-8", "replace")
 
     def time(self) -> int:
@@ -229,6 +254,7 @@ class _Reader:
         return kind, (self.chunk() or b"") if self.u8() else b""
 
     def extension(self) -> Extension:
+        """Read a structure with its encoding."""
         start = self._at
         self.node_id()
         encoding = self._data[start : self._at]
@@ -252,6 +278,7 @@ class _Reader:
         return [(self.u32(), self.data_value(0)) for _ in range(count)]
 
     def data_value(self, depth: int) -> Sample:
+        """Read a DataValue."""
         mask = self.u8()
         kind, value, dims = self.variant(depth) if mask & 1 else (0, None, None)
         code = self.u32() if mask & 2 else 0
@@ -271,20 +298,10 @@ class _Reader:
         mask = self.u8()
         kind = mask & 0x3F
         if not mask & 0x80:
-            if kind in _STRUCTS:
-                layout = _STRUCTS[kind]
-                self.skip(layout.size)
-                return kind, layout.unpack_from(self._data, self._at - layout.size)[0], None
-            return kind, self.scalar(kind, depth), None
-        values: list[Any]
-        if kind in _STRUCTS:
-            count = self.count(_STRUCTS[kind].size)
-            layout = struct.Struct(f"<{count}{_FIXED[kind]}")
-            values = list(layout.unpack(self.take(layout.size)))
-        elif kind:
-            values = [self.scalar(kind, depth) for _ in range(self.count())]
-        else:  # an array of nothing could be of any length
+            return kind, self.value(kind, depth), None
+        if not kind:  # an array of nothing could be of any length
             raise MalformedError
+        values = self.elements(kind, self.count(size_of(kind)), depth)
         dims: tuple[int, ...] = (len(values),)
         if mask & 0x40:
             given = struct.unpack(f"<{count}i", self.take(4 * count)) if (count := self.count(4)) else ()
@@ -296,6 +313,21 @@ class _Reader:
             if given and product == len(values):
                 dims = given
         return kind, values, dims
+
+    def value(self, kind: int, depth: int) -> Any:
+        """Read a value of a built-in type."""
+        if kind in _STRUCTS:
+            layout = _STRUCTS[kind]
+            self.skip(layout.size)
+            return layout.unpack_from(self._data, self._at - layout.size)[0]
+        return self.scalar(kind, depth)
+
+    def elements(self, kind: int, count: int, depth: int) -> list[Any]:
+        """Read values of a built-in type."""
+        if kind in _STRUCTS:
+            layout = struct.Struct(f"<{count}{_FIXED[kind]}")
+            return list(layout.unpack(self.take(layout.size)))
+        return [self.scalar(kind, depth) for _ in range(count)]
 
     def scalar(self, kind: int, depth: int) -> Any:
         """Read a value of a type that has no fixed size."""
@@ -328,6 +360,11 @@ class _Reader:
         if kind == 0:
             return None
         raise MalformedError
+
+
+def size_of(kind: int) -> int:
+    """Return the minimum number of bytes of a value of a built-in type."""
+    return _STRUCTS[kind].size if kind in _STRUCTS else 1
 
 
 _TEXTS_OF_IDS: Final[dict[int, Callable[[Any], str]]] = {

@@ -28,6 +28,7 @@ from asyncua.crypto import security_policies
 from asyncua.ua import ua_binary
 
 from shmio.connectors.opcua import decode
+from shmio.connectors.opcua.data_types import DataTypes, Structures
 from shmio.connectors.opcua.decode import FaultError, MalformedError, Publication, Sample
 from shmio.connectors.opcua.options import Credentials, OpcUaOptions
 from shmio.errors import ConnectorError
@@ -53,6 +54,7 @@ _HIERARCHICAL: Final = 33
 _CLASSES: Final = 1 | 2
 """The classes of objects and variables."""
 REFERENCES_AT_ONCE: Final = 500
+_ORIGINS_AT_ONCE: Final = 20
 _BAD_NO_CONTINUATION_POINTS: Final = 0x804B0000
 _RUNNING: Final = 0
 STATES: Final = (
@@ -100,6 +102,12 @@ class Item:
     """Until this time, samples from before the last write may come."""
     written_ns: int = 0
     """Source time of the value that was read after the last write."""
+    is_structure: bool = False
+    """True if registers are members of the node's value."""
+    structures: Structures = field(default_factory=dict)
+    """The structures that the node may have as values."""
+    unread: bool = False
+    """True if the last value could not be read with these structures."""
     skipped: bool = False
     """True if a sample was skipped because it may be from before the last write."""
 
@@ -195,6 +203,7 @@ class Session:
         self._tasks.append(asyncio.create_task(self._renew()))
         await self._ask_limits()
         await self._resolve(self._items)
+        await self._learn(self._items)
         if options.mode == "subscribe":
             await self._subscribe([item for item in self._items if item.node is not None])
         self._report_failed(self._items)
@@ -430,9 +439,43 @@ class Session:
                 target = targets[0].TargetId
                 item.node = ua.NodeId(target.Identifier, target.NamespaceIndex)
 
+    async def _learn(self, items: Iterable[Item]) -> None:
+        """Ask for the definitions of the structures whose members are registers."""
+        wanted = [item for item in items if item.is_structure and item.node is not None]
+        if not wanted:
+            return
+        types = DataTypes(self)
+        try:
+            await types.learn([item.node for item in wanted])
+        except FaultError as error:
+            log.warning("the server refuses to define its structures: %s", describe(error.code))
+        for item in wanted:
+            item.structures = types.structures
+
     async def read(self, nodes: Sequence[Any], attribute: Any) -> list[Sample]:
         """Read an attribute of nodes."""
         return await self._samples(nodes, attribute)
+
+    async def origins(self, nodes: Sequence[Any], reference: Any) -> list[Any]:
+        """Return the node from which a reference leads to each node; None if there is none."""
+        found: list[Any] = []
+        for at in range(0, len(nodes), _ORIGINS_AT_ONCE):
+            part = nodes[at : at + _ORIGINS_AT_ONCE]
+            request = ua.BrowseRequest()
+            request.Parameters.RequestedMaxReferencesPerNode = 1
+            request.Parameters.NodesToBrowse = [
+                ua.BrowseDescription(node, ua.BrowseDirection.Inverse, reference, False, 0, 63) for node in part
+            ]
+            results = (await self._response(ua.BrowseResponse, request)).Results
+            if len(results) != len(part):
+                raise MalformedError
+            found += [one.References[0].NodeId if one.References else None for one in results]
+            if points := [one.ContinuationPoint for one in results if one.ContinuationPoint]:
+                release = ua.BrowseNextRequest()
+                release.Parameters.ReleaseContinuationPoints = True
+                release.Parameters.ContinuationPoints = points
+                await self._response(ua.BrowseNextResponse, release)
+        return found
 
     async def browse(self, nodes: Sequence[Any], most: int) -> tuple[list[list[Any]], bool]:
         """Return the hierarchical references from nodes to objects and variables; none of an unknown node.
@@ -774,11 +817,17 @@ class Session:
                 dead = await self._find_dead([item for item in self._items if item.subscription is not None])
                 if unknown:
                     await self._resolve(unknown)
+                await self._learn_again([item for item in self._items if item.unread or item in unknown])
                 if subscribes:
                     await self._subscribe_again([item for item in (*unknown, *dead) if item.node is not None])
             except Exception as error:  # noqa: BLE001
                 self.fail(self.explained(error))
                 return
+
+    async def _learn_again(self, items: Sequence[Item]) -> None:
+        """Ask for definitions again that did not fit, and deliver the last values once more."""
+        await self._learn(items)
+        self._deliver([(item, item.seen) for item in items if item.unread and item.seen is not None])
 
     async def _find_dead(self, items: Sequence[Item]) -> list[Item]:
         """Return the monitored items for which the server has stopped sending changes.

@@ -6,6 +6,10 @@ A node id is ``ns=3;s=Speed`` or ``nsu=http://maker/device;i=1001``, as in OPC 1
 ``/Objects/2:Device/2:Speed``. Each step is a browse name, with the number of its namespace unless
 that is 0; ``&`` precedes one of the characters ``/ . < > : # ! &`` in a name (OPC 10000-4, annex
 A.2).
+
+A member of a structure has the address of the structure's node, a ``#``, and the way to the member:
+``ns=3;s=Pump#Motor.Speed``, ``/Objects/2:Line#[0].Forces``. In the way, ``&`` precedes one of the
+characters ``. [ ] # &`` in a name. In a text identifier, ``##`` stands for ``#``.
 """
 
 from __future__ import annotations
@@ -18,10 +22,16 @@ from dataclasses import dataclass
 from typing import Final
 
 MAX_STEPS: Final = 64
+"""Maximum number of steps of a browse path, and of the way to a member."""
 _MAX_NAME: Final = 4096  # characters of a text identifier (OPC 10000-3, section 8.2.4)
 _EXAMPLE: Final = "write a node id such as ns=3;s=Speed or nsu=http://maker/device;i=1001, or a browse path such as "
 _NODE: Final = re.compile(
     r"(?:ns=(?P<index>[0-9]{1,5});|nsu=(?P<uri>[^;]+);)?(?P<kind>[isgb])=(?P<identifier>.+)", re.DOTALL
+)
+_IDENTIFIER: Final = re.compile(r"((?:[^#]|##)*)(?:#([^#].*))?", re.DOTALL)
+_PATH: Final = re.compile(r"((?:[^#&]|&.)*)(?:#(.+))?", re.DOTALL)
+_MEMBER: Final = re.compile(
+    r"\[([0-9]{1,7}(?:,[0-9]{1,7})*)\]|(?:(?<=[\s\S])\.|(?<![\s\S]))((?:[^.\[\]#&]|&[.\[\]#&])+)"
 )
 _STEP: Final = re.compile(r"(?:([0-9]{1,5}):)?((?:[^/.<>:#!&]|&[/.<>:#!&])+)")
 
@@ -42,6 +52,8 @@ class BrowsePath:
 
 
 Address = NodeAddress | BrowsePath
+Member = tuple[str | tuple[int, ...], ...]
+"""The way from a structure to a member: the names of members, and the indices of elements."""
 
 
 def parse(text: str) -> Address:
@@ -51,18 +63,70 @@ def parse(text: str) -> Address:
         ValueError: The text is neither a node id nor a browse path.
 
     """
+    address, member = parse_member(text)
+    if member:
+        raise ValueError(f"{text!r} is a member of a structure, which only the connector opcua reads")
+    return address
+
+
+def parse_member(text: str) -> tuple[Address, Member]:
+    """Return the address of a node, and the way to a member of its structure; empty for the node's whole value.
+
+    Raises:
+        ValueError: The text is neither a node id nor a browse path, or the way is wrong.
+
+    """
     text = text.strip()
     if not text:
         raise ValueError(f"its `address` is missing; {_EXAMPLE}/Objects/2:Device/2:Speed")
     if text.startswith("/"):
-        return _browse_path(text)
+        parts = _PATH.fullmatch(text)
+        if parts is None:
+            return _browse_path(text), ()
+        return _browse_path(parts[1]), _member(text, parts[2])
     found = _NODE.fullmatch(text)
     if found is None:
         raise ValueError(f"{text!r} is no address of OPC UA; {_EXAMPLE}/Objects/2:Device/2:Speed")
     namespace: int | str = unescaped_uri(found["uri"] or "") or int(found["index"] or 0)
     if isinstance(namespace, int) and namespace > 0xFFFF:
         raise ValueError(f"{text!r}: namespaces have numbers up to 65535")
-    return NodeAddress(namespace, _identifier(text, found["kind"], found["identifier"]))
+    parts = _IDENTIFIER.fullmatch(found["identifier"])
+    if parts is None or not parts[1]:
+        raise ValueError(f"{text!r}: a # precedes the member of a structure; write ## for a # of the identifier")
+    identifier = _identifier(text, found["kind"], parts[1].replace("##", "#"))
+    return NodeAddress(namespace, identifier), _member(text, parts[2])
+
+
+def node_text(text: str) -> str:
+    """Return a node id as an address has it."""
+    return text.replace("#", "##")
+
+
+def member_text(member: Member) -> str:
+    """Return the way to a member as an address has it, with its ``#``; empty for the whole value."""
+    steps = [
+        "." + re.sub(r"([.\[\]#&])", r"&\1", one) if isinstance(one, str) else f"[{','.join(map(str, one))}]"
+        for one in member
+    ]
+    return f"#{''.join(steps).removeprefix('.')}" if steps else ""
+
+
+def _member(text: str, way: str | None) -> Member:
+    """Return the steps to a member. ValueError: the way is wrong."""
+    steps: list[str | tuple[int, ...]] = []
+    at = 0
+    while way and at < len(way):
+        found = _MEMBER.match(way, at)
+        if found is None:
+            raise ValueError(
+                f"{text!r}: the way to the member is wrong at {way[at : at + 20]!r}; write it as #Motor.Forces or "
+                "#[0].Speed, and & before one of . [ ] # & in a name"
+            )
+        steps.append(re.sub(r"&(.)", r"\1", found[2]) if found[2] else tuple(map(int, found[1].split(","))))
+        at = found.end()
+    if len(steps) > MAX_STEPS:
+        raise ValueError(f"{text[:40]!r}…: the way to a member has at most {MAX_STEPS} steps")
+    return tuple(steps)
 
 
 def escaped_uri(uri: str) -> str:

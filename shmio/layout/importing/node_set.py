@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Final
 from xml.etree.ElementTree import Element
 
-from shmio.layout.addresses.opcua import escaped_uri
+from shmio.layout.addresses.opcua import escaped_uri, node_text
 from shmio.layout.importing.found import Found, ImportingError
 
 ROOT: Final = "UANodeSet"
@@ -87,8 +87,8 @@ class _Model:
         """Return a node id with its namespace's URI: servers number namespaces differently."""
         match = _NODE.fullmatch(key)
         if match is None or int(match[1]) >= len(self.uris):
-            return key
-        return f"nsu={escaped_uri(self.uris[int(match[1])])};{match[2]}"
+            return node_text(key)
+        return f"nsu={escaped_uri(self.uris[int(match[1])])};{node_text(match[2])}"
 
 
 def read(root: Element) -> Found:

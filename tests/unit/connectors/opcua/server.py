@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from asyncua import Server, ua
+from asyncua.common.structures104 import new_enum, new_struct, new_struct_field
 from asyncua.common.utils import ServiceError
 from asyncua.crypto.permission_rules import User, UserRole
 from asyncua.server.internal_session import InternalSession
@@ -38,6 +39,8 @@ class Device:
     def __init__(self, server: Server) -> None:
         self.server = server
         self.counting: asyncio.Task[None] | None = None
+        self.types: dict[str, Any] = {}
+        self.structures: set[str] = set()
 
     def node(self, name: str) -> Any:
         return self.server.get_node(ua.NodeId(name, 2))
@@ -50,6 +53,35 @@ class Device:
         made = await parent.add_variable(ua.NodeId(name, 2), f"2:{name}", variant, None, of_type)
         if writable:
             await made.set_writable()
+
+    async def define(self, name: str, fields: list[tuple[str, str, str]], union: bool = False) -> None:
+        """Define a structure of fields: name, type or another structure, and ``optional``, ``array`` or nothing."""
+        made = []
+        for one, kind, how in fields:
+            known = self.types.get(kind)
+            data_type = known if known is not None else ua.VariantType[kind]
+            made.append(new_struct_field(one, data_type, array="array" in how, optional="optional" in how))
+        node, _ = await new_struct(self.server, 2, name, made, is_union=union)
+        self.types[name] = node
+        await self.server.load_data_type_definitions()
+
+    async def enumerate(self, name: str, *values: str) -> None:
+        """Define an enumeration."""
+        self.types[name] = await new_enum(self.server, 2, name, list(values))
+        await self.server.load_data_type_definitions()
+
+    async def structure(self, name: str, data_type: str, value: Any) -> None:
+        """Add a variable that is a structure, or an array of them, or set its value."""
+        made = (
+            [_structure(data_type, one) for one in value] if isinstance(value, list) else _structure(data_type, value)
+        )
+        variant = ua.Variant(made, ua.VariantType.ExtensionObject)
+        if name in self.structures:
+            await self.node(name).write_value(variant)
+            return
+        self.structures.add(name)
+        of_type = self.types[data_type].nodeid
+        await self.node("Device").add_variable(ua.NodeId(name, 2), f"2:{name}", variant, None, of_type)
 
     async def set(self, name: str, kind: str, value: Any, code: int = 0, source_s: float = 0) -> None:
         data = ua.DataValue(_variant(kind, value), ua.StatusCode(code))
@@ -192,6 +224,19 @@ class Device:
     async def clients(self) -> int:
         """Return the number of sessions of clients."""
         return len(self.server.iserver._external_sessions)
+
+
+def _structure(data_type: str, value: Any) -> Any:
+    """Make a structure of the values of its fields; ``[name, values]`` is a structure in it."""
+    made = getattr(ua, data_type)()
+    for name, given in value.items():
+        inner = given
+        if isinstance(given, list) and given and isinstance(given[0], str) and isinstance(given[-1], dict):
+            inner = (
+                _structure(given[0], given[1]) if len(given) == 2 else [_structure(given[0], one) for one in given[1:]]
+            )
+        setattr(made, name, inner)
+    return made
 
 
 def _variant(kind: str, value: Any) -> ua.Variant:

@@ -1,14 +1,20 @@
 // Serves the nodes that a file describes, as an S7-1500 names them; prints its port, and ends with its standard input.
 // Usage: node opcua_server.js PORT FOLDER NODES.json [secured]; a node is {"id", "type", "value", "writable"}.
+// With {"id", "structure", "value"}, a node is a structure of opcua_structures.xml, or an array of them.
 // A secured server also has an encrypted endpoint, and rejects there clients whose certificates are not in its folder.
 'use strict';
 
 const fs = require('fs');
+const path = require('path');
 const opcua = require('node-opcua-server');
 const { DataType, MessageSecurityMode, SecurityPolicy, VariantArrayType } = require('node-opcua-client');
 const { OPCUACertificateManager } = require('node-opcua-certificate-manager');
+const { nodesets } = require('node-opcua-nodesets');
 
 const [port, folder, file, secured] = process.argv.slice(2);
+
+const nodes = JSON.parse(fs.readFileSync(file));
+const structures = nodes.some((one) => one.structure) ? [path.join(__dirname, 'opcua_structures.xml')] : [];
 
 async function main() {
   const certificates = new OPCUACertificateManager({ rootFolder: folder, automaticallyAcceptUnknownCertificate: !secured });
@@ -20,13 +26,27 @@ async function main() {
     securityPolicies: [SecurityPolicy.None, ...(secured ? [SecurityPolicy.Basic256Sha256] : [])],
     serverCertificateManager: certificates,
     disableDiscovery: true,
+    nodeset_filename: [nodesets.standard, ...structures],
   });
   await server.initialize();
   const space = server.engine.addressSpace;
   space.registerNamespace('http://test/other');
   const names = space.registerNamespace('http://www.siemens.com/simatic-s7-opcua');
   const device = names.addObject({ organizedBy: space.rootFolder.objects, browseName: 'PLC', nodeId: 's=PLC' });
-  for (const { id, type, value, writable } of JSON.parse(fs.readFileSync(file))) {
+  for (const { id, type, value, writable, structure } of nodes) {
+    if (structure) {
+      const dataType = space.findDataType(structure, space.getNamespaceIndex('http://test/structures'));
+      const made = (one) => space.constructExtensionObject(dataType, one);
+      const array = Array.isArray(value);
+      names.addVariable({
+        componentOf: device, browseName: id, nodeId: `s=${id}`, dataType: dataType.nodeId, valueRank: array ? 1 : -1,
+        value: {
+          dataType: DataType.ExtensionObject, arrayType: array ? VariantArrayType.Array : VariantArrayType.Scalar,
+          value: array ? value.map(made) : made(value),
+        },
+      });
+      continue;
+    }
     const dataType = DataType[type];
     const array = Array.isArray(value) && type !== 'Int64'; // one is [high, low]
     const held = type === 'DateTime' ? new Date(value) : value;

@@ -4,7 +4,7 @@ import uuid
 
 import pytest
 
-from shmio.layout.addresses.opcua import BrowsePath, NodeAddress, parse
+from shmio.layout.addresses.opcua import BrowsePath, NodeAddress, member_text, node_text, parse, parse_member
 
 GUID = "72962b91-fa75-4ae6-8d28-b404dc7daf63"
 
@@ -48,3 +48,33 @@ def test_addresses(text: str, expected: object) -> None:
 def test_wrong_addresses_are_explained(text: str, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         parse(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "node", "member"),
+    [
+        ("ns=2;s=Pump#Axis.Speed", NodeAddress(2, "Pump"), ("Axis", "Speed")),
+        ("ns=2;s=a##b###Axes[3].X", NodeAddress(2, "a#b#"), ("Axes", (3,), "X")),
+        ("nsu=http://x/#a;i=5#[0].Grid[1,2]", NodeAddress("http://x/#a", 5), ((0,), "Grid", (1, 2))),
+        ("/Objects/2:a&#b#&[&].c", BrowsePath(((0, "Objects"), (2, "a#b"))), ("[]", "c")),
+        ("i=5#a&.b&#&&", NodeAddress(0, 5), ("a.b#&",)),
+        ("i=5", NodeAddress(0, 5), ()),
+    ],
+)
+def test_members_of_structures(text: str, node: object, member: object) -> None:
+    found = parse_member(text)
+    assert found == (node, member)
+    if member:
+        with pytest.raises(ValueError, match="a member of a structure"):
+            parse(text)
+        assert parse_member(f"i=1{member_text(found[1])}")[1] == member
+
+
+def test_a_number_sign_in_an_identifier_is_doubled() -> None:
+    assert parse(f"ns=2;{node_text('s=a#b##')}") == NodeAddress(2, "a#b##")
+
+
+@pytest.mark.parametrize("text", ["i=5#", "i=5#.a", "i=5#a..b", "i=5#a[x]", "i=5#a[1", "i=5#a]", "i=5#a" + ".a" * 64])
+def test_wrong_ways_to_members_are_explained(text: str) -> None:
+    with pytest.raises(ValueError, match="member"):
+        parse_member(text)

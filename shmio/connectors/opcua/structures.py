@@ -1,0 +1,356 @@
+"""Reads structures by the definitions that a server offers of their data types (OPC 10000-6, section 5.2.7).
+
+A definition comes from a server as well as the structure does, so each may be anything: the bytes of a
+structure must have exactly the length that its definition demands, or none of its members has a value.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+from shmio.connectors.opcua import decode as ua
+from shmio.connectors.opcua.decode import Extension, MalformedError, NodeKey, Reader, Sample, node_key
+from shmio.connectors.opcua.values import MismatchError
+from shmio.layout.addresses.opcua import Member, member_text
+
+MAX_DEPTH: Final = 16
+"""Maximum number of structures inside each other."""
+MAX_VALUES: Final = 100_000
+"""Maximum number of members and elements of a structure, except for the elements of arrays of numbers."""
+_MAX_FIELDS: Final = 1000
+_MAX_RANK: Final = 6
+_MAX_NAMED: Final = 10
+_MAX_OPTIONAL: Final = 32
+_STRUCTURE_DEFINITION: Final = 122
+_PLAIN, _OPTIONAL, _UNION = 0, 1, 2
+NULL: Final[NodeKey] = (2, 0, 0)
+"""The node id of nothing."""
+
+
+class DefinedField(NamedTuple):
+    """A field as the definition of a data type declares it."""
+
+    name: str
+    data_type: NodeKey
+    rank: int
+    """As a value rank of OPC UA: -1 for a scalar, else the number of dimensions."""
+    optional: bool
+
+
+class Definition(NamedTuple):
+    """Definition of a data type that is a structure, with the node id of its binary encoding."""
+
+    encoding: NodeKey
+    form: int
+    fields: tuple[DefinedField, ...]
+
+
+class Field(NamedTuple):
+    """A member of a structure; ``kind`` is its built-in type unless it is a structure itself."""
+
+    name: str
+    kind: int
+    structure: Structure | None
+    rank: int
+    """Number of dimensions; 0: a scalar."""
+    optional: bool
+
+
+@dataclass(eq=False)
+class Structure:
+    """A data type that is a structure, with all that is needed to read its values."""
+
+    name: str
+    form: int = _PLAIN
+    fields: list[Field] = field(default_factory=list)
+    fault: str = ""
+    """Why its values cannot be read; empty if they can."""
+
+    @property
+    def is_union(self) -> bool:
+        """True if a value has one member, or none."""
+        return self.form == _UNION
+
+
+class Members(NamedTuple):
+    """Value of a structure. A member that this value does not have is None."""
+
+    structure: Structure
+    values: dict[str, Found | None]
+
+
+class Elements(NamedTuple):
+    """Value of an array of structures."""
+
+    values: list[Members]
+    dims: tuple[int, ...]
+
+
+Found = Sample | Members | Elements
+
+
+def read_definition(sample: Sample) -> Definition | None:
+    """Return the definition in the attribute DataTypeDefinition; None: it defines no structure.
+
+    Raises:
+        MalformedError: It does not follow the protocol.
+
+    """
+    value = sample.value
+    if sample.kind != ua.EXTENSION or not isinstance(value, Extension):
+        return None
+    if Reader(value.encoding).type_id() != _STRUCTURE_DEFINITION:
+        return None
+    reader = Reader(value.body)
+    encoding = node_key(reader.node_id())
+    reader.node_id()  # the base type, whose fields are among these
+    form = reader.i32()
+    if (count := reader.count(20)) > _MAX_FIELDS:
+        raise MalformedError(f"a structure has more than {_MAX_FIELDS} members")
+    return Definition(encoding, form, tuple(_defined_field(reader) for _ in range(count)))
+
+
+def _defined_field(reader: Reader) -> DefinedField:
+    name = reader.text()
+    reader.scalar(ua.LOCALIZED_TEXT, 0)
+    data_type, rank = node_key(reader.node_id()), reader.i32()
+    reader.skip(4 * reader.count(4))
+    reader.skip(4)  # the maximum length of texts
+    return DefinedField(name, data_type, rank, bool(reader.u8()))
+
+
+def complete(structure: Structure, form: int, fields: list[Field]) -> None:
+    """Give a structure its fields, and find out whether its values can be read."""
+    structure.form, structure.fields = form, fields
+    names = [one.name for one in fields]
+    if form not in (_PLAIN, _OPTIONAL, _UNION):
+        structure.fault = "it may have values of other types than its definition says, which cannot be read"
+    elif form == _OPTIONAL and sum(one.optional for one in fields) > _MAX_OPTIONAL:
+        structure.fault = f"it has more than {_MAX_OPTIONAL} optional members"
+    elif len({*names}) < len(names) or not all(names):
+        structure.fault = "its members have no names of their own"
+    for one in fields:
+        if not structure.fault and not 0 <= one.rank <= _MAX_RANK:
+            structure.fault = f"its definition does not say whether {one.name} is an array"
+        if not structure.fault and not one.kind and one.structure is None:
+            structure.fault = f"the server does not define the type of {one.name}"
+
+
+def _read(structure: Structure, reading: _Reading) -> Members:
+    """Read the body of a structure. MismatchError: the definition does not fit it, or cannot be used."""
+    try:
+        found = reading.members(structure, 0)
+    except MalformedError as error:
+        raise MismatchError(f"the structure {structure.name} is not as the server defines it") from error
+    if reading.left:
+        raise MismatchError(f"the structure {structure.name} is longer than the server defines it")
+    return found
+
+
+class _Reading(Reader):
+    """Reads the body of a structure."""
+
+    def __init__(self, data: bytes, values: int) -> None:
+        super().__init__(data)
+        self.values_left = values
+        """Number of members and elements that it may still have."""
+
+    def _count(self, values: int) -> None:
+        self.values_left -= values
+        if self.values_left < 0:
+            raise MalformedError
+
+    def members(self, structure: Structure, depth: int) -> Members:
+        if structure.fault:
+            raise MismatchError(f"the structure {structure.name} cannot be read: {structure.fault}")
+        if depth >= MAX_DEPTH:
+            raise MalformedError
+        fields = structure.fields
+        self._count(1 + len(fields))
+        if structure.is_union:
+            chosen = self.u32()
+            if chosen > len(fields):
+                raise MalformedError
+            values: dict[str, Found | None] = {one.name: None for one in fields}
+            if chosen:
+                values[fields[chosen - 1].name] = self.field(fields[chosen - 1], depth)
+            return Members(structure, values)
+        mask = self.u32() if structure.form == _OPTIONAL else 0
+        values = {}
+        for one in fields:
+            if structure.form == _OPTIONAL and one.optional:
+                there, mask = mask & 1, mask >> 1
+                values[one.name] = self.field(one, depth) if there else None
+            else:
+                values[one.name] = self.field(one, depth)
+        if mask:
+            raise MalformedError
+        return Members(structure, values)
+
+    def field(self, one: Field, depth: int) -> Found:
+        inner, kind = one.structure, one.kind
+        if not one.rank:
+            if inner is not None:
+                return self.members(inner, depth + 1)
+            if kind == ua.VARIANT:
+                return Sample(*self.variant(depth), 0, 0)
+            return (
+                self.data_value(depth) if kind == ua.DATA_VALUE else Sample(kind, self.value(kind, depth), None, 0, 0)
+            )
+        least = 1 if inner is not None else ua.size_of(kind)
+        if one.rank == 1:
+            dims: tuple[int, ...] = (self.count(least),)
+        else:
+            if self.count(4) != one.rank:
+                raise MalformedError
+            dims = tuple(max(self.i32(), 0) for _ in range(one.rank))
+        count = math.prod(dims)
+        if count * least > self.left:
+            raise MalformedError
+        if inner is not None:
+            self._count(count)
+            return Elements([self.members(inner, depth + 1) for _ in range(count)], dims)
+        if least == 1:
+            self._count(count)
+        return Sample(kind, self.elements(kind, count, depth), dims, 0, 0)
+
+
+class AbsentError(ValueError):
+    """A node has no structure at present, or a structure does not have a member or an element."""
+
+
+def read_value(structures: Mapping[NodeKey, Structure], sample: Sample) -> Members | Elements:
+    """Return the value of a node that is a structure, or an array of structures.
+
+    Args:
+        structures: The known structures, by the node ids of their encodings.
+        sample: The value.
+
+    Raises:
+        MismatchError: It is no structure, or its definition is missing or does not fit.
+        AbsentError: It is null.
+
+    """
+    if sample.kind != ua.EXTENSION:
+        raise MismatchError(f"the node is {_named(sample)}, and no structure")
+    values: list[Extension] = sample.value if sample.dims is not None else [sample.value]
+    found: list[Members] = []
+    left = MAX_VALUES
+    for one in values:
+        encoding = node_key(Reader(one.encoding).node_id())
+        if encoding == NULL:
+            raise AbsentError("it has no value")
+        structure = structures.get(encoding)
+        if structure is None:
+            raise MismatchError("the server does not define the node's structure")
+        reading = _Reading(one.body, left)
+        found.append(_read(structure, reading))
+        left = reading.values_left
+    return found[0] if sample.dims is None else Elements(found, sample.dims)
+
+
+def find(found: Found, member: Member) -> Sample:
+    """Return the member of a structure.
+
+    Raises:
+        AbsentError: The value does not have this optional member, alternative of a union, or element.
+        MismatchError: The structure has no such member.
+
+    """
+    for place, step in enumerate(member):
+        here = member_text(member[:place])[1:] or "the value"
+        if isinstance(step, str):
+            if not isinstance(found, Members):
+                raise MismatchError(f"{here} is {_named(found)}, which has no member {step}")
+            if step not in found.values:
+                raise MismatchError(f"the structure {found.structure.name} has no member {step}; {_there(found)}")
+            inner = found.values[step]
+            if inner is None:
+                raise AbsentError("it has no such member at present")
+            found = inner
+        elif isinstance(found, Members) or found.dims is None or len(found.dims) != len(step):
+            raise MismatchError(f"{here} is {_named(found)}, which has no element [{','.join(map(str, step))}]")
+        else:
+            index = 0
+            for one, size in zip(step, found.dims, strict=True):
+                if one >= size:
+                    raise AbsentError("it has no such element at present")
+                index = index * size + one
+            element = found.values[index] if isinstance(found, Elements) else found.value[index]
+            if isinstance(element, Members):
+                found = element
+            else:
+                assert isinstance(found, Sample)  # noqa: S101 - for the type checker
+                found = found._replace(value=element, dims=None)
+    if not isinstance(found, Sample):
+        raise MismatchError(f"it is {_named(found)}: give the address of a member")
+    return found
+
+
+class Listed(NamedTuple):
+    """A member of a structure that may be a register; without a value, ``sample`` has only its type."""
+
+    member: Member
+    sample: Sample
+    refused: str
+    """Why it cannot be a register; empty if it may."""
+
+
+def members_of(found: Members | Elements) -> Iterator[Listed]:
+    """Yield the members of a structure, and of the structures in it. There may be very many: take only some."""
+    if isinstance(found, Members):
+        yield from _listed(found.structure, found, (), ())
+    elif found.values:
+        yield from _listed(found.values[0].structure, found, (), ())
+    else:
+        yield Listed((), Sample(ua.EXTENSION, None, None, 0, 0), "an array without elements")
+
+
+def _listed(
+    structure: Structure, found: Found | None, member: Member, outer: tuple[Structure, ...]
+) -> Iterator[Listed]:
+    """Yield the members of a structure; if ``found`` is None, those that its definition allows."""
+    refused = structure.fault
+    if not refused and not structure.fields:
+        refused = "a structure without members"
+    elif structure in outer and found is None:
+        refused = "a structure that contains itself"
+    elif len(outer) >= MAX_DEPTH:
+        refused = f"structures deeper than {MAX_DEPTH} levels"
+    elif isinstance(found, Elements) and not found.values:
+        refused = "an array without elements"
+    if refused:
+        yield Listed(member, Sample(ua.EXTENSION, None, None, 0, 0), refused)
+        return
+    if isinstance(found, Elements):
+        for index, element in zip(itertools.product(*map(range, found.dims)), found.values, strict=True):
+            yield from _listed(element.structure, element, (*member, index), outer)
+        return
+    for one in structure.fields:
+        here = (*member, one.name)
+        value = found.values.get(one.name) if isinstance(found, Members) else None
+        if one.structure is not None:
+            inner = Elements([], ()) if one.rank and value is None else value
+            yield from _listed(one.structure, inner, here, (*outer, structure))
+        elif isinstance(value, Sample):
+            yield Listed(here, value, "")
+        else:
+            yield Listed(here, Sample(one.kind, None, (0,) * one.rank if one.rank else None, 0, 0), "")
+
+
+def _named(found: Found) -> str:
+    if isinstance(found, Members):
+        return f"the structure {found.structure.name}"
+    if isinstance(found, Elements):
+        return f"an array of {len(found.values)} structures"
+    name = ua.NAMES[found.kind] if found.kind < len(ua.NAMES) else f"type {found.kind}"
+    return f"a {name}" if found.dims is None else f"an array of {name}"
+
+
+def _there(found: Members) -> str:
+    names = [*found.values]
+    return f"it has {', '.join(names[:_MAX_NAMED])}{', …' if len(names) > _MAX_NAMED else ''}"
