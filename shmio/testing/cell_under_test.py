@@ -7,7 +7,7 @@ import os
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import groupby
 from math import ceil
 from pathlib import Path
@@ -37,7 +37,7 @@ from shmio.recorder.file_output import Output
 from shmio.recorder.instance_follower import InstanceEntry, InstanceFollower, StartPositions
 from shmio.recorder.recorder import CLOSE_S, ConfigFiles, Recorder
 from shmio.recording.injection_times import InjectionTimes
-from shmio.segment import Block, Event, Frame, Quality, Segment
+from shmio.segment import Block, Event, Frame, Quality, Segment, running_instances
 from shmio.segment.block import Layouts
 from shmio.testing.own_configuration import LOGS, OwnConfiguration
 
@@ -294,8 +294,13 @@ def running_cell(file: Path, folder: Path, title: str, *, real_time: bool = Fals
 
 
 def _stop(instance: str) -> None:
+    if instance not in running_instances():  # the test has stopped it
+        return
     with Segment.open(instance) as segment:
+        supervisor = segment.supervisor[0]
         stop(segment)
+    with suppress(ChildProcessError):
+        os.waitpid(supervisor, 0)  # start() does not wait for it
 
 
 @contextmanager
