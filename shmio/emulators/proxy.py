@@ -29,6 +29,7 @@ Edit = Callable[[bytes], bytes | None]
 Framing = Callable[[bytes | bytearray], int]
 
 _CHUNK = 1 << 16
+_MAX_CLIENTS = 256  # connections at a time: select() takes no descriptors above 1023
 _TIMEOUT_S = 10
 _MAX_QUEUED = 4 << 20  # bytes queued in one direction; then the sender has to wait
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER: close with RST
@@ -434,6 +435,9 @@ class FaultProxy:
 
     def _accept(self, listener: socket.socket) -> None:
         client, _ = listener.accept()
+        if len(self._links) + len(self._waiting) >= _MAX_CLIENTS:
+            client.close()
+            return
         self.accepted += 1
         if self._frozen:
             self._waiting.append(client)

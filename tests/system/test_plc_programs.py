@@ -47,7 +47,7 @@ def cell(tmp_path: Path) -> Iterator[CellUnderTest]:
     (plant / "line.py").write_text(PROGRAM)
     text = '[instance]\nname = "line"\n'
     for port, (kind, (run, lamp, scans, keys)) in enumerate(KINDS.items(), 1102):
-        rows = {
+        rows: dict[str, dict[str, object]] = {
             "run": {"type": "BOOL", "address": run, "writable": True},
             "lamp": {"type": "BOOL", "address": lamp},
             "scans": {"type": "INT", "address": scans},
