@@ -1,9 +1,9 @@
-"""Steps of an FMU a second: by FMPy alone, by shmio's model runner, and in an instance.
+"""Steps of FMUs a second: by FMPy alone, by shmio's model runner, and in an instance.
 
 FMPy simulates with its own loop and records the outputs. The runner makes the same steps, and has the outputs in its
 image. In the instance, a program on the host steps, and each step has a frame in the shared memory. The FMUs of the
 tests are compiled from C: a tank (FMI 2.0, 4 inputs and 5 outputs) and two axes (FMI 3.0, arrays, 6 inputs and 7
-outputs).
+outputs). In the last table, two tanks fill each other, and the A50 cell is computed beside them.
 """
 
 from __future__ import annotations
@@ -81,6 +81,56 @@ def by_runner(file: Path, count: int) -> Callable[[], float]:
     return sample
 
 
+COUPLED = """
+[[source]]
+name = "one"
+connector = "simulation"
+model = "{file.name}"
+folder = "{file.parent}"
+connections = {{ "pump.inflow" = "two/phase" }}
+[[source]]
+name = "two"
+connector = "simulation"
+model = "{file.name}"
+folder = "{file.parent}"
+connections = {{ "pump.inflow" = "one/phase" }}
+[[source]]
+name = "cell"
+connector = "simulation"
+model = "shmio.simulation.a50:A50Cell"
+"""
+
+
+def coupled_alone(file: Path, duration_s: float) -> Callable[[], float]:
+    """Make a sampler of the steps a second of two FMUs that a loop over FMPy couples, without the A50 cell."""
+    import fmpy  # noqa: PLC0415
+
+    folder = fmpy.extract(str(file), str(file.with_suffix("")))
+    description = fmpy.read_model_description(folder)
+    references = {variable.name: variable.valueReference for variable in description.modelVariables}
+    inflow, shown = [references["pump.inflow"]], [references["phase"], references["level"]]
+
+    def sample() -> float:
+        pair = [fmpy.instantiate_fmu(folder, description, "CoSimulation") for _ in range(2)]
+        for fmu in pair:
+            fmu.setupExperiment(startTime=0.0)
+            fmu.enterInitializationMode()
+            fmu.exitInitializationMode()
+        steps, begun_s = 0, time.perf_counter()
+        while (taken_s := time.perf_counter() - begun_s) < duration_s:
+            phases = [fmu.getReal(shown)[0] for fmu in pair]
+            for fmu, phase in zip(pair, reversed(phases), strict=True):
+                fmu.setReal(inflow, [phase])
+                fmu.doStep(steps * DT_NS / 1e9, DT_NS / 1e9)
+            steps += 1
+        for fmu in pair:
+            fmu.terminate()
+            fmu.freeInstance()
+        return steps / taken_s
+
+    return sample
+
+
 def main() -> None:
     quick = begin("FMUs: steps a second, next to FMPy alone")
     count, duration_s, rounds = (200, 0.2, 1) if quick else (20_000, 2.0, 7)
@@ -98,6 +148,14 @@ def main() -> None:
                     rounds,
                 )
             report(f"{name}.fmu: steps a second", samples, OURS, "more")
+        file = build("tank2", Path(folder))
+        with started([], more=COUPLED.format(file=file), clock="stepped") as running:
+            ours = "shmio, an instance with the A50 cell"
+            samples = interleave(
+                {ours: local(running.segment.instance, duration_s), "FMPy, in a loop": coupled_alone(file, duration_s)},
+                rounds,
+            )
+        report("two coupled tanks: steps a second", samples, ours, "more")
 
 
 if __name__ == "__main__":

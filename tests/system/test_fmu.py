@@ -83,6 +83,60 @@ def test_steps_equal_fmpy_and_the_fmu_ends_cleanly(
     assert not list(tmp_path.glob("shmio-fmu-*"))
 
 
+COUPLED = """
+[instance]
+name = "{instance}"
+clock = "stepped"
+
+[[source]]
+name = "one"
+connector = "simulation"
+model = "tank2.fmu"
+connections = {{ "pump.inflow" = "two/phase" }}
+
+[[source]]
+name = "two"
+connector = "simulation"
+model = "tank2.fmu"
+parameters = {{ area = 5.0 }}
+connections = {{ "pump.inflow" = "one/level" }}
+
+[grpc]
+listen = ["{grpc}"]
+"""
+
+
+def test_two_coupled_fmus_equal_a_loop_over_fmpy(make_cell: Callable[..., Cell], tmp_path: Path) -> None:
+    cell = make_cell(config=COUPLED)
+    file = build("tank2", cell.folder)
+    cell.up()
+    levels = []
+    with shmio.attach(cell.instance, writable=True) as attached:
+        for _ in range(30):
+            attached.step(dt_s=0.02)
+            levels.append([attached["one/level"], attached["two/level"]])
+    folder = fmpy.extract(str(file), str(tmp_path / "extracted"))
+    description = fmpy.read_model_description(folder)
+    reference = {one.name: one.valueReference for one in description.modelVariables}
+    pair = [fmpy.instantiate_fmu(folder, description, "CoSimulation") for _ in range(2)]
+    pair[1].setReal([reference["area"]], [5.0])
+    for fmu in pair:
+        fmu.setupExperiment(startTime=0.0)
+        fmu.enterInitializationMode()
+        fmu.exitInitializationMode()
+    theirs = []
+    for number in range(30):
+        given = [pair[1].getReal([reference["phase"]]), pair[0].getReal([reference["level"]])]
+        for fmu, value in zip(pair, given, strict=True):
+            fmu.setReal([reference["pump.inflow"]], value)
+            fmu.doStep(number * 0.02, (number + 1) * 0.02 - number * 0.02)
+        theirs.append([fmu.getReal([reference["level"]])[0] for fmu in pair])
+    for fmu in pair:
+        fmu.terminate()
+        fmu.freeInstance()
+    assert levels == theirs
+
+
 def test_an_fmu_that_crashes_fails_its_step_and_begins_again(make_tank: Callable[[str], Cell]) -> None:
     cell = make_tank("stepped")
     with shmio.attach(cell.instance, writable=True) as attached:

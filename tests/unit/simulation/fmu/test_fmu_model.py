@@ -244,8 +244,8 @@ def test_the_ranges_of_inputs_and_parameters_are_checked(run: Runner) -> None:
     with pytest.raises(ValueRangeError, match=r"^pump\.inflow: 5\.5 is outside the limits of -1 to 5"):
         runner.connect({"pump.inflow": 5.5})
     place = find(runner.layout, "pulses").offset
-    writes = [Write(place, 0, number.to_bytes(4, "little")) for number in (101, 100)]
-    assert runner.write(writes) == ["101 is outside the limits of 0 to 100", ""]
+    writes = [Write(place, 0, number.to_bytes(4, "little")) for number in (100, 101)]
+    assert runner.write(writes) == ["", "101 is outside the limits of 0 to 100"]
     assert value(runner, "pulses", runner.step(20 * MS, 20 * MS)) == 100
     for parameters, message in (
         ({"area": 0.0}, r"^parameters\.area: 0 is outside the limits of 0\.1 to inf"),
