@@ -39,7 +39,7 @@ COUNTERS: Final[Mapping[str, tuple[str, ...]]] = {
     "mqtt": ("messages", "commands", "refused", "waiting", "backlog", "dropped", "connects", "missed"),
     "opcua": ("sessions", "items", "writes", "refused"),
     "recorder": ("frames", "events", "missed", "bytes"),
-    "web": ("requests", "refused", "connections"),
+    "web": ("requests", "refused", "connections", "pages", "messages", "bytes"),
     "alerts": ("active", "notices", "suppressed", "waiting", "failed", "missed"),
 }
 """Names of a worker's counters, at most 8, by kind of process.

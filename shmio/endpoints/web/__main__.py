@@ -79,7 +79,8 @@ async def _serve(worker: Worker) -> None:
     worker.running()
     while not stopping.is_set():
         counters = server.counters
-        worker.report((counters.requests, counters.refused, counters.connections))
+        sent = (0, 0, 0) if page is None else page.counters
+        worker.report((counters.requests, counters.refused, counters.connections, *sent))
         try:
             await asyncio.wait_for(stopping.wait(), BEAT_S)
         except TimeoutError:

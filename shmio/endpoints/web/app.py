@@ -112,6 +112,11 @@ class PageApp:
         }
         self._files["/"] = self._files["/index.html"]
 
+    @property
+    def counters(self) -> tuple[int, int, int]:
+        """Number of open pages, and of messages and bytes that were sent to pages."""
+        return len(self._pages), self._served.messages, self._served.bytes
+
     def app(self, measurements: Measurements, registers: Sequence[str]) -> Starlette:
         """Return the routes of the application.
 

@@ -90,6 +90,9 @@ _COUNTERS: Final[Mapping[str, Mapping[str, _Named]]] = {
         "requests": _Named("shmio_web_requests", "Requests that were answered."),
         "refused": _Named("shmio_web_refused", "Requests and connections that were refused."),
         "connections": _Named("shmio_web_connections", "Connections that are open.", gauge=True),
+        "pages": _Named("shmio_web_pages", "Pages that are open.", gauge=True),
+        "messages": _Named("shmio_web_messages", "Messages that were sent to pages."),
+        "bytes": _Named("shmio_web_sent_bytes", "Bytes of the messages that were sent to pages."),
     },
     "alerts": {
         "active": _Named("shmio_alerts_active", "Alerts that are active.", gauge=True),

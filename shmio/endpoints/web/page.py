@@ -282,9 +282,14 @@ class Page:
                 await self._waiting.wait()
                 self._waiting.clear()
                 while self._answers:
-                    await self._socket.send_text(self._answers.popleft().decode())
+                    await self._socket.send_text(self._sent(self._answers.popleft()).decode())
                     self._room.release()
                 while self._newest:
-                    await self._socket.send_text(self._newest.pop(next(iter(self._newest))).decode())
+                    await self._socket.send_text(self._sent(self._newest.pop(next(iter(self._newest)))).decode())
                 while self._batches and not self._answers:
-                    await self._socket.send_bytes(self._batches.popleft())
+                    await self._socket.send_bytes(self._sent(self._batches.popleft()))
+
+    def _sent(self, message: bytes) -> bytes:
+        self.served.messages += 1
+        self.served.bytes += len(message)
+        return message

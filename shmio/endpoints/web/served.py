@@ -78,6 +78,8 @@ class Served:
         self.timeline = Timeline(segment)
         """The newest events."""
         self.recordings = Recordings(recordings)
+        self.messages = self.bytes = 0
+        """Messages that were sent to pages, and their bytes."""
         self._overview: dict[str, Any] = {}
         self._overview_s = -OVERVIEW_S
         self._usages: dict[int, _Usage] = {}

@@ -47,7 +47,7 @@ export class Lanes {
     this.lanes = [];
     this.times = element("span", { class: "dim" });
     this.pauseButton = element("button", { type: "button", click: () => this.pause(!this.paused) }, "Pause");
-    this.root = element("div", { class: "lanes" });
+    this.root = element("div", { class: "lanes", scroll: () => this.request() });
     this.resize = new ResizeObserver(() => this.request());
     this.resize.observe(this.root);
     this.theme = new MutationObserver(() => this.request());
@@ -248,7 +248,8 @@ export class Lanes {
     setTimeout(() => requestAnimationFrame(() => this.draw()), Math.max(0, REDRAW_MS - (performance.now() - this.drawnMs)));
   }
 
-  draw() {
+  /** @param {boolean} [all] Draw the lanes that are scrolled out of view as well. */
+  draw(all = false) {
     this.asked = false;
     this.drawnMs = performance.now();
     if (!this.paused && this.data.newest !== null) {
@@ -258,9 +259,15 @@ export class Lanes {
     const marks = this.data.marks();
     const view = { from: this.from, to: this.to, cursor: this.cursor, mark: this.mark, marks };
     let pixelS = 0;
-    for (const { paths, canvas, legend } of this.lanes) {
-      const scale = devicePixelRatio;
+    const scale = devicePixelRatio;
+    const seen = this.root.getBoundingClientRect();
+    const sizes = this.lanes.map(({ paths, canvas, legend, root }) => {
+      const { top, bottom } = root.getBoundingClientRect();
       const { clientWidth: width, clientHeight: height } = canvas;
+      return { paths, canvas, legend, width, height, visible: bottom > seen.top && top < seen.bottom };
+    }); // all of them before the first change, so that the browser computes the layout once
+    for (const { paths, canvas, legend, width, height, visible } of sizes) {
+      if (!visible && !all) continue;
       if (canvas.width !== Math.round(width * scale)) canvas.width = Math.round(width * scale);
       if (canvas.height !== Math.round(height * scale)) canvas.height = Math.round(height * scale);
       const pen = canvas.getContext("2d");
@@ -303,6 +310,7 @@ export class Lanes {
   savePicture() {
     const parts = this.lanes.map((lane) => lane.canvas);
     if (!parts.length) return;
+    this.draw(true);
     const scale = devicePixelRatio;
     const head = 22 * scale;
     const whole = document.createElement("canvas");
