@@ -236,6 +236,13 @@ def test_benchmark_of_reading_mqtt() -> None:
     assert len(re.findall(r"^(?:shmio|paho) +[1-9]\d* +\d+\.\d+", found, re.MULTILINE)) == 2, found
 
 
+def test_benchmark_of_reading_ros() -> None:
+    pytest.importorskip("cyclonedds")
+    found = printed("ros_read")
+    clients = r"^(?:rosbridge|websockets, json|ros2|cyclonedds) +[1-9]\d* +\d+\.\d+"
+    assert len(re.findall(clients, found, re.MULTILINE)) == 4, found
+
+
 def test_benchmark_of_the_web_page() -> None:
     pytest.importorskip("uvicorn")
     found = printed("web_page")
