@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 from collections.abc import Collection, Iterable, Iterator
 from itertools import islice
@@ -66,6 +67,8 @@ class Trees:
     def __init__(self) -> None:
         self._trees: dict[int, Node] = {}
         self._making = threading.Lock()
+        self.looking = asyncio.Lock()
+        """Held while rows are searched. Searches at the same time would delay all that pages get."""
 
     def of(self, block: Block, blocks: Iterable[Block]) -> Node:
         """Return the tree of a block. Trees of blocks that are none of ``blocks`` are forgotten."""

@@ -76,6 +76,7 @@ class Registers(Tab):
     def __init__(self, page: Page) -> None:
         super().__init__(page)
         self._cell: Attachment = page.served.cell
+        self._looking = asyncio.Lock()
         self._allowed: dict[int, bytes] = {}
         self._visible: list[tuple[str, Register]] = []
         self._sent: dict[str, list[Any]] = {}
@@ -91,7 +92,8 @@ class Registers(Tab):
     @call("read", Shown)
     async def rows(self, given: Shown) -> dict[str, Any]:
         """Return rows, and send the values of these rows from now on, whenever they change."""
-        found, total = await run_in_threadpool(self._rows, given)
+        async with self._looking, self.page.served.trees.looking:  # one at a time of a page, and of all pages
+            found, total = await run_in_threadpool(self._rows, given)
         self._show([(row.path, row.register) for row in found if row.register is not None])
         return {"first": given.first, "total": total, "rows": [self._describe(row) for row in found]}
 
