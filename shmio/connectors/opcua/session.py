@@ -817,7 +817,8 @@ class Session:
                 dead = await self._find_dead([item for item in self._items if item.subscription is not None])
                 if unknown:
                     await self._resolve(unknown)
-                await self._learn_again([item for item in self._items if item.unread or item in unknown])
+                again = {*unknown}
+                await self._learn_again([item for item in self._items if item.unread or item in again])
                 if subscribes:
                     await self._subscribe_again([item for item in (*unknown, *dead) if item.node is not None])
             except Exception as error:  # noqa: BLE001
