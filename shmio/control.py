@@ -52,6 +52,7 @@ _CHECK: Final = "… and {} more: shmio-supervisor check prints them"
 _REPLY: Final = "… and {} more"
 _MORE: Final = {
     "restart": _REPLY,
+    "change": _REPLY,
     "injections": _REPLY,
     "faults": _CHECK,
     "warnings": "… and {} more warnings: shmio-supervisor check prints them",

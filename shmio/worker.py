@@ -32,6 +32,7 @@ from shmio.segment import Activity, Report, Segment
 BEAT_S = 0.2
 ROLE_WAIT_S = 10.0
 MAX_SPEC_BYTES = 1 << 26
+STDIN = 0
 
 
 class Worker:
@@ -41,6 +42,7 @@ class Worker:
         self.name: str = spec["name"]
         self.kind: str = spec["kind"]
         self.config: dict[str, Any] = spec["config"]
+        self._revision = spec.get("revision", 0)
         self.stopping = threading.Event()
         self._on_stop: Callable[[], object] | None = None
         self._on_reread: Callable[[], object] | None = None
@@ -121,6 +123,22 @@ class Worker:
         if self._rereads:
             call()
 
+    def revised(self) -> dict[str, Any] | None:
+        """Return the configuration of a new description that the supervisor has written.
+
+        None if there is none since the start or the last call that returned one. The supervisor
+        writes it into the file that is this process's standard input, and then sends SIGHUP.
+        """
+        try:
+            spec = json.loads(os.pread(STDIN, MAX_SPEC_BYTES, 0))
+            revision, config = spec["revision"], spec["config"]
+        except (OSError, ValueError, KeyError, TypeError):  # a pipe, or it is being written
+            return None
+        if revision == self._revision or not isinstance(config, dict):
+            return None
+        self._revision = revision
+        return config
+
     def _install_signal_handlers(self) -> None:
         """Make SIGTERM set ``stopping``, and SIGHUP call what :meth:`on_reread` was given.
 
@@ -179,8 +197,7 @@ def _read_spec() -> dict[str, Any]:
     if sys.stdin.isatty():
         raise ConfigError("this module is a worker process: only shmio-supervisor can start it")
     try:
-        data = sys.stdin.buffer.read(MAX_SPEC_BYTES + 1)
-        sys.stdin.close()
+        data = sys.stdin.buffer.read(MAX_SPEC_BYTES + 1)  # it stays open for a new description
         if len(data) > MAX_SPEC_BYTES:
             raise ConfigError(f"the process description is larger than {MAX_SPEC_BYTES} bytes: the layout is too large")
         spec = json.loads(data)

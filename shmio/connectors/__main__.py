@@ -17,7 +17,7 @@ from shmio.connectors.injections import blocks_of, owner_of
 from shmio.connectors.models.stepped import PageClock, SteppedLoop, connected_inputs
 from shmio.connectors.poll_loop import Schedule, SourceLoop, WallClock
 from shmio.errors import ConfigError, ConnectorError
-from shmio.segment import Segment
+from shmio.segment import Activity, Segment
 from shmio.worker import BEAT_S, Worker
 
 if TYPE_CHECKING:
@@ -40,25 +40,56 @@ class _LoopHandle(NamedTuple):
 def run(worker: Worker) -> None:
     """Run the poll loop and the commands in two threads, and send reports from the calling thread.
 
-    Therefore, a method of the source that blocks delays neither commands nor reports.
+    Therefore, a method of the source that blocks delays neither commands nor reports. If the
+    supervisor writes a new configuration, another loop with it replaces the loop, and takes over
+    the connection to the device.
     """
     sys.setswitchinterval(SWITCH_S)
-    part = _loop_of(worker)
-    loop = part.loop
-    thread = threading.Thread(target=_guarded, args=(loop.run,), name="poll", daemon=True)
-    commands = threading.Thread(target=_guarded, args=(loop.commands.run,), name="commands", daemon=True)
-    thread.start()
-    commands.start()
+    woken = threading.Event()
+    worker.on_stop(woken.set)
+    worker.on_reread(woken.set)
+    running = _Running(_loop_of(worker))
     worker.running()
     rate = _Rate()
-    while not worker.stopping.wait(BEAT_S):
-        if not thread.is_alive() or not commands.is_alive():
+    while not worker.stopping.is_set():
+        woken.wait(BEAT_S)
+        woken.clear()
+        running.report(worker, rate)
+        if isinstance(running.part.loop, SourceLoop) and (config := worker.revised()) is not None:
+            part = _replaced(running, running.part.loop, worker, config, woken)
+            if part is None:
+                return
+            running = _Running(part)
+            worker.running()
+    running.stop()
+
+
+class _Running:
+    """The two threads of a loop."""
+
+    def __init__(self, part: _LoopHandle) -> None:
+        self.part = part
+        loop = part.loop
+        self.poll = threading.Thread(target=_guarded, args=(loop.run,), name="poll", daemon=True)
+        self.commands = threading.Thread(target=_guarded, args=(loop.commands.run,), name="commands", daemon=True)
+        self.poll.start()
+        self.commands.start()
+
+    def report(self, worker: Worker, rate: _Rate) -> None:
+        """Report that the loop runs.
+
+        Raises:
+            ConnectorError: It has ended.
+
+        """
+        if not self.poll.is_alive() or not self.commands.is_alive():
             raise ConnectorError("the poll loop or the command thread ended unexpectedly; its traceback is in the log")
+        loop = self.part.loop
         busy_s = _busy_s(loop.counters.busy_since_ns)
-        if busy_s > part.timeout_s + HANG_MARGIN_S:
-            continue  # without a heartbeat the supervisor replaces the process
+        if busy_s > self.part.timeout_s + HANG_MARGIN_S:
+            return  # without a heartbeat the supervisor replaces the process
         counters = loop.counters
-        note = f"a cycle takes longer than {part.timeout_s:g} s" if busy_s > part.timeout_s else loop.note
+        note = f"a cycle takes longer than {self.part.timeout_s:g} s" if busy_s > self.part.timeout_s else loop.note
         worker.report(
             (
                 counters.polls,
@@ -70,13 +101,55 @@ def run(worker: Worker) -> None:
             ),
             note=note,
         )
-    part.stop()
-    thread.join(timeout=min(part.timeout_s + 0.5, LAST_WORDS_S))
-    commands.join(timeout=1.0)
+
+    def stop(self, meanwhile: Callable[[], None] = lambda: None) -> bool:
+        """Stop the loop, and call ``meanwhile`` again and again; return whether it has ended."""
+        self.part.stop()
+        deadline_s = time.monotonic() + min(self.part.timeout_s + 0.5, LAST_WORDS_S)
+        while self.poll.is_alive() and (left_s := deadline_s - time.monotonic()) > 0:
+            self.poll.join(min(left_s, BEAT_S))
+            meanwhile()
+        self.commands.join(timeout=1.0)
+        return not self.poll.is_alive() and not self.commands.is_alive()
 
 
-def _loop_of(worker: Worker) -> _LoopHandle:
-    """Create the loop that runs this source."""
+def _replaced(
+    running: _Running, loop: SourceLoop, worker: Worker, config: dict[str, Any], woken: threading.Event
+) -> _LoopHandle | None:
+    """Stop a loop, wait until the supervisor has changed the segment, and return the next loop.
+
+    None: the process must stop. If the supervisor has died and has not changed the segment, the next
+    loop continues with the present configuration.
+
+    Raises:
+        ConnectorError: The loop does not end.
+
+    """
+    block, digest, supervisor = worker.segment.blocks[worker.name], worker.slot.digest, worker.segment.supervisor[0]
+    loop.keep()
+    if not running.stop(worker.report):
+        raise ConnectorError("the device did not answer in time for the reload; the process starts again")
+    worker.report(activity=Activity.PAUSED)
+    while not (block.retired or worker.slot.digest != digest):
+        if worker.stopping.is_set():
+            break
+        if not worker.segment.supervised or worker.segment.supervisor[0] != supervisor:
+            worker.log.warning("the supervisor ended during a reload; the source continues as before")
+            return _loop_of(worker, loop)
+        woken.wait(BEAT_S)
+        woken.clear()
+        worker.report()
+    if worker.stopping.is_set():
+        if loop.kept is not None:
+            loop.kept.close()
+        return None
+    worker.config = config
+    worker.segment.refresh()
+    return _loop_of(worker, loop)
+
+
+def _loop_of(worker: Worker, predecessor: SourceLoop | None = None) -> _LoopHandle:
+    """Create the loop that runs this source; ``predecessor``: the loop that it replaces."""
     segment, name = worker.segment, worker.config["connector"]
     found = registry.load(name)
     options = registry.convert_options(name, worker.config["options"])
@@ -96,7 +169,7 @@ def _loop_of(worker: Worker) -> _LoopHandle:
         armed = writer.block.attributes.armed
         loop = SourceLoop(
             source, writer, schedule, clock, writable,
-            allow_nonfinite=allow, armed=armed, owner_of=owners, blocks=blocks,
+            allow_nonfinite=allow, armed=armed, owner_of=owners, blocks=blocks, predecessor=predecessor,
         )  # fmt: skip
         return _LoopHandle(loop, clock.stop, source.timeout_s)
     page_clock = PageClock(segment.clock, worker.slot.index)

@@ -90,6 +90,13 @@ class Connector(ABC):
     A relative path starts at the folder of the configuration.
     """
 
+    register_options: ClassVar[frozenset[str] | None] = None
+    """The keys of ``Options`` that say what is read or written, and not how to connect.
+
+    If a reload changes only these and the layout, a new connector takes over the connection of the
+    old one by :meth:`take_over`. None: the connector cannot, and its process is restarted.
+    """
+
     @classmethod
     def for_layout(cls, layout: Layout) -> type[Connector]:  # noqa: ARG003  most read all layouts
         """Return the connector class for a layout; it has the same ``Options``.
@@ -140,6 +147,26 @@ class Connector(ABC):
             ConnectorError: The device cannot be reached.
 
         """
+
+    def take_over(self, other: Any) -> bool:  # noqa: ARG002  not every connector can
+        """Take over the open connection of another connector, instead of :meth:`connect`.
+
+        No answer to a request of the other connector may become a value of this one.
+
+        Args:
+            other: A connector of the same class. Its options are the same except for
+                ``register_options``. No read and no write of it is in flight. If this method
+                returns True, the connection no longer belongs to it.
+
+        Returns:
+            Whether this connector has taken over the connection. If not, the loop closes ``other``,
+            and connects.
+
+        Raises:
+            ConnectorError: The connection was lost.
+
+        """
+        return False
 
     @abstractmethod
     def read(self) -> bytes:

@@ -227,6 +227,7 @@ class SourceLoop:
         armed: bool = False,
         owner_of: OwnerOf = lambda _: None,
         blocks: Blocks | None = None,
+        predecessor: SourceLoop | None = None,
     ) -> None:
         """Create the loop.
 
@@ -240,9 +241,15 @@ class SourceLoop:
             armed: Whether injections may change what is written to the device.
             owner_of: Returns the process that uses a command queue.
             blocks: Returns the blocks of all sources.
+            predecessor: A loop that has ended, and whose counters this loop continues. If it has kept
+                its connection, this loop takes that over.
 
         """
         self._connector = connector
+        self._offered = None if predecessor is None else predecessor.kept
+        self.kept: Connector | None = None
+        """After the end of the loop, the connector with its open connection, if :meth:`keep` has asked for it."""
+        self._keep = False
         self._writer = writer
         self._schedule = schedule
         self._clock = clock
@@ -261,12 +268,19 @@ class SourceLoop:
         self._accepting = False
         self._in_flight: deque[_Submitted] = deque()
         self._quality_log = QualityLog(writer)
-        self.counters = Counters()
+        self.counters: Counters = Counters() if predecessor is None else predecessor.counters
 
     @property
     def note(self) -> str:
         """Why quality is not good; empty if it is."""
         return self._quality_log.note
+
+    def keep(self) -> None:
+        """At the end of the loop, keep the connection open, if nothing is in flight on it.
+
+        Call this before you stop the clock.
+        """
+        self._keep = True
 
     def run(self) -> None:
         """Poll until the clock tells the loop to stop, then publish that the source has stopped."""
@@ -280,10 +294,15 @@ class SourceLoop:
                     self.counters.overruns += 1
                 elif not self.poll(due.cycle):
                     break
+            if self._keep and self._settled():
+                self.kept = self._connector
         finally:
             self.commands.stop()
             self._confirm_last()
-            self._connector.close()
+            if self._offered is not None:
+                self._offered.close()
+            if self.kept is None:
+                self._connector.close()
             self._writer.cycle = max(self._writer.cycle, self._schedule.at(self._clock.now_ns()))
             self._disconnected(self._writer.cycle, "the source was stopped")
             self._writer.event(Record(EventKind.STOPPED))
@@ -380,10 +399,35 @@ class SourceLoop:
             self._retries = 0
 
     def _connect(self) -> None:
-        self._call(self._connector.connect)
+        if not self._taken_over():
+            self._call(self._connector.connect)
+            self.counters.connects += 1
         self._connected_ns = self._clock.now_ns()
-        self.counters.connects += 1
         self._accepting = False
+
+    def _taken_over(self) -> bool:
+        """Take over the connection of the predecessor, if it is offered; return whether this was done."""
+        if (other := self._offered) is None:
+            return False
+        self._offered = None
+        try:
+            return self._call(lambda: self._connector.take_over(other))
+        finally:
+            other.close()
+
+    def _settled(self) -> bool:
+        """Wait until nothing is in flight on the connection; return whether it is open and this is so."""
+        if self._connected_ns is None:
+            return False
+        try:
+            self._drain()
+            if self.commands.unconfirmed:
+                until_ns = time.monotonic_ns() + round(self._connector.timeout_s * 1e9)
+                self._call(lambda: self.commands.confirm(lambda: self._connector.confirm(until_ns)))
+        except ConnectorError as error:
+            log.warning("the connection cannot be kept: %s", error)
+            return False
+        return not self._in_flight and not self.commands.unconfirmed
 
     def _call(self, hook: Callable[[], _Result]) -> _Result:
         return self.counters.watch(self._clock.now_ns, hook)

@@ -146,6 +146,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
         computed=sources.computed,
         replayed=sources.replayed,
         remote=sources.remote,
+        register_options=sources.register_options,
         origin=origin,
         recordings=directory,
         scene=scene,

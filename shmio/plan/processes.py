@@ -93,6 +93,16 @@ class Job:
     log_format: str = "text"
     audit: AuditSettings | None = None
     """Where the process writes who did what; None: nowhere."""
+    connection: dict[str, Any] | None = None
+    """The part of a source's section that says how to connect to its device.
+
+    While it stays the same, the process can change without a new connection. None: it cannot.
+    """
+
+    def connects_like(self, other: Job) -> bool:
+        """Return whether a process with the other job can take over this job, and keep its connection."""
+        same = (self.log_file, self.log_format, self.audit) == (other.log_file, other.log_format, other.audit)
+        return same and self.connection is not None and self.connection == other.connection
 
     @property
     def rank(self) -> int:
@@ -110,11 +120,22 @@ class Job:
         """Return the JSON object that the process reads from its standard input."""
         return self._json(instance, epoch, self.config | (self.rules or {}))
 
+    def describe_again(self, instance: str, epoch: int, revision: int) -> bytes:
+        """Return the JSON object that replaces that of :meth:`describe` while the process runs.
+
+        Args:
+            instance: Name of the instance.
+            epoch: Epoch of the segment.
+            revision: A number that no earlier description of the process had; not 0.
+
+        """
+        return self._json(instance, epoch, self.config | (self.rules or {}), revision=revision)
+
     def identify(self, instance: str, epoch: int) -> bytes:
         """Return the part of the description that cannot change without starting a new process."""
         return self._json(instance, epoch, self.config)
 
-    def _json(self, instance: str, epoch: int, config: dict[str, Any]) -> bytes:
+    def _json(self, instance: str, epoch: int, config: dict[str, Any], **more: int) -> bytes:
         return msgspec.json.encode(
             {
                 "instance": instance,
@@ -125,6 +146,7 @@ class Job:
                 "log_format": self.log_format,
                 "audit": self.audit,
                 "config": config,
+                **more,
             },
             order="deterministic",  # compared with the description of an earlier supervisor
         )
@@ -174,6 +196,7 @@ def make_plan(
     computed: Collection[str] = (),
     replayed: Collection[str] = (),
     remote: Mapping[str, tuple[Sequence[str], Sequence[str]]] | None = None,
+    register_options: Mapping[str, tuple[str, Collection[str]]] | None = None,
     origin: Origin | None = None,
     recordings: Path | None = None,
     scene: Mapping[str, Any] | None = None,
@@ -193,6 +216,8 @@ def make_plan(
         replayed: Those of the computed sources that play a recording.
         remote: For sources that a remote program computes, by source name: patterns of their
             outputs and in-outs.
+        register_options: For sources that can change without a new connection, by source name: the name
+            of the connector's class, and the keys of ``options`` that may then change.
         origin: The clock's origin in a replayed recording; None if there is none.
         recordings: The directory of the configured recorder, also if the mode leaves it out; None if there is none.
         scene: The cell in 3D, which the web page draws; None if the configuration has none.
@@ -265,7 +290,8 @@ def make_plan(
         audit=audit,
         blocks=blocks,
         jobs=tuple(
-            _job(name, kind, log_dir / f"{name}.log", section, log_format, audit) for name, kind, section in sections
+            _job(name, kind, log_dir / f"{name}.log", section, log_format, audit, (register_options or {}).get(name))
+            for name, kind, section in sections
         ),
         warnings=tuple(warnings),
         stepped=config.instance.clock == "stepped",
@@ -334,8 +360,19 @@ def _mqtt(mqtt: Mqtt) -> list[tuple[str, str, dict[str, Any]]]:
 
 
 def _job(
-    name: str, kind: str, log_file: Path, section: dict[str, Any], log_format: str, audit: AuditSettings | None
+    name: str,
+    kind: str,
+    log_file: Path,
+    section: dict[str, Any],
+    log_format: str,
+    audit: AuditSettings | None,
+    changeable: tuple[str, Collection[str]] | None,
 ) -> Job:
     keys = RULES.get(kind)
     rules = None if keys is None else {key: value for key in keys if (value := section.pop(key))}
-    return Job(name, kind, log_file, section, rules, log_format, audit)
+    connection = None
+    if changeable is not None and kind == "source":
+        options = {key: value for key, value in section["options"].items() if key not in changeable[1]}
+        connection = {"class": changeable[0], "options": options}
+        connection |= {key: section[key] for key in ("connector", "realtime_priority")}
+    return Job(name, kind, log_file, section, rules, log_format, audit, connection)

@@ -39,6 +39,8 @@ class Sources(NamedTuple):
     """Sources that play a recording."""
     remote: dict[str, tuple[list[str], list[str]]]
     """For each source that a remote program computes: patterns of its outputs and in-outs."""
+    register_options: dict[str, tuple[str, frozenset[str]]]
+    """For each source that can change without a new connection: its connector's class and ``register_options``."""
 
 
 def check_sources(config: Config, files: LayoutFiles, recordings: Recordings, faults: Faults) -> Sources:
@@ -50,7 +52,7 @@ def check_sources(config: Config, files: LayoutFiles, recordings: Recordings, fa
     Returns:
         The layouts and the kinds of the sources.
     """
-    found = Sources({}, [], [], {})
+    found = Sources({}, [], [], {}, {})
     inputs: dict[int, tuple[str, ...]] = {}
     for index, source in enumerate(config.source):
         with faults.catching():
@@ -96,6 +98,9 @@ def _check_source(
         connector = connector.for_layout(layout)
         if connector.register_quality:
             layout = layout.with_statuses()
+        if connector.register_options is not None:
+            where = f"{connector.__module__}.{connector.__qualname__}"
+            found.register_options[source.name] = where, connector.register_options
         if options is not None and (paths := [name for name in connector.path_options if source.options[name]]):
             source.options |= {name: str(config.path(source.options[name])) for name in paths}
             options = msgspec.convert(source.options, connector.Options)

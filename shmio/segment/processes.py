@@ -81,6 +81,8 @@ class Activity(IntEnum):
     STARTING = 1
     RUNNING = 2
     STOPPING = 3
+    PAUSED = 4
+    """A source has stopped its loop, and waits until the supervisor has replaced its block."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +176,7 @@ class ProcessSlot:
         if data is None:
             return Report()
         pid, activity, started_ns, *counters, note = _REPORT.unpack(data)
-        return Report(pid, Activity(min(activity, Activity.STOPPING)), started_ns, tuple(counters), text(note))
+        return Report(pid, Activity(min(activity, Activity.PAUSED)), started_ns, tuple(counters), text(note))
 
     @report.setter
     def report(self, value: Report) -> None:

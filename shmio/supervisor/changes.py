@@ -19,13 +19,14 @@ from shmio.supervisor.fleet import Fleet, digest
 class Changes:
     """The differences between an instance and a plan, as names.
 
-    ``replaced`` processes stop and start.
+    ``replaced`` processes stop and start. ``changed`` sources keep their process and its connection.
     """
 
     kept: tuple[str, ...]
     started: tuple[str, ...]
     stopped: tuple[str, ...]
     replaced: tuple[str, ...]
+    changed: tuple[str, ...]
     add: tuple[BlockSpec, ...]
     retire: tuple[str, ...]
 
@@ -34,14 +35,14 @@ def reconcile(plan: Plan, epoch: int, fleet: Fleet, blocks: Iterable[Block]) -> 
     """Compare a plan with the present processes and blocks.
 
     A source is replaced together with its block, because the process of a source writes to one
-    block only.
+    block only. If the new source connects as before, its process goes on with the new block.
     """
     present = {block.source: block for block in blocks}
     add = tuple(spec for spec in plan.blocks if spec.source not in present or not _same(spec, present[spec.source]))
     planned = {spec.source for spec in plan.blocks}
     retire = (*(spec.source for spec in add if spec.source in present), *(n for n in present if n not in planned))
-    changed = {spec.source for spec in add}
-    kept, started, replaced = [], [], []
+    new_blocks = {spec.source for spec in add}
+    kept, started, replaced, changed = [], [], [], []
     processes = {managed.name: managed for managed in fleet}
     stopped = [name for name in processes if name not in {job.name for job in plan.jobs}]
     for job in plan.jobs:
@@ -54,12 +55,14 @@ def reconcile(plan: Plan, epoch: int, fleet: Fleet, blocks: Iterable[Block]) -> 
         elif (
             there.well
             and there.slot.digest == digest(job.identify(plan.instance, epoch))
-            and not (job.kind == "source" and job.name in changed)
+            and not (job.kind == "source" and job.name in new_blocks)
         ):
             kept.append(job.name)
+        elif there.can_follow(job):
+            changed.append(job.name)
         else:
             replaced.append(job.name)
-    return Changes(tuple(kept), tuple(started), tuple(stopped), tuple(replaced), add, retire)
+    return Changes(tuple(kept), tuple(started), tuple(stopped), tuple(replaced), tuple(changed), add, retire)
 
 
 def _same(spec: BlockSpec, block: Block) -> bool:
@@ -130,6 +133,7 @@ def preview(plan: Plan, running: Plan, epoch: int, fleet: Fleet, segment: Segmen
         "stop": list(changes.stopped),
         "start": list(changes.started),
         "restart": [f"{name}: {'; '.join(_reasons(name, plan, running, fleet))}" for name in changes.replaced],
+        "change": [f"{name}: {'; '.join(_reasons(name, plan, running, fleet))}" for name in changes.changed],
         "injections": list(_changed_injections(plan, running)),
         "reread": [name for name in changes.kept if fleet.named(name).rereads(jobs[name])],
         "keep": list(changes.kept),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import logging
 import os
@@ -94,6 +95,22 @@ class ManagedProcess:
         known = job.rules or (self._job and self._job.rules)
         return bool(self.child is not None and job.rules is not None and known)
 
+    def can_follow(self, job: Job) -> bool:
+        """Return whether the running process can take over a job and keep its connection to the device."""
+        known = self._job is not None and job.connects_like(self._job)
+        return known and self.ready and self.life.state is State.RUNNING
+
+    def follow(self, job: Job) -> None:
+        """Continue the process with a job that it has received, and wake it."""
+        self._job = job
+        if self.child is not None:
+            self.child.reread()
+
+    def reports(self, activity: Activity) -> bool:
+        """Return whether the present process has reported this activity last."""
+        report = self.slot.report
+        return self.child is not None and report.pid == self.child.pid and report.activity is activity
+
     def adopt(self, child: AdoptedProcess) -> None:
         """Adopt a running process that another supervisor has started."""
         supervised = self.slot.supervised
@@ -111,8 +128,7 @@ class ManagedProcess:
 
         Reports of its predecessor do not count.
         """
-        report = self.slot.report
-        return self.child is not None and report.pid == self.child.pid and report.activity is Activity.RUNNING
+        return self.reports(Activity.RUNNING)
 
     @property
     def advice(self) -> str:
@@ -242,6 +258,23 @@ class Fleet:
             slot = self._segment.processes.add(ProcessSpec(job.name, job.kind))
             managed = self._managed[job.name] = ManagedProcess(slot)
         managed.renew(job)
+
+    def offer(self, managed: ManagedProcess, job: Job) -> None:
+        """Give a running process the description of another job.
+
+        Raises:
+            OSError: This is not possible.
+
+        """
+        if managed.child is None:
+            raise ProcessLookupError(errno.ESRCH, "it has ended")
+        place = self._segment.instance, self._segment.header.epoch
+        managed.child.describe_again(job.describe_again(*place, time.monotonic_ns()))
+
+    def follow(self, managed: ManagedProcess, job: Job) -> None:
+        """Let a process that waits continue with the job that it was offered."""
+        managed.slot.digest = digest(job.identify(self._segment.instance, self._segment.header.epoch))
+        managed.follow(job)
 
     def drop(self, name: str) -> None:
         """Forget a process that has ended, and free its slot."""

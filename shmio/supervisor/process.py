@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import select
@@ -15,6 +16,7 @@ import shmio
 
 NOTIFY_VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
 """Variables of the service manager: sd_notify(3), sd_watchdog_enabled(3)."""
+_DESCRIPTION = "description"
 _PACKAGED = ("site-packages", "dist-packages")
 _TAIL_BYTES = 4096
 _STAMP = re.compile(r"^\S+Z [A-Z]+ +\S+\[\d+\] ")  # beginning of a line of shmio.logs
@@ -47,7 +49,7 @@ class ChildProcess:
         try:
             log_size = os.fstat(log).st_size
             # A file in memory, not a pipe: a child that does not read cannot block the supervisor.
-            stdin = os.memfd_create("description")
+            stdin = os.memfd_create(_DESCRIPTION)
             try:
                 os.write(stdin, description)
                 os.lseek(stdin, 0, os.SEEK_SET)
@@ -72,6 +74,16 @@ class ChildProcess:
     def reread(self) -> None:
         """Send SIGHUP, which makes the process read its rules again."""
         self._popen.send_signal(signal.SIGHUP)
+
+    def describe_again(self, description: bytes) -> None:
+        """Replace the process's description, and signal it.
+
+        Raises:
+            OSError: The process cannot be given a new description.
+
+        """
+        _write_description(self.pid, self.pidfd, description)
+        self.reread()
 
     def kill(self) -> None:
         """Send SIGKILL."""
@@ -124,6 +136,16 @@ class AdoptedProcess:
         """Send SIGHUP, which makes the process read its rules again."""
         self._send(signal.SIGHUP)
 
+    def describe_again(self, description: bytes) -> None:
+        """Replace the process's description, and signal it.
+
+        Raises:
+            OSError: The process cannot be given a new description.
+
+        """
+        _write_description(self.pid, self.pidfd, description)
+        self.reread()
+
     def kill(self) -> None:
         """Send SIGKILL."""
         self._send(signal.SIGKILL)
@@ -144,6 +166,28 @@ class AdoptedProcess:
     def last_words(self) -> str:
         """Return "", because it is not known which lines of the log file are from this process."""
         return ""
+
+
+def _write_description(pid: int, pidfd: int, description: bytes) -> None:
+    """Replace the contents of the file in memory that is a process's standard input.
+
+    This also reaches a process that another supervisor has started.
+
+    Raises:
+        OSError: The process has ended, or its standard input is not such a file.
+
+    """
+    path = Path(f"/proc/{pid}/fd/0")
+    if not str(path.readlink()).startswith(f"/memfd:{_DESCRIPTION}"):
+        raise OSError(errno.EBADF, "its standard input is not its description")
+    file = os.open(path, os.O_WRONLY | os.O_CLOEXEC)
+    try:
+        if select.select([pidfd], [], [], 0)[0]:  # then the file may be that of another process with this pid
+            raise ProcessLookupError(errno.ESRCH, "it has ended")
+        os.ftruncate(file, 0)
+        os.pwrite(file, description, 0)
+    finally:
+        os.close(file)
 
 
 def _open_log(file: Path) -> int:

@@ -9,19 +9,91 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from typing import Final
 
 from shmio.control import Answer
 from shmio.errors import ShmioError
 from shmio.logs import fields
 from shmio.plan.processes import Job, Plan
-from shmio.segment import Block, Segment
+from shmio.segment import Activity, Block, Segment
 from shmio.supervisor import policy
 from shmio.supervisor.changes import injection_changes, preview, reconcile, refusal
 from shmio.supervisor.fleet import Fleet, brief, log
 from shmio.supervisor.health import Notifier
 from shmio.supervisor.policy import Event, Limits, State
 
+PAUSE_S: Final = 6.0
+"""Time-out in s until a source whose registers change waits for its new block; then it is restarted."""
+FOLLOW_S: Final = 20.0
+"""Time-out in s until it runs with its new block; then it is restarted."""
 _SETTLED = (State.RUNNING, State.BACKOFF, State.FATAL, State.STOPPED)
+
+
+class _Followers:
+    """The sources that keep their process and its connection, while their registers change.
+
+    Each receives its new description, ends its loop and pauses. When the segment has been changed, it
+    continues with its new block. A process that ends or takes too long is restarted instead, so that
+    nothing waits for it for ever.
+    """
+
+    def __init__(self, fleet: Fleet, jobs: list[Job]) -> None:
+        self._fleet = fleet
+        self._jobs = {job.name: job for job in jobs}
+        self._pids: dict[str, int] = {}
+        self.failed: dict[str, str] = {}
+        """Why the others are restarted, by name."""
+        self._deadline_s = time.monotonic() + PAUSE_S
+        for job in jobs:
+            managed = fleet.named(job.name)
+            try:
+                fleet.offer(managed, job)
+            except OSError as error:
+                self._fail(job.name, error.strerror or str(error))
+            else:
+                self._pids[job.name] = managed.child.pid if managed.child else 0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of those that are not restarted."""
+        return tuple(self._pids)
+
+    def _fail(self, name: str, why: str) -> None:
+        self._pids.pop(name, None)
+        self.failed[name] = why
+        log.warning("%s is restarted, as it cannot keep its connection: %s", name, why)
+
+    def _all(self, activity: Activity) -> bool:
+        """Return whether all that are left have reported an activity; drop those that have ended or are late."""
+        done = True
+        for name, pid in list(self._pids.items()):
+            managed = self._fleet.named(name)
+            if managed.life.state is not State.RUNNING or managed.child is None or managed.child.pid != pid:
+                self._fail(name, managed.life.note or "its process has ended")
+            elif not managed.reports(activity):
+                if time.monotonic() >= self._deadline_s:
+                    self._fail(name, "it was not ready in time")
+                else:
+                    done = False
+        return done
+
+    def paused(self) -> bool:
+        """Return whether all that are left wait for their blocks."""
+        return self._all(Activity.PAUSED)
+
+    def go_on(self) -> None:
+        """Let them continue, after the segment has been changed."""
+        self._deadline_s = time.monotonic() + FOLLOW_S
+        for name in self._pids:
+            self._fleet.follow(self._fleet.named(name), self._jobs[name])
+
+    def running(self) -> bool:
+        """Return whether all that are left run again. Those that take too long are restarted."""
+        before = self.names
+        done = self._all(Activity.RUNNING)
+        for name in set(before) - set(self._pids):
+            self._fleet.apply(self._fleet.named(name), Event.RESTART)
+        return done
 
 
 class InstanceChange:
@@ -44,15 +116,20 @@ class InstanceChange:
         self._injections: list[str] = []
         segment.processes.require(len(self.changes.started) - len(self.changes.stopped))
         segment.reserve(self.changes.add)  # last, because it cannot be undone
+        self._followers = _Followers(fleet, [self._jobs[name] for name in self.changes.changed])
         self._signalled = [name for name in self.changes.kept if self._fleet.named(name).keep(self._jobs[name])]
 
     @property
     def _leaving(self) -> tuple[str, ...]:
-        return (*self.changes.stopped, *self.changes.replaced)
+        return (*self.changes.stopped, *self._replaced)
+
+    @property
+    def _replaced(self) -> tuple[str, ...]:
+        return (*self.changes.replaced, *self._followers.failed)
 
     @property
     def _coming(self) -> list[Job]:
-        names = {*self.changes.started, *self.changes.replaced}
+        names = {*self.changes.started, *self._replaced}
         return [job for job in self.plan.jobs if job.name in names]
 
     def step(self) -> bool:
@@ -66,7 +143,7 @@ class InstanceChange:
                 self._apply()
         if self._stopped:
             self._fleet.start_due()
-        return self._stopped and all(self._has_come(job.name) for job in self._coming)
+        return self._stopped and self._followers.running() and all(self._has_come(job.name) for job in self._coming)
 
     def _has_come(self, name: str) -> bool:
         life = self._fleet.named(name).life
@@ -88,6 +165,8 @@ class InstanceChange:
             True if all of them have ended.
 
         """
+        if not self._followers.paused():  # first, so that a recorder records their last events
+            return False
         leaving = [self._fleet.named(name) for name in self._leaving]
         for index in policy.to_stop([(managed.rank, managed.life) for managed in leaving]):
             self._fleet.apply(leaving[index], Event.STOP)
@@ -103,6 +182,7 @@ class InstanceChange:
             self._fleet.drop(name)
         for job in self._coming:
             self._fleet.assign(job)
+        self._followers.go_on()
 
     def _declare(self, block: Block, declared: bytes) -> None:
         before = {declaration.name: declaration for declaration in block.declared.read()}
@@ -115,10 +195,13 @@ class InstanceChange:
         """Return two lists of lines: what was done, and which problems there are."""
         done = [*(f"{name}: stopped" for name in self.changes.stopped), *self._injections]
         done += [f"{name}: the supervisor asked it to reload its tokens and roles" for name in self._signalled]
+        done += [f"{name}: its registers have changed; it keeps its connection" for name in self._followers.names]
         problems = []
         for job in self._coming:
             managed = self._fleet.named(job.name)
-            how = "restarted, as its configuration has changed" if job.name in self.changes.replaced else "started"
+            how = "restarted, as its configuration has changed" if job.name in self._replaced else "started"
+            if why := self._followers.failed.get(job.name):
+                how += f"; it cannot keep its connection: {why}"
             if job.name in self.changes.replaced and job.name in self._unwell:
                 how = "started again, as it was not running"
             if managed.life.state is State.RUNNING:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
+from itertools import cycle
 from typing import Any, ClassVar, Protocol
 
 import pytest
@@ -39,6 +40,12 @@ class Rig(Protocol):
     def connector(self) -> Connector:
         """Return a new connector to the device through the proxy, with a time-out of about 200 ms."""
 
+    def changed(self) -> Rig:
+        """Return a rig of the same device and proxy whose layout lacks registers, and has others.
+
+        It is needed only if the connector has ``register_options``.
+        """
+
     def generation(self, raw: bytes) -> int:
         """Return a number for an image of the device that never decreases over time.
 
@@ -52,13 +59,19 @@ class Run:
     """A source's running loop, observed through its block."""
 
     def __init__(self, segment: Segment, rig: Rig, writable: tuple[str, ...] = ()) -> None:
-        self.block = block = segment.blocks["device"]
+        self._segment = segment
+        self._start(rig, writable)
+
+    def _start(self, rig: Rig, writable: tuple[str, ...] = (), predecessor: SourceLoop | None = None) -> None:
+        self.block = block = self._segment.blocks["device"]
         self.frames: list[Frame] = []
         self._rig = rig
         self._cursor = block.cursor()
-        schedule = Schedule(segment.header.started_ns, block.period_ns)
+        schedule = Schedule(self._segment.header.started_ns, block.period_ns)
         self._clock = WallClock()
-        self.loop = SourceLoop(rig.connector(), segment.writer("device"), schedule, self._clock, writable)
+        self.loop = SourceLoop(
+            rig.connector(), self._segment.writer("device"), schedule, self._clock, writable, predecessor=predecessor
+        )
         self._threads = [threading.Thread(target=run, daemon=True) for run in (self.loop.run, self.loop.commands.run)]
         for thread in self._threads:
             thread.start()
@@ -93,6 +106,14 @@ class Run:
             assert time.monotonic() < deadline, "the loop has called nothing"
             _NEVER.wait(0.001)
 
+    def reload(self, rig: Rig) -> None:
+        """Replace the block and the loop as a reload does in which only the registers change."""
+        before = self.loop
+        before.keep()
+        self.stop()
+        self._segment.change([block_of(rig)], ["device"])
+        self._start(rig, predecessor=before)
+
     def stop(self) -> None:
         """Stop the loop. Check the rules that all its frames must obey."""
         self._clock.stop()
@@ -116,6 +137,11 @@ class Run:
         assert cycles == sorted(cycles)
 
 
+def block_of(rig: Rig) -> BlockSpec:
+    """Return the specification of the source's block."""
+    return BlockSpec("device", rig.layout, PERIOD_NS, 10**9, 1 << 24)
+
+
 class ConnectorConformance:
     """Tests of reading. Inherit from this class, and define a fixture ``rig``, a :class:`Rig`.
 
@@ -128,8 +154,7 @@ class ConnectorConformance:
     @pytest.fixture
     def run(self, rig: Rig, instance: str) -> Iterator[Run]:
         """Provide a running loop. Stop and check it after the test."""
-        block = BlockSpec("device", rig.layout, PERIOD_NS, 10**9, 1 << 24)
-        with Segment.create(instance, [block], [ProcessSpec("device", "source")]) as segment:
+        with Segment.create(instance, [block_of(rig)], [ProcessSpec("device", "source")]) as segment:
             run = Run(segment, rig, self.writable)
             try:
                 yield run
@@ -232,6 +257,44 @@ class ConnectorConformance:
     def test_a_stop_in_the_middle_of_connecting(self, frozen: None, run: Run) -> None:
         """Stopping never takes longer than the device's time-out. The fixture ``run`` checks this."""
         run.wait_busy()
+
+    @pytest.fixture
+    def others(self, rig: Rig) -> Iterator[Rig]:
+        """Return endless layouts for reloads, in turn; skip the test if the connector cannot change."""
+        if type(rig.connector()).register_options is None:
+            pytest.skip("a reload restarts the sources of this connector")
+        return cycle((rig.changed(), rig))
+
+    def test_a_reload_that_adds_and_removes_registers_without_reconnecting(
+        self, others: Iterator[Rig], run: Run, rig: Rig
+    ) -> None:
+        """The connection stays, there and back, also while answers take several periods."""
+        last = rig.generation(run.good().raw)
+        rig.proxy.delay(SLOW_S, SLOW_S)
+        for _ in range(4):
+            run.reload(other := next(others))
+            frame = run.good()
+            assert len(run.frames) == 1, "the connection was lost"
+            assert other.generation(frame.raw) >= last
+            last = other.generation(run.good().raw)
+        assert (rig.proxy.accepted, run.loop.counters.connects) == (1, 1)
+
+    @pytest.mark.parametrize("lost", ["before", "after", "frozen"])
+    def test_a_device_lost_during_a_reload(self, others: Iterator[Rig], run: Run, rig: Rig, lost: str) -> None:
+        """The new registers become good over a new connection."""
+        run.good()
+        if lost == "frozen":
+            rig.proxy.freeze()
+        elif lost == "before":
+            rig.proxy.refuse()
+        run.reload(next(others))
+        if lost == "after":
+            rig.proxy.cut(reset=True)
+            run.bad()
+        rig.proxy.pass_all()
+        run.good()
+        run.reload(next(others))
+        run.good()
 
     def test_close_may_come_at_any_time(self, rig: Rig) -> None:
         """A program may close the connector before the first connect, and may close it twice."""

@@ -31,11 +31,16 @@ def framing(data: bytes | bytearray) -> int:
     return 6 + int.from_bytes(data[4:6], "big") if len(data) >= 6 else 0
 
 
-def layout(words: int) -> Layout:
-    tags = {
+def layout(words: int, *, changed: bool = False) -> Layout:
+    tags = {"added": {"type": "UINT", "address": "holding 0"}} if changed else {}
+    tags |= {
         "counted": {"type": f"ARRAY[1..{words}] OF UINT", "address": "holding 0"},
         "flags": {"type": "BYTE", "address": f"holding {words}"},
         "copy": {"type": "BYTE", "address": f"holding {words + 1}"},
+    }
+    if changed:
+        return place_tags("device", tags).with_statuses()
+    tags |= {
         "spare": {"type": f"ARRAY[1..{SPARE}] OF BYTE", "address": "holding 1000"},
         "missing": {"type": "UINT", "address": "holding 3000"},
     }
@@ -45,14 +50,20 @@ def layout(words: int) -> Layout:
 class ModbusRig:
     """The device behind a proxy."""
 
-    def __init__(self, proxy: FaultProxy, words: int) -> None:
+    def __init__(self, proxy: FaultProxy, words: int, *, changed: bool = False) -> None:
         self.proxy = proxy
-        self.layout = layout(words)
-        registers = self.layout.registers
-        self._codecs = [codec(register, "little") for register in registers[:3]]
+        self.layout = layout(words, changed=changed)
+        registers = {one.path: one for one in self.layout.registers}
+        self._codecs = [codec(registers[name], "little") for name in ("counted", "flags", "copy")]
+        self._added = codec(registers["added"], "little") if changed else None
+        self._words = words
         self._one_request = words < 100
-        self.flags, self.spare, missing = (registers[index].offset for index in (1, 3, 4))
-        self.refused = Write(missing, 0, b"\1\0")
+        if not changed:
+            self.flags, self.spare = registers["flags"].offset, registers["spare"].offset
+            self.refused = Write(registers["missing"].offset, 0, b"\1\0")
+
+    def changed(self) -> ModbusRig:
+        return ModbusRig(self.proxy, self._words, changed=True)
 
     def connector(self) -> Connector:
         address = self.proxy.address
@@ -66,6 +77,8 @@ class ModbusRig:
         if self._one_request:
             assert len(set(numbers)) == 1, "words of different moments in one request"
         assert sorted(numbers) == numbers, "a request has an older answer than the one before it"
+        if self._added:
+            assert self._added.decode(raw) == numbers[0], "the added register has another value"
         assert flags & 0xFE == copy, "a write has changed the neighbours of its bit"
         return numbers[0]
 

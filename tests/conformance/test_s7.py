@@ -51,10 +51,11 @@ class Shared:
 class S7Rig:
     """The emulated PLC, which runs the program ``Shared``."""
 
-    def __init__(self, proxy: FaultProxy, plc: Emulator, size: int) -> None:
+    def __init__(self, proxy: FaultProxy, plc: Emulator, size: int, *, tail: int = TAIL) -> None:
         self.proxy = proxy
         self.plc = plc
-        self.layout = layout(size)
+        self.layout = layout(size - TAIL + tail)
+        self._size, self._tail = size, tail
         self.one_pdu = size <= 900
         self.spare = size - TAIL
         self.flags = size - 2
@@ -64,15 +65,18 @@ class S7Rig:
         address = self.proxy.address
         return S7Connector(S7Options(host=address.host, port=address.port, timeout=200, dbNumber=7), self.layout)
 
+    def changed(self) -> S7Rig:
+        return S7Rig(self.proxy, self.plc, self._size, tail=0)
+
     def generation(self, raw: bytes) -> int:
         """Return the PLC's cycle in which the frame was read.
 
         A frame that fits into one PDU is of one cycle. A frame of several PDUs may span a few cycles.
         """
-        found = generations(raw[:-TAIL])
+        found = generations(raw[: len(raw) - self._tail])
         assert len(found) == 1 or not self.one_pdu, f"mixed cycles {found}"
         assert found[-1] - found[0] < 10_000, f"bytes that the PLC never had: {found}"
-        assert raw[-2] & 0xFE == raw[-1], "a write has changed the neighbours of its bit"
+        assert not self._tail or raw[-2] & 0xFE == raw[-1], "a write has changed the neighbours of its bit"
         return found[0]
 
 

@@ -30,25 +30,37 @@ PART = 80
 class TableRig:
     """The emulated PLC, read by a table of parts of its block, one of which does not exist."""
 
-    def __init__(self, proxy: FaultProxy, plc: Emulator, size: int) -> None:
+    def __init__(self, proxy: FaultProxy, plc: Emulator, size: int, *, changed: bool = False) -> None:
         self.proxy, self.plc = proxy, plc
+        self._size, self._changed = size, changed
         self._counted = counted = size - TAIL
         self._one_pdu = size <= 400
-        tags: dict[str, object] = {
+        tags: dict[str, object] = {}
+        if changed:  # two registers more, then the same data, and two registers less
+            tags["added"] = {"type": "BYTE", "address": f"DB7.DBB{size - 1}"}
+            tags["marker"] = {"type": "BYTE", "address": "%MB5"}
+        tags |= {
             f"data/{start}": {
                 "type": f"ARRAY[1..{min(PART, counted - start)}] OF BYTE",
                 "address": f"DB7.DBB{start}",
             }
             for start in range(0, counted, PART)
         }
-        tags["spare"] = {"type": f"ARRAY[1..{SPARE}] OF BYTE", "address": f"DB7.DBB{counted}"}
+        if not changed:
+            tags["spare"] = {"type": f"ARRAY[1..{SPARE}] OF BYTE", "address": f"DB7.DBB{counted}"}
         tags["flags"] = {"type": "BYTE", "address": f"DB7.DBB{size - 2}"}
         tags["copy"] = {"type": "BYTE", "address": f"DB7.DBB{size - 1}"}
-        tags["missing"] = {"type": "INT", "address": "DB7.DBW60000"}
+        if not changed:
+            tags["missing"] = {"type": "INT", "address": "DB7.DBW60000"}
         self.layout = place_tags("device", tags).with_statuses()
-        registers = self.layout.registers
-        self.spare, self.flags, self.copy, missing = (one.offset for one in registers[-4:])
-        self.refused = Write(missing, 0, b"\1\0")
+        offsets = {one.path: one.offset for one in self.layout.registers}
+        self._data, self.flags, self.copy = offsets["data/0"], offsets["flags"], offsets["copy"]
+        if not changed:
+            self.spare = offsets["spare"]
+            self.refused = Write(offsets["missing"], 0, b"\1\0")
+
+    def changed(self) -> TableRig:
+        return TableRig(self.proxy, self.plc, self._size, changed=True)
 
     def connector(self) -> Connector:
         address = self.proxy.address
@@ -56,11 +68,12 @@ class TableRig:
         return S7Connector.for_layout(self.layout)(options, self.layout)
 
     def generation(self, raw: bytes) -> int:
-        found = generations(raw[: self._counted])
+        found = generations(raw[self._data : self._data + self._counted])
         assert len(found) == 1 or not self._one_pdu, f"mixed cycles {found}"
         assert found[-1] - found[0] < 10_000, f"bytes that the PLC never had: {found}"
         if self._one_pdu:
             assert raw[self.flags] & 0xFE == raw[self.copy], "a write has changed the neighbours of its bit"
+            assert not self._changed or raw[0] == raw[self.copy], "the added register has another value"
         return found[0]
 
 

@@ -98,7 +98,7 @@ def test_a_new_layout_keeps_the_streams_of_registers_that_remain(cell: Cell, stu
     edit(cell, 'connector = "s7"\nlayout = "db201.db"', 'connector = "s7"\nlayout = "own.db"')
     done = cell.supervisor("reload")
     assert done.stderr == ""
-    assert "cell: restarted, as its configuration has changed" in done.stdout
+    assert "cell: its registers have changed; it keeps its connection" in done.stdout
     with pytest.raises(grpc.RpcError) as caught:
         for _ in ended:
             pass
@@ -116,7 +116,7 @@ def test_reload_prints_the_same_warnings_as_check(cell: Cell) -> None:
     dry = cell.supervisor("reload", "--dry-run")
     assert (dry.returncode, dry.stderr) == (0, f"{warning}\n")
     assert dry.stdout.splitlines() == [
-        'would restart cell: writable: ["Outpts"] instead of []',
+        'would keep the connection of cell: writable: ["Outpts"] instead of []',
         f"{cell.instance}: 2 processes would be kept; nothing was changed",
     ]
     done = cell.supervisor("reload")

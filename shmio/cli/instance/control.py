@@ -29,6 +29,7 @@ PREVIEWED: Final[Mapping[str, str]] = {
     "stop": "would stop",
     "start": "would start",
     "restart": "would restart",
+    "change": "would keep the connection of",
     "injections": "would change",
     "reread": "would reload the tokens and roles of",
     "keep": "would keep",

@@ -146,6 +146,7 @@ class ModbusConnector(Connector):
     Options = ModbusOptions
     can_write = True
     register_quality = True
+    register_options = frozenset({"unit", "word_order", "byte_order", "max_registers", "max_bits", "max_gap"})
 
     def __init__(self, options: ModbusOptions, layout: Layout) -> None:
         self._options, self._layout = options, layout
@@ -200,6 +201,15 @@ class ModbusConnector(Connector):
         self._client.connect()
         self._silent.clear()
         self._no_masks.clear()
+
+    def take_over(self, other: ModbusConnector) -> bool:
+        """Take over the connection of another connector, and what it knows of the units."""
+        if not other._client.connected:
+            return False
+        self._client, other._client = other._client, self._client
+        self._silent = {unit: silence for unit, silence in other._silent.items() if unit in self._units}
+        self._no_masks = other._no_masks
+        return True
 
     def close(self) -> None:
         """Close the connection."""

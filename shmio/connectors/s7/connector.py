@@ -11,7 +11,7 @@ from shmio.connectors.s7.block_check import BlockChangeMonitor, ExpectedBlock
 from shmio.connectors.s7.blocks import BlockRead, BlockWrite, SizeProbe, waves
 from shmio.connectors.s7.explain import OUT_OF_RANGE, RefusedError, explain_size
 from shmio.connectors.s7.request_count import NOTE, by_pdu_size
-from shmio.connectors.s7.session import MAX_DEPTH, Read, S7Options, S7Session
+from shmio.connectors.s7.session import MAX_DEPTH, REGISTER_OPTIONS, Read, S7Options, S7Session
 from shmio.connectors.s7.table import S7TableConnector
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.model import Layout
@@ -79,6 +79,7 @@ class S7Connector(S7Client, Connector):
 
     Options = S7Options
     can_write = True
+    register_options = REGISTER_OPTIONS
 
     @classmethod
     def for_layout(cls, layout: Layout) -> type[Connector]:

@@ -30,6 +30,8 @@ from shmio.errors import ConnectorError
 from shmio.layout.values.write import Write
 
 MAX_DEPTH = 4  # reads in flight at once; with more, images would only be older
+REGISTER_OPTIONS = frozenset({"dbNumber", "every", "packetSize"})
+"""The keys that say what is read, and not how to connect."""
 LONGEST_WRITE_S = 20  # limit for a whole batch; ``timeout`` if that is longer
 
 # The slot of the CPU in its rack by family, unless the key slot is configured.
@@ -217,6 +219,38 @@ class S7Session(ABC):
             if transport.left:
                 raise ConnectorError("the controller sent unexpected bytes after the session was set up")
             self._use(granted, transport)
+        self._begin(deadline_ns)
+
+    def take_over(self, other: S7Session) -> bool:
+        """Take over the open session of another object with the same options of the session.
+
+        Wait until the controller has answered all questions of that object.
+
+        Returns:
+            Whether the session was taken over.
+
+        Raises:
+            ConnectorError: The session was lost.
+
+        """
+        if other._transport is None:
+            return False
+        deadline_ns = time.monotonic_ns() + self._timeout_ns
+        with other._close_on_error:
+            for query in other._queries:
+                other._finish(query, deadline_ns)
+        transport, window = other._transport, other._window
+        if transport.left or not window.idle or window.waiting:
+            return False
+        other._transport = None
+        self._transport = transport
+        self._window = Window(0, window.reference)
+        self._use(other._session, transport)
+        self._begin(deadline_ns)
+        return True
+
+    def _begin(self, deadline_ns: int) -> None:
+        """Ask for the operating mode as the first question of the session."""
         with self._close_on_error:
             self._ask()
             self._flush()

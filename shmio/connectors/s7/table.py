@@ -33,7 +33,7 @@ from shmio.connectors.s7.explain import (
 )
 from shmio.connectors.s7.plan import Field, Job, Piece, Range, merge, most_bytes, pack
 from shmio.connectors.s7.request_count import NOTE, by_pdu_size
-from shmio.connectors.s7.session import MAX_DEPTH, Read, S7Options, S7Session
+from shmio.connectors.s7.session import MAX_DEPTH, REGISTER_OPTIONS, Read, S7Options, S7Session
 from shmio.connectors.s7.tag import Tag
 from shmio.errors import ConfigError, ConnectorError, PathError
 from shmio.layout.glob import Glob
@@ -365,6 +365,7 @@ class S7TableConnector(S7Session, Connector):
     Options = S7Options
     can_write = True
     register_quality = True
+    register_options = REGISTER_OPTIONS
 
     def __init__(self, options: S7Options, layout: Layout) -> None:
         """Create the connector without connecting it.

@@ -27,7 +27,7 @@ CHECK_S: Final = 90.0
 WHERE_S: Final = 5.0
 FRESH_S: Final = 1.0
 """Time in s for which a result is used again."""
-_KINDS: Final = ("stop", "start", "restart", "injections", "reread", "keep")
+_KINDS: Final = ("stop", "start", "restart", "change", "injections", "reread", "keep")
 
 
 class ConfigurationFile:

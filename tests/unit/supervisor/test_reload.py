@@ -350,7 +350,9 @@ def test_a_dry_run_says_what_a_reload_then_does(launch: Launch) -> None:
     cell = launch([*CELL, PRESS])
     cell.wait_state("running")
     before, log = cell.pids(), cell.log()
-    none: dict[str, Any] = {key: [] for key in ("faults", "warnings", "stop", "start", "restart", "injections")}
+    none: dict[str, Any] = {
+        key: [] for key in ("faults", "warnings", "stop", "start", "restart", "change", "injections")
+    }
     names = ["plc", "cell", "grpc", "press"]
     assert dry_run(cell, [*CELL, PRESS]) == {"ok": True, **none, "reread": [], "keep": names}
     jobs = [CELL[0], (*CELL[1], "new"), ("grpc", "grpc", ["good", "good"]), ("robot", "source", ["good"])]

@@ -5,7 +5,7 @@ import { DroppedFiles } from "./dropped.js";
 
 /** @typedef {import("./main.js").Context} Context */
 /** @typedef {{ kind: string, line: number, text: string }} Message */
-/** @typedef {{ stop: string[], start: string[], restart: string[], injections: string[], reread: string[], keep: string[] }} Changes */
+/** @typedef {{ stop: string[], start: string[], restart: string[], change: string[], injections: string[], reread: string[], keep: string[] }} Changes */
 /**
  * @typedef {{ file: string, version: string, lines: string[], problem: string, messages: Message[], changes: Changes | null,
  *   read_s: number | null }} Configuration
@@ -16,6 +16,7 @@ const KINDS = [
   ["stop", "−", "bad", "stop"],
   ["start", "+", "good", "start"],
   ["restart", "±", "uncertain", "restart"],
+  ["change", "±", "uncertain", "keep the connection of"],
   ["injections", "±", "injected", "change"],
   ["reread", "±", "uncertain", "reload the tokens and roles of"],
 ];
