@@ -195,7 +195,7 @@ class InstanceChange:
         """Return two lists of lines: what was done, and which problems there are."""
         done = [*(f"{name}: stopped" for name in self.changes.stopped), *self._injections]
         done += [f"{name}: the supervisor asked it to reload its tokens and roles" for name in self._signalled]
-        done += [f"{name}: its registers have changed; it keeps its connection" for name in self._followers.names]
+        done += [f"{name}: changed, and keeps its connection" for name in self._followers.names]
         problems = []
         for job in self._coming:
             managed = self._fleet.named(job.name)
