@@ -367,6 +367,7 @@ def test_a_dry_run_says_what_a_reload_then_does(launch: Launch) -> None:
             "cell: registers: 1 new, 1 changed",
             'grpc: behaviour: ["good","good"] instead of ["good"]',
         ],
+        "change": [],
         "injections": [],
         "reread": [],
         "keep": ["plc"],

@@ -23,7 +23,7 @@ name = "cell"
 password = "hunter2-hunter2"
 period_ms = -1
 """
-DRY = ("stop", "start", "restart", "injections", "reread", "keep")
+DRY = ("stop", "start", "restart", "change", "injections", "reread", "keep")
 
 
 class FakeSupervisor:
