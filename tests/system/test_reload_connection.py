@@ -159,3 +159,14 @@ def test_a_device_that_is_away_does_not_delay_the_reload(plant: Plant) -> None:
     plant.proxy.admit()
     assert plant.value("pumps/Level") == 7
     assert plant.pid == pid
+
+
+def test_a_process_that_was_taken_over_keeps_its_connection(plant: Plant) -> None:
+    pid = plant.pid
+    with Segment.open(plant.cell.instance) as segment:
+        kill(segment.supervisor[0])
+    plant.cell.up()
+    plant.table(LEVEL)
+    assert plant.reload()[0] == SAME
+    assert plant.value("pumps/Level") == 7
+    assert (plant.pid, plant.proxy.accepted) == (pid, 1)
