@@ -17,12 +17,12 @@ from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket
 
 from shmio.audit import trail
-from shmio.endpoints.web.dropped import MAX_BYTES, MAX_HEAD_BYTES, compile_dropped
 from shmio.endpoints.web.measurements import Measurements
 from shmio.endpoints.web.metrics import Exposition, InstanceCollector
 from shmio.endpoints.web.page import Page, Tab
 from shmio.endpoints.web.served import Served
 from shmio.endpoints.web.sessions import COOKIE, MAX_AGE_S, Sessions, User
+from shmio.endpoints.web.uploads import MAX_BYTES, MAX_HEAD_BYTES, compile_uploads
 from shmio.errors import ShmioError
 from shmio.segment import Segment
 
@@ -204,7 +204,7 @@ class PageApp:
             body = await _body(request, MAX_BYTES + MAX_HEAD_BYTES)
             if body is None:
                 return JSONResponse({"error": f"these files have more than {MAX_BYTES >> 20} MB"}, 413)
-            return Response(await compile_dropped(body), media_type="application/json")
+            return Response(await compile_uploads(body), media_type="application/json")
         except ShmioError as error:
             return JSONResponse({"error": str(error)}, 422)
         finally:

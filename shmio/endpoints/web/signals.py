@@ -1,4 +1,4 @@
-"""The course of registers over time, for plots. What several pages plot is packed once.
+"""The history of registers over time, for plots. What several pages plot is packed once.
 
 A batch is a binary message with the frames of one feed, little-endian: the feed's number (uint32),
 the number of frames (uint32), and the time of the frame before them (float64), NaN after a gap.

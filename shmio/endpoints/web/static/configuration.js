@@ -1,7 +1,7 @@
 // The configuration tab: the file with its faults, what a reload would do, and the reload.
 
 import { element, notify, replace, setText } from "./dom.js";
-import { DroppedFiles } from "./dropped.js";
+import { UploadedFiles } from "./uploads.js";
 
 /** @typedef {import("./main.js").Context} Context */
 /** @typedef {{ kind: string, line: number, text: string }} Message */
@@ -38,7 +38,7 @@ export class ConfigurationTab {
       "Reload …",
     );
     this.result = element("ul", { class: "messages", role: "status" });
-    this.dropped = new DroppedFiles();
+    this.uploads = new UploadedFiles();
     const plan = element(
       "section",
       { class: "plan", "aria-label": "Reload" },
@@ -50,15 +50,15 @@ export class ConfigurationTab {
       "div",
       { class: "configuration" },
       element("div", { class: "columns" }, element("section", {}, this.place, this.others, this.file), plan),
-      this.dropped.root,
+      this.uploads.root,
     );
-    this.dropped.accept(this.root);
+    this.uploads.accept(this.root);
     this.stop = context.connection.follow("configuration", (data) => this.show(data));
   }
 
   close() {
     this.stop();
-    this.dropped.close();
+    this.uploads.close();
     this.context.connection.call("configuration.leave").catch(() => {});
   }
 

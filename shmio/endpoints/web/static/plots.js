@@ -3,7 +3,7 @@
 import { element, notify, setText } from "./dom.js";
 import { Feeds, sourceOf } from "./feeds.js";
 import { Lanes } from "./lanes.js";
-import { Course } from "./recorded.js";
+import { SignalHistory } from "./recorded.js";
 import { suggest } from "./suggest.js";
 
 /** @typedef {import("./main.js").Context} Context */
@@ -45,9 +45,9 @@ export class PlotsTab {
     this.context = context;
     /** @type {Feeds} */
     this.feeds = new Feeds(context.connection, () => this.lanes.paths, () => this.lanes.request(), MAX_SAMPLES);
-    /** @type {Map<string, Course>} The past of each source. */
+    /** @type {Map<string, SignalHistory>} The past of each source. */
     this.pasts = new Map();
-    /** @type {Map<string, Course>} The past of each source that was requested last. */
+    /** @type {Map<string, SignalHistory>} The past of each source that was requested last. */
     this.wanted = new Map();
 
     this.search = element("input", { type: "search", placeholder: "Add a register", "aria-label": "Add a register", list: "plot-paths", maxlength: 200 });
@@ -152,7 +152,7 @@ export class PlotsTab {
     const old = this.pasts.get(source);
     if (from >= until || (old !== undefined && paths.every((path) => old.series.has(path)) && old.serves(from, until))) return;
     const margin = (until - from) / 2;
-    const course = new Course(paths, from - margin, until === this.lanes.to ? until + margin : until);
+    const course = new SignalHistory(paths, from - margin, until === this.lanes.to ? until + margin : until);
     const given = { source, paths, from_s: Math.max(0, course.from), to_s: course.to, columns: 2 * this.lanes.columns };
     this.wanted.set(source, course);
     try {

@@ -1,4 +1,4 @@
-// Reads the course of registers from recordings, part by part.
+// Reads the history of registers from recordings, part by part.
 
 import { Series, readBatch } from "./series.js";
 
@@ -6,8 +6,8 @@ import { Series, readBatch } from "./series.js";
 /** @typedef {{ time_s: number, source: string, kind: string, by: string, text: string, paths: string[], more?: number, count?: number }} RecordedEvent */
 /** @typedef {{ batches: string[], events: RecordedEvent[], share: number, reduced: boolean, damage: string[] }} Part */
 
-/** The course of some registers in a window of time. It grows while it is read. */
-export class Course {
+/** The history of some registers in a window of time. It grows while it is read. */
+export class SignalHistory {
   /** @param {string[]} paths In the order of the request. @param {number} from @param {number} to */
   constructor(paths, from, to) {
     this.paths = paths;
@@ -42,7 +42,7 @@ export class Course {
   }
 
   /**
-   * Read the course.
+   * Read the history.
    *
    * @param {Connection} connection
    * @param {string} call The call that returns the next part.

@@ -4,7 +4,7 @@ import { clock } from "./chart.js";
 import { element, notify, replace, setText } from "./dom.js";
 import { bytes, duration } from "./format.js";
 import { Lanes } from "./lanes.js";
-import { Course } from "./recorded.js";
+import { SignalHistory } from "./recorded.js";
 import { ReplayPanel } from "./replays.js";
 
 /** @typedef {import("./main.js").Context} Context */
@@ -37,9 +37,9 @@ export class RecordingsTab {
     this.name = name;
     /** @type {Map<string, Signal>} */
     this.signals = new Map();
-    /** @type {Course | null} The whole recording. */
+    /** @type {SignalHistory | null} The whole recording. */
     this.overview = null;
-    /** @type {Course | null} The part in view, in detail. */
+    /** @type {SignalHistory | null} The part in view, in detail. */
     this.detail = null;
     /** @type {Map<string, number>} The work of each kind on the server. */
     this.works = new Map();
@@ -266,11 +266,11 @@ export class RecordingsTab {
   }
 
   /**
-   * Read a course, in place of what was being read of this kind.
+   * Read a history, in place of what was being read of this kind.
    *
    * @param {string} kind
    * @param {{ paths: string[], from_s?: number, to_s?: number }} given
-   * @param {(course: Course) => void} begin
+   * @param {(course: SignalHistory) => void} begin
    * @returns {Promise<boolean>} False if the server refused it.
    */
   async read(kind, given, begin) {
@@ -286,7 +286,7 @@ export class RecordingsTab {
       this.stop(kind);
       this.works.set(kind, plot.number);
       for (const signal of plot.signals) this.signals.set(signal.path, signal);
-      const course = new Course(given.paths, plot.from_s, plot.to_s);
+      const course = new SignalHistory(given.paths, plot.from_s, plot.to_s);
       begin(course);
       await course.read(this.context.connection, "recordings.more", plot.number, () => {
         setText(this.progress, course.share < 1 ? `${Math.floor(100 * course.share)} % read` : "");
@@ -306,7 +306,7 @@ export class RecordingsTab {
     }
   }
 
-  /** @returns {Course | null} What is drawn: the detail once all of it is here and it has what is in view, else the overview. */
+  /** @returns {SignalHistory | null} What is drawn: the detail once all of it is here and it has what is in view, else the overview. */
   get shown() {
     const { overview, detail } = this;
     const { from, to } = this.lanes;

@@ -1,4 +1,4 @@
-"""The plots tab: the course of registers, live, and their past from the recording of this run."""
+"""The plots tab: the history of registers, live, and their past from the recording of this run."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Annotated, Any, ClassVar, Final
 import msgspec
 from msgspec import Meta
 
-from shmio.endpoints.web.course import Part, Window, first_time, past, signals_of
 from shmio.endpoints.web.page import Page, Tab, call
 from shmio.endpoints.web.recordings import Opened, Work
 from shmio.endpoints.web.served import Served
+from shmio.endpoints.web.signal_history import Part, Window, first_time, past, signals_of
 from shmio.endpoints.web.signals import Feed, check_plottable
 from shmio.errors import PathError
 from shmio.layout.model import MAX_PATH
@@ -50,7 +50,7 @@ class Numbered(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Plots(Tab):
-    """Sends the course of registers. A page that stalls gets a gap, and then the newest data."""
+    """Sends the history of registers. A page that stalls gets a gap, and then the newest data."""
 
     name: ClassVar[str] = "plots"
 
@@ -116,7 +116,7 @@ class Plots(Tab):
 
     @call("read", Plotted)
     async def follow(self, given: Plotted) -> dict[str, Any] | None:
-        """Send the course of these registers of a source, in place of those sent so far.
+        """Send the history of these registers of a source, in place of those sent so far.
 
         The answer comes before the first batch. It names the feed's number, and the registers in
         the order of the batch.

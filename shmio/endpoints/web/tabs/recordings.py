@@ -15,9 +15,9 @@ import msgspec
 from msgspec import Meta
 from starlette.concurrency import run_in_threadpool
 
-from shmio.endpoints.web.course import Window, course, signals_of
 from shmio.endpoints.web.page import Nothing, Page, Tab, call
 from shmio.endpoints.web.recordings import MAX_NAME, Opened, Recordings, Work
+from shmio.endpoints.web.signal_history import Window, signal_history, signals_of
 from shmio.errors import CommandError, RecordingError
 from shmio.layout.model import MAX_PATH, Register
 from shmio.local.replays import ReplayRequest
@@ -136,7 +136,7 @@ class RecordingsTab(Tab):
 
     @call("read", Plotted)
     async def plot(self, given: Plotted) -> dict[str, Any]:
-        """Begin to read the course of registers, reduced to the width of the plot; ``more`` returns it."""
+        """Begin to read the history of registers, reduced to the width of the plot; ``more`` returns it."""
         opened = await self._recordings.open(given.name)
         try:
             dump = opened.dump
@@ -145,7 +145,9 @@ class RecordingsTab(Tab):
             from_ns = dump.begin_ns if given.from_s is None else round(given.from_s * 1e9)
             to_ns = dump.end_ns if given.to_s is None else round(given.to_s * 1e9)
             window = Window(from_ns, max(from_ns + 1, to_ns), given.columns)
-            number = self._start(Work(self._recordings, lambda _: course(dump, signals, window, opened.damage), opened))
+            number = self._start(
+                Work(self._recordings, lambda _: signal_history(dump, signals, window, opened.damage), opened)
+            )
         except BaseException:
             self._recordings.release(opened)
             raise

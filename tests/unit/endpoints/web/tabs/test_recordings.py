@@ -54,7 +54,7 @@ def listed(browser: Connection, name: str) -> dict[str, Any]:
 
 
 def plot(browser: Connection, name: str, *paths: str, columns: int = WIDE, **given: Any) -> tuple[list[Any], list[Any]]:
-    """Return the course of each register as (times, values, marks), and the events."""
+    """Return the history of each register as (times, values, marks), and the events."""
     number = result(browser, "plot", name=name, paths=paths, columns=columns, **given)["number"]
     course: list[list[Batch]] = [[] for _ in paths]
     events: list[dict[str, Any]] = []

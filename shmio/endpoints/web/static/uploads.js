@@ -11,7 +11,7 @@ const HEADS = ["Register", "Type", "Place", "Bytes", "Initial value", "Comment"]
 const HINT = "Drop a .db source here to see its registers, with the files of its UDTs; or a tag table, or another tool's tag list.";
 
 /** A place to drop files, and their registers. The server compiles them and keeps nothing. */
-export class DroppedFiles {
+export class UploadedFiles {
   constructor() {
     /** @type {Row[]} */
     this.rows = [];

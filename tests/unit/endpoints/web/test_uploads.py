@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmio.endpoints.web import app, dropped
-from shmio.endpoints.web.dropped import compile_dropped, describe
+from shmio.endpoints.web import app, uploads
+from shmio.endpoints.web.uploads import compile_uploads, describe
 from shmio.errors import CommandError
 from shmio.segment import Segment
 from tests.unit.endpoints.web.test_page import SECRETS, pages
@@ -93,11 +93,11 @@ def test_any_file_is_answered(suffix: str, data: bytes) -> None:
 
 
 def test_answer_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dropped, "MAX_ROWS", 1)
+    monkeypatch.setattr(uploads, "MAX_ROWS", 1)
     (layout,) = compiled(press_db=BLOCK)["layouts"]
     assert (layout["count"], len(layout["registers"])) == (2, 1)
-    monkeypatch.setattr(dropped, "MAX_ROWS", 10)
-    monkeypatch.setattr(dropped, "MAX_ANSWER_BYTES", 60)
+    monkeypatch.setattr(uploads, "MAX_ROWS", 10)
+    monkeypatch.setattr(uploads, "MAX_ANSWER_BYTES", 60)
     (layout,) = compiled(press_db=BLOCK)["layouts"]
     assert (layout["count"], len(layout["registers"])) == (2, 1)
 
@@ -107,7 +107,7 @@ def test_page_gets_the_registers_of_its_files(segment: Segment) -> None:
         status, headers, text = server.request("POST", "/layout", request(press_db=BLOCK))
         assert (status, headers["content-type"]) == (200, "application/json")
         assert json.loads(text)["layouts"][0]["name"] == "Press"
-        too_large = b"x" * (dropped.MAX_BYTES + dropped.MAX_HEAD_BYTES + 1)
+        too_large = b"x" * (uploads.MAX_BYTES + uploads.MAX_HEAD_BYTES + 1)
         assert server.request("POST", "/layout", too_large)[0] == 413
 
 
@@ -137,6 +137,6 @@ def test_page_upload_that_ends_early_leaves_room_for_others(
 
 
 def test_page_is_told_if_files_take_too_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dropped, "LIMIT_S", 0)
+    monkeypatch.setattr(uploads, "LIMIT_S", 0)
     with pytest.raises(CommandError, match="use shmio-layout"):
-        asyncio.run(compile_dropped(request(press_db=BLOCK)))
+        asyncio.run(compile_uploads(request(press_db=BLOCK)))

@@ -1,4 +1,4 @@
-"""The course of registers in a recording, reduced for a plot, part by part.
+"""The history of registers in a recording, reduced for a plot, part by part.
 
 A part has batches as in ``signals.py``, each with one register. A batch's number is the register's
 index in the request. A NaN between two samples means that frames are missing there.
@@ -109,8 +109,8 @@ def signals_of(dump: Dump, paths: Sequence[str]) -> list[Signal]:
     return found
 
 
-def course(dump: Dump, signals: Sequence[Signal], window: Window, damage: Sequence[str] = ()) -> Iterator[Part]:
-    """Yield the course of registers in a window of log times, and then the events of their sources.
+def signal_history(dump: Dump, signals: Sequence[Signal], window: Window, damage: Sequence[str] = ()) -> Iterator[Part]:
+    """Yield the history of registers in a window of log times, and then the events of their sources.
 
     Args:
         dump: The recording.
@@ -123,7 +123,7 @@ def course(dump: Dump, signals: Sequence[Signal], window: Window, damage: Sequen
     turns = len(sources) + 1
     for turn, source in enumerate(sources):
         of_source = {index: signal.registers for index, signal in enumerate(signals) if signal.source == source}
-        for part in _Course(dump, of_source, window).parts(source):
+        for part in _History(dump, of_source, window).parts(source):
             part.share = (turn + part.share) / turns
             yield part
     for part in events(dump, sources or dump.sources, window):
@@ -133,7 +133,7 @@ def course(dump: Dump, signals: Sequence[Signal], window: Window, damage: Sequen
 
 
 def past(dump: Dump, signals: Sequence[Signal], window: Window, utc_ns: int) -> Iterator[Part]:
-    """Yield the course of registers of one source, with the times that the plots of a running instance have.
+    """Yield the history of registers of one source, with the times that the plots of a running instance have.
 
     Args:
         dump: A recording of this run.
@@ -149,7 +149,7 @@ def past(dump: Dump, signals: Sequence[Signal], window: Window, utc_ns: int) -> 
 
     begin_ns, _ = _log_times(dump, source, window.from_ns - utc_ns)
     _, end_ns = _log_times(dump, source, window.to_ns - utc_ns)
-    work = _Course(dump, {index: signal.registers for index, signal in enumerate(signals)}, window, times)
+    work = _History(dump, {index: signal.registers for index, signal in enumerate(signals)}, window, times)
     yield from work.parts(source, begin_ns, end_ns)
 
 
@@ -176,7 +176,7 @@ def _log_times(dump: Dump, source: str, publish_ns: int) -> tuple[int, int]:
     return low, high
 
 
-class _Course:
+class _History:
     """Reads the frames of one source."""
 
     def __init__(

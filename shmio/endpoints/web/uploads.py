@@ -55,7 +55,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     size: _Bytes
 
 
-async def compile_dropped(body: bytes) -> bytes:
+async def compile_uploads(body: bytes) -> bytes:
     """Compile files in a process of its own; return its answer, which is JSON.
 
     Args:
@@ -66,7 +66,7 @@ async def compile_dropped(body: bytes) -> bytes:
 
     """
     process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-P", "-m", "shmio.endpoints.web.dropped"),
+        *(sys.executable, "-P", "-m", "shmio.endpoints.web.uploads"),
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.DEVNULL,
@@ -92,7 +92,7 @@ def describe(body: bytes) -> dict[str, Any]:
     """Return the layouts in the files of a request, and the messages about them.
 
     Args:
-        body: As for :func:`compile_dropped`.
+        body: As for :func:`compile_uploads`.
 
     """
     try:
