@@ -35,9 +35,9 @@ _REPORT: Final = struct.Struct("<IIq8Q408s")
 COUNTERS: Final[Mapping[str, tuple[str, ...]]] = {
     "source": ("polls", "overruns", "failures", "connects", "round_trip_us", "rate_mhz"),
     "emulator": ("cycles", "overruns"),
-    "grpc": ("streams", "messages", "dropped", "published", "refused"),
+    "grpc": ("streams", "messages", "dropped", "published", "refused", "bytes"),
     "mqtt": ("messages", "commands", "refused", "waiting", "backlog", "dropped", "connects", "missed"),
-    "opcua": ("sessions", "items", "writes", "refused"),
+    "opcua": ("sessions", "items", "writes", "refused", "bytes"),
     "recorder": ("frames", "events", "missed", "bytes"),
     "web": ("requests", "refused", "connections", "pages", "messages", "bytes"),
     "alerts": ("active", "notices", "suppressed", "waiting", "failed", "missed"),

@@ -14,11 +14,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import grpc
 import pytest
 
 from shmio.config import Address
 from shmio.testing.cell import CONFIG, Cell, until
 from shmio.testing.ports import reserved_port
+from shmio.wire.simlog_v1_pb2 import TopicDescriptor
 
 PACKAGING = Path(__file__).parents[2] / "packaging/prometheus"
 pytestmark = pytest.mark.skipif(
@@ -63,6 +65,11 @@ def test_a_cell_is_monitored(make_cell: Callable[..., Cell], tmp_path: Path) -> 
         cell = make_cell(config=CONFIG.replace("timeout = 1000", 'timeout = 1000\nwritable = ["Outputs"]') + section)
         cell.up()
         cell.output("shmio", "set", "Outputs/0", "3")
+        with grpc.insecure_channel(str(cell.grpc)) as channel:
+            get_topic: Any = channel.unary_unary(
+                "/simulation.server.SimlogAPI/GetTopic", TopicDescriptor.SerializeToString
+            )
+            assert get_topic(TopicDescriptor(path="cell/Outputs/0"), timeout=20)
         figures = get(f"http://{target}/metrics")
         checked = subprocess.run(["promtool", "check", "metrics"], input=figures, capture_output=True, check=False)
         assert (checked.returncode, checked.stdout, checked.stderr) == (0, b"", b"")
@@ -83,6 +90,7 @@ def test_a_cell_is_monitored(make_cell: Callable[..., Cell], tmp_path: Path) -> 
                 text = expression.replace("$__rate_interval", "1m").replace("$instance", ".*")
                 assert query(api, text), text
             assert query(api, "shmio_source_quality")[0]["value"][1] == "2"
+            until(lambda: query(api, "shmio_grpc_sent_bytes_total > 0") != [], "the bytes of the answer")
 
             def alerts() -> set[str]:
                 return {one["labels"]["alertname"] for one in json.loads(get(f"{api}/alerts"))["data"]["alerts"]}

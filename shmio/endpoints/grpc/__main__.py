@@ -102,7 +102,8 @@ async def _serve(worker: Worker) -> None:
         trimmer.trim(server.unknown)
         services.stepper.timeline.update()
         streams, dropped, published, refused = services.counters
-        worker.report((streams, feeds.messages + services.updates, dropped, published, refused))
+        messages = feeds.messages + services.updates
+        worker.report((streams, messages, dropped, published, refused, server.calls.sent_bytes))
         try:
             await asyncio.wait_for(stopping.wait(), BEAT_S)
         except TimeoutError:

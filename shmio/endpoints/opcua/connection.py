@@ -173,6 +173,21 @@ class Processor(UaProcessor):
         return not self.iserver.subscriptions.of(session)
 
 
+class _CountedTransport:
+    """A connection's transport that counts the bytes written to it."""
+
+    def __init__(self, transport: asyncio.BaseTransport, counters: Any) -> None:
+        self._transport: Any = transport
+        self._counters = counters
+
+    def write(self, data: bytes) -> None:
+        self._counters.sent_bytes += len(data)
+        self._transport.write(data)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._transport, name)
+
+
 class Protocol(OPCUAProtocol):
     """Receives messages, limits their size and number, and disconnects clients that break the protocol."""
 
@@ -188,7 +203,8 @@ class Protocol(OPCUAProtocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Accept a connection, if there are not too many."""
-        super().connection_made(transport)
+        counted: Any = _CountedTransport(transport, self.iserver.counters)
+        super().connection_made(counted)
         if self.transport is None:  # refused
             return
         self.processor: Any = Processor(self.iserver, self.transport, self.limits)

@@ -54,7 +54,8 @@ class Endpoint:
     def counters(self) -> tuple[int, ...]:
         """The counters, in the order in which the process table names them."""
         shared = self.server.iserver
-        return shared.sessions, shared.subscriptions.items, shared.counters.writes, shared.counters.refused
+        counted = shared.counters
+        return shared.sessions, shared.subscriptions.items, counted.writes, counted.refused, counted.sent_bytes
 
     def poll(self) -> None:
         """Read all new frames."""

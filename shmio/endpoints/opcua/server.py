@@ -59,10 +59,12 @@ log = logging.getLogger("shmio.opcua")
 
 @dataclass
 class Counters:
-    """Counts of what clients have done."""
+    """Counts of what clients have done, and of what they were sent."""
 
     writes: int = 0
     refused: int = 0
+    sent_bytes: int = 0
+    """Number of bytes that were written to the connections."""
 
 
 class InternalServer(LibraryInternalServer):

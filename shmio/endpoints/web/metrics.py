@@ -63,6 +63,7 @@ _COUNTERS: Final[Mapping[str, Mapping[str, _Named]]] = {
         "dropped": _Named("shmio_grpc_dropped", "Changes and events that slow clients missed."),
         "published": _Named("shmio_grpc_published", "Values that clients wrote or injected."),
         "refused": _Named("shmio_grpc_refused", "Calls that were refused."),
+        "bytes": _Named("shmio_grpc_sent_bytes", "Bytes of the messages that were sent to clients."),
     },
     "mqtt": {
         "messages": _Named("shmio_mqtt_messages", "Messages that were published."),
@@ -79,6 +80,7 @@ _COUNTERS: Final[Mapping[str, Mapping[str, _Named]]] = {
         "items": _Named("shmio_opcua_monitored_items", "Monitored items.", gauge=True),
         "writes": _Named("shmio_opcua_writes", "Values that clients wrote."),
         "refused": _Named("shmio_opcua_refused", "Writes and calls that were refused."),
+        "bytes": _Named("shmio_opcua_sent_bytes", "Bytes that were written to the connections of clients."),
     },
     "recorder": {
         "frames": _Named("shmio_recorder_frames", "Frames that were recorded."),

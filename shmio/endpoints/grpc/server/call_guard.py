@@ -76,6 +76,7 @@ class Refusals:
 
 Handler = Any
 Decode = Callable[[bytes], Any]
+Encode = Callable[[Any], bytes]
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +127,8 @@ class OpenCalls:
     def __init__(self, limits: CallLimits | None = None) -> None:
         self.limits = limits or CallLimits()
         self.refusals = Refusals("call refused", "call")
+        self.sent_bytes = 0
+        """Size of all messages that were sent to clients, without the framing of gRPC and HTTP/2."""
         self._open: set[_Call] = set()
         self._by_client: Counter[str] = Counter()
         self._silent: dict[_Call, float] = {}  # deadlines, in order, of the calls whose message has not come yet
@@ -272,9 +275,20 @@ class CallGuard(grpc.aio.ServerInterceptor):
             finally:
                 self._calls.leave(call)
 
+        encode = self._counting(handler.response_serializer)
         if handler.response_streaming:
-            return grpc.stream_stream_rpc_method_handler(run, None, handler.response_serializer)
-        return grpc.stream_unary_rpc_method_handler(run, None, handler.response_serializer)
+            return grpc.stream_stream_rpc_method_handler(run, None, encode)
+        return grpc.stream_unary_rpc_method_handler(run, None, encode)
+
+    def _counting(self, encode: Encode | None) -> Encode:
+        """Return an encoder that counts the bytes of the messages. gRPC sends each message that it encodes."""
+
+        def counting(message: Any) -> bytes:
+            data: bytes = message if encode is None else encode(message)
+            self._calls.sent_bytes += len(data)
+            return data
+
+        return counting
 
     async def _message(self, call: _Call, decode: Decode | None, context: Context) -> Any:
         """Return the decoded single message of a call."""

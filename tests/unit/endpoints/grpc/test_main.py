@@ -18,6 +18,7 @@ import pytest
 
 from shmio.endpoints.grpc.__main__ import _follow, _take_anew, run
 from shmio.segment import Segment
+from shmio.segment.processes import COUNTERS
 from shmio.testing.ports import reserved_port
 from shmio.wire import simlog_v1_pb2 as v1
 from shmio.wire import simlog_v2_pb2 as v2
@@ -96,7 +97,8 @@ def test_a_stop_with_open_streams_leaves_no_traceback(
     over = threading.Event()
 
     def report(counters: tuple[int, ...]) -> None:
-        if counters[0] == 2 * STREAMS:
+        known = dict(zip(COUNTERS["grpc"], counters, strict=True))
+        if known["streams"] == 2 * STREAMS:
             stops[0]()
 
     def publishing() -> Iterator[v1.PubRequest]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from asyncua import ua
 
 from shmio.layout.model import Layout, Register
@@ -171,5 +173,27 @@ def test_a_queue_keeps_the_values_in_between_and_says_what_it_lost(segment: Segm
             await changes.until("cell/step", lambda value: value.Value.Value == 5)
             assert [value.Value.Value for _, value in changes.seen] == [3, 4, 5]
             assert changes.seen[0][1].StatusCode.value == 0x480
+
+    serve(segment, test)
+
+
+def test_bytes_written_to_connections_are_counted(segment: Segment) -> None:
+    async def test(one: Served) -> None:
+        received = 0
+        one.publish(image(step=1))
+        async with one.client() as client:
+            protocol: Any = client.uaclient.protocol
+            receive = protocol.data_received
+            before = one.endpoint.counters[4]
+
+            def count(data: bytes) -> None:
+                nonlocal received
+                received += len(data)
+                receive(data)
+
+            protocol.data_received = count
+            for _ in range(3):
+                await node(client, "cell/step").read_value()
+            await one.until(lambda: one.endpoint.counters[4] - before == received > 0)
 
     serve(segment, test)

@@ -233,3 +233,25 @@ def test_refusals_beyond_a_few_lines_are_logged_as_a_count(caplog: pytest.LogCap
 
     with caplog.at_level(logging.WARNING):
         asyncio.run(test())
+
+
+def test_bytes_of_answers_and_streams_are_counted(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        served.publish(image(step=7))
+        async with grpc.aio.insecure_channel(f"127.0.0.1:{served.port}") as channel:
+            get: Any = channel.unary_unary(GET, wire.TopicDescriptor.SerializeToString)
+            answer = await get(STEP, timeout=TIMEOUT_S)
+            assert served.server.calls.sent_bytes == len(answer) > 0
+            with pytest.raises(grpc.aio.AioRpcError):
+                await get(wire.TopicDescriptor(path="cell/nothing"), timeout=TIMEOUT_S)
+            subscribe: Any = channel.unary_stream(
+                "/simulation.server.SimlogAPI/Subscribe", wire.TopicDescriptor.SerializeToString
+            )
+            stream = subscribe(STEP, timeout=TIMEOUT_S)
+            sent = len(answer) + len(await stream.read())
+            served.publish(image(step=30_000))
+            sent += len(await stream.read())
+            assert served.server.calls.sent_bytes == sent
+            stream.cancel()
+
+    serve(segment, test)
