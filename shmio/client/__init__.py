@@ -81,7 +81,7 @@ def connect(
     token_in_plain_text: bool = False,
     timeout_s: float = 10.0,
 ) -> Client:
-    """Return a client of an endpoint. It connects at the first call of a method.
+    """Return a client of an endpoint. The client connects when you first call one of its methods.
 
     Args:
         address: ``HOST:PORT`` or ``unix:PATH``.
@@ -89,8 +89,8 @@ def connect(
         certificate: PEM file of a client certificate, if the endpoint needs one.
         key: PEM file of the certificate's key.
         token: Token of this client, if the endpoint needs one.
-        token_in_plain_text: Whether to send the token to another host even without TLS.
-        timeout_s: Time-out in s of calls that the endpoint answers at once.
+        token_in_plain_text: Whether to send the token to another host without TLS.
+        timeout_s: Time-out in s of calls that the endpoint answers immediately.
 
     Raises:
         OSError: A file cannot be read.

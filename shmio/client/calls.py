@@ -30,7 +30,7 @@ from shmio.wire import shmio_v1_pb2 as wire
 STEP_PATIENCE_S: Final = 60.0
 SERVICE: Final = wire.DESCRIPTOR.services_by_name["Shmio"].full_name
 WRITE_PATIENCE_S: Final = 30.0
-"""Time in s that is added to the time-out of a write, because a source may have long cycles."""
+"""Time in s to add to the time-out of a write, because a source may have long cycles."""
 _SEARCH_PATIENCE_S: Final = 600.0
 """Time-out of a search in a recording, in s."""
 OPTIONS: Final = [
@@ -102,7 +102,7 @@ class Target:
 
     @property
     def credentials(self) -> grpc.ChannelCredentials | None:
-        """Credentials for TLS; None for plain text. Raises OSError if a file cannot be read."""
+        """Credentials for TLS; None for plain text. Raise OSError if a file cannot be read."""
         if self.ca is None:
             return None
         ca, key, certificate = (
@@ -152,7 +152,7 @@ def _is_here(address: str) -> bool:
 
 
 def ns(dt_s: float | None) -> int:
-    """Convert the length of a step to ns. None, which means the step size, becomes 0.
+    """Convert the length of a step to ns. None, which stands for the step size, becomes 0.
 
     Raises:
         ValueRangeError: The length is out of range.
@@ -216,7 +216,7 @@ def _kind(kind: int) -> OutcomeKind:
 
 
 def clock(found: Any) -> Clock:
-    """Convert the state of the clock from a message."""
+    """Convert a message to the state of the clock."""
     return Clock(
         ClockMode.VIRTUAL if found.virtual else ClockMode.WALL, found.step, found.time_ns, done=found.step,
         step_size_ns=found.step_size_ns, playing=found.playing, rate=found.rate, note=found.note,
@@ -248,7 +248,7 @@ def steps_requests(count: int, dt_s: float | None) -> list[Any]:
 
 
 def status(found: Any) -> dict[str, Any]:
-    """Convert an answer to the object that ``shmio-supervisor status --json`` prints."""
+    """Convert the answer to GetStatus to what ``shmio-supervisor status --json`` prints."""
     return {
         "instance": found.instance,
         "mode": found.mode,
@@ -308,5 +308,5 @@ def replay_status(found: Any) -> list[ReplayStatus]:
 
 
 def replay_patience_s(changes: ReplayChanges) -> float | None:
-    """Return the time-out of a request to replay, in s; None: the client's time-out applies."""
+    """Return the time-out of a Replay request, in s; None if the client's time-out applies."""
     return _SEARCH_PATIENCE_S if "change" in changes or "event" in changes else None

@@ -19,11 +19,11 @@ from shmio.model.values import Column, Outcome
 from shmio.wire import shmio_v1_pb2 as wire
 
 _MAX_WAITING: Final = 4096
-"""Maximum number of unread messages with originals."""
+"""Largest number of unread messages with originals, the values that an injection covers."""
 
 Given = Array | list[Any]
 Arrays = Mapping[Column, Given | tuple[Given, Given]]
-"""Values by column: either the values of the whole column in the table, or (slots, values)."""
+"""Values by column: either all values of the column in the table, or (slots, values)."""
 Raw = Iterable[Piece | tuple[int, bytes] | tuple[int, bytes, int]]
 """Each item is (offset, bytes) or (offset, bytes, mask): see :class:`Piece`."""
 Ranges = Iterable[tuple[int, int] | tuple[int, int, int]]
@@ -41,7 +41,7 @@ def inject_request(
     for_s: float | None,
     originals: bool,
 ) -> bytes:
-    """Return the first message of a call Inject, which creates an injection.
+    """Return the first message of a call of Inject, which creates the injection.
 
     Raises:
         ValueRangeError: An argument is invalid.
@@ -64,7 +64,7 @@ class ShadowState:
     """An injection of this client, with its table of registers."""
 
     def __init__(self, found: Any) -> None:
-        """Read the endpoint's first answer (None: there was none). Raise RemoteError if it is invalid."""
+        """Read the endpoint's first answer. Raise RemoteError if it is None or invalid."""
         if found is None or not found.HasField("laid"):
             raise RemoteError("the endpoint's first answer to Inject is invalid")
         self.number: int = found.laid.number
@@ -77,7 +77,9 @@ class ShadowState:
     def request(
         self, values: Mapping[str, object], arrays: Arrays | None, raw: Raw, *, answered: bool
     ) -> tuple[int, bytes]:
-        """Return a message with values, and its sequence number.
+        """Return the sequence number of a message with values, and the message.
+
+        The sequence number is 0 if the endpoint need not answer the message.
 
         Raises:
             ValueRangeError: A value is wrong.
@@ -134,7 +136,7 @@ class ShadowState:
 def ends(values: Mapping[str, object], outcome: Any, *, more: bool) -> list[Outcome]:
     """Return the same outcome for every value.
 
-    With ``more``, the last outcome is that of all arrays and raw bytes; its path is empty.
+    With ``more``, a last outcome with an empty path stands for all arrays and raw bytes.
     """
     paths = [*values, *([""] if more else [])]
     return calls.outcomes(paths, [outcome])

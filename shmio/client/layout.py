@@ -23,14 +23,14 @@ MAX_REGISTERS: Final = 1 << 20
 
 @dataclass(frozen=True, kw_only=True)
 class BlockLayout(Layout):
-    """Layout of a source's block, with properties of the source.
+    """Layout of a source's block, with more properties of the source.
 
     Attributes:
         source: Name of the source.
         section: Number of the source's block. It changes if a reload replaces the block.
         hash: Hash of the layout.
         period_ns: Time between two cycles, in ns.
-        stale_ns: Age above which a frame is bad, in ns.
+        stale_ns: Age above which a frame's quality is bad, in ns.
         writable: Patterns of the registers that may be written.
         armed: True if injections may change what is written to the device.
     """
@@ -68,7 +68,7 @@ class BlockLayout(Layout):
         return np.frombuffer(image, self._dtype)[0]  # type: ignore[no-any-return]
 
     def value(self, image: bytes, path: str) -> Any:
-        """Return the value of one register of a raw frame: as in :meth:`array`, but BOOLs as bools.
+        """Return a register's value from a raw frame, as in :meth:`array`, but BOOLs as bools.
 
         Raises:
             PathError: There is no such register.
@@ -83,7 +83,7 @@ class BlockLayout(Layout):
         if not register.dims:
             return bool(image[register.offset] >> (register.bit or 0) & 1)
         *rows, length = register.shape
-        if register.partial:  # a row that may begin within a byte, of a tag table over the block
+        if register.partial:  # a row of a tag table over the block, which may begin within a byte
             bits = np.frombuffer(image, np.uint8, register.size, register.offset)
             return np.unpackbits(bits, bitorder="little")[(register.bit or 0) :][:length].astype(bool)
         packed = np.frombuffer(image, np.uint8, register.size, register.offset).reshape(*rows, -(-length // 8))

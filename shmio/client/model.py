@@ -30,13 +30,14 @@ log = logging.getLogger("shmio.client")
 class Values(Mapping[str, Any]):
     """Values by path without the source: numpy scalars and arrays, and texts.
 
-    None stands for bytes that are not a valid value. The next step changes the values in place.
+    None stands for bytes that are not a valid value. The next step replaces the values in this
+    mapping.
     """
 
     def __init__(self, table: Table) -> None:
         self._table = table
         self.changed: tuple[str, ...] = ()
-        """Paths of the values that came with the present step: all values in the first step."""
+        """Paths of the values that came with the present step. The first step brings all values."""
 
     def __getitem__(self, path: str) -> Any:
         """Return a register's value; PathError if there is no such register."""
@@ -58,7 +59,7 @@ class Work:
     Attributes:
         time_s: Simulation time after the step.
         dt_s: Length of the step.
-        doubt: Reason why inputs may be wrong; empty if they are right.
+        doubt: Reason why inputs may be wrong; empty if there is none.
         refused: Reason why the previous answer was refused; empty if it was accepted.
     """
 
@@ -87,7 +88,7 @@ class Part:
     """A source that a program computes, with its inputs and outputs."""
 
     def __init__(self, found: Any) -> None:
-        """Read the endpoint's first answer (None: there was none). Raise RemoteError if it is invalid."""
+        """Read the endpoint's first answer. Raise RemoteError if it is None or invalid."""
         if found is None or found.WhichOneof("what") != "joined":
             raise RemoteError("the endpoint's first answer to Simulate is invalid")
         joined = found.joined
@@ -142,7 +143,7 @@ class Part:
 
     @staticmethod
     def failed(step: int, reason: str) -> bytes:
-        """Return an answer that reports that the step has failed, and why."""
+        """Return the answer that tells the endpoint that the step has failed, and why."""
         return wire.SimulateRequest(done=wire.Done(step=step, failure=_shorten(reason))).SerializeToString()
 
 
@@ -168,7 +169,7 @@ class Member:
         self.period_s = part.period_s
 
     def _present(self) -> int:
-        """Return the number of the step to answer. Raise RemoteError if there is none."""
+        """Return the number of the step to answer. Raise RemoteError if no step is requested."""
         if self._work is None:
             raise RemoteError(f"{self.source}: there is no step to answer")
         return self._work.step
@@ -187,11 +188,11 @@ class Rejoining:
         self._lost_s: float | None = time.monotonic()
         self._joined = False
         self._known: dict[str, object] = {}  # latest outputs by path
-        self._sent = True  # whether the present endpoint has all of them
+        self._sent = True  # True if the present endpoint has all of these outputs
         self._failure = ""
 
     def joined(self) -> None:
-        """Note that the model has joined."""
+        """Remember that the model has joined."""
         self._lost_s, self._sent, self._joined = None, not self._joined, True
 
     def patient(self, error: ShmioError) -> bool:
@@ -208,9 +209,10 @@ class Rejoining:
             log.warning("%s: %s", part.source, work.refused)
 
     def answer(self, part: Part, work: Work, outputs: Mapping[str, object] | None) -> bytes:
-        """Return the answer with the outputs; after joining again, also with earlier outputs.
+        """Return the answer with the outputs; the first answer after a rejoin has all outputs.
 
-        It raises the errors of :meth:`Part.done`.
+        Raises:
+            PathError, ValueRangeError: As for :meth:`Part.done`.
         """
         outputs = {} if outputs is None else outputs
         if not isinstance(outputs, Mapping):
@@ -221,7 +223,7 @@ class Rejoining:
         return answer
 
     def failed(self, part: Part, work: Work, error: Exception) -> bytes:
-        """Return an answer that reports that the step has failed; log each reason once."""
+        """Return the answer that the step has failed. Log the reason if it is a new one."""
         text = explain(error)
         if text != self._failure:
             self._failure = text

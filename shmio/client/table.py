@@ -1,8 +1,8 @@
 """Tables of registers with their latest values as numpy arrays, and the messages that fill them.
 
 On the wire, a packed field of elements with a fixed size looks the same as a ``bytes`` field
-(protobuf.dev, "Encoding"). So this module derives message types in which such a field has the type
-``bytes``. The bytes are those of a little-endian array.
+(protobuf.dev, "Encoding"). Therefore, this module derives message types in which such a field has
+the type ``bytes``: numpy reads them as a little-endian array without a copy.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ FIELDS: Final = {
 _NEAR_CANDIDATES: Final = 500
 _SHOWN: Final = 200
 MAX_SLOTS: Final = 1 << 22
-"""Maximum number of elements of a table. No endpoint sends larger tables."""
+"""Largest number of elements in a table. No endpoint sends larger tables."""
 
 
 # -- messages with packed arrays as bytes --------------------------------------------------------------------
@@ -96,7 +96,7 @@ SimulateResponse = _message("SimulateResponse")
 
 
 class Register(model.Register, frozen=True, gc=False, kw_only=True):
-    """A register, or an array's element, as the wire describes it.
+    """A register, or an element of an array, as the endpoint describes it.
 
     Attributes:
         column: Column with the register's values.
@@ -110,7 +110,7 @@ class Register(model.Register, frozen=True, gc=False, kw_only=True):
 
     @property
     def element(self) -> ElementType:
-        """The elementary type. Raises RemoteError if this version does not know the type."""
+        """The elementary type. Raise RemoteError if this version does not know the type."""
         found = element_type(self.type)
         if found is None:
             raise RemoteError(
@@ -150,7 +150,7 @@ def unknown(path: str, paths: Sequence[str], what: str) -> PathError:
 
 
 class Change(NamedTuple):
-    """Received elements of a column, as read-only arrays: ``values[i]`` belongs to ``slots[i]``."""
+    """Received elements of a column, as read-only arrays: slot ``slots[i]`` has ``values[i]``."""
 
     column: Column
     slots: Array
@@ -201,7 +201,7 @@ class Table:
         self.codes: Array | None = None
         """The status code of each register; None if the source gives registers no status."""
         self.times_ns: Array | None = None
-        """The source time of each register, UTC in ns; 0: the time of the update applies."""
+        """The source time of each register, UTC in ns; 0 if the time of the update applies."""
         self.state: object = None
         """Quality, reason, provenance and incarnation of the latest frame."""
         self._everything = {column: np.arange(len(array), dtype=np.uint32) for column, array in self.arrays.items()}
@@ -260,7 +260,7 @@ class Table:
         }
 
     def apply(self, values: Any) -> tuple[Change, ...]:
-        """Copy a message's values into the arrays, and return them.
+        """Copy a message's values into the arrays, and return them as changes.
 
         Raises:
             RemoteError: The values are invalid.

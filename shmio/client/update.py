@@ -32,12 +32,12 @@ class Update:
         clock_ns: Time since the instance's start, in ns.
         source_ns: UTC time of the values, in ns; 0 if there are no values yet.
         marked: True if the update also says which registers are invalid or injected.
-        missed: With ``every_frame``: number of frames lost before this one.
+        missed: Number of frames lost before this one. It is counted only with ``every_frame``.
         ended: True if a reload has removed the source, or all requested registers.
-        image: With ``frames``: the frame as consumers see it.
-        raw: With ``frames``: the frame as the source delivered it.
-        age_ns: After a read: the age of the frame, in ns.
-        pieces: For an injection over ranges: the changed bytes in these ranges.
+        image: The frame as consumers see it, if ``frames`` was requested.
+        raw: The frame as the source delivered it, if ``frames`` was requested.
+        age_ns: Age of the frame in ns, after a read.
+        pieces: The changed bytes in the ranges of an injection over ranges.
     """
 
     __slots__ = (
@@ -71,7 +71,7 @@ class Update:
         if found.HasField("injected"):
             table.mark(found.injected, table.injected)
         self._statuses = table.take_statuses(found.statuses) if found.HasField("statuses") else []
-        state = self.quality, self.reason.partition(":")[0], self.provenance, self.incarnation  # without an age
+        state = self.quality, self.reason.partition(":")[0], self.provenance, self.incarnation  # the age always changes
         self._everything = self.whole or self.marked or table.state != state
         table.state = state
         self._originals: Mapping[Column, Array] | None = None
@@ -106,7 +106,7 @@ class Update:
     def reading(self, place: int, register: model.Register | None = None) -> Reading:
         """Return the reading of the register at index ``place``.
 
-        ``register``: description of the register for the reading; None: the table's description.
+        ``register`` is the description to put in the reading; None for the table's description.
         """
         found = self.table.registers[place]
         value: Any = self.table.value(place) if self.source_ns else None
@@ -211,7 +211,7 @@ class Tables:
 
 
 def _same(old: Table, new: Table) -> bool:
-    """Return whether ``new`` replaces ``old``, because both have one source and direction."""
+    """Return whether ``new`` replaces ``old``: both have the same source and direction."""
     return (old.source, old.direction) == (new.source, new.direction)
 
 

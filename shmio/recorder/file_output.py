@@ -1,4 +1,4 @@
-"""Writes a recording's file in a separate thread. So a slow disk does not delay the recorder."""
+"""Writes a recording's file in a separate thread, so a slow disk does not delay the recorder."""
 
 from __future__ import annotations
 
@@ -169,9 +169,9 @@ class Output:
         return not self._thread.is_alive()
 
     def close(self, patience_s: float) -> bool:
-        """Write the waiting bytes, at most for ``patience_s``.
+        """Write the waiting bytes, for at most ``patience_s`` seconds.
 
-        Return whether all are safely on the disk.
+        Return whether all bytes of the file are safely on the disk.
         """
         self.flush()
         with self._condition:

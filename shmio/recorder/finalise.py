@@ -44,7 +44,7 @@ from shmio.recording.format.records import (
 from shmio.recording.reading.reader import Reader
 
 CHECKED: Final = 128
-"""Number of chunks at the end of a file to verify. After a power cut, they may have zeros."""
+"""Number of chunks at the end of a file to verify. After a power cut, they may contain zeros."""
 ZEROS_BYTES: Final = 1 << 20
 
 _MESSAGE: Final = struct.Struct("<HIQ")  # channel, sequence, log time

@@ -246,7 +246,7 @@ class InstanceFollower:
     ) -> None:
         """Create the follower.
 
-        ``selection`` names the sources and registers to record; None: all.
+        ``selection`` names the sources and registers to record; None selects all.
         """
         self.segment = segment
         self.start = start

@@ -32,7 +32,7 @@ from shmio.version import __version__
 MAX_FILE_BYTES: Final = 16 << 20
 """Largest size of a file that is attached to a recording."""
 CHUNK_S: Final = 0.8
-"""Longest duration of a chunk, in s. So a killed recorder loses less than a second."""
+"""Longest duration of a chunk, in s, so that a killed recorder loses less than a second."""
 CLOSE_S: Final = 3.0
 CHECK_S: Final = 1.0
 """Interval in s at which to check whether the file was removed."""
@@ -54,9 +54,9 @@ class AttachedFile(NamedTuple):
 
 
 AttachedFiles = Callable[[str | None, int], list[AttachedFile]]
-"""Returns the files to attach for a source: its arguments are the source's name and block number.
+"""A function from a source's name and block number to the files to attach for the source.
 
-If the name is None, it returns the files of the instance.
+If the name is None, the function returns the files of the instance.
 """
 
 
@@ -154,7 +154,7 @@ class RecordedBlock:
         return sum(lost.count for lost in self.lost.values())
 
     def come_to(self, what: str, number: int, log_ns: int) -> None:
-        """Note that all frames or events up to this number were recorded."""
+        """Remember that all frames or events up to this number were recorded."""
         self.log_ns = log_ns
         if what == "frames":
             self.frame = number
@@ -435,7 +435,7 @@ class Recorder:
     def _tell_lost(self, followed: RecordedBlock, before_ns: int) -> None:
         """Record gaps for lost entries.
 
-        ``before_ns``: log time of the entry that follows them; 0: none.
+        ``before_ns`` is the log time of the entry that follows them; 0 if no entry follows.
         """
         for gap in followed.found(before_ns):
             log_ns = before_ns or self.tap.now()
@@ -584,9 +584,10 @@ class RotatingRecorder:
 
     @property
     def _due(self) -> bool:
-        """True if rotation is due, and the disk has no problem.
+        """True if the file is too old or too large, and can be replaced now.
 
-        A new file would not solve a problem.
+        A file without entries is not replaced. While the disk has a problem, a new file would not
+        help.
         """
         settings, recorder = self._settings, self.recorder
         old = bool(settings.rotate_min) and time.monotonic() - self._begun_s >= settings.rotate_min * 60

@@ -18,7 +18,7 @@ NS = 1e9
 
 @dataclass(slots=True)
 class _HeldValue:
-    """A value that a client gave to an injection, and the time at which it did so."""
+    """A value that a client gave to an injection, and the time at which the client gave it."""
 
     place: Place
     since_ns: int
@@ -50,9 +50,9 @@ class Derived:
 
     @property
     def begin_s(self) -> float:
-        """The earliest start of all declarations in s.
+        """The earliest start of a declaration, in s.
 
-        0: there are no declarations, or one has no start.
+        The value is 0 if there are no declarations, or if a declaration has no start.
         """
         return min((one.start_s or 0.0 for one in self.declarations), default=0.0)
 
@@ -69,7 +69,7 @@ class Derived:
 
 
 def derive(dump: Dump) -> Derived:
-    """Derive declarations that repeat a recording's injections at the same times of the clock.
+    """Derive declarations that repeat a recording's injections at the same instance times.
 
     A declared injection keeps its declaration and its seed, but lasts no longer than it did in the
     recording. Each value that a client gave over ``/out`` becomes a ``set``, which lasts until the
@@ -192,10 +192,10 @@ class _Source:
 
 
 def _named(found: Derived) -> Iterator[Declaration]:
-    """Yield the declarations, with unique names.
+    """Yield the declarations; rename each whose name another declaration already has.
 
-    A new name changes the random values of an injection. In that case, add a message to
-    ``left_out``.
+    The random values of an injection depend on its name. If a new name changes them, add a message
+    to ``left_out``.
     """
     seen: dict[str, int] = {}
     for one in found.declarations:

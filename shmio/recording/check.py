@@ -1,4 +1,4 @@
-"""Verifies that all of a recording conforms to its format (docs/reference/dump-format.md)."""
+"""Verifies that a whole recording conforms to its format (docs/reference/dump-format.md)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from shmio.recording.reading.survey import MAX_BLOCKS, Count, read_index
 from shmio.recording.times import lost
 
 MAX_TOLD: Final = 1000
-"""Largest number of damaged places, and of problems, that a result lists. It counts all of them."""
+"""A result lists at most this many damaged places and this many problems. It counts all of them."""
 
 
 @dataclass(slots=True)
@@ -39,7 +39,7 @@ class Findings:
         return self.count == 0
 
     def texts(self) -> list[str]:
-        """Return a message about each place, and one about those that are not listed."""
+        """Return a message for each listed place, and one with the number of unlisted places."""
         found = [lost(damage) for damage in self.damage] + self.problems
         more = self.count - len(found)
         return [*found, f"and {more} more such places"] if more else found
@@ -190,7 +190,7 @@ class _Check:
 
 
 class _Numbers:
-    """Checks that there is a gap for each missing number of a block's frames and events."""
+    """Checks that a gap is recorded wherever the frame or event numbers of a block have a jump."""
 
     def __init__(self, problem: Callable[[str], None]) -> None:
         self._problem = problem

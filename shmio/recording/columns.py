@@ -82,8 +82,8 @@ class Columns(Mapping[str, Array]):
 
         The columns are time (UTC, ns), source time, number, cycle, quality, provenance, and the
         registers with native types: arrays are lists of fixed size, POINTER and ANY are bytes. A
-        value is null if the bytes are not valid for the type, or if the source had no image yet. If
-        a register has the name of another column, the name of its column begins with the source.
+        value is null if the bytes are not valid for the type, or if the source had no value yet. A
+        register whose path equals the name of another column gets the name ``source/path``.
 
         Raises:
             MissingLibraryError: pyarrow is not installed.

@@ -28,7 +28,7 @@ MAX_EVENTS: Final = 4096
 While time is paused, one cycle may have any number of events.
 """
 MAX_SHIFT: Final = 64
-"""Largest number of frames of the first common cycle that one recording may lack."""
+"""Number of frames at the start of the first common cycle in which the recordings are aligned."""
 
 T = TypeVar("T", Frame, Event)
 _Pair = tuple[Entry[T] | None, Entry[T] | None]
@@ -53,8 +53,8 @@ class RegisterDifference:
 class Difference:
     """The first pair of frames or events that differ.
 
-    ``times_ns`` and ``numbers`` have the log time and the number in each recording. None: this
-    recording lacks the frame or event.
+    ``times_ns`` and ``numbers`` have the log time and the number in each recording. They are None
+    for a recording that lacks the frame or event.
     """
 
     times_ns: tuple[int | None, int | None]
@@ -134,8 +134,8 @@ class SourceDifference:
 IGNORABLE: Final = ("times", "cycle", "reason", "events", "ends")
 """The items that a comparison can ignore.
 
-``ends`` stands for the frames and events of only one recording that come before the first, or after
-the last, frame or event of both recordings.
+``ends`` stands for frames and events that only one recording has, before the first or after the
+last frame or event that both have.
 """
 _OF_PROCESSES: Final = frozenset({EventKind.STARTED, EventKind.STOPPED})
 
@@ -151,7 +151,7 @@ class Comparison:
         ignore: The items of :data:`IGNORABLE` to ignore.
         only: Paths of the registers to compare, as for :meth:`Dump.select`; empty for all.
         tolerance: Absolute difference up to which REAL and LREAL values count as equal.
-        relative: Difference in relation to the larger value up to which they count as equal.
+        relative: The same tolerance as a fraction of the larger absolute value.
     """
 
     ignore: Collection[str] = ()
@@ -269,8 +269,8 @@ class _Source:
 
         Args:
             since: All entries at this end that only one recording has.
-            inside: Those of them that lie between the first and the last common frame. Only these
-                count if ends are ignored.
+            inside: The entries of ``since`` between the first and the last common entry. If ends
+                are ignored, only these count.
         """
         return inside if "ends" in self._how.ignore else since
 

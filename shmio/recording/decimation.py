@@ -1,4 +1,4 @@
-"""Reduces the course of a register to the samples that a plot of a certain width shows."""
+"""Reduces the samples of a register to those that a plot of a certain width can show."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Samples(NamedTuple):
     Attributes:
         time_ns: Times in ns, int64.
         values: Values, float64; NaN where there is no good value.
-        injected: Whether the value is injected, bool.
+        injected: True where the value is injected, bool.
     """
 
     time_ns: npt.NDArray[np.int64]
@@ -22,7 +22,7 @@ class Samples(NamedTuple):
     injected: npt.NDArray[np.bool_]
 
     def take(self, chosen: Any) -> Samples:
-        """Return some of the samples."""
+        """Return the samples that a numpy index or mask selects."""
         return Samples(self.time_ns[chosen], self.values[chosen], self.injected[chosen])
 
 
@@ -30,17 +30,16 @@ NO_SAMPLES = Samples(np.empty(0, np.int64), np.empty(0, np.float64), np.empty(0,
 
 
 def joined(first: Samples, second: Samples) -> Samples:
-    """Return the samples of both."""
+    """Return the samples of ``first``, followed by those of ``second``."""
     return Samples(*(np.concatenate(pair) for pair in zip(first, second, strict=True)))
 
 
 class Decimator:
-    """Reduces samples that come part by part.
+    """Reduces samples that are added in parts, in the order of time.
 
-    Time is divided into columns, such as the pixels of a plot. Of each column these samples remain:
-    the first and the last, the least and the greatest, the first without a value, and the first
-    injected one. So a plot of the remaining samples looks like a plot of all of them, and in a
-    column with few samples all remain.
+    Time is divided into columns, such as the pixels of a plot. From each column, the decimator
+    keeps the first and the last sample, the least and the greatest, the first without a good value,
+    and the first injected one. A plot of these looks like a plot of all samples.
     """
 
     def __init__(self, begin_ns: int, end_ns: int, columns: int) -> None:
@@ -49,10 +48,10 @@ class Decimator:
         self._width_ns = max(1, (end_ns - begin_ns) // max(1, columns))
         self._rest = NO_SAMPLES
         self.reduced = False
-        """True if samples were left out so far."""
+        """True if any sample was left out so far."""
 
     def add(self, samples: Samples) -> Samples:
-        """Add later samples; return what remains of the columns before the last one."""
+        """Add later samples. Return the kept samples of all columns that are now complete."""
         whole = joined(self._rest, samples)
         if not len(whole.time_ns):
             return NO_SAMPLES
@@ -65,13 +64,13 @@ class Decimator:
         return whole.take(complete)
 
     def end(self) -> Samples:
-        """Return what remains of the last column."""
+        """Return the kept samples of the last column."""
         rest, self._rest = self._rest, NO_SAMPLES
         return rest
 
 
 def _kept(samples: Samples, column: npt.NDArray[np.int64]) -> npt.NDArray[np.intp]:
-    """Return the indices of the samples that remain."""
+    """Return the indices of the samples to keep."""
     changes = np.flatnonzero(column[1:] != column[:-1]) + 1
     starts = np.concatenate(([0], changes))
     ends = np.concatenate((changes, [len(column)]))

@@ -45,8 +45,8 @@ Chosen = dict[DumpBlock, list[Register]]
 def open_dump(files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], damaged: Damaged | None = None) -> Dump:
     """Open a recording that consists of one file, or of several files of one run in any order.
 
-    This reads only the index of each file; of a file that was not closed, the headers of its
-    chunks.
+    Opening reads only the index of each file. If a file was not closed, it reads the headers of the
+    file's chunks instead.
 
     Args:
         files: The path of a file, or the paths of several files.
@@ -213,7 +213,7 @@ class Dump:
     def events(
         self, sources: str | Collection[str] | None = None, from_ns: int = 0, to_ns: int = MAX_NS
     ) -> Iterator[Entry[Event]]:
-        """Iterate over the events of some sources. Read only the chunks that have events.
+        """Iterate over the events of some sources. This reads only the chunks that have events.
 
         Args:
             sources: Names of the sources; None for all.
@@ -264,7 +264,7 @@ class Dump:
         return next(self.events(source, after_ns + 1), None)
 
     def next_change(self, path: str, after_ns: int = -1, to_ns: int = MAX_NS) -> Entry[Frame] | None:
-        """Return the first frame after a time in which readers saw that registers had changed.
+        """Return the first frame after ``after_ns`` in which readers saw a change of registers.
 
         Args:
             path: A register, a structure or a pattern of one source.

@@ -46,7 +46,7 @@ _FRAME: Final = "frame"
 _FRAME_FIELDS: Final = {"number": "integer", "cycle": "integer", "quality": "integer", "provenance": "integer"}
 """The header fields of a frame, with their JSON types.
 
-They are under the key _FRAME of a message.
+In a message, they are below the key ``frame``.
 """
 _JSON_TYPES: Final = {"b": "boolean", "i": "integer", "u": "integer", "f": "number", "m": "integer"}
 _EVENT_TYPES: Final = {
@@ -66,7 +66,7 @@ def pieces(
     *,
     raw: bool = False,
 ) -> Iterator[tuple[DumpBlock, Columns]]:
-    """Yield the values of chosen registers of one source in pieces. Each piece is of one block.
+    """Yield the values of chosen registers of one source in pieces, each from one block.
 
     Raises:
         PathError: There is no such source.
@@ -213,9 +213,9 @@ def _new_folder(path: Path) -> Iterator[None]:
 
 
 class BlockTables:
-    """Writes a file for each block.
+    """Writes a table file for each block.
 
-    It is named after the source; later blocks get a number, too.
+    A file is named after its source; the files of the source's later blocks also have a number.
     """
 
     def __init__(self, stack: ExitStack, output: Path, form: str, chosen: Chosen, *, named: bool) -> None:
@@ -426,7 +426,7 @@ def _channel(writer: Writer, topic: str, name: str, properties: dict[str, Any]) 
 def _tree(registers: Sequence[Register], source: str) -> dict[str, Any]:
     """Return a tree of the registers by path segments. Its leaves are the indices of the registers.
 
-    If a register has the name of a field of the frame, its path begins with the source.
+    If a path begins with ``frame``, which is the key of the header fields, the source precedes it.
     """
     tree: dict[str, Any] = {}
     for place, register in enumerate(registers):

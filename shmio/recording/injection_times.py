@@ -8,13 +8,14 @@ from shmio.judging.report import Span
 from shmio.segment.events import Event, EventKind
 
 MAX_SPANS: Final = 10_000
-"""Maximum number of times that are stored; later ones are left out."""
+"""Largest number of finished periods that are stored; later ones are left out."""
 
 
 class InjectionTimes:
-    """The times in which injections were active, from the events of sources.
+    """The periods in which injections were active, according to the events of their sources.
 
-    A declared injection is active from its activation, another one from its first value.
+    A declared injection is active from its activation on; a client's injection, from its first
+    value on.
     """
 
     def __init__(self) -> None:
@@ -37,7 +38,7 @@ class InjectionTimes:
 
     @property
     def spans(self) -> list[Span]:
-        """The times, in the order of their begin."""
+        """The periods, sorted by their start. The end is None if the injection is still active."""
         open_ = [Span(self._name(key), key[0], begin_ns, None) for key, begin_ns in self._begun.items()]
         return sorted([*self._over, *open_], key=lambda span: span.begin_ns)
 

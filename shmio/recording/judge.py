@@ -19,14 +19,14 @@ from shmio.recording.reading.batch import Batch
 from shmio.recording.reading.part import MAX_NS, DumpBlock
 
 MAX_GOLDEN: Final = 20_000_000
-"""Maximum number of values of a recording with which an expectation compares."""
+"""Largest number of values to read from a recording that expectations name in ``like``."""
 
 
 def recording_judge(dump: Dump, expectations: Sequence[Expectation], golden: Golden | None = None) -> Judge:
     """Return a judge of the sources of a recording. ``golden`` is as for :class:`Judge`.
 
     Raises:
-        ConfigError: An expectation is invalid; the message starts as ``expect[0].formula: …``.
+        ConfigError: An expectation is invalid; the message starts like ``expect[0].formula: …``.
         RecordingError: The recording has no source.
 
     """
@@ -46,7 +46,7 @@ def judge_recording(
 
     Args:
         dump: The recording.
-        judge: A new judge of it.
+        judge: A new judge of this recording.
         from_ns: Start of the range, log time.
         to_ns: End of the range, log time.
         seen: Called with the values of the signals, by source, in order.
@@ -71,7 +71,7 @@ class GoldenRecordings:
         self._folder = folder
 
     def __call__(self, name: str, signals: Sequence[Signal]) -> list[Piece]:
-        """Return signals of a recording, from 0 on: see :data:`shmio.judging.judge.Golden`.
+        """Return signals of a recording, with times from 0 on: :data:`shmio.judging.judge.Golden`.
 
         Raises:
             ConfigError: The recording cannot be read, is too long, or does not have a signal.
@@ -126,7 +126,7 @@ def _follow(source: Source, block: DumpBlock, name: str) -> None:
 
 
 def _first_blocks(dump: Dump) -> dict[str, DumpBlock]:
-    """Return the first block of each source. RecordingError: there is none."""
+    """Return the first block of each source; raise RecordingError if there is no source."""
     blocks: dict[str, DumpBlock] = {}
     for block in dump.blocks:
         blocks.setdefault(block.source, block)
@@ -138,14 +138,14 @@ def _first_blocks(dump: Dump) -> dict[str, DumpBlock]:
 def _frames_of(
     dump: Dump, raws: Mapping[str, bool], from_ns: int = 0, to_ns: int = MAX_NS
 ) -> Iterator[tuple[str, DumpBlock, Frames]]:
-    """Yield the frames of sources, chunk by chunk, with those of one source in order.
+    """Yield the frames of some sources, chunk by chunk. The frames of each source are in order.
 
-    ``raws`` says for each source whether to read what it delivered, too.
+    ``raws`` says, for each source, whether to also read the images without injections.
     """
     readers = {source: _batches(dump, source, from_ns, to_ns, raws=need) for source, need in raws.items()}
     come_to = dict.fromkeys(readers, -1)
     while readers:
-        source = min(readers, key=come_to.__getitem__)  # the sources keep step, so that little has to wait
+        source = min(readers, key=come_to.__getitem__)  # the source that is furthest behind
         found = next(readers[source], None)
         if found is None:
             del readers[source]

@@ -41,7 +41,7 @@ class _Track:
 
 
 class Rewriter:
-    """Writes entries to a new file like a recorder, with gaps for missing frames and events."""
+    """Writes entries to a new file as a recorder does, with gaps for missing frames and events."""
 
     def __init__(self, stream: IO[bytes], dump: Dump, made: str, *, whole: bool) -> None:
         """Begin the file. The arguments are as for :func:`rewrite`."""
@@ -184,8 +184,8 @@ def rewrite(
         path: The new file.
         made: Name of the command that makes the file, for its metadata.
         entries: The entries in order: from ``dump.items()``, or from :func:`part`.
-        whole: True: if entries are missing at the beginning of a block, write a gap. False: they
-            were not selected.
+        whole: True to write a gap if entries are missing at the beginning of a block; False if they
+            were left out on purpose.
         progress: Called with the length in ns of the part that is done.
 
     Returns:
@@ -214,7 +214,7 @@ def part(
 ) -> Iterator[Entry[Item]]:
     """Return the entries of a part of a recording.
 
-    Write them by :func:`rewrite` with ``whole=False``.
+    Write them with :func:`rewrite` and ``whole=False``.
 
     Args:
         dump: The recording.

@@ -20,7 +20,8 @@ from shmio.segment import Block, Frame
 class RecordedRegisters:
     """The registers of a block to record. ``layout`` has only these, at their original offsets.
 
-    If the block has a status area, the recorded one is shorter: it has only their statuses.
+    If the block has a status area, the recorded area is shorter: it has the statuses of only these
+    registers.
     """
 
     def __init__(self, layout: Layout, registers: Sequence[Register] | None = None) -> None:

@@ -49,7 +49,7 @@ TEXT: Final = "text/plain"
 
 
 def layout_files(layout: Layout) -> Iterator[tuple[str, bytes]]:
-    """Yield name and data of the attachments with a layout.
+    """Yield the name and the data of each attachment that describes a layout.
 
     If the layout has tag tables over the block, a second attachment is the layout without them.
     Readers before version 0.2 refuse a layout whose registers overlap, and use the second

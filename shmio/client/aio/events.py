@@ -11,7 +11,7 @@ from shmio.model.event import Event
 
 
 class Events(AsyncIterator[Event]):
-    """Iterator over events, for one task. It ends when it or its client is closed.
+    """Iterator over events, for one task. It ends when the iterator or its client is closed.
 
     Any task may call :meth:`close`.
     """

@@ -17,9 +17,9 @@ from shmio.model.values import Outcome
 class Shadow(AsyncIterator[Update]):
     """An injection to which this program gives values.
 
-    Iterate over it for the originals, which are the values that the injection covers. Several tasks
-    may give values, and one may iterate. ``table`` has the registers that the injection covers, with
-    the latest originals.
+    Iterate over it to receive the originals, which are the values that the injection covers.
+    Several tasks may give values, but only one may iterate. ``table`` has the covered registers
+    with their latest originals.
     """
 
     def __init__(self, channel: Channel, stream: Duplex, state: injection.ShadowState) -> None:
@@ -60,7 +60,7 @@ class Shadow(AsyncIterator[Update]):
             raw: Values as raw bytes.
 
         Returns:
-            An outcome for each value. All values have the same outcome, the worst of them. It is
+            An outcome for each value. All values have the same outcome: the worst one. It is
             ``rejected`` if a path or value is wrong, or the injection does not cover the path.
 
         Raises:
@@ -102,7 +102,7 @@ class Shadow(AsyncIterator[Update]):
         await self._stream.write(data)
 
     async def __anext__(self) -> Update:
-        """Wait for the next originals. They come only if the injection was created with ``originals``."""
+        """Wait for the next originals. They come only if ``originals`` was set at the creation."""
         async with self._changed:
             if not self._updates:
                 await self._changed.wait_until(lambda: self._state.waits or self._over)
@@ -203,7 +203,7 @@ class Campaign(AsyncIterator[InjectionEvent]):
                 with suppress(PathError, CommandError):  # it has ended, or a reload has removed its source
                     await self._lift(source, number)
         finally:
-            self._stream.close()  # this ends what still remains
+            self._stream.close()  # this lifts any that remain
 
     async def __aenter__(self) -> Self:
         return self

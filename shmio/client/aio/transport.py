@@ -98,7 +98,7 @@ class Stream(AsyncIterator[Any]):
 
 
 class Duplex(Stream):
-    """A stream that also sends further requests. The first requests are sent at its first use."""
+    """A stream that can send further requests. Its first use sends the first requests."""
 
     def __init__(self, channel: Channel, method: Any, *first: Any) -> None:
         super().__init__(channel, method)
@@ -113,7 +113,7 @@ class Duplex(Stream):
     async def write(self, *requests: Any) -> None:
         """Send requests.
 
-        If the stream has ended, they are dropped, and reading raises the reason.
+        If the stream has ended, this drops them, and the next read raises the reason.
         """
         async with self._lock:
             requests, self._first = (*self._first, *requests), ()
@@ -138,7 +138,7 @@ def _closing() -> Iterator[None]:
 
 
 class Condition(asyncio.Condition):
-    """Condition for which several tasks can wait, each with a time-out."""
+    """Condition for which several tasks can wait, each with its own time-out."""
 
     async def wait_until(self, predicate: Callable[[], bool], timeout_s: float | None = None) -> bool:
         """Wait until the predicate is true. Return False after a time-out."""
@@ -155,5 +155,5 @@ class Background:
         self._task = asyncio.get_running_loop().create_task(run(), name=name)
 
     async def join(self, timeout_s: float | None = None) -> None:
-        """Wait until the coroutine has ended, at most ``timeout_s``."""
+        """Wait until the coroutine has ended, for at most ``timeout_s`` seconds."""
         await asyncio.wait((self._task,), timeout=timeout_s)

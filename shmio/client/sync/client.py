@@ -35,7 +35,8 @@ class Client:
     A client has the methods of :class:`shmio.Cell`, and more.
 
     Raises:
-        PathError, ValueRangeError, CommandError, QualityError: In the same cases as a local cell.
+        PathError, ValueRangeError, CommandError, QualityError: In the same cases as for a local
+            cell.
         EndpointError: The endpoint has reached a limit, for this client or for all.
         RemoteError: The endpoint cannot be reached, or refuses this client.
     """
@@ -57,7 +58,7 @@ class Client:
         self._simulate: Any = connection.stream_stream(f"/{calls.SERVICE}/Simulate", None, SimulateResponse.FromString)
 
     def layouts(self, *sources: str) -> dict[str, BlockLayout]:
-        """Return the layouts of these sources, or of all sources, by source.
+        """Return the layouts of these sources, by source; of all sources if none is named.
 
         Raises:
             PathError: There is no such source.
@@ -74,7 +75,7 @@ class Client:
     def get(self, *patterns: str) -> list[Reading]:
         """Read the registers that patterns name, whatever their quality: see :class:`shmio.Cell`.
 
-        The first call also fetches the layouts, as does the first call after a reload.
+        The first call also fetches the layouts; so does the first call after a reload.
 
         Raises:
             PathError: A pattern names nothing.
@@ -109,7 +110,7 @@ class Client:
 
         Args:
             patterns: Paths, elements, slices, structures, globs, or the names of sources.
-            originals: Whether to read also the values that the source delivered, without
+            originals: Whether to also read the values that the source delivered, without
                 injections.
 
         Raises:
@@ -144,7 +145,7 @@ class Client:
                 each update has the newest frame.
             frames: Whether to receive raw frames of the sources instead of values.
             max_rate_hz: Maximum number of updates per second of each source; 0 for no limit.
-            deadband: A change of a number is reported only if it is larger than this.
+            deadband: A number's change up to this size is not reported.
 
         Returns:
             An iterator over updates. Its first step raises PathError if a pattern names nothing.
@@ -155,7 +156,9 @@ class Client:
         return Subscription(Stream(self._channel, self._subscribe, request))
 
     def events(self, *sources: str) -> Events:
-        """Follow the events of these sources, or of all sources: see :class:`shmio.Cell`.
+        """Follow the events of these sources; of all sources if none is named.
+
+        See :class:`shmio.Cell`.
 
         Raises:
             PathError: There is no such source.
@@ -204,15 +207,15 @@ class Client:
         for_s: float | None = None,
         originals: bool = False,
     ) -> Shadow:
-        """Create an injection over registers of one source, all of /out or all of /in.
+        """Create an injection over registers of one source, either all in /out or all in /in.
 
         The injection is lifted when you close it, at the end of its ``with`` block, when this
         program ends, or after ``for_s``.
 
         Args:
             patterns: Registers, elements, slices, structures or globs.
-            ranges: Bytes and bits of a frame, in addition to the patterns or alone.
-            source: Source of the ranges if there is no pattern, as ``cell`` or ``cell/in``.
+            ranges: Bytes and bits of a frame to cover, in addition to the registers or without any.
+            source: Source of the ranges if there is no pattern, such as ``cell`` or ``cell/in``.
             priority: Injections with a higher priority cover those with a lower one.
             keep: Whether the injection stays when this program ends, until somebody lifts it.
             name: Name in the list of injections.
@@ -249,7 +252,7 @@ class Client:
         return Campaign.create(Stream(self._channel, self._stub.Declare, request), self.lift, keep=keep)
 
     def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
-        """Return the present injections of these sources, or of all sources.
+        """Return the present injections of these sources; of all sources if none is named.
 
         Within a source, the innermost injection comes first.
         """
@@ -266,9 +269,9 @@ class Client:
         self._call(self._stub.Lift, wire.LiftRequest(source=source, number=number))
 
     def lift_all(self, *sources: str) -> list[Lifted]:
-        """Lift all injections of these sources, or of all sources, whichever program created them.
+        """Lift all injections of these sources; of all sources if none is named.
 
-        Return the result for each injection.
+        It does not matter which program created them. Return the result for each injection.
 
         Raises:
             CommandError: Some injections were not lifted.
@@ -344,11 +347,11 @@ class Client:
         return calls.clock((self._call(self._stub.GetStatus, wire.GetStatusRequest())).clock)
 
     def real_sources(self) -> list[str]:
-        """Return the names of the sources that no step moves, such as sources with a real device."""
+        """Return the names of the sources that steps do not advance, such as real devices."""
         return [one["name"] for one in (self.status())["processes"] if one.get("real_time")]
 
     def step(self, dt_s: float | None = None, count: int = 1) -> Clock:
-        """Take control of time, and move it by steps. Return when all streams have the changes.
+        """Take control of time, and advance it by steps. Return when all streams have the changes.
 
         Args:
             dt_s: Length of each step in s; None for the step size.
@@ -383,7 +386,7 @@ class Client:
         return Steps(Duplex(self._channel, self._stub.Steps, *requests), count)
 
     def set_step_size(self, dt_s: float) -> Clock:
-        """Take control of time, and set the step size: the length of steps whose request names no length.
+        """Take control of time, and set the step size: the length of steps requested without one.
 
         Args:
             dt_s: The size in s.
@@ -461,7 +464,7 @@ class Client:
 
 
 class Subscription(Iterator[Update]):
-    """Iterator over updates, for one thread. It ends when it or its client is closed.
+    """Iterator over updates, for one thread. It ends when the iterator or its client is closed.
 
     Any thread may call :meth:`close`.
     """
@@ -472,7 +475,7 @@ class Subscription(Iterator[Update]):
         self._waiting: Iterator[Update] = iter(())
 
     def __next__(self) -> Update:
-        """Wait for the next update. It changes the previous update's arrays, so use these first.
+        """Wait for the next update, which overwrites the arrays of the previous update.
 
         Raises:
             RemoteError: The instance has ended.
@@ -498,8 +501,9 @@ class Steps(Iterator[Stepped]):
     """Steps of time on one stream, which is cheaper than one call for each step.
 
     Use it in one thread, and close it, or use ``with``. Iterate over the steps that
-    :meth:`Client.steps` requested: each comes when all streams have its changes, while the endpoint
-    already computes the next ones. To do something between steps, call :meth:`step` instead.
+    :meth:`Client.steps` requested. A step arrives when all streams have its changes; meanwhile, the
+    endpoint already computes the next steps. To do something between steps, call :meth:`step`
+    instead.
     """
 
     def __init__(self, stream: Duplex, count: int) -> None:
@@ -512,7 +516,7 @@ class Steps(Iterator[Stepped]):
         """Wait for the next finished step. The iteration ends after all requested steps.
 
         Raises:
-            CommandError: The step failed, or another program owns time; no later step is done.
+            CommandError: The step failed, or another program owns time; no later step follows.
             ValueRangeError: The step size is out of range.
             RemoteError: The connection failed.
         """
@@ -529,9 +533,10 @@ class Steps(Iterator[Stepped]):
                 raise
 
     def step(self, dt_s: float | None = None) -> Stepped:
-        """Request one more step, and wait for it and for all earlier steps.
+        """Request one more step, and wait for this step and all earlier ones.
 
-        It raises the same errors as the iteration.
+        Raises:
+            ShmioError: As for the iteration.
         """
         self._stream.write(*calls.steps_requests(1, dt_s))
         self._left += 1
@@ -543,7 +548,7 @@ class Steps(Iterator[Stepped]):
         return last
 
     def close(self) -> None:
-        """Cancel the requested steps, except a step that has begun."""
+        """Cancel the requested steps. A step that has already started is completed."""
         self._left = 0
         self._stream.close()
 
@@ -586,7 +591,7 @@ class Simulation(Member, Iterator[Work]):
         return self._work
 
     def done(self, outputs: Mapping[str, object]) -> None:
-        """Answer the present step with outputs by path. Outputs left out keep their values.
+        """Answer the present step with outputs by path. Missing outputs keep their values.
 
         Raises:
             PathError: There is no such output; nothing was sent.
@@ -604,7 +609,7 @@ class Simulation(Member, Iterator[Work]):
         try:
             outputs = outputs_of(step(work.time_s, work.dt_s, work.inputs))
             answer = rejoining.answer(self._part, work, outputs)
-        except Exception as error:  # noqa: BLE001  whatever it is, the step has failed with it
+        except Exception as error:  # noqa: BLE001  any error of the program's function fails the step
             answer = rejoining.failed(self._part, work, error)
         self._answer(answer)
 

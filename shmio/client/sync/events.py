@@ -12,7 +12,7 @@ from shmio.model.event import Event
 
 
 class Events(Iterator[Event]):
-    """Iterator over events, for one thread. It ends when it or its client is closed.
+    """Iterator over events, for one thread. It ends when the iterator or its client is closed.
 
     Any thread may call :meth:`close`.
     """

@@ -18,9 +18,9 @@ from shmio.model.values import Outcome
 class Shadow(Iterator[Update]):
     """An injection to which this program gives values.
 
-    Iterate over it for the originals, which are the values that the injection covers. Several threads
-    may give values, and one may iterate. ``table`` has the registers that the injection covers, with
-    the latest originals.
+    Iterate over it to receive the originals, which are the values that the injection covers.
+    Several threads may give values, but only one may iterate. ``table`` has the covered registers
+    with their latest originals.
     """
 
     def __init__(self, channel: Channel, stream: Duplex, state: injection.ShadowState) -> None:
@@ -61,7 +61,7 @@ class Shadow(Iterator[Update]):
             raw: Values as raw bytes.
 
         Returns:
-            An outcome for each value. All values have the same outcome, the worst of them. It is
+            An outcome for each value. All values have the same outcome: the worst one. It is
             ``rejected`` if a path or value is wrong, or the injection does not cover the path.
 
         Raises:
@@ -103,7 +103,7 @@ class Shadow(Iterator[Update]):
         self._stream.write(data)
 
     def __next__(self) -> Update:
-        """Wait for the next originals. They come only if the injection was created with ``originals``."""
+        """Wait for the next originals. They come only if ``originals`` was set at the creation."""
         with self._changed:
             if not self._updates:
                 self._changed.wait_until(lambda: self._state.waits or self._over)
@@ -204,7 +204,7 @@ class Campaign(Iterator[InjectionEvent]):
                 with suppress(PathError, CommandError):  # it has ended, or a reload has removed its source
                     self._lift(source, number)
         finally:
-            self._stream.close()  # this ends what still remains
+            self._stream.close()  # this lifts any that remain
 
     def __enter__(self) -> Self:
         return self

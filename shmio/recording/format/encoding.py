@@ -42,9 +42,9 @@ PLAIN: Final = "json"
 GAP: Final = "gap"
 STEP: Final = "step"
 PROCESS: Final = "process"
-"""GAP, STEP and PROCESS: how the code calls the encodings of gaps, steps and process changes.
+"""GAP, STEP and PROCESS stand for the encodings of gaps, steps and process changes in the code.
 
-In the file, all three have the encoding PLAIN. Their topics differ.
+In the file, all three have the encoding PLAIN; only their topics differ.
 """
 
 _FRAME: Final = struct.Struct("<QQqqqQIBBHHHII")
@@ -113,7 +113,7 @@ class Gap(msgspec.Struct, frozen=True):
     """Frames or events of a block, from ``first`` to ``last``, that are missing in the recording.
 
     ``after_ns`` is the log time of the entry before the gap, and ``before_ns`` is the log time of
-    the entry after it. 0: there is no such entry.
+    the entry after it. Each is 0 if there is no such entry.
     """
 
     source: str
@@ -317,9 +317,9 @@ def decode_position(text: str) -> BlockPosition:
 class Channel:
     """A channel with a block's frames or events, or with gaps, steps or process changes.
 
-    ``layout`` is the hash of the block's layout in hexadecimal digits, with the tag tables over the
-    block. ``encoding`` is FRAME for both versions of frames. It is empty if another program wrote
-    the channel's messages.
+    ``layout`` is the hash of the block's layout, including its tag tables, in hexadecimal digits.
+    ``encoding`` is FRAME for both versions of frames, and empty if another program wrote the
+    channel's messages.
     """
 
     number: int

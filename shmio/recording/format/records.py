@@ -1,9 +1,9 @@
 """Reads the records of an MCAP file from front to back, without an index.
 
-So a file may end anywhere. The reader does not trust the content: it compares lengths with the size
-of the file, with each other and with limits, and checks the CRC of each chunk. At most one chunk is
-in memory at a time. After a damaged place, reading continues with the next intact chunk or
-attachment.
+Therefore, it can read a file that ends anywhere. The reader does not trust the content: it compares
+lengths with the size of the file, with each other and with limits, and checks the CRC of each
+chunk. At most one chunk is in memory at a time. After a damaged place, reading continues with the
+next intact chunk or attachment.
 """
 
 from __future__ import annotations
@@ -189,9 +189,9 @@ class Records:
         return found
 
     def _peek(self, at: int, size: int) -> bytes:
-        """Return up to ``size`` bytes.
+        """Return up to ``size`` bytes from offset ``at``.
 
-        Leave out bytes that were appended after the file was opened.
+        Ignore bytes that were appended after the file was opened.
         """
         return self._pread(max(0, min(size, self.size - at)), at)
 
@@ -223,7 +223,7 @@ class Records:
         return Record(opcode, content, size)
 
     def _whole(self, at: int, end: int) -> int:
-        """Return the start of the next chunk or attachment with a correct CRC; 0: there is none."""
+        """Return the start of the next chunk or attachment with a correct CRC; else 0."""
         for begin in range(at, end, _SEARCH_BYTES):
             for found in _MARK.finditer(self._peek(begin, _SEARCH_BYTES + _MARK_BYTES - 1)):
                 record = self.record(begin + found.start())
@@ -242,7 +242,7 @@ class Records:
         return self.record(start) if start else None
 
     def _footer(self, at: int) -> int:
-        """Return the start of the footer at the end of the file; 0: there is none after ``at``."""
+        """Return the start of the footer at the end of the file; 0 if none begins after ``at``."""
         start = self.size - len(MAGIC) - FOOTER.size - HEAD.size
         record = self.record(start) if start >= at else None
         if record is None or record.opcode != Opcode.FOOTER or record.at + record.size + len(MAGIC) != self.size:
@@ -329,7 +329,7 @@ class Damage(NamedTuple):
     """A damaged place in a file: bytes ``first`` to ``last`` cannot be read, or only in part.
 
     ``after_ns`` is the log time of the last readable entry before this place. ``before_ns`` is the
-    log time of the first readable entry after it. 0: there is no such entry.
+    log time of the first readable entry after it. Each is 0 if there is no such entry.
     """
 
     first: int
@@ -360,13 +360,13 @@ class DamageLog:
             self._found = self._found._replace(last=last)
 
     def after(self, last_ns: int) -> None:
-        """Note that a chunk was read. ``last_ns`` is the log time of its last entry."""
+        """Remember that a chunk was read. ``last_ns`` is the log time of its last entry."""
         self._after_ns = last_ns
 
     def end(self, before_ns: int = 0) -> None:
         """Report the damage since the last chunk.
 
-        ``before_ns``: log time of the next entry; 0: none.
+        ``before_ns`` is the log time of the next entry; 0 if no entry follows.
         """
         if self._found is not None:
             self._report(self._found._replace(before_ns=before_ns))

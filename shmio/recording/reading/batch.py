@@ -1,4 +1,4 @@
-"""Reads the frames of a block as arrays, chunk by chunk. It creates no Python object per frame."""
+"""Reads the frames of a block as arrays, chunk by chunk, without a Python object for each frame."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from shmio.recording.reading.survey import Track, survey, survey_by_index
 from shmio.segment import Frame
 
 MAX_NS: Final = (1 << 63) - 1
-"""The largest log time. It is the end of a range of time without an end."""
+"""The largest log time, used as the end of a range that has no end."""
 BATCH_FRAMES: Final = 256
 """Number of frames in a batch that :func:`batches_of` makes from single frames."""
 

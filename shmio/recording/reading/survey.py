@@ -23,7 +23,7 @@ MAX_CHUNKS: Final = 1 << 22
 MAX_SETS: Final = 1 << 16
 """Largest number of different sets of channels that the chunks of a file may have."""
 MAX_GAPS: Final = 1000
-"""Largest number of gaps that a survey lists. It counts all of them."""
+"""Largest number of gaps that a survey lists; it counts all gaps."""
 MAX_DAMAGE: Final = 20
 """Largest number of damaged places that a survey lists."""
 MAX_BLOCKS: Final = 10_000
@@ -145,7 +145,7 @@ class Count(NamedTuple):
 
 @dataclass(slots=True)
 class Track:
-    """The number of a channel's messages in a file; time and chunk of the first and last."""
+    """The number of a channel's messages in a file; the times and chunks of the first and last."""
 
     channel: Channel
     count: int
@@ -158,7 +158,7 @@ class Track:
         """Return the numbers of the first and the last frame or event.
 
         Raises:
-            RecordingError: The chunk of the first or the last cannot be read.
+            RecordingError: A chunk with one of these cannot be read.
         """
         return self._in(reader, self.first_in)[0], self.last(reader)
 
@@ -233,7 +233,7 @@ class Survey:
 
 
 def survey(reader: Reader) -> Survey:
-    """Survey a recording by reading through the file. Note damage, and continue after it.
+    """Survey a recording by reading through the file. List damage, and continue after it.
 
     Raises:
         RecordingError: The file is not a recording of shmio.
@@ -323,7 +323,7 @@ def _read(reader: Reader, found: Survey, chunk: Record) -> list[Count]:
 
 
 def survey_by_index(reader: Reader) -> Survey | None:
-    """Survey a recording by its index; None if it has no intact and consistent index.
+    """Survey a recording by its index; return None if the index is missing, damaged or wrong.
 
     The result is the same as that of :func:`survey`, but this takes less time.
     """
@@ -335,7 +335,7 @@ def survey_by_index(reader: Reader) -> Survey | None:
 
 
 def _summary(reader: Reader) -> bytes:
-    """Return the bytes of the summary. Empty: the file has none, or its CRC is wrong."""
+    """Return the bytes of the summary; empty if the file has none or its CRC is wrong."""
     footer = reader.records.footer()
     if footer is None:
         return b""
@@ -354,7 +354,7 @@ class _IndexSurvey:
         self._found = Survey()
         self._first: dict[int, tuple[Record, int]] = {}
         self._last: dict[int, tuple[Record, int]] = {}
-        """Last chunk of each channel, and offset of its message index; likewise ``_first``."""
+        """Last chunk of each channel, and the offset of its message index; likewise ``_first``."""
         self._counts: dict[int, int] = {}
         self._chunk_count = -1
 
