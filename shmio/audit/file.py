@@ -1,4 +1,4 @@
-"""The audit file of an instance: several processes append to it, and rotate it, without losing a line."""
+"""Writes an instance's audit files. Several processes may append and rotate without losing a line."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Final
 import msgspec
 
 LOCK_S: Final = 2.0
-"""How long to wait for another process that writes to the file. Each holds the lock for a moment only."""
+"""How long to wait for another process's lock on the file, in s. Each write holds the lock only briefly."""
 _LOCK_TURN_S: Final = 0.002
 
 
@@ -22,7 +22,7 @@ class AuditSettings(msgspec.Struct, frozen=True):
 
     Attributes:
         path: The newest file.
-        max_bytes: Size at which a new file begins.
+        max_bytes: Size in bytes above which a new file is started.
         files: Number of files, including the newest.
 
     """
@@ -33,7 +33,7 @@ class AuditSettings(msgspec.Struct, frozen=True):
 
 
 def file_paths(newest: Path, files: int) -> list[Path]:
-    """Return the paths that the files of an audit log have, the newest first."""
+    """Return the paths of an audit log's files, the newest first."""
     return [newest, *(newest.with_name(f"{newest.name}.{number}") for number in range(1, files))]
 
 
@@ -41,12 +41,12 @@ class AuditFile:
     """Appends lines to the newest file of an audit log. Use it from one thread.
 
     Each write holds a lock on the file, so that lines of several processes do not mix, and that only
-    one process rotates. The kernel releases the lock of a process that is killed. A write that fails
+    one process rotates. The kernel releases the lock of a process that is killed. A failed write
     leaves nothing behind, not even a part of a line.
     """
 
     def __init__(self, settings: AuditSettings) -> None:
-        """Create it. The file is opened by the first write."""
+        """Prepare to write. The first write opens the file."""
         self._paths = file_paths(Path(settings.path), settings.files)
         self._max_bytes = settings.max_bytes
         self._fd = -1
@@ -55,7 +55,7 @@ class AuditFile:
         """Append complete lines.
 
         Raises:
-            OSError: Nothing was written, because the disk is full, for example.
+            OSError: The disk is full, for example. Nothing was written.
 
         """
         self._lock()
@@ -70,13 +70,13 @@ class AuditFile:
                 fcntl.flock(self._fd, fcntl.LOCK_UN)
 
     def close(self) -> None:
-        """Close the file. Another write opens it again."""
+        """Close the file. The next write opens it again."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
 
     def _lock(self) -> None:
-        """Lock the newest file: another process may have rotated it, or somebody may have removed it."""
+        """Lock the newest file. If it was rotated or removed meanwhile, open the file that is newest now."""
         until_s = time.monotonic() + LOCK_S
         while True:
             if self._fd < 0:
@@ -100,10 +100,10 @@ class AuditFile:
         self._fd = os.open(newest, flags, 0o600)
 
     def _rotate(self) -> None:
-        """Give each file the next name, remove the oldest, and begin a new one.
+        """Rename each file to the next number, remove the oldest file, and start a new one.
 
-        Only the owner of the lock does so. The newest file is renamed last, so that no other process
-        can rotate meanwhile.
+        Call this only while you hold the lock. The newest file is renamed last, so that no other
+        process can rotate meanwhile.
         """
         for older, newer in zip(reversed(self._paths), reversed(self._paths[:-1]), strict=False):
             with suppress(FileNotFoundError):

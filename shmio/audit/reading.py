@@ -14,7 +14,7 @@ import msgspec
 from shmio.audit.trail import Entry
 
 SUPERVISOR: Final = "supervisor"
-"""Name of the process that writes the entries of programs which nobody serves."""
+"""Name of the supervisor's process. It also writes the entries for programs on this host."""
 MAX_LINE_BYTES: Final = 1 << 16
 
 _decode: Final = msgspec.json.Decoder(Entry).decode
@@ -32,7 +32,7 @@ def present_files(newest: Path) -> list[Path]:
 
 
 def parse_entry(line: bytes) -> Entry | None:
-    """Return the entry of a line; None if it is damaged."""
+    """Return the entry of a line; None if the line is damaged."""
     try:
         return _decode(line)
     except (msgspec.MsgspecError, UnicodeDecodeError):
@@ -44,7 +44,8 @@ def entries(newest: Path, since_s: float = 0.0) -> Iterator[Entry]:
 
     Args:
         newest: The newest file.
-        since_s: UNIX time in s; older files are not read. Entries before it may be yielded.
+        since_s: UNIX time in s. Files last written before this time are not read. Earlier entries
+            of newer files are yielded.
 
     Raises:
         OSError: A file cannot be read.
@@ -62,13 +63,13 @@ def entries(newest: Path, since_s: float = 0.0) -> Iterator[Entry]:
 
 @dataclass(frozen=True, slots=True)
 class EntryFilter:
-    """Chooses entries. An empty field chooses all.
+    """Selects entries of an audit log. An empty field matches every entry.
 
     Attributes:
-        since: Time as in the entries.
-        who: Name of the actor, or pattern of it.
+        since: Earliest time, in the format of the entries.
+        who: Pattern for the name or the kind of the actor.
         action: The action.
-        pattern: Pattern of a path or of another word in what the entry is about.
+        pattern: Pattern for a path or another word in :attr:`Entry.what`.
 
     """
 
@@ -78,7 +79,7 @@ class EntryFilter:
     pattern: str = ""
 
     def chooses(self, entry: Entry) -> bool:
-        """Return whether an entry is chosen."""
+        """Return whether the filter selects an entry."""
         return (
             entry.time >= self.since
             and (not self.who or fnmatchcase(entry.who, self.who) or fnmatchcase(entry.kind, self.who))
@@ -100,7 +101,7 @@ def _words(what: Any) -> Iterator[str]:
 
 
 def last_events(newest: Path, since: str) -> dict[str, int]:
-    """Return for each source the last event that has an entry of the supervisor, of all entries since a time."""
+    """Return the number of each source's last event that the supervisor has entered since a time."""
     found: dict[str, int] = {}
     try:
         for entry in entries(newest):
@@ -113,7 +114,7 @@ def last_events(newest: Path, since: str) -> dict[str, int]:
 
 
 def source_of(entry: Entry) -> str:
-    """Return the source that an entry is about; empty if it is about none."""
+    """Return the source that an entry is about; empty if the entry is about no source."""
     if not isinstance(entry.what, Mapping) or not entry.what:
         return ""
     named = entry.what.get("source")

@@ -1,11 +1,11 @@
-"""What this process writes to the audit log.
+"""Writes this process's entries to the audit log.
 
 A module calls :func:`record`, or creates an :class:`Attempt` and ends it when the outcome is known.
-Neither waits: a thread encodes the entries and writes them to the file. A process without an audit
-log, such as a test or a user's program, ignores them.
+Neither waits for the disk: a thread encodes the entries and writes them to the file. In a process
+without an audit log, such as a test or a user's program, they do nothing.
 
-Who acts is in a context variable, so that it need not be passed through all layers: the code that
-identifies a client sets it (:func:`acting`), and asyncio and thread pools pass it on.
+A context variable holds the actor, so that functions need not pass it on. The code that identifies
+a client sets the variable (:func:`acting`). New tasks and ``asyncio.to_thread`` inherit it.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from shmio.errors import ShmioError
 from shmio.logs import stamp
 
 MAX_WAITING: Final = 10_000
-"""Maximum number of entries that wait for a disk that does not take them. Further ones are counted."""
+"""Maximum number of entries that wait to be written. Further entries are only counted."""
 MAX_NAMED: Final = 32
-"""Maximum number of values in an entry. The others are counted."""
+"""Maximum number of values in an entry. Further values are only counted."""
 MAX_ELEMENTS: Final = 16
 """Maximum number of an array's elements in an entry."""
 MAX_TEXT: Final = 200
@@ -42,19 +42,19 @@ MAX_TEXT: Final = 200
 MAX_REASON: Final = 500
 """Maximum number of characters of a reason."""
 MAX_BATCH: Final = 500
-"""Maximum number of entries in a write."""
+"""Maximum number of entries that are written at once."""
 MERGED: Final = frozenset({"feed", "read", "sign in", "step"})
-"""Actions that a client can repeat many times a second. Repetitions of a second are one entry, with their number.
+"""Actions that a client can repeat many times a second. Repetitions within a second get one entry, with their count.
 
 A ``read`` has an entry only if it is denied.
 """
 MERGE_S: Final = 1.0
 MAX_MERGED: Final = 1000
-"""Maximum number of different repetitions at a time. Further ones have an entry each."""
+"""Maximum number of different actions whose repetitions are merged. Others get an entry for each repetition."""
 RETRY_S: Final = 1.0
 """Pause in s before the next attempt after a write has failed."""
 CLOSE_S: Final = 2.0
-"""How long the end of a process waits for the last entries to be written, in s."""
+"""How long a process that ends waits until its last entries are written, in s."""
 
 log = logging.getLogger("shmio.audit")
 
@@ -65,7 +65,7 @@ class Actor(NamedTuple):
     Attributes:
         kind: How the actor is known: ``token``, ``certificate``, ``account``, ``uid``, ``host`` (of
             Sparkplug), ``process`` (of the instance), ``signal``, or ``anonymous``.
-        name: Name of the token or the account, first name in the certificate, number of the user.
+        name: Name of the token or account, first name in the certificate, or number of the user.
         origin: Address of the client, or the program and its pid.
 
     """
@@ -77,9 +77,9 @@ class Actor(NamedTuple):
 
 @dataclass(slots=True)
 class Acting:
-    """An actor at work, for example during a call.
+    """An actor and the endpoint that the actor uses, for example during a call.
 
-    ``refused`` tells whether a refusal is recorded already, so that no other layer records it again.
+    ``refused`` is True if a refusal has been recorded, so that no other layer records it again.
     """
 
     actor: Actor
@@ -91,7 +91,7 @@ _present: ContextVar[Acting | None] = ContextVar("acting", default=None)
 
 
 def act(actor: Actor, endpoint: str) -> Acting:
-    """From now on, this task or thread acts for ``actor``."""
+    """Make ``actor`` the actor of this task or thread from now on."""
     found = Acting(actor, endpoint)
     _present.set(found)
     return found
@@ -99,7 +99,7 @@ def act(actor: Actor, endpoint: str) -> Acting:
 
 @contextmanager
 def acting(actor: Actor, endpoint: str) -> Iterator[Acting]:
-    """Act for ``actor`` within a ``with`` block."""
+    """Make ``actor`` the actor within a ``with`` block."""
     found = Acting(actor, endpoint)
     before = _present.set(found)
     try:
@@ -109,12 +109,12 @@ def acting(actor: Actor, endpoint: str) -> Iterator[Acting]:
 
 
 def uid_actor(uid: int | None, origin: str) -> Actor:
-    """Return the actor for a user of this host; None: the user is not known."""
+    """Return the actor for a user of this host. If ``uid`` is None, the user is unknown."""
     return Actor("uid", "" if uid is None else str(uid), origin)
 
 
 def program_of(pid: int) -> str:
-    """Return the name of a process's program; empty if it has ended."""
+    """Return the name of a process's program; empty if the process has ended."""
     try:
         return Path(f"/proc/{pid}/comm").read_text(errors="replace").strip()
     except OSError:
@@ -158,7 +158,7 @@ class _Waiting(NamedTuple):
 
     @property
     def kind(self) -> tuple[object, ...] | None:
-        """Equal for repetitions of the same action; None if each of these has an entry of its own."""
+        """Key that all repetitions of an action share; None if repetitions are not merged."""
         if self.action not in MERGED or not isinstance(self.what, Mapping):
             return None
         return self.acting.actor, self.acting.endpoint, self.action, self.outcome, self.reason, *self.what
@@ -186,14 +186,15 @@ def record(
     event: int = 0,
     count: int = 1,
 ) -> None:
-    """Write an entry. This never waits, and never fails.
+    """Add an entry to the audit log. This never waits, and never fails.
 
     Args:
         action: What was done or attempted, such as ``write``.
-        what: To what: values by path or by name. A function returns them later, in another thread.
+        what: What the action is about: values by path or by name, or a function that returns them.
+            The audit thread calls the function.
         outcome: The outcome, such as ``written`` or ``denied``.
         reason: The reason of the outcome; empty for a success.
-        who: Who acts; None: the actor of the present task.
+        who: The actor; None: the actor of this task or thread.
         command: Number of the command; 0: none.
         event: Number of the source's event that ended the command; 0: none, or not known.
         count: How many times this was done.
@@ -209,14 +210,14 @@ def record(
 class Attempt:
     """An action whose outcome is not known yet. Only the first call of :meth:`end` has an effect.
 
-    In a ``with`` block, an exception ends it. The end of the block does not: the outcome may come
-    later.
+    In a ``with`` block, an exception ends the attempt. Without an exception, the attempt stays open
+    after the block, because the outcome may come later.
     """
 
     __slots__ = ("_action", "_ended", "_who", "command", "event", "what")
 
     def __init__(self, action: str, what: What) -> None:
-        """Begin. The actor is that of the present task."""
+        """Start an attempt by the actor of this task or thread."""
         self._action = action
         self._who = _present.get()
         self._ended = False
@@ -238,12 +239,12 @@ class Attempt:
         self.end("refused" if expected else "cancelled", reason, refused=expected)
 
     def end(self, outcome: str, reason: str = "", *, refused: bool = False) -> None:
-        """Write the entry.
+        """Record the outcome in the audit log.
 
         Args:
             outcome: The outcome.
-            reason: Its reason.
-            refused: Whether this is a failure that no other layer has to record.
+            reason: The reason of the outcome; empty for a success.
+            refused: Whether this entry records a refusal. Then no other layer records it again.
 
         """
         if self._ended:
@@ -255,13 +256,13 @@ class Attempt:
 
 
 def values_of(source: str, values: Mapping[str, Any]) -> What:
-    """Return values by path within a source as values by full path."""
+    """Return the values for an entry: their paths begin with ``source``."""
     first = {f"{source}/{path}": _cut(value) for path, value in islice(values.items(), MAX_NAMED)}
     return _Cut(first, max(0, len(values) - MAX_NAMED))
 
 
 def _brief(what: What) -> What:
-    """Return ``what`` without the values that are not written anyway, so that they need no memory."""
+    """Return ``what`` cut to the values that an entry has, so that the others need no memory."""
     if callable(what) or isinstance(what, _Cut):
         return what
     return _Cut({key: _cut(value) for key, value in islice(what.items(), MAX_NAMED)}, max(0, len(what) - MAX_NAMED))
@@ -289,7 +290,7 @@ def _cut(value: Any, most: int = MAX_TEXT) -> Any:
     if hasattr(value, "__len__") and hasattr(value, "__getitem__"):  # a list, a tuple or an array
         first = [_cut(value[at]) for at in range(min(len(value), MAX_ELEMENTS))]
         return first if len(value) <= MAX_ELEMENTS else [*first, f"… {len(value) - MAX_ELEMENTS} more"]
-    item = getattr(value, "item", None)  # a number of numpy
+    item = getattr(value, "item", None)  # a numpy number
     return _cut(str(value) if item is None else item())
 
 
@@ -320,7 +321,7 @@ class Trail:
                 self._lost += 1
 
     def close(self) -> None:
-        """Write what waits, for a limited time."""
+        """Write the waiting entries, for at most ``CLOSE_S``."""
         self._closing.set()
         self._waiting.put(None)
         self._thread.join(CLOSE_S)
@@ -337,13 +338,13 @@ class Trail:
         self._file.close()
 
     def _due_s(self) -> float | None:
-        """Return the time in s until an entry for repetitions is due; None: there are none."""
+        """Return the time in s until an entry for repetitions is due; None if there are no repetitions."""
         if not self._repeated:
             return None
         return max(0.0, min(one.until_s for one in self._repeated.values()) - time.monotonic())
 
     def _merge(self, batch: list[_Waiting]) -> Iterator[_Waiting]:
-        """Yield the entries to write now: those of a batch, and those for earlier repetitions."""
+        """Yield the entries to write now: new actions of the batch, and repetitions that are due."""
         now_s = time.monotonic()
         for entry in batch:
             kind = entry.kind
@@ -365,7 +366,7 @@ class Trail:
                 self._repeated[key] = _Repeated(now_s + MERGE_S)
 
     def _batch(self, wait_s: float | None) -> list[_Waiting]:
-        """Wait for an entry, at most ``wait_s``, and return it with those that have come meanwhile."""
+        """Wait up to ``wait_s`` for an entry. Return the waiting entries, at most ``MAX_BATCH``."""
         found: list[_Waiting | None] = []
         try:
             found.append(self._waiting.get(timeout=wait_s))
@@ -383,7 +384,7 @@ class Trail:
         return batch
 
     def _keep_writing(self, lines: bytes) -> bool:
-        """Write lines as soon as that is possible. Return False if the process ends before."""
+        """Write lines, and retry until that succeeds. Return False if the process ends first."""
         while True:
             try:
                 self._file.append(lines)
@@ -423,14 +424,14 @@ _trail: Trail | None = None
 
 
 def open_trail(settings: AuditSettings | None, instance: str, process: str) -> None:
-    """Write the entries of this process to an audit log from now on; None: there is none."""
+    """Write this process's entries to an audit log from now on; to none if ``settings`` is None."""
     global _trail  # noqa: PLW0603  one for each process, as for log lines
     close_trail()
     _trail = None if settings is None else Trail(settings, instance, process)
 
 
 def close_trail() -> None:
-    """Write what waits, and end."""
+    """Write the waiting entries, and stop."""
     global _trail
     trail, _trail = _trail, None
     if trail is not None:

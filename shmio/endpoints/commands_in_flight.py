@@ -16,11 +16,11 @@ from shmio.segment.events import EVENT_DATA_SIZE
 MAX_OPEN: Final = 512
 """Maximum number of events that commands in flight may still cause.
 
-It is a quarter of the event ring, so that no event is overwritten before it is read.
+The limit is a quarter of the event ring, so that no event is overwritten before it is read.
 """
 
 SUCCESS: Final = DONE | {EventKind.ACCEPTED, EventKind.INJECTED, EventKind.LIFTED, EventKind.NOTED}
-"""Outcomes of commands of any kind that are a success."""
+"""Outcomes that are a success, for commands of any kind."""
 
 Done = Callable[[Sequence[End]], None]
 """Function that is called once for each command, with the outcome of each of its values."""
@@ -33,7 +33,7 @@ def in_words(end: End) -> str:
 
 
 class CommandCost(NamedTuple):
-    """The most that a command can need: bytes in the queue, and events until its end."""
+    """Upper bounds of what a command needs: bytes in the queue, and number of events."""
 
     record_bytes: int
     events: int
@@ -56,10 +56,10 @@ class InFlightCommand:
     """A command in flight.
 
     Attributes:
-        incarnation: Number of starts of the source's process when the command was sent.
+        incarnation: How often the source's process had been started when the command was sent.
         until_ns: Deadline for the outcomes, in ns of the monotonic clock.
         cost: The queue space and the events that the command may need.
-        values: For each value, the range of its items.
+        values: For each value, the indices of its items in the command.
         outcomes: The outcomes of the items.
         done: Called once, with the outcome of each value.
         accepted: Called once, if the source accepts the command.
@@ -92,7 +92,7 @@ class InFlightCommand:
         return self.outcomes.follow(event)
 
     def finish(self, missing: str = "") -> None:
-        """Report the outcomes.
+        """Report the outcomes to :attr:`done` and to the audit log.
 
         Args:
             missing: Why some outcomes are unknown; empty if all are known.
@@ -108,7 +108,7 @@ class InFlightCommand:
 
 
 class InFlightTable:
-    """The commands of one writer that are in flight, by number."""
+    """The commands in flight of one writer, by command number."""
 
     def __init__(self, writer: int) -> None:
         self.open_events = 0
@@ -123,7 +123,7 @@ class InFlightTable:
 
     @property
     def due_ns(self) -> int | None:
-        """The earliest deadline of a command, in ns of the monotonic clock; None if there are none."""
+        """The earliest deadline of a command, in ns of the monotonic clock; None if no command is in flight."""
         return min((pending.until_ns for pending in self._by_number.values()), default=None)
 
     def add(
@@ -139,8 +139,8 @@ class InFlightTable:
         """Add a command that was sent.
 
         Args:
-            ticket: The command, as the function that sent it has returned it.
-            cost: The queue space and the events that it may need.
+            ticket: The sent command, as the source's writer returned it.
+            cost: The queue space and the events that the command may need.
             done: Called once, with the outcome of each value.
             accepted: Called once, if the source accepts the command.
             attempt: The command's entry in the audit log, which gets the outcome.
@@ -181,7 +181,7 @@ class InFlightTable:
         return True
 
     def shorten_timeouts(self) -> None:
-        """Shorten all time-outs after missed events, because these may have contained outcomes."""
+        """Shorten all time-outs, because events were missed that may have contained outcomes."""
         self._shorten(self._by_number.values())
 
     def expire(self) -> bool:
@@ -210,8 +210,8 @@ class InFlightTable:
     def _restarted(self, incarnation: int) -> None:
         """Handle a restart of the source.
 
-        Commands that its previous process had taken end with an unknown outcome. The new process
-        rejects the others, so their time-outs are shortened.
+        End the commands that its previous process had taken: their outcomes stay unknown. The new
+        process rejects the others, so shorten their time-outs.
         """
         before = [(number, one) for number, one in self._by_number.items() if one.incarnation != incarnation]
         for number, pending in before:

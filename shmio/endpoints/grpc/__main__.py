@@ -120,7 +120,7 @@ async def _serve(worker: Worker) -> None:
 async def _follow(worker: Worker, feeds: Feeds, services: Services) -> None:
     """Adopt the changes of a reload.
 
-    No call may begin after the feeds have changed and before the services' streams have moved.
+    No call may start after the feeds have changed and before the services' streams have moved.
     """
     if changed := await feeds.follow():
         worker.log.info("a reload added, changed or removed %s", ", ".join(changed))

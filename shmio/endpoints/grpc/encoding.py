@@ -1,4 +1,4 @@
-"""Encodes images of blocks as messages: subjects, and Protobuf's wire format.
+"""Encodes images of blocks as messages in Protobuf's wire format.
 
 Serialised fields may be concatenated to a message (protobuf.dev, "Encoding"). So messages are built
 from parts that all listeners share.
@@ -35,7 +35,7 @@ class BlockImage(Protocol):
 
 
 class ShownImage(NamedTuple):
-    """A :class:`BlockImage` that is not a frame, such as an image with applied writes or of an injection."""
+    """A :class:`BlockImage` that is not a frame, such as a frame's image with writes applied."""
 
     number: int
     clock_ns: int
@@ -83,7 +83,7 @@ class Subject:
 def unless_bad(
     encode: Callable[[BlockImage], M | None], registers: Sequence[Register], layout: Layout
 ) -> Callable[[BlockImage], M | None]:
-    """Return a function like ``encode`` that returns None if the source reports a bad register."""
+    """Return a function like ``encode``. It also returns None if one of the registers is bad."""
     area = status_area(layout)
     if area is None:
         return encode
@@ -101,7 +101,7 @@ _SHORT: Final = [bytes((number,)) for number in range(0x80)]
 
 
 def varint(number: int) -> bytes:
-    """Encode a non-negative number."""
+    """Encode a non-negative integer as a varint."""
     if number < 0x80:
         return _SHORT[number]
     if number < 0x4000:
@@ -125,5 +125,5 @@ def field(field_number: int, data: bytes) -> bytes:
 
 
 def number(field_number: int, value: int) -> bytes:
-    """Encode a field that has an enum or a non-negative integer."""
+    """Encode a field whose value is an enum or a non-negative integer."""
     return varint(field_number << 3) + varint(value)

@@ -33,8 +33,8 @@ class Topics:
 
         Args:
             feeds: The feeds of all sources, by name.
-            default_source: The source of paths that name none; None: the only source, if there is
-                just one.
+            default_source: The source of paths that name no source; None: the only source, if there
+                is just one.
 
         """
         self._feeds = feeds
@@ -145,8 +145,8 @@ class Shape(NamedTuple):
 def shape(layout: Layout, topic: Topic) -> Shape:
     """Return the registers that a topic names in a layout.
 
-    A structure of the data block has the block's members only, whatever a tag table puts below it:
-    old clients know its message by them.
+    For a structure of the data block, return only the block's own members, not those that a tag
+    table adds, because old clients expect the same message as before.
 
     Raises:
         PathError: There is no such register or structure.

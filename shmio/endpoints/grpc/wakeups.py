@@ -36,7 +36,7 @@ class WakeUp:
         """
         self.listeners: dict[Callback, None] = {}  # in the order in which they came
         self.patient: set[Callback] = set()
-        """Listeners that do not need a call at once."""
+        """Listeners that can wait during a pause."""
         self._loop = asyncio.get_running_loop()
         self._relay = Relay(word, name, turn_ns)
         self._pausing: asyncio.TimerHandle | None = None
@@ -48,7 +48,7 @@ class WakeUp:
         return self._relay.alive
 
     def mute(self) -> None:
-        """Stop calling the listeners until :meth:`unmute`, which makes up for a missed call."""
+        """Stop calling the listeners. After :meth:`unmute`, one call makes up for those missed."""
         self._loop.remove_reader(self._relay.descriptor)
 
     def unmute(self) -> None:
@@ -56,13 +56,13 @@ class WakeUp:
         self._loop.add_reader(self._relay.descriptor, self._ring)
 
     def pause(self) -> None:
-        """Pause for ``PAUSE_S``, if all listeners are patient."""
+        """Stop calling the listeners for ``PAUSE_S``, if all of them are patient."""
         if self._pausing is None and self.patient >= self.listeners.keys():
             self.mute()
             self._pausing = self._loop.call_later(PAUSE_S, self._pause_over)
 
     def _pause_over(self) -> None:
-        """Call the listeners after a pause."""
+        """End the pause, and call the listeners."""
         self.resume()
         for ring in tuple(self.listeners):
             ring()
@@ -186,7 +186,7 @@ class BatchReader:
         self._passes = passes
         self._patient = patient
         self._loop = asyncio.get_running_loop()
-        self._again = False  # whether another look is scheduled
+        self._again = False  # whether another read is scheduled
 
     def start(self) -> None:
         """Start following the block."""

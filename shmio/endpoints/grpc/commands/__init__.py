@@ -1,1 +1,1 @@
-"""Commands to a block's source: sends values, returns outcomes, and passes on the events."""
+"""Sends commands to a block's source, returns their outcomes, and passes on the source's events."""

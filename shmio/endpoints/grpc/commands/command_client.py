@@ -83,7 +83,7 @@ class CommandClient:
 
     @property
     def over(self) -> bool:
-        """True if the client is idle and stopped: no events, commands, subscribers or listeners."""
+        """True if the client has stopped, and has no commands in flight, subscribers or listeners."""
         return not (
             self._reader.alive
             or self._in_flight
@@ -133,7 +133,7 @@ class CommandClient:
         Args:
             values: Values by register path.
             done: Called once within a bounded time, with the outcome of each value.
-            accepted: Called before that, if the source accepts the command.
+            accepted: Called before ``done``, if the source accepts the command.
             timeout_s: How long to wait for outcomes, in s; None: the default.
             until_accepted: Whether the command ends as soon as the source accepts it.
 
@@ -163,7 +163,8 @@ class CommandClient:
             injection: Number of the injection.
             values: Values by register path.
             done: Called once, with the outcome of each write, not of each value.
-            accepted: Called if the source accepts the command, only for an injection over ``/in``.
+            accepted: Called before ``done``, if an injection is over ``/in`` and the source accepts
+                the command.
             raw: Bytes to give in addition to the values.
 
         Raises:
@@ -180,7 +181,7 @@ class CommandClient:
         """Ask the source to create an injection, without waiting for the outcome.
 
         Args:
-            bits: Mask of the block, with the bits set that the injection covers.
+            bits: Mask of the block in which the bits that the injection covers are set.
             follower: Receives the injection's events.
             done: Called once, with the outcome.
             options: Options of the injection, such as its name and priority.

@@ -41,7 +41,7 @@ class InjectionFollower:
         """
 
     def fail(self, reason: str) -> None:
-        """Handle missed events."""
+        """Handle missed events, some of which may have been about the injection."""
 
 
 class WriteListener(Protocol):
@@ -55,7 +55,7 @@ class WriteListener(Protocol):
 
 
 class InjectionFollowers:
-    """The followers of a block's injections, by number, and the listeners to its writes."""
+    """The followers of a block's injections, by injection number, and the block's write listeners."""
 
     def __init__(self) -> None:
         self._followers: dict[int, InjectionFollower] = {}
@@ -122,7 +122,7 @@ class InjectionBase:
     """The image that an injection replaces: the source's image with inner injections applied."""
 
     def __init__(self, block: Block, image: bytes = b"") -> None:
-        """Begin without inner injections.
+        """Start without inner injections.
 
         Args:
             block: The block of the injection.

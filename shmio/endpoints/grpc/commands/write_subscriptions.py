@@ -12,7 +12,7 @@ from shmio.segment.commands import NO_COMMAND, apply
 
 
 class PendingImage:
-    """The image of a frame, to which all commands accepted after the frame have been applied.
+    """A frame's image with the effects of all commands that were accepted after the frame.
 
     In ``mask``, the bits that the current command writes are set.
     """
@@ -24,7 +24,7 @@ class PendingImage:
         self._frame = -1
 
     def begin(self, number: int) -> None:
-        """Begin a command that was accepted after frame ``number``.
+        """Start a command that was accepted after frame ``number``.
 
         A new frame that arrives between the parts of the command does not change the image.
         """
@@ -76,7 +76,7 @@ Message = tuple[InChannel, Sized]
 
 
 class WriteSubscriptions:
-    """Makes messages of the accepted writes of all writers, in the order of acceptance.
+    """Turns the accepted writes of all writers into messages, in the order of acceptance.
 
     A subject is delivered as soon as a command has written all of it. If a command writes only a
     part, such as one array element, the subject is delivered at the end of the command. The rest of
@@ -85,7 +85,7 @@ class WriteSubscriptions:
     """
 
     def __init__(self, block: Block, stamp: Callable[[Event], tuple[int, int]]) -> None:
-        """Begin without listeners.
+        """Start without listeners.
 
         Args:
             block: The block that is written to.

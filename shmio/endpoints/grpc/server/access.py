@@ -201,7 +201,7 @@ class ListenerAccess:
         raise self._denial(method, needed, secret, shown, by_name)
 
     def actor(self, shown: Credentials, peer: str) -> Actor:
-        """Return who a client is, for the audit log. Its token may lack roles, or not be known."""
+        """Return a client's identity for the audit log. Its token may be unknown, or lack roles."""
         secret = None if shown.token is None else self.keys.secret(shown.token)
         if secret is not None:
             return Actor("token", secret.name, peer)
@@ -253,9 +253,10 @@ class ListenerAccess:
 def holder_of(
     peer: str, metadata: Iterable[tuple[str, str | bytes]], shown: Mapping[str, Iterable[bytes]] | None
 ) -> object:
-    """Return the owner of a name that a client has chosen: the client's credentials, or its host.
+    """Return a client's identity, which owns the names that the client chooses.
 
-    Two connections of one client have equal owners, whatever their ports.
+    The identity is the client's credentials, or without credentials its host. All connections of
+    a client have equal identities, whatever their ports.
     """
     credentials = Credentials.of(metadata, shown)
     if credentials.token or credentials.names:

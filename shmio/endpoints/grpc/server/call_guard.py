@@ -1,6 +1,6 @@
-"""Guards the services: checks the access, limits and messages of each call.
+"""Checks the access rights, limits and messages of each call.
 
-It also refuses calls of unknown names.
+The guard also refuses calls with unknown names.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from shmio.layout.topic import shorten
 from shmio.logs import fields
 
 TURN_S: Final = 10.0
-"""Length of the period for which log lines are counted, in s."""
+"""Period for which log lines are counted, in s."""
 LINES: Final = 10
 """Maximum number of log lines in ``TURN_S``. One more line reports how many were left out."""
 
@@ -45,12 +45,12 @@ class Refusals:
     """Counts and logs refused messages or calls. Use it only in the event loop's thread."""
 
     def __init__(self, what: str = "publish refused", about: str = "topic", turn_s: float = TURN_S) -> None:
-        """Begin to count.
+        """Start counting.
 
         Args:
-            what: The beginning of each log line.
+            what: The first words of each log line.
             about: The log field that names what was refused.
-            turn_s: Length of the period for which log lines are counted, in s.
+            turn_s: Period for which log lines are counted, in s.
 
         """
         self.count = 0
@@ -138,7 +138,7 @@ class OpenCalls:
         return len(self._open)
 
     def enter(self, method: str, access: ListenerAccess, context: Context) -> _Call:
-        """Admit a call. When the call has ended, :meth:`leave` removes it.
+        """Admit a call. The caller must call :meth:`leave` when the call has ended.
 
         Raises:
             DeniedError: The call is refused.
@@ -299,7 +299,7 @@ class CallGuard(grpc.aio.ServerInterceptor):
 
 
 def _record_end(call: _Call, reason: str) -> None:
-    """Write that a call which needs more than the role read has failed, unless its command says so already."""
+    """Record that a call has failed, unless it needs only the role read, or its refusal is recorded already."""
     if NEEDS.get(call.method) != READ and not call.acting.refused:
         trail.record(action_of(call.method), {"call": call.method}, "refused", reason, who=call.acting)
 
@@ -318,7 +318,7 @@ async def _parsed(method: str, decode: Decode | None, data: bytes, context: Cont
         )
 
 
-# ---- calls of unknown names ------------------------------------------------------------------------------
+# ---- calls with unknown names ----------------------------------------------------------------------------
 #
 # grpcio's serving task decodes the name of every call that is not registered. A name that is not UTF-8 ends the
 # task, and its cleanup frees memory that the core still writes to. All unregistered calls also share one queue. So
@@ -372,7 +372,7 @@ class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]
 
     @property
     def alive(self) -> bool:
-        """True if the core serves. If not, it never serves again, and the process has to end."""
+        """True while the core serves. A core that has stopped cannot serve again: the process has to end."""
         return bool(self.is_running()) and not any(worker.done() for worker in self._workers)
 
     def _make_request_call_future(self, method: bytes | None) -> asyncio.Future[Any]:
@@ -410,7 +410,7 @@ class CoreServer(AioServer):  # type: ignore[misc]
 
     @property
     def alive(self) -> bool:
-        """True if the server serves."""
+        """True while the server serves."""
         return bool(self._server.alive)
 
     @property
@@ -425,6 +425,6 @@ class CoreServer(AioServer):  # type: ignore[misc]
 
 
 def _kept(request: asyncio.Task[Any]) -> asyncio.Future[Any]:
-    """Shield a request for a call from cancellation, because the core writes to its memory."""
+    """Shield a request for a call from cancellation, because the core writes to the request's memory."""
     request.add_done_callback(lambda done: done.cancelled() or done.exception())  # else asyncio may log the error
     return asyncio.shield(request)

@@ -12,7 +12,7 @@ from typing import Any, Final, TypeVar
 # ---- file descriptors ------------------------------------------------------------------------------------
 
 OWN: Final = 256
-"""Number of file descriptors that are reserved for everything but connections. It is ample."""
+"""Number of file descriptors that are reserved for everything but connections; more than needed."""
 EACH: Final = 1
 """Number of file descriptors that are reserved for each connection."""
 FEW: Final = 64
@@ -80,7 +80,7 @@ class Trimmer:
         self._due_s = self._until_s = 0.0
 
     def trim(self, refused: int) -> None:
-        """Return free memory to the kernel if it is time.
+        """Return free memory to the kernel, if that is due.
 
         Args:
             refused: Number of refused calls so far.

@@ -51,7 +51,7 @@ class Server:
 
         Args:
             services: The handlers of each service, by the service's full name.
-            calls: The open calls; default: none.
+            calls: Counts and limits the open calls; default: a new :class:`OpenCalls`.
 
         """
         self.calls = OpenCalls() if calls is None else calls
@@ -114,7 +114,7 @@ class Server:
         return ports
 
     async def set_source(self, source: str, good: bool) -> None:
-        """Set the health of ``source.<name>`` to the quality of a source."""
+        """Set the health of ``source.<name>``, which is serving while the source's quality is good."""
         self._health.set(f"source.{source}", serving=good)
 
     async def stop(self) -> None:

@@ -1,6 +1,7 @@
 """Injections of SimlogAPI clients.
 
-By an injection's shadow topics, clients read the values that it diverts, and give other values.
+Clients use an injection's shadow topics to read the values that it diverts, and to give other
+values.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ MAX_PATH: Final = 1024
 LOOK_S: Final = 0.25
 """Interval of the checks for disconnected clients, in s. Their injections end within a second."""
 UNSEEN_S: Final = 10.0
-"""Lifetime of an injection without a stream, in s, if the kernel does not list its client."""
+"""Lifetime of an injection without a stream, in s, if the kernel does not list its client's connection."""
 
 _TIME_TOPICS: Final = frozenset(topic.value for topic in TimeTopic)
 _SCHEME: Final = re.compile(r"^[^/:]*://")
@@ -89,7 +90,7 @@ class Injection(InjectionFollower):
     """
 
     def __init__(self, target: Topic, shape: Shape, feed: Feed, name: str) -> None:
-        """Begin to create the injection.
+        """Start creating the injection.
 
         Args:
             target: The topic of the injection.
@@ -142,7 +143,7 @@ class Injection(InjectionFollower):
             self._finish(str(error))
             raise CommandError(f"{self.target}: {error}") from None
         finally:
-            if self.over:  # it ended meanwhile, or the source may have created it although it did not answer
+            if self.over:  # ended meanwhile, or the source may have created it without answering
                 self._have_it_lifted()
 
     def end(self, reason: str) -> None:
@@ -287,11 +288,11 @@ class Injection(InjectionFollower):
             self._tell_again()
 
     def lifted(self, reason: str) -> None:
-        """Handle the end of the injection, if another program has lifted it."""
+        """Handle an end of the injection that this endpoint did not request."""
         self._finish(f"it was lifted: {reason}" if reason != "lifted" else "somebody has lifted it")
 
     def fail(self, reason: str) -> None:
-        """End the listeners to originals with an error, because events were missed."""
+        """End the streams of originals with an error, because events were missed."""
         self._diverted.fail(reason)
 
 
@@ -315,8 +316,8 @@ class Shadow(NamedTuple):
 class _Client:
     """A client that uses an injection without a stream.
 
-    ``peer`` is None if the kernel does not list the client's connection. Then ``until_s`` is the
-    end of the use.
+    ``peer`` is None if the kernel does not list the client's connection. Then the use ends at
+    ``until_s``, in s of the monotonic clock.
     """
 
     peer: Peer | None
@@ -345,7 +346,7 @@ class Shadows:
             target: The topic to create the injection over.
             shape: The registers that the target names.
             kinds: The shadow topics, by path.
-            user: The object that holds the injection until :meth:`release`.
+            user: The object that keeps the injection alive until :meth:`release`.
             peer: The client, for the list of all injections.
 
         Raises:
@@ -379,7 +380,7 @@ class Shadows:
     ) -> Injection:
         """Create an injection as :meth:`create` does.
 
-        The client's connection holds the injection until a stream does.
+        The client's connection keeps the injection alive until a stream takes it over.
         """
         seen = peer_of(peer)
         if seen not in await asyncio.to_thread(connected):
@@ -391,7 +392,7 @@ class Shadows:
         return injection
 
     def take_over(self, injection: Injection, stream: object) -> None:
-        """Make a stream use an injection, instead of the clients without a stream."""
+        """Make a stream the user of an injection, in place of the clients without a stream."""
         users = self._users.get(injection, set())
         users.difference_update([user for user in users if isinstance(user, _Client)])
         users.add(stream)

@@ -33,7 +33,7 @@ class ReceiveBarrier:
     """Waits until the handlers have all messages that gRPC has received so far.
 
     Received messages pass through a queue to the event loop. To wait, the barrier appends an
-    operation to this queue that ends at once: it watches the state of an unused channel.
+    operation that ends at once to this queue: a check of an unused channel's state.
     """
 
     def __init__(self) -> None:
@@ -271,7 +271,7 @@ class Publisher:
         return await answer
 
     async def _resolve(self, request: Request) -> _Destination:
-        """Find the receiver of a request's value. It raises the errors of :meth:`write`."""
+        """Find the receiver of a request's value. This method raises the errors of :meth:`write`."""
         if shadow := self._shadows.find(request.path):
             if shadow.kind is ShadowKind.ORIGINALS:
                 raise CommandError(

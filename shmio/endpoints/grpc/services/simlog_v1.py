@@ -42,7 +42,7 @@ _TIME_TOPIC_TYPES: Final = {TimeTopic.STEP: "int", TimeTopic.CLOCK: "time"}
 log = logging.getLogger("shmio.grpc")
 
 _Fill = Callable[[bytes, Any], None]
-"""Fills a message with values from an image."""
+"""Function that fills a message with values from an image."""
 
 _BITS: Final = {"seq": 32, "sec": 64, "nsec": 64, "msec": 64}
 

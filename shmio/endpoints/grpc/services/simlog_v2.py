@@ -410,7 +410,7 @@ class Subscriber:
     def _join_shadow(self, path: str, shadow: Shadow, finish: Finish) -> Callable[[], None]:
         """Listen to a shadow topic. Return the function that ends the subscription.
 
-        While a stream listens to the originals, it holds the injection.
+        While a stream listens to the originals, it keeps the injection alive.
         """
         injection, key = shadow.injection, object()
         to_message = encoder(injection.shape, injection.feed.block.layout)
@@ -662,7 +662,7 @@ class SimlogV2:
         Statuses:
             NOT_FOUND: There is no such topic.
             INVALID_ARGUMENT: The value does not fit the topic's type.
-            FAILED_PRECONDITION: The topic is not writable, or the source does not take the value.
+            FAILED_PRECONDITION: The topic is not writable, or the source does not accept the value.
             DEADLINE_EXCEEDED: The source did not answer; the value may have been written.
         """
         try:
@@ -749,7 +749,7 @@ class SimlogV2:
 
 
 def _holder(context: Context) -> object:
-    """Return the client that owns the uuids of a call."""
+    """Return the identity of a call's client, which owns the uuids that the client chooses."""
     return holder_of(context.peer(), context.invocation_metadata() or (), context.auth_context())
 
 

@@ -59,7 +59,7 @@ class SimServer:
         return _wire(self._stepper.timeline.status._replace(clock_ns=step.time_ns, dt_ns=step.dt_ns))
 
     async def start(self, request: wire.StartRequest, context: Context) -> wire.SimStatus:
-        """Play from now on, in real time.
+        """Start playing in real time.
 
         Statuses:
             INVALID_ARGUMENT: The step is out of range.

@@ -38,7 +38,7 @@ class StepsCall:
         self._stepper = stepper
         self._peer = peer
         self._answers: list[bytes] = []
-        self._wake = asyncio.Event()  # set when there is an answer, or when there will be no more
+        self._wake = asyncio.Event()  # set when there is an answer, or when no more answers will come
         self._room = asyncio.Event()
 
     async def messages(self, requests: AsyncIterator[wire.StepsRequest]) -> AsyncIterator[bytes]:
@@ -84,7 +84,7 @@ MAX_WATCHERS = 256
 
 
 class TimeCalls:
-    """The calls about time."""
+    """Serves the calls about time."""
 
     def __init__(self, segment: Segment, stepper: Stepper) -> None:
         self._segment = segment
@@ -121,7 +121,7 @@ class TimeCalls:
         return found
 
     async def steps(self, requests: AsyncIterator[wire.StepsRequest], context: Context) -> AsyncIterator[bytes]:
-        """Make steps until one fails.
+        """Make the steps that the client requests, until a step fails.
 
         Statuses:
             INVALID_ARGUMENT: A step is out of range.
@@ -143,7 +143,7 @@ class TimeCalls:
         return await self._do(self._stepper.set_step_size(request.dt_ns), context)
 
     async def play(self, request: wire.PlayRequest, context: Context) -> wire.Clock:
-        """Play from now on, at a multiple of real time.
+        """Start playing, at a multiple of real time.
 
         Statuses:
             INVALID_ARGUMENT: The rate or the step is out of range.

@@ -1,4 +1,4 @@
-"""The call Declare: injections that their sources run, and a record of their events."""
+"""The call Declare: creates injections that their sources run, and streams a record of their events."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from shmio.segment import Block, Event, EventKind
 from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_MATCHES: Final = 10_000_000
-"""Maximum number of times that one call may compare a target with a register.
+"""Maximum number of comparisons of a target with a register in one call.
 
-So many comparisons take a few seconds.
+This many comparisons take a few seconds.
 """
 SEED_BITS: Final = 53
 """Number of bits of a random seed. Every JSON reader reads integers of this size exactly."""
@@ -54,7 +54,7 @@ class DeclareCall:
         Args:
             feeds: The feeds of all sources, by name.
             request: The request of the call.
-            lock: Lock that lets only one call at a time check its declarations.
+            lock: Lock that a call holds while it checks its declarations.
 
         Raises:
             ConfigError: A declaration is not valid.
@@ -125,12 +125,12 @@ class DeclareCall:
     def abandon(self) -> None:
         """Stop creating injections, because the client has disconnected.
 
-        Injections that :meth:`open` has created are lifted, unless it has already created all.
+        If :meth:`open` has not created all injections yet, it lifts those that it has created.
         """
         self._abandoned = True
 
     async def close(self) -> None:
-        """Lift the injections, unless they are to be kept. Retry until the sources have done so."""
+        """Lift the injections, unless the client asked to keep them. Retry until that succeeds."""
         if self._lifting is not None:
             await self._lifting
         elif not self._keep:
@@ -169,8 +169,8 @@ class DeclareCall:
     def end(self, reason: str) -> None:
         """End the call, because its record has a gap.
 
-        Unless they are to be kept, the injections are lifted at once. They do not wait for the end
-        of the stream, which a client that does not read would delay.
+        Unless the client asked to keep the injections, lift them at once: a client that does not read
+        could delay the end of the stream.
         """
         self.over = self.over or reason
         if self._complete and not self._keep and self._lifting is None:

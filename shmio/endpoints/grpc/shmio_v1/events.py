@@ -50,7 +50,7 @@ class EventLog:
     """
 
     def __init__(self, block: Block, wake_ups: WakeUps, after: int) -> None:
-        """Begin after the event with the number ``after``."""
+        """Start after the event with the number ``after``."""
         self.block = block
         self.began = after
         self.reader = EventReader(block, after=after)
@@ -59,7 +59,7 @@ class EventLog:
         self.missed = 0
         """Number of events that were overwritten in the ring before the log could read them."""
         self.listeners: dict[Callback, None] = {}  # in the order in which they came
-        self._entries: deque[tuple[int, int, bytes]] = deque()  # number of the event, missed until then, message
+        self._entries: deque[tuple[int, int, bytes]] = deque()  # event's number, events missed until then, message
         self._size = 0
         self._batches = BatchReader(block, wake_ups, self._read, patient=True)
 
@@ -88,7 +88,7 @@ class EventLog:
         self._batches.stop()
 
     def entry(self, place: int) -> tuple[int, int, bytes]:
-        """Return an entry.
+        """Return the entry at an index.
 
         Returns:
             The number of the event, how many events were missed until then, and the message.
@@ -140,7 +140,7 @@ class EventLogs:
         self._logs: dict[int, EventLog] = {}  # by the block's section
 
     def join(self, block: Block, wake: Callback, *, after: int) -> EventLog:
-        """Return the log of a block. The first call of this method for a block starts its log.
+        """Join the log of a block, and return it. The first call that joins starts the log.
 
         Args:
             block: The block to follow.
@@ -168,7 +168,7 @@ class _Place:
     """The position of one call in a block's log."""
 
     def __init__(self, log: EventLog, after: int, missed: int = 0) -> None:
-        """Begin after the event with the number ``after``.
+        """Start after the event with the number ``after``.
 
         Args:
             log: The log.
@@ -205,7 +205,7 @@ class EventsCall:
     """An Events call: follows its sources, and collects their events."""
 
     def __init__(self, feeds: Mapping[str, Feed], logs: EventLogs, instance: str, sources: Sequence[str]) -> None:
-        """Begin to follow the sources.
+        """Start following the sources.
 
         Raises:
             PathError: There is no such source.
@@ -329,7 +329,7 @@ class EventCalls:
         return {"Events": grpc.unary_stream_rpc_method_handler(self.events, wire.EventsRequest.FromString)}
 
     async def events(self, request: wire.EventsRequest, context: Context) -> AsyncIterator[bytes]:
-        """Stream the events of these sources, or of all sources, from now on.
+        """Stream new events of the requested sources; of all sources if the request names none.
 
         Statuses:
             NOT_FOUND: There is no such source.

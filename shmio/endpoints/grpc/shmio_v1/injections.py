@@ -156,7 +156,7 @@ def raw_writes(pieces: Collection[wire.Piece], bits: bytes) -> list[Write]:
 
     Args:
         pieces: The raw bytes.
-        bits: Mask of the block with the bits set that the injection covers.
+        bits: Mask of the block in which the bits that the injection covers are set.
 
     Raises:
         ValueRangeError: The injection does not cover all of the bytes, or there are too many
@@ -201,9 +201,9 @@ class InjectCall(InjectionFollower):
         self._wake_ups = wake_ups
         self._options = options
         self.over = ""
-        """Why the call has to end: another client lifted the injection, or this one does not read.
+        """Reason why the call has to end; empty if it need not end.
 
-        Empty if the call need not end.
+        For example, another client has lifted the injection, or this client does not read.
         """
         self._lifted = self._ended = False
         self._lifting: asyncio.Task[None] | None = None
@@ -216,7 +216,7 @@ class InjectCall(InjectionFollower):
         self._room = asyncio.Semaphore(MAX_OPEN)
         self._shown: Frame | None = None
         self._shown_image = b""
-        self._sent: Frame | None = None  # that of the last originals
+        self._sent: Frame | None = None  # the frame of the last originals
         self._timer: asyncio.TimerHandle | None = None
         self._in_order = asyncio.Lock()
 
@@ -272,7 +272,7 @@ class InjectCall(InjectionFollower):
         return not (self._inward or self._options.quiet)
 
     async def close(self) -> None:
-        """Lift the injection, unless it is to be kept. Retry until the source has done so."""
+        """Lift the injection, unless the client asked to keep it. Retry until that succeeds."""
         for task in self._giving:
             task.cancel()
         if self._timer is not None:
@@ -314,8 +314,8 @@ class InjectCall(InjectionFollower):
     async def take(self, requests: AsyncIterator[wire.InjectRequest]) -> None:
         """Send the client's values in order.
 
-        If a message has a sequence number, the call answers an error in it. Otherwise the error
-        ends the stream.
+        If a message with a sequence number has an error, an answer reports the error. In a message
+        without a sequence number, an error ends the stream.
 
         Raises:
             ValueRangeError: A message gives no values.
@@ -405,7 +405,7 @@ class InjectCall(InjectionFollower):
         return head(self._view.number, frame, whole=before is None) + body + statuses.field
 
     def divert(self, diverted: CommandWrites) -> None:
-        """Handle diverted values: over ``/in`` of writers, over ``/out`` of inner injections."""
+        """Handle diverted values: over ``/in`` from writers, over ``/out`` from inner injections."""
         self._base.divert(diverted.writes)
         if not self._inward:
             self.restack()
@@ -426,8 +426,7 @@ class InjectCall(InjectionFollower):
     def _give_up(self, reason: str) -> None:
         """Lift the injection at once.
 
-        The lift does not wait for the end of the stream, which a client that does not read would
-        delay.
+        A client that does not read could delay the end of the stream.
         """
         self.over = self.over or reason
         if self._base.number and not (self._options.keep or self._lifted):
@@ -441,7 +440,7 @@ class InjectCall(InjectionFollower):
             self._wake.set()
 
     def lifted(self, reason: str) -> None:
-        """Handle the end of the injection, if another program has lifted it."""
+        """Handle an end of the injection that this call did not request."""
         self._lifted = True
         self.over = f"it was lifted: {reason}" if reason != "lifted" else "somebody has lifted it"
         self._wake.set()
@@ -495,7 +494,7 @@ class InjectionCalls:
     async def inject(self, requests: AsyncIterator[wire.InjectRequest], context: Context) -> AsyncIterator[bytes]:
         """Create an injection that ends with the stream, unless the client asks to keep it.
 
-        The call streams the originals to the client. The client streams other values to the call.
+        The call streams the originals to the client. The client streams values to give instead.
 
         Statuses:
             NOT_FOUND: There is no such register.
@@ -531,7 +530,7 @@ class InjectionCalls:
             await context.abort(grpc.StatusCode.ABORTED, f"{injection.source}: {injection.over}")
 
     async def _injection(self, requests: AsyncIterator[wire.InjectRequest]) -> InjectCall:
-        """Read the first message.
+        """Read the first message, and return its call.
 
         Raises:
             PathError: There is no such source, or the patterns differ in source or direction.
@@ -594,7 +593,7 @@ class InjectionCalls:
     async def list_injections(
         self, request: wire.ListInjectionsRequest, context: Context
     ) -> wire.ListInjectionsResponse:
-        """List the injections on these sources, or on all sources.
+        """List the injections on the requested sources; on all sources if the request names none.
 
         Statuses:
             NOT_FOUND: There is no such source.
@@ -627,7 +626,9 @@ class InjectionCalls:
             await refuse(context, error)
 
     async def lift_all(self, request: wire.LiftAllRequest, context: Context) -> wire.LiftResponse:
-        """Lift all injections concurrently. The answer says why an injection was not lifted.
+        """Lift all injections on the requested sources; on all sources if the request names none.
+
+        The answer gives the reason for each injection that was not lifted.
 
         Statuses:
             NOT_FOUND: There is no such source.

@@ -38,7 +38,7 @@ class ReplayCalls:
     async def replay(self, request: wire.ReplayRequest, context: Context) -> wire.ReplayResponse:
         """Control the replays, or return their status.
 
-        The endpoint carries out one call at a time. The end of a call also ends its search.
+        The endpoint carries out one call at a time. If a call ends early, its search ends too.
 
         Statuses:
             INVALID_ARGUMENT: The speed or a time is not valid.
@@ -68,7 +68,7 @@ class ReplayCalls:
 
 
 def _wanted(request: wire.ReplayRequest) -> ReplayRequest:
-    """Convert a request.
+    """Convert the message of a request.
 
     Raises:
         ValueRangeError: There are too many sources, or a text is too long.

@@ -23,9 +23,9 @@ MAX_REGISTERS: Final = 16_384
 MAX_ELEMENTS: Final = 262_144
 """Maximum number of elements of one call."""
 MAX_MATCHES: Final = 1_000_000
-"""Maximum number of times that one call may compare a star pattern with a register.
+"""Maximum number of comparisons of a star pattern with a register in one call.
 
-So many comparisons take a few seconds.
+This many comparisons take a few seconds.
 """
 MAX_ALL_ELEMENTS: Final = 1 << 22
 """Maximum number of elements of all clients together. Equal patterns count once."""
@@ -34,7 +34,7 @@ KEPT: Final = 16
 
 
 class SourceDirection(NamedTuple):
-    """The values of a source, or with ``inward`` the writes to the source."""
+    """A source's values; if ``inward`` is True, the writes to the source."""
 
     source: str
     inward: bool = False
@@ -60,7 +60,7 @@ class Selections:
 
         Args:
             patterns: Paths, structures, globs or source names.
-            inward: Whether ``/in`` is allowed.
+            inward: Whether the patterns may end in ``/in``.
 
         Raises:
             PathError: There is no such source, or ``/in`` is not allowed.
@@ -97,7 +97,7 @@ class Selections:
 
         Args:
             wanted: The topics, by source and direction.
-            frames: Return views of raw frames.
+            frames: Whether to return views of raw frames.
 
         Raises:
             PathError: There is no such register.

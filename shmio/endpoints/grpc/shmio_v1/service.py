@@ -93,7 +93,7 @@ class ShmioV1:
         return calls
 
     async def get_layouts(self, request: wire.GetLayoutsRequest, context: Context) -> AsyncIterator[wire.LayoutPart]:
-        """Stream the layouts of these sources, or of all sources.
+        """Stream the layouts of the requested sources; of all sources if the request names none.
 
         Statuses:
             NOT_FOUND: There is no such source.

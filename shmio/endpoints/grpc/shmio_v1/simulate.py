@@ -43,7 +43,7 @@ class OutputEncoder:
         self._paths: dict[str, Register] = {}
 
     async def packed(self, values: wire.Values, image: bytearray) -> None:
-        """Encode values by slot, in time slices.
+        """Encode values by slot. Other tasks run in between.
 
         Raises:
             ValueRangeError: A slot or value does not fit the table.
@@ -71,7 +71,7 @@ class OutputEncoder:
                 self._put(*self._at(column, int(slots[at])), part.values[at], image)
 
     async def decode_assignments(self, assignments: Any, image: bytearray) -> None:
-        """Encode values by path, in time slices.
+        """Encode values by path. Other tasks run in between.
 
         Raises:
             PathError: The table has no such register.
@@ -254,11 +254,11 @@ class SimulateCall:
         self._joined = False
         self._over = False
         self._wake = asyncio.Event()
-        self._bell: WakeUp | None = None  # rings when the source asks for a step
+        self._bell: WakeUp | None = None  # wakes the call when the source asks for a step
         self._handed = 0
         self._asked: ModelRequest | None = None  # the step that the model computes now
         self._given: DecodedImage | None = None
-        self._image: bytearray | None = None  # with the model's latest outputs
+        self._image: bytearray | None = None  # the source's image with the model's latest outputs
         self._refused = ""
 
     @property
@@ -328,7 +328,7 @@ class SimulateCall:
         """Return the step that the source waits for.
 
         Returns:
-            The step; None if there is none, or if the model already has it.
+            The step; None if there is none, if the model already has it, or if it is too late.
 
         """
         link = self._link

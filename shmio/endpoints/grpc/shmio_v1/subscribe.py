@@ -41,7 +41,7 @@ BATCH_BYTES: Final = 1 << 18
 BATCH_UPDATES: Final = 256
 """Maximum number of updates in one message.
 
-It takes some milliseconds to make that many. Then other tasks run.
+That many take some milliseconds to make. Then other tasks can run.
 """
 MAX_RATE_HZ: Final = 1e6
 
@@ -76,7 +76,7 @@ class BlockUpdates(Protocol):
     view: View
     follower: FrameFollower
     due_s: float
-    """Event loop's time of the next possible update, in s; infinite: at the next new frame."""
+    """Event loop's time of the next possible update, in s; infinite: after the next new frame."""
 
     def next(self, now_s: float) -> bytes | None:
         """Return the next serialised ``Update``, or None if there is none yet."""
@@ -92,7 +92,7 @@ class EveryFrame:
         self.follower = FrameFollower(view.block)
 
     def next(self, now_s: float) -> bytes | None:  # noqa: ARG002  there is no rate limit
-        """Return the update of the next frame, or one that reports that the last frame is stale."""
+        """Return the update of the next frame, or an update that reports the last frame as stale."""
         follower = self.follower
         frame = follower.poll()
         if frame is None:
@@ -114,11 +114,11 @@ class LatestFrame:
         self._interval_s = interval_s
         self._deadband = deadband
         self._last_s = -math.inf
-        self._values: DecodedImage | None = None  # the receiver's values; only with a dead-band
-        self._sent: Frame | None = None  # that of the last update; only if registers have statuses
+        self._values: DecodedImage | None = None  # the receiver's values; kept only with a dead-band
+        self._sent: Frame | None = None  # frame of the last update; kept only if registers have statuses
 
     def next(self, now_s: float) -> bytes | None:
-        """Return the changes of the newest frame, or an update that reports it as stale."""
+        """Return the changes of the newest frame, or an update that reports the last frame as stale."""
         follower = self.follower
         shown = follower.frame
         if shown is not None and not follower.behind:
@@ -171,7 +171,7 @@ class WriteFollower:
     """Follows the writes to a table for one subscriber. Its queue drops no write."""
 
     def __init__(self, writes: WriteUpdates, commands: CommandClient, ring: Callable[[], None]) -> None:
-        """Begin to follow the writes.
+        """Start following the writes.
 
         Args:
             writes: Encodes the writes.
@@ -291,8 +291,8 @@ class SubscribeCall:
         """Queue the marker of a step, which is sent after the changes of the step.
 
         Returns:
-            A future that is done when the marker has been sent or the call has ended. Until
-            :meth:`open` has returned, which takes seconds for a large layout, it is done at once.
+            A future that is done when the marker has been sent or the call has ended. If the call
+            is not open yet, the future is done at once: :meth:`open` can take seconds.
 
         """
         sent = asyncio.get_running_loop().create_future()

@@ -120,7 +120,7 @@ class _SingleValues(NamedTuple):
 
 
 class Columns:
-    """Maps registers to columns.
+    """Maps registers to columns, and decodes images into columns.
 
     Use it only in one thread, because decoding caches unchanged values.
     """
@@ -354,7 +354,7 @@ class UpdateMessage(NamedTuple):
     body: bytes
     """The changes; empty if there are none."""
     changed: bool
-    """True if there are other changes than those of source times.
+    """True if the update has changes other than source times.
 
     A receiver of the newest values gets new source times only with the next other change. Otherwise
     it would get an update for each frame.
@@ -382,7 +382,7 @@ class WriteUpdates:
     """
 
     def __init__(self, number: int, block: Block, registers: Sequence[Register], columns: Columns) -> None:
-        """Begin without a command.
+        """Start without a command.
 
         Args:
             number: Number of the table.
@@ -403,7 +403,7 @@ class WriteUpdates:
     def of(self, event: Event) -> bytes:
         """Return the serialised ``Update`` of an accepted write.
 
-        It is empty if the write changes no register of the table. If a command writes only a part
+        The result is empty if the write covers no register of the table. If a command writes only a part
         of an element, the rest of its value comes from the frame before the command. If the
         command's next event completes the element, only the update of that event has the element.
         """
@@ -707,7 +707,7 @@ def stale_fields(reason: str) -> bytes:
 
 
 def describe(register: Register, found: wire.Register, column: Column | None = None, slot: int = 0) -> None:
-    """Fill in a message with the description of a register."""
+    """Fill in a message that describes a register."""
     found.path, found.type = register.path, register.type
     found.offset, found.size, found.count = register.offset, register.size, register.count
     found.column = int(column or column_of(register.element))  # type: ignore[assignment]

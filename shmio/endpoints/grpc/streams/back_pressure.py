@@ -1,4 +1,4 @@
-"""Back-pressure: limits the messages that wait for clients, and skips frames if all are busy."""
+"""Back-pressure: limits the messages that wait for clients, and skips frames if all clients are busy."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from shmio.segment import Block, FrameFollower
 WINDOW_S: Final = 0.25
 """Period for which a client's lost values are compared with those offered to it, in s."""
 BEHIND_S: Final = 5.0
-"""A client that is far behind gets another chance at the next multiple of this time, in s.
+"""Interval at which clients that are far behind get another chance, in s.
 
-The values that it loses while it is behind do not show how fast it could be. All clients get their
-chance at the same time, because a frame that is read for one client is available to all.
+The values that a client loses while it is behind do not show how fast it could be. All clients get
+their chance at the same time, because a frame that is read for one client is available to all.
 """
 PART: Final = 3
-"""A client that loses more than one value in this number of values is far behind."""
+"""A client that loses more than one in ``PART`` values is far behind."""
 LATE_S: Final = 0.002
 """Time in s after which a newer value replaces a waiting value, if the client is far behind."""
 
@@ -31,7 +31,7 @@ class LossMonitor:
 
     def __init__(self) -> None:
         self.behind = False
-        """True if the client is far behind. Queued values would only reach it later."""
+        """True if the client is far behind, so that a queue would only delay its values."""
         self._offered = 0
         self._lost = 0
         self._until_s = 0.0
@@ -55,9 +55,9 @@ class LossMonitor:
 
 
 BOUND_BYTES: Final = 8 << 20
-"""Maximum size of the values that wait in one stream, in bytes, and the same for its events."""
+"""Maximum size of one stream's waiting values, and of its waiting events, in bytes."""
 TOTAL_BYTES: Final = 256 << 20
-"""Maximum size of all waiting messages, in bytes. Above it, each stream has an equal share."""
+"""Maximum size of all waiting messages, in bytes. Above it, no stream may exceed an equal share."""
 
 
 class TotalBacklog:
@@ -68,7 +68,7 @@ class TotalBacklog:
         self.streams = 0
 
     def over(self, size: int) -> bool:
-        """Return whether the total is too large, and a stream's ``size`` bytes exceed its share."""
+        """Return whether the total is too large, and ``size`` bytes exceed a stream's equal share."""
         return self.size > TOTAL_BYTES and size > TOTAL_BYTES // max(1, self.streams)
 
 
@@ -81,13 +81,13 @@ class Backlog:
         self._total = total
 
     def full(self, message: Sized, bound: int, bound_bytes: int | None = None) -> bool:
-        """Return whether one more message would exceed a limit. A single message never does."""
+        """Return whether one more message would exceed a limit. A single message always fits."""
         most = BOUND_BYTES if bound_bytes is None else bound_bytes
         size = self.size + len(message)
         return self.count > 0 and (self.count >= bound or size > most or self._total.over(size))
 
     def add(self, message: Sized) -> None:
-        """Count a message that begins to wait."""
+        """Count a message that starts to wait."""
         size = len(message)
         self.count += 1
         self.size += size
@@ -109,9 +109,9 @@ for the clients wait in the ring. The MQTT bridge has a time limit instead, beca
 only if it is delayed itself.
 """
 FEW_FRAMES: Final = 8
-"""Number of new frames that a client far behind gets at once, before it has to wait for more."""
+"""Maximum number of frames that a client that is far behind gets at once."""
 LOOK_S: Final = 0.02
-"""Longest time between two reads while all clients are busy, in s. The quality may turn bad."""
+"""Longest time between two reads while all clients are busy, in s. A read may find bad quality."""
 
 
 class Stream(Protocol):
@@ -140,7 +140,7 @@ class BackPressure:
     """
 
     def __init__(self, block: Block, refill: Callable[[], object]) -> None:
-        """Begin without streams.
+        """Start without streams.
 
         Args:
             block: The block that the streams follow.

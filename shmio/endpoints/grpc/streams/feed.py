@@ -165,7 +165,7 @@ class Feed:
 
     @property
     def alive(self) -> bool:
-        """True while the feed follows the block and its events, or if the block has retired."""
+        """True while the feed follows the block and its events, or if a reload has retired the block."""
         return (self._reader.alive or self.block.retired) and self.commands.alive
 
     @property
@@ -335,9 +335,9 @@ class Feed:
         return True
 
     def _take(self, frame: Frame) -> None:
-        """Deliver a frame if it is good.
+        """Deliver a frame if its quality is good.
 
-        Turn bad if the frame is not good, or if the previous frame was stale.
+        If its quality is bad, or if the previous frame had become stale, drop the waiting values.
         """
         change = self._follower.take(frame)
         bad = self._follower.quality is Quality.BAD
@@ -412,7 +412,7 @@ class Feeds(Mapping[str, Feed]):
         on_quality: Callable[[str, bool], None],
         virtual_time: VirtualTime | None = None,
     ) -> None:
-        """Begin without feeds; :meth:`start` starts them.
+        """Prepare without feeds; :meth:`start` creates and starts them.
 
         Args:
             segment: The instance's shared memory.

@@ -46,7 +46,7 @@ class Outbox:
         self.failure = ""
         """Why the outbox failed; empty if it has not failed."""
         self.on_failure: Callable[[], object] | None = None
-        """Called on failure. The stream itself may wait for ever if its client does not read."""
+        """Called when the outbox fails: the stream may wait for ever if its client does not read."""
         self._waiting: OrderedDict[int, tuple[_Lane, Sized, float]] = OrderedDict()  # messages with their time in s
         self._next = 0
         self._waiter: asyncio.Future[None] | None = None
@@ -115,12 +115,12 @@ class Outbox:
         self._report_delivery()
 
     def end(self) -> None:
-        """End the reader after the messages that wait now."""
+        """Make :meth:`pop` return None after the messages that wait now."""
         self._ended = True
         self._wake()
 
     def fail(self, reason: str) -> None:
-        """End at once. Drop the messages that wait, and the messages that are added later."""
+        """End the stream at once. Drop all waiting messages, and those that are added later."""
         failed, self.failure = self.failure, self.failure or reason
         self.clear()
         self.end()
@@ -225,10 +225,9 @@ class _Lane:
 
 
 class StateLane(_Lane):
-    """A lane for states. While the client is too slow, it has only the newest value.
+    """A lane for states. A client that keeps up gets every change; a slow one gets the newest value.
 
-    While the client keeps up, it has every change. The outbox counts the values that are left out.
-    The lane is a listener of a feed.
+    The outbox counts the values that are left out. The lane is a listener of a feed.
     """
 
     def __init__(self, outbox: Outbox, finish: Finish = bytes) -> None:
@@ -268,7 +267,7 @@ class StateLane(_Lane):
 
 
 class EventLane(_Lane):
-    """A lane for events. No event replaces another. If there is no room for one, the outbox fails.
+    """A lane for events. No event replaces another. If there is no room for an event, the outbox fails.
 
     The lane is a listener of write subscriptions.
     """
@@ -334,7 +333,7 @@ class Outboxes:
     """The outboxes of all open streams."""
 
     def __init__(self, open_streams: OpenStreams | None = None) -> None:
-        """Begin without outboxes.
+        """Start without outboxes.
 
         Args:
             open_streams: Counts the open streams of all services together.

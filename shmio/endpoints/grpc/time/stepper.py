@@ -21,9 +21,9 @@ from shmio.segment import ProcessSlot, Segment
 from shmio.segment.clock import ClockPage
 
 BRIEF_NS: Final = 500_000
-"""Time for which the event loop itself waits for the sources to answer, in ns.
+"""Time for which a step blocks the event loop while it waits for the sources' answers, in ns.
 
-A wake-up by another thread takes about as long.
+A wake-up by another thread would take about as long.
 """
 
 
@@ -37,9 +37,9 @@ class StepDriver:
         self._delivered: WakeUp | None = None  # made when needed: usually no other process delivers steps
 
     async def step(self, dt_ns: int | None) -> Step:
-        """Make one step. Cancelling aborts it.
+        """Make one step. If the task is cancelled, the step is aborted.
 
-        It raises the errors of :meth:`Coordinator.step`.
+        This method raises the errors of :meth:`Coordinator.step`.
         """
         until_ns = time.monotonic_ns() + BRIEF_NS
         with closing(self._coordinator.stepping(dt_ns)) as stepping:
@@ -84,7 +84,7 @@ class StepDriver:
 
 
 def _brief(wait: StepWait, rest_ns: int) -> bool:
-    """Halt the event loop until the source's block has a new frame or event, at most ``rest_ns``.
+    """Block the event loop until the source's block has a new frame or event, at most ``rest_ns``.
 
     Returns:
         True if the block had a new frame or event.
@@ -216,7 +216,7 @@ class Stepper:
         self._player = Player(self._make, lambda: segment.clock.read().step_size_ns)
         self._tasks: set[asyncio.Task[Any]] = set()
         self.timeline = Timeline(segment, slot, virtual_time, feeds, outboxes, open_streams, lambda: self._player.dt_ns)
-        """The state of time. It does not matter which program moves time."""
+        """The state of time, whichever program moves time."""
 
     async def start(self, predecessor: int = 0) -> None:
         """Start following time.
@@ -257,8 +257,8 @@ class Stepper:
         """Make a step. Return when all streams have taken the marker of the step.
 
         Values that came earlier on the peer's Publish streams reach their sources before the step.
-        A step that has begun is completed even if its client disconnects. A step that still waits
-        is then cancelled.
+        If the client disconnects, a step that has started is completed, and a step that still waits
+        is cancelled.
 
         Args:
             dt_ns: Size in ns; None: the step size.
@@ -368,7 +368,7 @@ class Stepper:
 
     @asynccontextmanager
     async def _moved(self) -> AsyncIterator[None]:
-        """Take control of time. Meanwhile, no other client of this endpoint can move it."""
+        """Take control of time. Until the block ends, no other client of this endpoint can move time."""
         async with self._lock:
             self._moving, self.timeline.steered = asyncio.current_task(), True
             try:

@@ -62,7 +62,7 @@ class TimeTopics:
     """
 
     def __init__(self, virtual_time: VirtualTime, now: Callable[[], Moment], tick_s: Callable[[], float]) -> None:
-        """Begin without listeners.
+        """Start without listeners.
 
         Args:
             virtual_time: The state of virtual time.
@@ -148,7 +148,7 @@ class StepReceiver(Protocol):
 
 
 class _Delivery:
-    """Delivers steps in order to all streams. It does not matter which program makes the steps.
+    """Delivers the steps that any program makes to all streams, in order.
 
     First come the writes before the step. Then come the changed values of all blocks on the
     instance's clock, in the segment's order. When all streams have taken these values, they get the
@@ -275,7 +275,7 @@ class Timeline:
         self._delivery = _Delivery(virtual_time, feeds, outboxes)
         self._watchers: list[Callable[[TimeStatus], None]] = []
         self._delivering: set[asyncio.Task[Any]] = set()
-        self._page: WakeUp | None = None  # when the clock page is written
+        self._page: WakeUp | None = None  # calls update() when the clock page is written
         state = self._clock.read()
         if state.virtual:
             self._delivery.begin(Moment(state.done, state.present_ns))
@@ -309,7 +309,7 @@ class Timeline:
         return self._page is not None
 
     def own(self, owns: bool) -> None:
-        """Note whether this process controls time.
+        """Set whether this process controls time.
 
         If it does, its own writes to the clock page need no wake-up.
         """
@@ -339,7 +339,8 @@ class Timeline:
     def update(self) -> Clock:
         """Read the clock page, and act on changes.
 
-        It is also called periodically, because no wake-up tells that a playing program has died.
+        This method is also called periodically, because a program that plays time and dies causes no
+        wake-up.
         """
         state = self._clock.read()
         if state.virtual and not self.virtual_time.on:
