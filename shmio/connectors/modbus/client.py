@@ -3,8 +3,8 @@
 Each answer must have the transaction, unit and function of the request, and exactly the requested
 length. Any other answer ends the connection, and so does a time-out, so that the client never mistakes
 a late answer for the next one. There is one exception: the caller may stop waiting for a read. Then
-the client remembers the transaction, and discards the answer if it comes late. shmio does not use
-pymodbus's client, because it skips all unexpected answers, and repeats writes after a time-out.
+the client remembers the transaction, and discards the answer if it comes late. shmio does not use the
+client of pymodbus, which skips all unexpected answers, and repeats writes after a time-out.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _HEADER: Final = 7
 _MAX_PDU: Final = 253
 _FAILED: Final = 0x80
 MAX_ABANDONED: Final = 256
-"""Largest number of abandoned requests whose late answers are still recognized."""
+"""Maximum number of abandoned requests whose late answers are still recognized."""
 
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE, ACKNOWLEDGE, BUSY = 1, 2, 3, 4, 5, 6
 PARITY, NO_PATH, NO_ANSWER = 8, 10, 11
@@ -80,7 +80,7 @@ class ModbusClient:
         return self._socket is not None
 
     def connect(self) -> None:
-        """Look up the name and connect. Each of the two has the time-out.
+        """Look up the host name and connect. The time-out applies to each of these two steps.
 
         Raises:
             ConnectorError: The device cannot be reached.
@@ -138,7 +138,7 @@ class ModbusClient:
             raise self._failed("its confirmation is that of another write")
 
     def call(self, unit: int, function: int, data: bytes, size: int, until_ns: int | None = None) -> bytes:
-        """Exchange a request; return the data of the answer, ``size`` bytes."""
+        """Send a request; return the data of the answer, which must have ``size`` bytes."""
         self.sent = False
         if self._socket is None:
             raise ConnectorError(f"not connected to {self.peer}")
@@ -184,7 +184,7 @@ class ModbusClient:
         return found
 
     def _receive(self, size: int, until_ns: int | None) -> None:
-        """Receive this many bytes of an answer, and never a byte of the next answer."""
+        """Receive until ``size`` bytes of an answer are there, and never a byte of the next answer."""
         while len(self._received) < size:
             if self._socket is None:
                 raise ConnectionResetError

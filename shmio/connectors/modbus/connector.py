@@ -72,9 +72,9 @@ class ModbusOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_
     timeout: Annotated[int, msgspec.Meta(ge=1, le=600_000)] = 2000
     """Time-out in ms for connecting, for reading all registers, and for the writes of a cycle."""
     unit: Annotated[int, msgspec.Meta(ge=0, le=255)] = 1
-    """Unit id of addresses without a unit."""
+    """Unit id for addresses that name no unit."""
     word_order: Order = "big"
-    """The first word of a number of several words; ``big``: the highest word."""
+    """Order of the words within a number; ``big``: the highest word comes first."""
     byte_order: Order = "big"
     """Order of the bytes within a word. The protocol specifies ``big``."""
     max_registers: Annotated[int, msgspec.Meta(ge=1, le=125)] = 125
@@ -94,7 +94,7 @@ class _Silence(NamedTuple):
     """Length of the present pause."""
     status: int
     mute: bool
-    """False if the gateway said that the unit does not answer: then the connection is alive."""
+    """True if no answer came at all; False if the gateway reported the silence, so that the connection is alive."""
 
 
 class _Register:
@@ -108,9 +108,9 @@ class _Register:
             self.codec = WordCodec(address, register, options.word_order, options.byte_order)
 
     def byte_places(self, byte_order: str) -> list[int] | None:
-        """Return the place in the device's words of each byte of the register in the image.
+        """Return for each byte of the register in the image its place in the device's words.
 
-        None if the value must be converted.
+        Return None if the value must be converted.
         """
         register, size = self.register, self.register.size
         if self.codec is None or register.dims or register.scale or self.address.kind is not register.element:
@@ -197,7 +197,7 @@ class ModbusConnector(Connector):
         return CycleRequests(f"{what} of {some}", (Requests(len(self._refusals.requests)),), NOTE)
 
     def connect(self) -> None:
-        """Connect to the device; ConnectorError if it cannot be reached."""
+        """Connect to the device. Raise ConnectorError if it cannot be reached."""
         self._client.connect()
         self._silent.clear()
         self._no_masks.clear()
@@ -218,7 +218,7 @@ class ModbusConnector(Connector):
     # -- reading -------------------------------------------------------------------------------------------------------
 
     def read(self) -> bytes:
-        """Read all registers; ConnectorError if the connection is lost."""
+        """Read all registers. Raise ConnectorError if the connection is lost."""
         if self._image is None:
             raise ConnectorError("the layout has no status area")
         self._client.begin()
@@ -257,9 +257,10 @@ class ModbusConnector(Connector):
         return [unit for unit in units if unit not in self._silent] + due[:1]
 
     def _until_ns(self, units: int) -> int | None:
-        """Return the deadline for the next of ``units`` units, in ns of CLOCK_MONOTONIC.
+        """Return the deadline for the next unit, in ns of CLOCK_MONOTONIC; None for the whole time-out.
 
-        None: the time-out, because a source with one unit has no other unit to protect.
+        ``units`` is the number of units still to read. They share the rest of the time-out, so that
+        a silent unit leaves time for the others.
         """
         if len(self._units) == 1:
             return None
@@ -413,8 +414,8 @@ class ModbusConnector(Connector):
     def _joined(self, writes: Sequence[Write]) -> list[list[int]]:
         """Group the indices of the writes that are joined to one write, in the order of writing.
 
-        For example, two commands write a word and one of its bits: then the write of the word lacks
-        the bit. Writes of a value are joined only if together they contain all its bits.
+        For example, if one command writes a word and another one of its bits, the write of the word
+        lacks that bit. Writes of a value are joined only if together they contain all its bits.
         """
         group = list(range(len(writes)))  # for each write, the last write of its group
         for one in self._registers:
@@ -461,7 +462,7 @@ class ModbusConnector(Connector):
         """Yield the requests (unit, function, data) of joined writes.
 
         Raises:
-            ValueError: The device cannot hold the value, or a write names nothing that can be written.
+            ValueError: The device cannot hold the value, or nothing can be written at these bytes.
 
         """
         found = False
@@ -525,13 +526,13 @@ class ModbusConnector(Connector):
         """Return how many elements one request writes at most."""
         kind = one.address.kind
         if one.address.bit is not None or (kind.size == 1 and kind.base not in ("STRING", "BOOL")):
-            return 1  # the rest of each word belongs to others
+            return 1  # the rest of each word may belong to other registers
         return MAX_WRITE_BITS if one.address.table.of_bits else max(1, MAX_WRITE_WORDS // one.address.width)
 
     def _requests_of(self, one: _Register, number: int, values: list[Any]) -> Iterator[tuple[int, int, bytes]]:
-        """Yield the requests that write consecutive elements from an address on.
+        """Yield the requests that write consecutive elements, starting at entry ``number`` of the table.
 
-        That is one request, or two for a text of more than 246 characters.
+        There is one request, or two for a text of more than 246 characters.
         """
         address = one.address
         start = number.to_bytes(2, "big")
@@ -564,7 +565,7 @@ class ModbusConnector(Connector):
 
 
 def _places(register: Register) -> Iterator[tuple[int, int, int]]:
-    """Yield the first byte, the size and the own bits of each element."""
+    """Yield for each element its first byte, its size in bytes and the mask of its bits in each byte."""
     if register.type == "BOOL":
         for byte, bit in bit_positions(register):
             yield register.offset + byte, 1, 1 << bit
@@ -592,7 +593,7 @@ def _cut(write: Write, register: Register) -> Iterator[int]:
 
 
 def _share(write: Write, at: int, size: int) -> bytes:
-    """Return the bits of each byte of an element that a write contains."""
+    """Return for each byte of an element a mask of the bits that a write contains."""
     offset, mask, data = write
     return bytes((mask or 0xFF) if offset <= place < offset + len(data) else 0 for place in range(at, at + size))
 

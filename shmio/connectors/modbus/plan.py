@@ -63,7 +63,7 @@ Place = tuple[int, Table, int]
 
 
 class Limits(NamedTuple):
-    """Limits of a request."""
+    """Limits of a read request: its maximum size in words, or in bits, and its gaps."""
 
     words: int
     bits: int
@@ -152,7 +152,7 @@ class Refusals:
         return first
 
     def due(self, now_ns: int, most: int) -> list[ReadRequest]:
-        """Return requests that retry refused addresses, at most this many."""
+        """Return requests that retry refused addresses whose pause is over, at most ``most``."""
         found: dict[tuple[Place, int], list[Element]] = {}
         for one, (retry_ns, _) in self.refused.items():
             if retry_ns <= now_ns:
@@ -160,7 +160,7 @@ class Refusals:
         return [_request(some) for some in list(found.values())[: max(0, most)]]
 
     def accept(self, request: ReadRequest) -> None:
-        """Read the elements of a request with the others again."""
+        """Merge the addresses of a request, which the device has answered again, with the others."""
         for one in request.elements:
             self.refused.pop(one, None)
         refused = {

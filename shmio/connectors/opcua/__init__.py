@@ -1,8 +1,8 @@
 """The connector ``opcua``: reads and writes the nodes of an OPC UA server.
 
-``address.py`` reads the addresses of a tag table, ``siemens.py`` derives those of a data block of an
-S7-1500, ``decode.py`` reads values from messages, and ``values.py`` fits them to registers.
-``trust.py`` decides about certificates, ``session.py`` has one session with its subscriptions,
-``connector.py`` runs the sessions in a thread, and ``browse.py`` lists what a server offers. The
-section numbers are those of OPC 10000.
+``decode.py`` reads values from messages, ``structures.py`` reads the members of structures by the
+definitions that ``data_types.py`` gets from the server, and ``values.py`` converts values to those of
+registers. ``trust.py`` checks certificates, ``session.py`` runs one session with its subscriptions,
+``connector.py`` runs all sessions in a thread, and ``browse.py`` lists what a server offers.
+``shmio.layout.addresses`` parses the addresses. Section numbers refer to OPC 10000.
 """

@@ -29,20 +29,20 @@ from shmio.layout.topic import shorten
 
 _OBJECTS: Final = ua.NodeId(85)
 _LEFT_OUT: Final = frozenset({ua.NodeId(2253), ua.NodeId(23470), ua.NodeId(31915)})
-"""The objects Server, Aliases and Locations, which each server has."""
+"""The objects Server, Aliases and Locations. Every server has them, so the search skips them."""
 _HAS_PROPERTY: Final = ua.NodeId(46)
 _NODES_AT_ONCE: Final = 20
 """Maximum number of nodes in a browse request. More would block the event loop for too long."""
 _VALUES_AT_ONCE: Final = 100
 REFERENCES_PER_NODE: Final = 30
-"""Maximum number of references per node of the limit. Some lead to properties or known nodes."""
+"""Maximum number of references, as a multiple of the limit of nodes: some lead to properties or known nodes."""
 MAX_CHARACTERS: Final = 1 << 26
 """Maximum number of characters of all names, identifiers and comments together."""
 MAX_MEMBERS: Final = 1000
 """Maximum number of members of a structure that are listed."""
 _MAX_COMMENT: Final = 1000
 _WRITE: Final = 2
-"""The bit of CurrentWrite in an access level."""
+"""The bit CurrentWrite of an access level."""
 _TYPES: Final = {
     decode.BOOLEAN: "BOOL", decode.SBYTE: "SINT", decode.BYTE: "USINT", decode.INT16: "INT", decode.UINT16: "UINT",
     decode.INT32: "DINT", decode.UINT32: "UDINT", decode.INT64: "LINT", decode.UINT64: "ULINT", decode.FLOAT: "REAL",
@@ -51,14 +51,14 @@ _TYPES: Final = {
     decode.QUALIFIED_NAME: "STRING", decode.LOCALIZED_TEXT: "STRING",
 }  # fmt: skip
 _DERIVED: Final = {29: decode.INT32, 290: decode.DOUBLE, 294: decode.DATE_TIME}
-"""Enumeration, Duration and UtcTime, by the numbers of their data types."""
+"""The built-in types of Enumeration, Duration and UtcTime, by the numbers of these data types."""
 
 
 def browse(options: OpcUaOptions, credentials: Credentials, wanted: Wanted) -> Browsed:
-    """List what a server offers.
+    """List the objects and variables that a server offers.
 
     Raises:
-        ConnectorError: The server cannot be reached, or refuses it.
+        ConnectorError: The server cannot be reached, or refuses the session or a request.
 
     """
     return asyncio.run(_browse(options, credentials, wanted))
@@ -85,9 +85,9 @@ class _Node:
     names: tuple[str, ...]
     is_variable: bool
     unit: Any = None
-    """Node id of its EngineeringUnits."""
+    """Node id of the variable's EngineeringUnits."""
     is_whole: bool = False
-    """True if the node is a register. Then its parts are not listed."""
+    """True if the node's value was listed, as one register or by its members; its children are then skipped."""
     children: list[_Node] = field(default_factory=list)
 
 
@@ -173,7 +173,7 @@ class _Search:
         self._characters += sum(len(one) for one in texts if isinstance(one, str | bytes))
 
     async def _list(self, nodes: Sequence[_Node]) -> None:
-        """Add nodes to what was found, with the types of variables."""
+        """Add nodes to the result, and read the types of variables."""
         variables = [node for node in nodes if node.is_variable]
         ids = [node.id for node in variables]
         names = ua.AttributeIds
@@ -181,7 +181,7 @@ class _Search:
             dict(zip(variables, await self._session.read(ids, attribute), strict=True))
             for attribute in (names.Value, names.DataType, names.Description, names.UserAccessLevel)
         ] if ids else [{}, {}, {}, {}]  # fmt: skip
-        # A structure whose parts are nodes is listed by these, since they can be written.
+        # If the members of a structure are nodes too, list these nodes instead: they can be written.
         structures = [one for one in variables if not one.children and details[0][one].kind == decode.EXTENSION]
         if structures:
             await self._types.learn([node.id for node in structures])
@@ -213,7 +213,7 @@ class _Search:
                 self._found.offers.append(Offer(node.names, kind, columns, refused))
 
     def _list_members(self, node: _Node, value: Sample) -> None:
-        """Add the members of a structure to what was found."""
+        """Add the members of a structure to the result."""
         kept: list[Listed] = []
         try:
             kept += itertools.islice(members_of(read_value(self._types.structures, value)), MAX_MEMBERS + 1)
@@ -240,7 +240,7 @@ class _Search:
             self._found.offers.append(Offer(names, kind, columns, refused))
 
     def _address(self, node: Any) -> str:
-        """Return a node's address, with the URI of its namespace, whose number may change."""
+        """Return a node's address with the URI of its namespace, since the namespace's number may change."""
         text = node_text(ua.NodeId(node.Identifier).to_string())
         number = node.NamespaceIndex
         if not number:

@@ -1,4 +1,4 @@
-"""The connector ``opcua``: its sessions in a thread, their values in an image, and writes."""
+"""The connector ``opcua``: runs sessions in a thread, stores their values in an image, and writes values."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ log = logging.getLogger("shmio.source")
 
 
 class _Node(NamedTuple):
-    """A node that is read, with the registers that get its value or members of it."""
+    """A node to read, with the indices of the registers that get its value or members of it."""
 
     address: Address
     is_structure: bool
@@ -76,7 +76,7 @@ class _Node(NamedTuple):
 
 
 class _NodeWrite(NamedTuple):
-    """A write of a node: a whole value, or the elements of an index range."""
+    """A write to a node: a whole value, or the elements in an index range."""
 
     write: int
     """Index of the write that this node's write belongs to."""
@@ -100,9 +100,9 @@ class _Sending:
     future: concurrent.futures.Future[None] | None = None
 
     def lost(self, reason: str) -> WriteLostError:
-        """Return the error with what is known of each write, if no answer can come any more.
+        """Return the error for a lost connection, with what is known of the outcome of each write.
 
-        Those that were sent may have been carried out.
+        A write that was sent but not answered is UNKNOWN: the server may have carried it out.
         """
         outcomes = [*self.outcomes]
         for step in self.steps[self.confirmed : self.begun]:
@@ -136,7 +136,7 @@ class OpcUaConnector(Connector):
         self._converters = [ValueConverter(register) for register in layout.registers]
         self._credentials = _credentials(options)
         self._image = RegisterImage(layout) if layout.status_offset is not None else None
-        self._lock = threading.Lock()  # of the image, and of what is known of its values
+        self._lock = threading.Lock()  # guards the image and the latest samples
         self._latest: dict[int, Sample] = {}
         self._reported: set[tuple[int, str]] = set()
         self._link: _Link | None = None
@@ -144,7 +144,7 @@ class OpcUaConnector(Connector):
 
     @classmethod
     def browse(cls, options: OpcUaOptions, wanted: Wanted) -> Browsed:
-        """List the variables below the server's folder Objects, apart from its own state."""
+        """List the variables below the server's folder Objects, without those about the server itself."""
         _need_library()
         from shmio.connectors.opcua.browse import browse  # noqa: PLC0415  a library that not all need
 
@@ -186,7 +186,7 @@ class OpcUaConnector(Connector):
         return CycleRequests(reads, (Requests(count, count),), note)
 
     def connect(self) -> None:
-        """Open the sessions, and wait for the first value of each node as long as the time-out allows.
+        """Open the sessions, and wait, at most for the time-out, for the first value of each node.
 
         Raises:
             ConnectorError: The server cannot be reached, or refuses the client.
@@ -212,10 +212,10 @@ class OpcUaConnector(Connector):
             raise
 
     def read(self) -> bytes:
-        """Return the present image, if all sessions are alive.
+        """Return the image of the newest values. In mode ``poll``, first read all nodes.
 
         Raises:
-            ConnectorError: A session is lost, or may be.
+            ConnectorError: A session is lost, or its server has been silent for too long.
 
         """
         link, image = self._link, self._image
@@ -236,7 +236,7 @@ class OpcUaConnector(Connector):
     # -- values --------------------------------------------------------------------------------------------------------
 
     def _deliver(self, samples: list[tuple[Item, Sample]]) -> None:
-        """Store samples; the thread of the sessions calls it."""
+        """Store samples. The thread of the sessions calls this method."""
         assert self._image is not None  # noqa: S101 - for the type checker
         with self._lock:
             for item, sample in samples:
@@ -296,7 +296,7 @@ class OpcUaConnector(Connector):
             image.fail(index, BAD_OUT_OF_RANGE, sample.source_ns)
 
     def _report(self, index: int, what: str) -> None:
-        """Log a fault of a register once per connection. The log names only the first registers."""
+        """Log a fault of a register, once per connection. After ``MAX_REPORTED`` faults, log no more of them."""
         if (index, what) in self._reported:
             return
         self._reported.add((index, what))
@@ -308,7 +308,7 @@ class OpcUaConnector(Connector):
     # -- writing -------------------------------------------------------------------------------------------------------
 
     def send(self, writes: Sequence[Write]) -> None:
-        """Begin to write to the nodes, in the thread of the sessions.
+        """Start to write to the nodes, in the thread of the sessions.
 
         Raises:
             WriteLostError: A session is lost.
@@ -329,7 +329,7 @@ class OpcUaConnector(Connector):
             raise sending.lost(str(error)) from None
 
     def confirm(self, until_ns: int) -> list[str] | None:
-        """Wait until the nodes are written, and read back, so that the next image has the new values.
+        """Wait until the nodes are written and read back, so that the next image has the new values.
 
         Raises:
             WriteLostError: A session was lost before all writes had their answers.
@@ -350,7 +350,7 @@ class OpcUaConnector(Connector):
         return [str(outcome) for outcome in sending.outcomes]
 
     async def _carry_out(self, link: _Link, sending: _Sending) -> None:
-        """Write in requests, and read back what was written; runs in the thread of the sessions."""
+        """Send the write requests, and read the nodes back. This runs in the thread of the sessions."""
         outcomes = sending.outcomes
         for step in sending.steps:
             if step.elements is not None and not await link.has_ranges(step):
@@ -369,11 +369,11 @@ class OpcUaConnector(Connector):
             await link.read_back(list({step.item.index: step.item for step in sending.steps}.values()))
 
     def _path(self, step: _NodeWrite) -> str:
-        """Return the path of the register that is written."""
+        """Return the path of the register that a step writes."""
         return self._layout.registers[self._nodes[step.item.index].registers[0]].path
 
     def _steps(self, link: _Link, number: int, write: Write) -> Iterator[_NodeWrite]:
-        """Yield the writes of nodes for a write of bytes. ValueError: the write is impossible."""
+        """Yield the node writes that carry out a write of bytes. Raise ValueError if that is impossible."""
         layout, found = self._layout, False
         covered, image = bytearray(layout.size), bytearray(layout.size)
         apply(Write(write.offset, write.mask, b"\xff" * len(write.data)), covered)
@@ -414,9 +414,9 @@ def _need_library() -> None:
 
 
 def _nodes(options: OpcUaOptions, layout: Layout) -> tuple[list[_Node], list[Member]]:
-    """Return the nodes of a layout, and for each register the way to its value in the node's.
+    """Return the nodes of a layout, and for each register which member of its node's value it is.
 
-    Members of the same structure share a node. Other registers have nodes of their own.
+    Registers that are members of the same structure share a node. Each other register has its own.
 
     Raises:
         ConfigError: An address is wrong.
@@ -444,14 +444,14 @@ def _nodes(options: OpcUaOptions, layout: Layout) -> tuple[list[_Node], list[Mem
 
 
 def _address(options: OpcUaOptions, layout: Layout, register: Register) -> tuple[Address, Member]:
-    """Return the node of a register, and the way to a member. ValueError: its address is wrong."""
+    """Return the address of a register's node, and the member of its value. Raise ValueError if it is wrong."""
     if options.nodes == "siemens" and not register.address:
         return siemens.node_address(layout, register), ()
     return parse_member(register.address)
 
 
 def _credentials(options: OpcUaOptions) -> Credentials:
-    """Read the files that the keys name. ConfigError: a file is unusable."""
+    """Read the password and the certificate from their files. Raise ConfigError if a file cannot be used."""
     password = read_password(options.password_file, "password_file") if options.password_file else ""
     if options.certificate is None or options.key is None:
         return Credentials(password=password)
@@ -475,10 +475,10 @@ def _overlapping(layout: Layout, write: Write) -> range:
 
 
 def _elements(register: Register, share: bytes) -> tuple[int, int]:
-    """Return the first element and the number of elements of these bits.
+    """Return the first and the number of the elements whose bits are set in ``share``.
 
     Raises:
-        ValueError: They are not consecutive whole elements.
+        ValueError: The bits are not those of consecutive whole elements.
     """
     if not register.dims:
         raise ValueError("OPC UA cannot write a part of a value: write the whole register")
@@ -501,7 +501,7 @@ def _elements(register: Register, share: bytes) -> tuple[int, int]:
 
 
 def _batches(steps: Sequence[_NodeWrite], most: int) -> Iterator[list[_NodeWrite]]:
-    """Group steps into requests, in order. A request belongs to one session, and writes no node twice."""
+    """Group steps into requests, in their order. A request is for one session, and writes no node twice."""
     batch: list[_NodeWrite] = []
     for step in steps:
         full = len(batch) >= most or any(one.item is step.item for one in batch)
@@ -514,7 +514,7 @@ def _batches(steps: Sequence[_NodeWrite], most: int) -> Iterator[list[_NodeWrite
 
 
 class _Link(threading.Thread):
-    """The sessions of one connection, in a thread with an event loop of its own."""
+    """A thread that runs the sessions of one connection in its own event loop."""
 
     def __init__(
         self,
@@ -558,7 +558,7 @@ class _Link(threading.Thread):
         return ""
 
     def check(self) -> None:
-        """Raise ConnectorError if a session is lost, or may be."""
+        """Raise ConnectorError if a session is lost, or its server has been silent for too long."""
         if self._failure is not None:
             raise self._failure
         for one in self.sessions:
@@ -573,7 +573,7 @@ class _Link(threading.Thread):
             work: Creates the coroutine.
 
         Raises:
-            ConnectorError: The session is lost, or does not answer within the time-out of a hook.
+            ConnectorError: A session is lost, or the result does not come in time.
 
         """
         future = self.begin(work)
@@ -585,7 +585,7 @@ class _Link(threading.Thread):
             raise ConnectorError(f"no answer within {limit_s * 1000:.0f} ms from {self._options.peer}") from None
 
     def begin(self, work: Callable[[], Coroutine[Any, Any, _Result]]) -> concurrent.futures.Future[_Result]:
-        """Run a coroutine in the loop; return the future with its result, for :meth:`result`.
+        """Start a coroutine in the loop; return a future, for :meth:`result`.
 
         Raises:
             ConnectorError: The session is lost.
@@ -618,7 +618,7 @@ class _Link(threading.Thread):
             raise self._failure or ConnectorError(f"the connection to {self._options.peer} was closed") from None
 
     def close(self) -> None:
-        """End the thread. If the sessions are alive, first give the server a moment to free them."""
+        """End the thread. If the sessions are alive, wait briefly until they have closed at the server."""
         self._closed = True
         healthy = self.ready
         with suppress(RuntimeError):  # the loop may have just ended
@@ -678,7 +678,7 @@ class _Link(threading.Thread):
             await asyncio.gather(*rest, return_exceptions=True)
 
     async def _first_values(self, sessions: Sequence[Session], lost: Sequence[asyncio.Future[Any]]) -> None:
-        """Wait for the first value of each node, at most for the time-out."""
+        """Read all nodes in mode ``poll``; else wait, at most for the time-out, for their first values."""
         if self._options.mode == "poll":
             await self._guarded(self.poll)
             return
@@ -706,12 +706,12 @@ class _Link(threading.Thread):
         await asyncio.gather(*(one.poll() for one in self.sessions))
 
     async def write(self, batch: Sequence[_NodeWrite]) -> list[int]:
-        """Write a batch of one session, and return the status codes."""
+        """Write a batch whose nodes belong to one session; return the status codes."""
         session = self.sessions[batch[0].item.session]
         return await session.write([(step.item, step.elements, step.sample) for step in batch])
 
     async def has_ranges(self, step: _NodeWrite) -> bool:
-        """Return whether the server can write the single elements of a write."""
+        """Return whether the server supports the index range of a write."""
         assert step.elements is not None  # noqa: S101 - for the type checker
         return await self.sessions[step.item.session].has_ranges(step.item, step.elements, len(step.sample.value))
 

@@ -15,7 +15,7 @@ from shmio.connectors.opcua.decode import Extension, MalformedError, NodeKey, Re
 from shmio.connectors.opcua.structures import NULL, Definition, Field, Structure, complete, read_definition
 
 MAX_TYPES: Final = 1000
-"""Maximum number of data types that a source looks at."""
+"""Maximum number of data types whose definitions a source reads."""
 _MAX_ANCESTORS: Final = 16
 _HAS_ENCODING, _HAS_SUBTYPE = 38, 45
 _TEXT: Final = re.compile(r"(?:ns=([0-9]+);)?([isgb])=(.*)", re.DOTALL)
@@ -27,20 +27,20 @@ Structures = Mapping[NodeKey, Structure]
 
 
 class Asked(Protocol):
-    """The requests of a session that are needed here."""
+    """The requests of a session that :class:`DataTypes` needs."""
 
     async def read(self, nodes: Sequence[Any], attribute: Any) -> list[Sample]:
         """Read an attribute of nodes."""
 
     async def origins(self, nodes: Sequence[Any], reference: Any) -> list[Any]:
-        """Return the node from which a reference leads to each node; None if there is none."""
+        """Return for each node a node that refers to it by ``reference``; None if no node does."""
 
 
 class DataTypes:
-    """The data types of some nodes, as far as the server defines them."""
+    """The structures that some nodes have as values, as far as the server defines them."""
 
     def __init__(self, session: Asked) -> None:
-        """Create it without a request."""
+        """Create the object without a request; :meth:`learn` sends the requests."""
         self._session = session
         self._definitions: dict[NodeKey, Definition] = {}
         self._abstract: set[NodeKey] = set()
@@ -51,7 +51,7 @@ class DataTypes:
         """The structures, by the node ids of their encodings."""
 
     async def learn(self, nodes: Sequence[Any]) -> None:
-        """Find the definitions of the structures that nodes have as values.
+        """Ask the server for the definitions of the structures that nodes have as values.
 
         Raises:
             ConnectorError: The session fails, or the server refuses a request.
@@ -74,7 +74,7 @@ class DataTypes:
             self.structures[encoding] = self._structure(key)
 
     async def _define(self, wanted: set[NodeKey]) -> None:
-        """Read the definitions of data types, and of those of their members, level by level."""
+        """Read the definitions of data types and of the data types of their members, level by level."""
         while wanted := {key for key in wanted if not self._is_known(key)}:
             level = sorted(wanted, key=repr)[: max(0, MAX_TYPES - len(self._definitions) - len(self._kinds))]
             if not level:
@@ -129,7 +129,7 @@ class DataTypes:
             self._names[key] = sample.value[:100] if isinstance(sample.value, str) else ""
 
     def _structure(self, key: NodeKey) -> Structure:
-        """Return the structure of a data type that is defined, with the structures in it."""
+        """Return the structure of a data type in ``_definitions``, complete with the structures inside it."""
         if key in self._built:
             return self._built[key]
         waiting = [key]
@@ -157,7 +157,7 @@ class DataTypes:
 
 
 def encodings_of(sample: Sample) -> Iterable[NodeKey]:
-    """Return the node ids of the encodings of a value, each once."""
+    """Return the node ids of the encodings of a value's structures, each once."""
     if sample.kind != decode.EXTENSION:
         return set()
     values = sample.value if sample.dims is not None else [sample.value]
@@ -165,7 +165,7 @@ def encodings_of(sample: Sample) -> Iterable[NodeKey]:
 
 
 def _built_in(key: NodeKey) -> int:
-    """Return the built-in type that a data type of the standard is; 0: it is none."""
+    """Return the built-in type that encodes a data type of the standard; 0 if there is none."""
     form, namespace, number = key
     if form != 2 or namespace or not isinstance(number, int):
         return 0
@@ -173,7 +173,7 @@ def _built_in(key: NodeKey) -> int:
 
 
 def _key(sample: Sample) -> NodeKey | None:
-    """Return the node id in a value; None if it has none."""
+    """Return the node id that a sample holds; None if it holds anything else."""
     if sample.kind != decode.NODE_ID or sample.dims is not None:
         return None
     found = _TEXT.fullmatch(sample.value)

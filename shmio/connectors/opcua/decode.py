@@ -23,7 +23,7 @@ NAMES: Final = (
     "String", "DateTime", "Guid", "ByteString", "XmlElement", "NodeId", "ExpandedNodeId", "StatusCode", "QualifiedName",
     "LocalizedText", "structure", "DataValue", "Variant", "DiagnosticInfo",
 )  # fmt: skip
-"""Names of the built-in types by their numbers."""
+"""Names of the built-in types, indexed by their numbers."""
 
 _FIXED: Final = {
     BOOLEAN: "?", SBYTE: "b", BYTE: "B", INT16: "h", UINT16: "H", INT32: "i", UINT32: "I", INT64: "q", UINT64: "Q",
@@ -46,7 +46,7 @@ class MalformedError(ConnectorError):
 
 
 class FaultError(ConnectorError):
-    """The server refuses a request; ``code`` is the status code."""
+    """The server refuses a request; ``code`` is its status code."""
 
     def __init__(self, code: int) -> None:
         super().__init__(f"the server refuses a request with 0x{code:08X}")
@@ -64,11 +64,13 @@ class Sample(NamedTuple):
     """A value that the server sent.
 
     Attributes:
-        kind: Number of the built-in type; 0: there is no value.
-        value: The value, or a flat list. Times are ns since 1970, texts are str, byte strings bytes.
+        kind: Number of the built-in type; 0 if there is no value.
+        value: The value; for an array, a flat list. Times are ns since 1970, texts are str, byte
+            strings are bytes.
         dims: Sizes of an array's dimensions; None for a scalar.
         code: Status code.
-        source_ns: UTC time of the source, else of the server, in ns since 1970; 0: neither is known.
+        source_ns: The source's timestamp, or else the server's, in ns since 1970 UTC; 0 if there is
+            neither.
 
     """
 
@@ -82,8 +84,9 @@ class Sample(NamedTuple):
 class Publication(NamedTuple):
     """Content of a publish response.
 
-    ``values`` has the number of each monitored item with its sample; ``closed`` is the status code
-    with which the server ended the subscription, or 0. Without notifications it is a keep-alive.
+    ``keep_alive`` is true if the response has no notifications. ``values`` are pairs of a monitored
+    item's number and its sample. ``closed`` is the status code with which the server ended the
+    subscription, or 0.
     """
 
     subscription: int
@@ -128,24 +131,33 @@ def publish_response(data: bytes) -> Publication:
 
 
 NodeKey = tuple[int, int, int | str | bytes]
-"""A node id, to compare: the type of its identifier (2 for a number), its namespace and the identifier."""
+"""A node id that can be compared: the type of its identifier (2 for a number), its namespace, the identifier."""
 
 
 def node_key(found: tuple[int, int, int | str | bytes]) -> NodeKey:
-    """Return a node id in the one form that can be compared."""
+    """Return a node id in the form that can be compared: all numbers have the same type."""
     form, namespace, identifier = found
     return max(form, 2), namespace, identifier
 
 
 class Reader:
-    """Reads a message, or a part of one, from its beginning. Each method reads the item that its name says."""
+    """Reads a message, or a part of one, from its beginning. Each method reads the item after which it is named."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
         self._at = 0
 
     def header(self, expected: int | None) -> None:
-        """Check the result of a response, and its type; FaultError if the server refuses the request."""
+        """Read the type and the header of a response.
+
+        Args:
+            expected: Number of the response's type; None if any will do.
+
+        Raises:
+            FaultError: The server refuses the request.
+            MalformedError: The response has another type, or is malformed.
+
+        """
         kind = self.type_id()
         self.skip(12)  # time, and the request's handle
         code = self.u32()
@@ -164,7 +176,7 @@ class Reader:
         return len(self._data) - self._at
 
     def skip(self, size: int) -> None:
-        """Pass over bytes."""
+        """Skip bytes."""
         self._at += size
         if self._at > len(self._data):
             raise MalformedError
@@ -191,7 +203,15 @@ class Reader:
         return int(_INT.unpack_from(self._data, self._at - 4)[0])
 
     def count(self, least: int = 1) -> int:
-        """Return the length of an array whose elements take at least this many bytes; 0: no array."""
+        """Read the length of an array; return 0 for a null.
+
+        Args:
+            least: Minimum number of bytes of an element.
+
+        Raises:
+            MalformedError: The message is too short for the array.
+
+        """
         self.skip(4)
         count = int(_INT.unpack_from(self._data, self._at - 4)[0])
         if count <= 0:
@@ -201,13 +221,13 @@ class Reader:
         return count
 
     def chunk(self) -> bytes | None:
-        """Read a length and as many bytes; None for a null."""
+        """Read a length and that many bytes; return None for a null."""
         self.skip(4)
         size = int(_INT.unpack_from(self._data, self._at - 4)[0])
         return None if size < 0 else self.take(size)
 
     def text(self) -> str:
-        """Read a String; a null is empty."""
+        """Read a String; return an empty text for a null."""
         return (self.chunk() or b"").decode("utf-8", "replace")
 
     def time(self) -> int:
@@ -244,17 +264,17 @@ class Reader:
         return found
 
     def type_id(self) -> int:
-        """Read a node id; return its number in the standard's namespace, or -1."""
+        """Read a node id; return its number in the standard's namespace, or -1 if it has none there."""
         form, namespace, identifier = self.node_id()
         return int(identifier) if form < 3 and namespace == 0 else -1
 
     def extension_parts(self) -> tuple[int, bytes]:
-        """Read a structure; return its type as from :meth:`type_id`, and its bytes."""
+        """Read a structure; return the number of its type, as :meth:`type_id` does, and its bytes."""
         kind = self.type_id()
         return kind, (self.chunk() or b"") if self.u8() else b""
 
     def extension(self) -> Extension:
-        """Read a structure with its encoding."""
+        """Read a structure; return the node id of its encoding, and its bytes."""
         start = self._at
         self.node_id()
         encoding = self._data[start : self._at]
@@ -299,7 +319,7 @@ class Reader:
         kind = mask & 0x3F
         if not mask & 0x80:
             return kind, self.value(kind, depth), None
-        if not kind:  # an array of nothing could be of any length
+        if not kind:  # an array of nulls takes no bytes, so it could have any length
             raise MalformedError
         values = self.elements(kind, self.count(size_of(kind)), depth)
         dims: tuple[int, ...] = (len(values),)
@@ -363,7 +383,7 @@ class Reader:
 
 
 def size_of(kind: int) -> int:
-    """Return the minimum number of bytes of a value of a built-in type."""
+    """Return how many bytes a value of a built-in type has at least."""
     return _STRUCTS[kind].size if kind in _STRUCTS else 1
 
 

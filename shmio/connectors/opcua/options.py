@@ -23,19 +23,19 @@ class OpcUaOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_o
 
     url: Annotated[str, msgspec.Meta(min_length=1, max_length=1000)]
     timeout: Annotated[int, msgspec.Meta(ge=10, le=600_000)] = 4000
-    """Time-out in ms for each answer, and for the time without any message of the server."""
+    """Maximum time in ms until each answer, and without any message from the server."""
     mode: Literal["subscribe", "poll"] = "subscribe"
     nodes: Literal["addresses", "siemens"] = "addresses"
-    """Where node ids come from: the layout's addresses, or the names of a data block of an S7-1500."""
+    """What node ids are made from: the layout's addresses, or the names of an S7-1500's data block."""
     sampling_ms: Annotated[int, msgspec.Meta(ge=-1, le=3_600_000)] = 50
     """Interval at which the server samples a node; 0: as fast as it can; -1: the publishing interval."""
     publishing_ms: Annotated[int, msgspec.Meta(ge=1, le=3_600_000)] = 100
     queue: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 1
-    """Samples of a node that the server keeps between two publications."""
+    """Maximum number of samples of a node that the server keeps between two publications."""
     max_items: _Count = 1000
-    """Maximum number of nodes of a subscription."""
+    """Maximum number of nodes in a subscription."""
     session_items: _Count = 10_000
-    """Maximum number of nodes of a session."""
+    """Maximum number of nodes in a session."""
     security: Literal["None", "Sign", "SignAndEncrypt"] = "None"
     policy: Literal["Basic256Sha256", "Aes128Sha256RsaOaep", "Aes256Sha256RsaPss"] = "Basic256Sha256"
     certificate: str | None = None
@@ -45,7 +45,7 @@ class OpcUaOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_o
     username: Annotated[str, msgspec.Meta(min_length=1, max_length=256)] | None = None
     password_file: str | None = None
     insecure: bool = False
-    """Allow a password over a channel without encryption beyond loopback."""
+    """True to allow a password over an unencrypted channel to another host."""
 
     def __post_init__(self) -> None:
         parts = urlsplit(self.url)
@@ -92,8 +92,9 @@ class Credentials:
 
     Attributes:
         application_uri: The client's URI, which is also in its certificate.
-        identity: The client's certificate and its private key, of the library cryptography.
-        password: The user's password.
+        identity: The client's certificate and its private key, as objects of the library
+            cryptography; None without security.
+        password: The user's password; empty without a user.
 
     """
 

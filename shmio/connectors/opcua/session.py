@@ -1,8 +1,8 @@
-"""One session of an OPC UA server, with the nodes that it reads and the subscriptions for them.
+"""One session with an OPC UA server, with the nodes that it reads and the subscriptions for them.
 
-It uses asyncua for the channel, the security and the requests, but not the supervision of asyncua's
-client. At the first error, the session ends, and the connector opens a new session with new objects.
-So nothing of the old session can be mistaken for an answer in the new one.
+The session uses asyncua for the channel, the security and the requests, but watches the connection
+itself. It ends at the first error. The connector then opens a new session with new objects, so that
+no late answer of the old session can be mistaken for one of the new session.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _LIMITS: Final = (11705, 11707, 11712, 11714)
 """Nodes with the server's limits for a request: nodes to read, nodes to write, browse paths, monitored items."""
 _HIERARCHICAL: Final = 33
 _CLASSES: Final = 1 | 2
-"""The classes of objects and variables."""
+"""The node classes Object and Variable, as a mask."""
 REFERENCES_AT_ONCE: Final = 500
 _ORIGINS_AT_ONCE: Final = 20
 _BAD_NO_CONTINUATION_POINTS: Final = 0x804B0000
@@ -90,24 +90,24 @@ class Item:
     node: Any = None
     """The node id; None if the server has not resolved the address yet."""
     code: int = BAD_WAITING_FOR_INITIAL_DATA
-    """Status code if the node cannot be read, or waits for its first value."""
+    """Status code of the newest sample, or why the node has none."""
     subscription: Subscription | None = None
     monitored: int = 0
-    """The server's number of the monitored item."""
+    """The server's id of the monitored item."""
     seen: Sample | None = None
-    """The sample that came last."""
+    """The newest sample."""
     last: Sample | None = None
-    """The last sample with a value."""
+    """The newest sample with a value."""
     settles_ns: int = 0
-    """Until this time, samples from before the last write may come."""
+    """Time (ns of CLOCK_MONOTONIC) until which samples from before the last write may arrive; 0: none may."""
     written_ns: int = 0
-    """Source time of the value that was read after the last write."""
+    """Source time of the value that was read back after the last write."""
     is_structure: bool = False
-    """True if registers are members of the node's value."""
+    """True if the node's registers are members of its value."""
     structures: Structures = field(default_factory=dict)
     """The structures that the node may have as values."""
     unread: bool = False
-    """True if the last value could not be read with these structures."""
+    """True if the newest value does not fit these structures."""
     skipped: bool = False
     """True if a sample was skipped because it may be from before the last write."""
 
@@ -119,7 +119,7 @@ class Subscription:
     number: int
     publishing_s: float
     silent_s: float
-    """Time after which the subscription is lost if the server sends nothing, in s."""
+    """Time in s without a message from the server after which the subscription counts as lost."""
     alive_ns: int
     sequence: int = 0
     items: list[Item] = field(default_factory=list)
@@ -129,7 +129,7 @@ Deliver = Callable[[list[tuple[Item, Sample]]], None]
 
 
 class Session:
-    """A session, from its connection to its end. All methods are for the thread of its event loop."""
+    """A session, from its connection to its end. Call :meth:`check` in any thread, all else in the event loop's."""
 
     def __init__(
         self, options: OpcUaOptions, credentials: Credentials, items: Sequence[Item], deliver: Deliver
@@ -149,9 +149,9 @@ class Session:
         self._client: Any = None
         self._protocol: Any = None
         self._newest: _Protocol | None = None
-        """The connection that was made last, which may be one only to ask for the server's certificate."""
+        """The newest connection; it may be the one that only asks for the server's certificate."""
         self._stage = ""
-        """What the server may refuse without a word; empty once the session exists."""
+        """Probable reason if the server closes the connection without an error; empty once the session exists."""
         self._subscriptions: dict[int, Subscription] = {}
         self._publishing = 0
         self._wanted = 0
@@ -160,9 +160,9 @@ class Session:
         self._per_read = self._per_write = self._per_path = self._per_items = MAX_PER_CALL
         self._answered_ns = time.monotonic_ns()
         self.failure = asyncio.get_running_loop().create_future()
-        """The future gets the reason if the session is lost."""
+        """Future whose result is the error that ended the session."""
         self.state = _RUNNING
-        """The server's state."""
+        """The server's state, as an index of ``STATES``."""
 
     # -- connection ----------------------------------------------------------------------------------------------------
 
@@ -263,7 +263,7 @@ class Session:
         )
 
     async def _renew(self) -> None:
-        """Renew the channel before it expires."""
+        """Renew the secure channel each time before it expires."""
         while True:
             await asyncio.sleep(0.75 * max(1.0, self._client.secure_channel_timeout / 1000))
             try:
@@ -283,17 +283,17 @@ class Session:
 
     @property
     def _refusal(self) -> ConnectorError | None:
-        """The error with which the server has closed the connection; None if it gave none."""
+        """The error that the server sent when it closed the connection; None if it sent none."""
         code = self._newest.refused if self._newest is not None else 0
         return ConnectorError(_explained_code(code, self._options)) if code else None
 
     def fail(self, error: ConnectorError) -> None:
-        """End the session; the first error counts."""
+        """Mark the session as failed. Only the first error is kept."""
         if not self.failure.done():
             self.failure.set_result(error)
 
     async def close(self, *, polite: bool) -> None:
-        """End the session. If ``polite``, first send CloseSession to the server."""
+        """Close the connection. If ``polite``, first send CloseSession to the server."""
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -317,7 +317,7 @@ class Session:
         await asyncio.sleep(0)
 
     def explained(self, error: BaseException) -> ConnectorError:
-        """Return the error of a connection as a ConnectorError with a text for the operator."""
+        """Convert any error of this connection to a ConnectorError with a text for the operator."""
         options, peer = self._options, self._options.peer
         reason = getattr(self._protocol, "reason", "")
         if isinstance(error, ConnectorError):
@@ -348,7 +348,7 @@ class Session:
     # -- requests ------------------------------------------------------------------------------------------------------
 
     async def _answer(self, request: Any) -> bytes:
-        """Send a request; return the body of its answer, which comes within the time-out."""
+        """Send a request; return the body of its answer. Raise TimeoutError if none comes in time."""
         if self._protocol is None:
             raise ConnectionError
         future = self._protocol._send_request(request, self._timeout_s)
@@ -357,7 +357,7 @@ class Session:
         return bytes(body)
 
     async def _response(self, kind: Any, request: Any) -> Any:
-        """Send a request; return its answer as the library decodes it. FaultError: the server refuses it."""
+        """Send a request; return its answer, decoded by the library. Raise FaultError if the server refuses it."""
         body = await self._answer(request)
         decode.check_fault(body)  # a fault has another type, without the answer's fields
         return ua_binary.struct_from_binary(kind, Buffer(body))
@@ -440,7 +440,7 @@ class Session:
                 item.node = ua.NodeId(target.Identifier, target.NamespaceIndex)
 
     async def _learn(self, items: Iterable[Item]) -> None:
-        """Ask for the definitions of the structures whose members are registers."""
+        """Ask the server for the definitions of the structures whose members are registers."""
         wanted = [item for item in items if item.is_structure and item.node is not None]
         if not wanted:
             return
@@ -457,7 +457,7 @@ class Session:
         return await self._samples(nodes, attribute)
 
     async def origins(self, nodes: Sequence[Any], reference: Any) -> list[Any]:
-        """Return the node from which a reference leads to each node; None if there is none."""
+        """Return for each node a node that refers to it by ``reference``; None if no node does."""
         found: list[Any] = []
         for at in range(0, len(nodes), _ORIGINS_AT_ONCE):
             part = nodes[at : at + _ORIGINS_AT_ONCE]
@@ -478,11 +478,11 @@ class Session:
         return found
 
     async def browse(self, nodes: Sequence[Any], most: int) -> tuple[list[list[Any]], bool]:
-        """Return the hierarchical references from nodes to objects and variables; none of an unknown node.
+        """Return the hierarchical references from nodes to objects and variables. An unknown node has none.
 
         Args:
             nodes: The node ids.
-            most: Once there are more references than this, the rest is left out.
+            most: Once there are more references than this, the server is asked for no more.
 
         Returns:
             The references of each node, and whether some were left out.
@@ -525,7 +525,7 @@ class Session:
                 if one.ContinuationPoint
             ]
             if open_points and sum(map(len, found)) == before:
-                raise MalformedError  # it would never end
+                raise MalformedError  # such a server could continue for ever
         return found, left_out
 
     # -- reading -------------------------------------------------------------------------------------------------------
@@ -536,7 +536,7 @@ class Session:
         self._deliver(list(zip(items, await self._samples([item.node for item in items]), strict=True)))
 
     async def read_back(self, items: Sequence[Item]) -> None:
-        """Read nodes that were just written, and deliver these samples before any others."""
+        """Read nodes that were just written, and deliver the samples before any older ones can arrive."""
         found = await self._samples([item.node for item in items])
         now_ns = time.monotonic_ns()
         for item, sample in zip(items, found, strict=True):
@@ -556,9 +556,9 @@ class Session:
         return found.code >> 30 == 0 and found.dims == (count,)
 
     async def write(self, values: Sequence[tuple[Item, str | None, Sample]]) -> list[int]:
-        """Write values, or with an index range elements of arrays. Return the status code of each.
+        """Write whole values, or the elements in an index range; return the status code of each write.
 
-        At most :attr:`per_write` of them, and no node twice.
+        ``values`` has at most :attr:`per_write` writes, and no node twice.
         """
         request = ua.WriteRequest()
         for item, elements, sample in values:
@@ -581,7 +581,7 @@ class Session:
 
     @property
     def waiting(self) -> bool:
-        """True if a node has shown no value yet."""
+        """True if a node still waits for its first value."""
         return any(item.code == BAD_WAITING_FOR_INITIAL_DATA for item in self._items)
 
     @property
@@ -604,7 +604,7 @@ class Session:
     # -- subscriptions -------------------------------------------------------------------------------------------------
 
     async def _subscribe(self, items: Sequence[Item]) -> None:
-        """Monitor items, in as many subscriptions as the limits of keys and server require."""
+        """Monitor items, in as many subscriptions as the options and the server's limits require."""
         left = deque(items)
         most = self._options.max_items
         while left:
@@ -620,7 +620,7 @@ class Session:
                 await self._drop(one)
 
     async def _drop(self, subscription: Subscription) -> None:
-        """End a subscription without items. Another subscription remains, for which publish requests can wait."""
+        """Delete a subscription without items. Never delete the last one: publish requests need a subscription."""
         del self._subscriptions[subscription.number]
         request = ua.DeleteSubscriptionsRequest()
         request.Parameters = ua.DeleteSubscriptionsParameters([subscription.number])
@@ -703,7 +703,7 @@ class Session:
         )
 
     def _publish(self) -> None:
-        """Send publish requests until the wanted number is waiting at the server."""
+        """Send publish requests until the server holds the wanted number of them."""
         while self._publishing < self._wanted and self.ready:
             request = ua.PublishRequest()
             request.Parameters.SubscriptionAcknowledgements, self._acknowledge = self._acknowledge, []
@@ -783,7 +783,10 @@ class Session:
             await asyncio.sleep(min(PROBES * self._timeout_s, max(0.1, self._client.session_timeout / 3000)))
 
     async def _watch(self) -> None:
-        """Check for silence. Read written nodes again when no older samples can come any more."""
+        """End the session if the server is silent. Read written nodes again whose samples were skipped.
+
+        A node is read once no sample from before its last write can arrive any more.
+        """
         while True:
             await asyncio.sleep(min(0.05, self._timeout_s / 8))
             if reason := self.check():
@@ -802,7 +805,7 @@ class Session:
                     return
 
     async def _retry(self) -> None:
-        """Request nodes again that the server did not know, or refused to monitor."""
+        """Request nodes again, at intervals, that the server did not know or refused to monitor."""
         while True:
             await asyncio.sleep(RETRY_S)
             subscribes = self._options.mode == "subscribe"
@@ -826,15 +829,16 @@ class Session:
                 return
 
     async def _learn_again(self, items: Sequence[Item]) -> None:
-        """Ask for definitions again that did not fit, and deliver the last values once more."""
+        """Ask again for the definitions of structures, and deliver again the values that did not fit the old ones."""
         await self._learn(items)
         self._deliver([(item, item.seen) for item in items if item.unread and item.seen is not None])
 
     async def _find_dead(self, items: Sequence[Item]) -> list[Item]:
         """Return the monitored items for which the server has stopped sending changes.
 
-        Some servers send nothing more for a node that was removed, even after it was added again. A
-        read shows that the values differ. Make items bad whose nodes do not exist.
+        Some servers send nothing more for a node that was removed, even after it was added again.
+        Such an item is found by reading its node: the value differs from the last sample. An item
+        whose node does not exist becomes bad.
         """
         items = [item for item in items if item.code & 0xFFFF0000 not in _AGAIN]
         found = await self._samples([item.node for item in items]) if items else []
@@ -849,7 +853,7 @@ class Session:
         return [item for item, one in zip(silent, again, strict=True) if _differs(item, one)]
 
     def _settle_s(self, item: Item) -> float:
-        """Return for how long samples may be in flight, in s."""
+        """Return the maximum time in s for which a sample may be in flight."""
         publishing_s = item.subscription.publishing_s if item.subscription is not None else 0.0
         return 2 * (publishing_s + max(0, self._options.sampling_ms) / 1000) + 0.2
 
@@ -874,14 +878,14 @@ class Session:
         self._report_failed(known)
 
     def _report_failed(self, items: Iterable[Item]) -> None:
-        """Deliver the status of items that cannot be read; those with a monitored item have their own samples."""
+        """Deliver the status codes of items that cannot be read. For monitored items, the server sends samples."""
         failed = [item for item in items if item.subscription is None and item.code not in _UNDECIDED]
         if failed:
             self._deliver([(item, Sample(0, None, None, item.code, 0)) for item in failed])
 
 
 class _Protocol(UASocketProtocol):
-    """Receives messages of the server, and limits their size."""
+    """The client's end of the connection. It limits the size of the server's messages."""
 
     reason = ""
     """Why this client closed the connection."""
@@ -895,7 +899,7 @@ class _Protocol(UASocketProtocol):
         super()._fail_all_pending(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes; close the connection if a message is too large."""
+        """Process received bytes; close the connection if a message is too large."""
         super().data_received(data)
         left = self.receive_buffer
         too_long = left is not None and len(left) >= 8 and int.from_bytes(left[4:8], "little") > MAX_CHUNK_BYTES + 64
@@ -905,7 +909,7 @@ class _Protocol(UASocketProtocol):
 
 
 def _differs(item: Item, found: Sample) -> bool:
-    """Return whether a read found another value than the last sample, so that a sample is missing."""
+    """Return whether a value that was read differs from the newest sample, so that a sample is missing."""
     seen = item.seen
     if seen is None or (seen.code ^ found.code) & 0xFFFF0000:
         return True

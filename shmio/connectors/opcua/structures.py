@@ -1,7 +1,7 @@
-"""Reads structures by the definitions that a server offers of their data types (OPC 10000-6, section 5.2.7).
+"""Reads structures by the server's definitions of their data types (OPC 10000-6, section 5.2.7).
 
-A definition comes from a server as well as the structure does, so each may be anything: the bytes of a
-structure must have exactly the length that its definition demands, or none of its members has a value.
+Both the definition and the structure come from the server, so either may be wrong. If the bytes of a
+structure do not have exactly the length that its definition demands, none of its members has a value.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from shmio.connectors.opcua.values import MismatchError
 from shmio.layout.addresses.opcua import Member, member_text
 
 MAX_DEPTH: Final = 16
-"""Maximum number of structures inside each other."""
+"""Maximum number of levels of nested structures."""
 MAX_VALUES: Final = 100_000
-"""Maximum number of members and elements of a structure, except for the elements of arrays of numbers."""
+"""Maximum number of members and elements of a value. Elements of two or more bytes each do not count."""
 _MAX_FIELDS: Final = 1000
 _MAX_RANK: Final = 6
 _MAX_NAMED: Final = 10
@@ -28,7 +28,7 @@ _MAX_OPTIONAL: Final = 32
 _STRUCTURE_DEFINITION: Final = 122
 _PLAIN, _OPTIONAL, _UNION = 0, 1, 2
 NULL: Final[NodeKey] = (2, 0, 0)
-"""The node id of nothing."""
+"""The null node id."""
 
 
 class DefinedField(NamedTuple):
@@ -37,7 +37,7 @@ class DefinedField(NamedTuple):
     name: str
     data_type: NodeKey
     rank: int
-    """As a value rank of OPC UA: -1 for a scalar, else the number of dimensions."""
+    """Value rank of OPC UA: -1 for a scalar; if positive, the number of dimensions."""
     optional: bool
 
 
@@ -56,13 +56,13 @@ class Field(NamedTuple):
     kind: int
     structure: Structure | None
     rank: int
-    """Number of dimensions; 0: a scalar."""
+    """Number of dimensions; 0 for a scalar, -1 if unknown."""
     optional: bool
 
 
 @dataclass(eq=False)
 class Structure:
-    """A data type that is a structure, with all that is needed to read its values."""
+    """A data type that is a structure, with everything needed to read its values."""
 
     name: str
     form: int = _PLAIN
@@ -72,19 +72,19 @@ class Structure:
 
     @property
     def is_union(self) -> bool:
-        """True if a value has one member, or none."""
+        """True if a value has at most one of the members."""
         return self.form == _UNION
 
 
 class Members(NamedTuple):
-    """Value of a structure. A member that this value does not have is None."""
+    """The value of a structure. In ``values``, a member that is absent at present is None."""
 
     structure: Structure
     values: dict[str, Found | None]
 
 
 class Elements(NamedTuple):
-    """Value of an array of structures."""
+    """The value of an array of structures."""
 
     values: list[Members]
     dims: tuple[int, ...]
@@ -94,10 +94,10 @@ Found = Sample | Members | Elements
 
 
 def read_definition(sample: Sample) -> Definition | None:
-    """Return the definition in the attribute DataTypeDefinition; None: it defines no structure.
+    """Return the definition in a value of the attribute DataTypeDefinition; None if it defines no structure.
 
     Raises:
-        MalformedError: It does not follow the protocol.
+        MalformedError: The definition does not follow the protocol.
 
     """
     value = sample.value
@@ -107,7 +107,7 @@ def read_definition(sample: Sample) -> Definition | None:
         return None
     reader = Reader(value.body)
     encoding = node_key(reader.node_id())
-    reader.node_id()  # the base type, whose fields are among these
+    reader.node_id()  # the base type, whose fields are repeated below
     form = reader.i32()
     if (count := reader.count(20)) > _MAX_FIELDS:
         raise MalformedError(f"a structure has more than {_MAX_FIELDS} members")
@@ -124,7 +124,7 @@ def _defined_field(reader: Reader) -> DefinedField:
 
 
 def complete(structure: Structure, form: int, fields: list[Field]) -> None:
-    """Give a structure its fields, and find out whether its values can be read."""
+    """Set the fields of a structure, and set ``fault`` if its values cannot be read."""
     structure.form, structure.fields = form, fields
     names = [one.name for one in fields]
     if form not in (_PLAIN, _OPTIONAL, _UNION):
@@ -141,7 +141,7 @@ def complete(structure: Structure, form: int, fields: list[Field]) -> None:
 
 
 def _read(structure: Structure, reading: _Reading) -> Members:
-    """Read the body of a structure. MismatchError: the definition does not fit it, or cannot be used."""
+    """Read the body of a structure. Raise MismatchError if its definition does not fit, or cannot be used."""
     try:
         found = reading.members(structure, 0)
     except MalformedError as error:
@@ -157,7 +157,7 @@ class _Reading(Reader):
     def __init__(self, data: bytes, values: int) -> None:
         super().__init__(data)
         self.values_left = values
-        """Number of members and elements that it may still have."""
+        """Number of members and elements that the body may still have."""
 
     def _count(self, values: int) -> None:
         self.values_left -= values
@@ -231,8 +231,8 @@ def read_value(structures: Mapping[NodeKey, Structure], sample: Sample) -> Membe
         sample: The value.
 
     Raises:
-        MismatchError: It is no structure, or its definition is missing or does not fit.
-        AbsentError: It is null.
+        MismatchError: The value is no structure, or its definition is missing or does not fit.
+        AbsentError: The value is null.
 
     """
     if sample.kind != ua.EXTENSION:
@@ -254,11 +254,11 @@ def read_value(structures: Mapping[NodeKey, Structure], sample: Sample) -> Membe
 
 
 def find(found: Found, member: Member) -> Sample:
-    """Return the member of a structure.
+    """Return the member of a value that ``member`` names.
 
     Raises:
         AbsentError: The value does not have this optional member, alternative of a union, or element.
-        MismatchError: The structure has no such member.
+        MismatchError: The data type has no such member, or ``member`` names a structure.
 
     """
     for place, step in enumerate(member):
@@ -292,16 +292,16 @@ def find(found: Found, member: Member) -> Sample:
 
 
 class Listed(NamedTuple):
-    """A member of a structure that may be a register; without a value, ``sample`` has only its type."""
+    """A member of a structure, as a candidate for a register. If it has no value, ``sample`` has only its type."""
 
     member: Member
     sample: Sample
     refused: str
-    """Why it cannot be a register; empty if it may."""
+    """Why the member cannot be a register; empty if it can."""
 
 
 def members_of(found: Members | Elements) -> Iterator[Listed]:
-    """Yield the members of a structure, and of the structures in it. There may be very many: take only some."""
+    """Yield the members of a structure and of the structures inside it. The caller must limit their number."""
     if isinstance(found, Members):
         yield from _listed(found.structure, found, (), ())
     elif found.values:
@@ -313,7 +313,7 @@ def members_of(found: Members | Elements) -> Iterator[Listed]:
 def _listed(
     structure: Structure, found: Found | None, member: Member, outer: tuple[Structure, ...]
 ) -> Iterator[Listed]:
-    """Yield the members of a structure; if ``found`` is None, those that its definition allows."""
+    """Yield the members of a structure. If it has no value (``found`` is None), yield those of its definition."""
     refused = structure.fault
     if not refused and not structure.fields:
         refused = "a structure without members"

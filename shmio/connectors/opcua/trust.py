@@ -37,7 +37,7 @@ def read_identity(certificate: Path, key: Path) -> tuple[x509.Certificate, rsa.R
     """Return the client's certificate and key.
 
     Raises:
-        ConfigError: A file cannot be used, or the key is not that of the certificate.
+        ConfigError: A file cannot be used, or the key does not belong to the certificate.
 
     """
     found = _certificates(_read("certificate", certificate))
@@ -68,8 +68,8 @@ def check_server(data: bytes, trusted: Path, host: str) -> x509.Certificate:
     Args:
         data: The certificate, or a chain that begins with it, in DER.
         trusted: Folder of trusted certificates.
-        host: Name or address of the server in the URL. A certificate of a trusted authority must
-            be for it.
+        host: Name or address of the server in the URL. A certificate must name this host if only the
+            authority that signed it is trusted.
 
     Raises:
         ConnectorError: The server is not trusted; the text says what to do.
@@ -96,7 +96,7 @@ def check_server(data: bytes, trusted: Path, host: str) -> x509.Certificate:
 
 
 def _reject(certificate: x509.Certificate, data: bytes, trusted: Path) -> str:
-    """Store a certificate in the folder for rejected ones; return the text of the error."""
+    """Store a certificate in the folder ``rejected``; return the text of the error."""
     thumbprint = hashlib.sha1(data, usedforsecurity=False).hexdigest().upper()
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     name = re.sub(r"[^A-Za-z0-9._-]+", "_", str(names[0].value))[:60] if names else "server"

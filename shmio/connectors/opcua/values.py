@@ -1,9 +1,9 @@
 """Converts values of OPC UA nodes to values of registers, and back.
 
-The conversion depends on the node's type. So it works for the nodes of an S7-1500 (a DATE is a UInt16,
-a DATE_AND_TIME eight bytes, a DTL a structure), of shmio's own server (dates are texts) and of other
-servers. Siemens' mapping: "Communication" function manual, table "SIMATIC and OPC UA
-data types".
+The conversion depends on the node's type, because servers represent the same type differently. An
+S7-1500 represents a DATE as a UInt16, a DATE_AND_TIME as eight bytes and a DTL as a structure; shmio's
+own server represents dates as texts. For the mapping of Siemens, see the function manual
+"Communication", table "SIMATIC and OPC UA data types".
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _DEFAULTS: Final = {
     "LINT": ua.INT64, "REAL": ua.FLOAT, "LREAL": ua.DOUBLE, "TIME": ua.INT32, "LTIME": ua.INT64,
     "TIME_OF_DAY": ua.UINT32, "LTOD": ua.UINT64, "STRING": ua.STRING, "WSTRING": ua.STRING, "LDT": ua.DATE_TIME,
 }  # fmt: skip
-"""The type to expect of a node without a value; types for which servers differ are missing."""
+"""Assumed type of a node without a value, by the register's type. Types for which servers differ are missing."""
 
 
 class MismatchError(ValueError):
@@ -87,7 +87,7 @@ class ValueConverter:
         return nest([element(one) for one in found], register.shape) if register.dims else element(found[0])
 
     def _groups(self, data: bytes, dims: tuple[int, ...] | None) -> tuple[list[bytes], tuple[int, ...] | None]:
-        """Split bytes into elements; return them with the dimensions that are left."""
+        """Split bytes into the elements of an array; return them and the array's dimensions."""
         size = _OF_BYTES[self._base]
         if len(data) % size:
             raise MismatchError(f"the node has {len(data)} bytes, which does not fit {_type(self._register)}")
@@ -97,7 +97,7 @@ class ValueConverter:
         return self._decoded(data)
 
     def _decoded(self, data: bytes) -> Scalar:
-        """Decode the bytes of an element in the controller's own format."""
+        """Decode an element from bytes in the controller's own format."""
         assert self._raw is not None  # noqa: S101 - for the type checker
         value = self._raw.decode(data, 0)
         if value is None:
@@ -105,7 +105,7 @@ class ValueConverter:
         return value
 
     def _converter(self, kind: int) -> Callable[[Any], Scalar] | None:
-        """Return the function for elements of a node's type; None if that does not fit."""
+        """Return the function that converts an element of node type ``kind``; None if the type does not fit."""
         base, scale = self._base, self._register.scale
         if base == "BOOL":
             return bool if kind == ua.BOOLEAN else None
@@ -181,7 +181,7 @@ class ValueConverter:
         return Sample(kind, there if register.dims else there[0], register.shape if register.dims else None, 0, 0)
 
     def elements(self, values: list[Any], like: Sample | None) -> Sample:
-        """Convert consecutive elements of an array to the node's type. ValueError: this is impossible."""
+        """Convert consecutive elements of an array to the node's type. Raise ValueError if this is impossible."""
         kind = like.kind if like is not None and like.kind else _DEFAULTS.get(self._base, 0)
         if not kind or kind == ua.BYTE_STRING or self._base in _OF_BYTES:
             raise ValueError("the node has no single elements: write the whole array")
@@ -245,6 +245,6 @@ def _type(register: Register) -> str:
 
 
 def bits_of_elements(register: Register) -> Iterator[tuple[int, int]]:
-    """Yield (first byte, number of bytes) of each element of an array of anything but BOOL."""
+    """Yield (first byte, number of bytes) of each element of an array; its type must not be BOOL."""
     for place in range(register.count):
         yield register.offset + place * register.element.stride, register.element.size
