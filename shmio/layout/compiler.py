@@ -48,7 +48,7 @@ _MARK = " has optimized access: "
 
 @dataclass(frozen=True)
 class Source:
-    """One source file: its name, for diagnostics, and its bytes as read."""
+    """One source file: its name, for diagnostics, and its content."""
 
     file: str
     text: bytes
@@ -58,7 +58,7 @@ class Source:
 class Compiled:
     """Result of a compilation: the layouts in source order, and the warnings.
 
-    ``unused`` has the types for which a size was given although no member has the type.
+    ``unused`` are the types whose size the caller gave although no member has the type.
     """
 
     layouts: tuple[Layout, ...]
@@ -77,9 +77,9 @@ class BlockName:
 def compile_sources(
     sources: Sequence[Source], *, blocks: Collection[str] | None = None, type_bytes: Mapping[str, int] | None = None
 ) -> Compiled:
-    """Compile the data blocks of files that may use each other's types, or one tag table.
+    """Compile the data blocks of files that may use each other's types, or compile one tag table.
 
-    Tag tables beside the source of a data block lie over it.
+    If the files include the source of a data block, all tag tables among them lie over the block.
 
     Args:
         sources: The files.
@@ -98,10 +98,15 @@ def compile_sources(
 
 
 class Program:
-    """Parsed sources, whose data blocks can be compiled together or one at a time."""
+    """Parsed sources, whose data blocks you can compile together or one at a time."""
 
     def __init__(self, sources: Sequence[Source]) -> None:
-        """Parse the sources; raise LayoutError for an invalid tag table, or several without a data block."""
+        """Parse the sources.
+
+        Raises:
+            LayoutError: A tag table is invalid, or there are several tag tables and nothing else.
+
+        """
         self._files = [source.file for source in sources]
         self._general = Report(self._files)
         self._table: Layout | None = None
@@ -166,7 +171,7 @@ class Program:
         yield from self._doubles
 
     def compile(self, blocks: Collection[str] | None = None, type_bytes: Mapping[str, int] | None = None) -> Compiled:
-        """Compile all data blocks, or those named; see :func:`compile_sources`.
+        """Compile the data blocks with the names ``blocks``, or all: see :func:`compile_sources`.
 
         Raises:
             LayoutError: A source is wrong; ``diagnostics`` has all errors, then all warnings.

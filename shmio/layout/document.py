@@ -49,11 +49,11 @@ _DECODER = msgspec.json.Decoder(_Layout)  # msgspec crashes if two threads are t
 
 
 def load_layout(data: bytes) -> Layout:
-    """Read and validate the JSON of ``Layout.to_json``; the data may be hostile.
+    """Read and validate the JSON that ``Layout.to_json`` writes; the data may be hostile.
 
     Raises:
-        LayoutError: The JSON is malformed, or the layout is impossible: registers that overlap,
-            have wrong sizes, or are outside the block.
+        LayoutError: The JSON is malformed, or the layout is impossible. For example, registers
+            overlap, have wrong sizes, or are outside the block.
 
     """
     if len(data) > MAX_JSON_BYTES:
@@ -72,12 +72,12 @@ def load_layout(data: bytes) -> Layout:
         document.byte_order, document.status_offset,
     )  # fmt: skip
     _check_overlay(layout)
-    vars(layout)["hash"] = hashlib.sha256(data).digest()  # making the JSON again would take longer
+    vars(layout)["hash"] = hashlib.sha256(data).digest()  # faster than making the JSON again
     return layout
 
 
 def _check(document: _Layout) -> None:
-    """Raise LayoutError if a register is impossible, or two contradict each other."""
+    """Raise LayoutError if a register is impossible, or if two registers contradict each other."""
     kinds: dict[tuple[str, Dims], tuple[int, int, bool]] = {}
     end_bits = elements = 0
     over = 0
@@ -118,9 +118,9 @@ def _check(document: _Layout) -> None:
 
 
 def _check_overlay(layout: Layout) -> None:
-    """Raise LayoutError unless each register over the block lies where its path of the block says.
+    """Raise LayoutError unless each register over the block lies where its ``over`` path says.
 
-    Rows of bits get the mark that the JSON does not have.
+    Set ``partial`` of each of these registers, which the JSON does not contain.
     """
     own = len(layout.own)
     for register in layout.registers[own:]:
@@ -140,10 +140,10 @@ def _place_of(register: Register) -> tuple[object, ...]:
 
 
 def _kind(register: Register) -> tuple[int, int, bool]:
-    """Return size, count and whether there is a bit, for a register's type and bounds.
+    """Return (size, count, whether the type is BOOL), as type and bounds of a register determine them.
 
     Raises:
-        LayoutError: There is no such type, or a bound is wrong.
+        LayoutError: There is no such type, or a lower bound is above the upper bound.
 
     """
     element = element_type(register.type)

@@ -37,13 +37,13 @@ def registers(group: Group, report: Report) -> Iterator[Register]:
 class _Expansion:
     """Flattens structures.
 
-    A structure's initial value is split and passed to its members as a layer; the outermost layer
-    that names a member wins.
+    The initial value of a structure is split into the initial values of its members, a *layer*. If
+    several nested structures give a member a value, the value of the outermost structure counts.
     """
 
     def __init__(self, report: Report) -> None:
         self._report = report
-        # Caches, so that each text is parsed once, however often its structure is expanded.
+        # Caches: each text is parsed only once, however often its structure is expanded.
         self._split: dict[tuple[int, str], dict[str, str]] = {}
         self._listed: dict[tuple[int, str], list[str | None]] = {}
         self._reported: set[Position] = set()
@@ -116,7 +116,7 @@ def _member_values(text: str, group: Group) -> dict[str, str]:
         The text of each member that has one, by the member's name in lower case.
 
     Raises:
-        ValueRangeError: The text is not such a list, names an unknown member, or has too many
+        ValueRangeError: The text is not a list of values, names an unknown member, or has too many
             values.
     """
     inner = _inside_structure(text)
@@ -137,7 +137,10 @@ def _member_values(text: str, group: Group) -> dict[str, str]:
 
 
 def _element_values(text: str, dims: Dims) -> list[str | None]:
-    """Return the initial value's text for each element of an array of structures, or None."""
+    """Split the initial value of an array of structures into one text for each element.
+
+    The text of an element without an initial value is None.
+    """
     shape = shape_of(dims)
     values: list[str | None] = [None] * math.prod(shape)
     if text.strip().startswith("("):
@@ -180,7 +183,7 @@ def assign(
     constants: Constants,
     report: Report,
 ) -> tuple[Register, ...]:
-    """Return the registers with the values assigned after BEGIN as their initial values.
+    """Return the registers ``found``, with the values that the source assigns after BEGIN as initial values.
 
     Assignments to elements of one array are joined into one array literal.
     """
@@ -218,9 +221,9 @@ class _Target:
 
 
 def _target(group: Group, assignment: Assignment) -> _Target | str | None:
-    """Return the register that is assigned, or the text of an error.
+    """Return the register to which a value is assigned, or the text of an error.
 
-    Returns None for a register inside a structure whose members are unknown.
+    Return None if the register is inside a structure whose members are unknown.
     """
     path = ""
     element: tuple[int, ...] = ()
@@ -275,17 +278,16 @@ def _written(part: str | tuple[int, ...]) -> str:
 
 
 class _InitialTexts:
-    """Initial value of one register as source text, to which assignments are applied.
+    """Applies assignments to the initial value of one register; ``str()`` returns the result as source text.
 
-    Only the assigned elements of an array are stored: an array may be large and its assignments
-    few.
+    Of an array, it stores only the assigned elements, because a large array may have few of them.
     """
 
     def __init__(self, register: Register) -> None:
         self._register = register
         self._whole = register.initial
         self._elements: dict[int, str] = {}
-        self._parts: dict[tuple[int, ...], dict[str, int]] = {}  # DTLs assigned by member
+        self._parts: dict[tuple[int, ...], dict[str, int]] = {}  # DTLs to whose members values are assigned
 
     def set(self, index: tuple[int, ...], text: str) -> None:
         """Assign one element, or the whole register if ``index`` is empty."""
@@ -329,7 +331,7 @@ class _InitialTexts:
         return f"[{', '.join(text if n == 1 else f'{n}({text})' for text, n in merged)}]"
 
     def _fill(self, runs: list[tuple[str, int]], assigned: list[int], start: int, stop: int, text: str) -> None:
-        """Append the elements from ``start`` to ``stop``; unassigned ones get ``text``."""
+        """Append the values of the elements ``start`` to ``stop`` - 1; ``text`` if none was assigned."""
         for flat in assigned[bisect_left(assigned, start) : bisect_left(assigned, stop)]:
             if flat > start:
                 runs.append((text, flat - start))

@@ -2,8 +2,8 @@
 
 ``*`` matches within one segment. ``**`` crosses segments; a whole segment ``**`` also matches no
 segment. The name of an array or a structure matches everything below it. Segments may be
-percent-encoded like those of a path, so ``%2A`` is a literal star. Patterns come from clients, so
-the time to match is linear in the path's length, whatever the pattern.
+percent-encoded like those of a path, so ``%2A`` is a literal star. Because patterns come from
+clients, the time to match is linear in the path's length, whatever the pattern.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def _pieces(segment: str) -> list[str]:
 
 
 def select(layout: Layout, patterns: Iterable[str]) -> tuple[int, ...]:
-    """Return the indices of the registers that match any of the patterns, ascending.
+    """Return the ascending indices of the registers that any of the patterns matches.
 
     Raises:
         PathError: A pattern is malformed.
@@ -148,7 +148,7 @@ def named(layout: Layout, topic: Topic) -> list[Register]:
 
 
 def choose(patterns: Iterable[str], layouts: Mapping[str, Layout]) -> list[tuple[str, Register]]:
-    """Return the registers that patterns name, each once and in order, with their sources.
+    """Return the registers that patterns name, in their order and each once, as (source, register).
 
     Args:
         patterns: Paths, array elements, slices, structures, globs, or names of sources.

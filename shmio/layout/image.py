@@ -13,14 +13,14 @@ from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.literal import default_text, parse_literal
 
 MAX_LISTED: Final = 20
-"""Maximum number of unreadable initial values that get a line each."""
+"""Maximum number of unreadable initial values that :func:`initial_value_warnings` lists."""
 
 
 def initial_frame(layout: Layout) -> tuple[bytearray, tuple[str, ...]]:
     """Return the initial frame, and the paths of registers whose initial value cannot be read.
 
-    These registers get their type's default: a source may name constants that only the
-    controller knows.
+    Such a value may be the name of a constant that only the controller knows. In the frame, these
+    registers have the default of their type.
     """
     frame = bytearray(layout.size)
     unread: list[str] = []
@@ -43,7 +43,7 @@ def unread(layout: Layout) -> tuple[Register, ...]:
 def initial_value_warnings(layout: Layout) -> Iterator[str]:
     """Yield a line for each initial value that cannot be read.
 
-    After ``MAX_LISTED`` of them, one line counts the rest.
+    After ``MAX_LISTED`` lines, a last one gives the number of the remaining values.
     """
     registers = unread(layout)
     for register in registers[:MAX_LISTED]:

@@ -1,4 +1,4 @@
-"""The compiled layout: the elementary types of S7, a block, its registers, and the address of each.
+"""The compiled layout of a block: its registers with their offsets, and the elementary types of S7.
 
 Everything here is immutable and free of I/O. Segments, recordings and ``shmio-layout --json``
 hold a ``Layout`` as JSON, which ``document.py`` reads. Sizes and alignments of the types are those
@@ -27,7 +27,7 @@ Dims = tuple[tuple[int, int], ...]
 MAX_DIMENSIONS = 6
 MAX_DEPTH = 32  # nested structures; Siemens allows 8
 MAX_STANDARD_BYTES = 65_536  # limit of an S7-1500 for a block with standard access
-MAX_BLOCK_BYTES = 1 << 20  # any block: optimized ones, and those of other sources
+MAX_BLOCK_BYTES = 1 << 20  # limit of any other block
 MAX_REGISTERS = 100_000
 MAX_IMAGE_BYTES = MAX_BLOCK_BYTES + 12 * MAX_REGISTERS + 8  # with a status area
 MAX_ELEMENTS = 1 << 20  # of all registers together
@@ -59,7 +59,7 @@ class ElementType:
 
     @property
     def stride(self) -> int:
-        """Bytes from one array element to the next, except for BOOL, which packs bits."""
+        """Distance from one array element to the next, in bytes. Not for BOOL, whose elements are bits."""
         return -(-self.size // self.align) * self.align
 
 
@@ -76,9 +76,9 @@ _FIXED = {
     name: ElementType(name, name, size, 1 if size == 1 else 2) for size, names in _SIZES.items() for name in names
 }
 
-# Hardware data types and parameter types are numbers that identify something. Siemens' help gives
-# each one's underlying type ("Hardware data types"; "Format of the parameter types BLOCK, COUNTER,
-# TIMER": a binary number in a word).
+# The values of hardware data types and parameter types are numbers that identify something. Siemens'
+# help gives the underlying type of each ("Hardware data types"; "Format of the parameter types BLOCK,
+# COUNTER, TIMER": a binary number in a word).
 # fmt: off
 _NAMING = {
     "UINT": (
@@ -119,7 +119,7 @@ def string_limit(base: str) -> int:
 
 @lru_cache(maxsize=1024)
 def element_type(name: str) -> ElementType | None:
-    """Return the elementary type with this name, or None; case does not matter, aliases count."""
+    """Return the elementary type with this name or alias, in any case; None if there is none."""
     upper = name.upper()
     fixed = _FIXED.get(ALIASES.get(upper, upper))
     if fixed is not None:
@@ -143,7 +143,7 @@ _Address = Annotated[str, msgspec.Meta(max_length=4096)]
 _Deadband = Annotated[float, msgspec.Meta(ge=0)]
 if TYPE_CHECKING:
     _Dims = Dims
-else:  # a scalar's JSON has null, which the reader of layouts replaces
+else:  # null in the JSON of a scalar; load_layout replaces it by ()
     _Dims = Annotated[tuple[tuple[_Bound, _Bound], ...], msgspec.Meta(min_length=1, max_length=MAX_DIMENSIONS)] | None
 
 
@@ -151,26 +151,27 @@ class Register(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True
     """A named, typed value at a fixed place in a block.
 
     Attributes:
-        path: Member names, percent-encoded and joined by ``/``, without source and direction.
+        path: Names of the members and indices, percent-encoded and joined by ``/``, without source
+            and direction.
         type: S7 name of the element type in upper case; strings with length: ``STRING[20]``.
         dims: (low, high) of each dimension; ``()`` for a scalar.
         offset: First byte in the block.
         bit: 0-7 for BOOL, else None.
-        size: Bytes from the first to the last that holds data, without trailing padding.
+        size: Size in bytes, without trailing padding.
         count: Number of elements.
         comment: The source's comment on the member.
-        initial: The source's text of the initial value.
-        partial: Whether this is a slice of a row of bits, which begins at ``bit``; its first and
-            last byte may hold bits of other registers.
+        initial: The source's text of the initial value; None: the source gives none.
+        partial: Whether this is a slice of an array of bits. The slice begins at ``bit``; its first
+            and last byte may hold bits of other registers.
         unit: Unit of the value, such as ``mm/s``; "" if unknown.
         address: Address in the device, in the notation of the source's connector; "" if the
             position in the block is the address.
-        scale: (factor, offset) by which the connector computes the value from the device's number:
+        scale: (factor, offset) with which the connector computes the value from the device's number:
             value = number * factor + offset. None: the value is the number.
-        deadband: Change of the value up to which the connector may keep the old value.
+        deadband: Largest change of the value that the connector may ignore.
         writable: Whether the tag table lets commands write the register.
-        over: Path of the part of the block that this register names, if it is of a tag table over a
-            data block; "" for a register of its own.
+        over: For a register of a tag table over a data block, the path of the part of the block that
+            it names; "" for a register that has bytes of its own.
 
     """
 
@@ -198,7 +199,7 @@ class Register(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True
 
     @property
     def element(self) -> ElementType:
-        """The elementary type; KeyError for an unknown name, which no validated layout has."""
+        """The elementary type. KeyError: its name is unknown; a validated layout has no such name."""
         found = element_type(self.type)
         if found is None:
             raise KeyError(self.type)
@@ -207,14 +208,15 @@ class Register(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True
 
 @dataclass(frozen=True)
 class Layout:
-    """A block's registers in address order, and behind them those that lie over them.
+    """The layout of a block: its registers, and the size of its images.
 
     Attributes:
-        registers: The registers of the block, none of which overlaps another, and then those of tag
-            tables over it, which do: see :attr:`own`.
-        size: Size of an image of the block in bytes, with its status area.
-        status_offset: Where the image has its status area, which holds a status code and a source
-            time for each register: see :class:`shmio.model.statuses.StatusArea`. None: it has none.
+        registers: First the registers of the block (:attr:`own`), in address order and without
+            overlaps. Then the registers of tag tables over the block, which lie over the first.
+        size: Size of an image of the block in bytes, including its status area.
+        status_offset: Offset of the status area in an image; None: the image has no status area. The
+            area holds a status code and a source time for each of the :attr:`own` registers: see
+            :class:`shmio.model.statuses.StatusArea`.
 
     """
 
@@ -233,15 +235,15 @@ class Layout:
 
     @cached_property
     def own(self) -> tuple[Register, ...]:
-        """The registers without those of tag tables over the block: in address order, without overlaps."""
+        """The registers that have bytes of their own: in address order, without overlaps."""
         count = len(self.registers)
         while count and self.registers[count - 1].over:
             count -= 1
-        return self.registers[:count]  # the same object if there are no others
+        return self.registers[:count]  # slicing a whole tuple makes no copy
 
     @cached_property
     def base(self) -> Layout:
-        """The layout without the registers of tag tables over the block, as programs before version 0.2 read it."""
+        """The layout with its :attr:`own` registers only, as programs before version 0.2 read it."""
         return self if len(self.own) == len(self.registers) else replace(self, registers=self.own)
 
     @cached_property
@@ -249,7 +251,8 @@ class Layout:
         """SHA-256 of the canonical JSON: equal for equal layouts."""
         return hashlib.sha256(self.to_json()).digest()
 
-    # A structure is a range of sorted paths; a table of all structures could far exceed the layout.
+    # A structure is found as a range of sorted paths. A table of all structures could be far larger
+    # than the layout.
     @cached_property
     def _sorted(self) -> _Sorted:
         return _Sorted(register.path for register in self.registers)
@@ -263,7 +266,7 @@ class Layout:
         return self._sorted.below(prefix)
 
     def in_any_case(self, path: str) -> str | None:
-        """Return the register's or structure's path that equals this one but for case, or None."""
+        """Return the path of the register or structure that equals ``path`` except for case, or None."""
         wanted = path.lower()
         at = self._sorted_in_lower_case.first(wanted)
         if at is None:
@@ -307,16 +310,16 @@ class Layout:
         )
 
     def with_statuses(self) -> Layout:
-        """Return the layout with a status area behind its registers."""
+        """Return the layout with a status area after its registers; itself if it has one already."""
         if self.status_offset is not None:
             return self
         start = -(-self.size // 8) * 8
         return replace(self, status_offset=start, size=start + status_bytes(len(self.own)))
 
     def describe(self) -> dict[str, object]:
-        """Return the layout as the object of ``shmio-layout --json``: JSON types, without ``byte_order``.
+        """Return the layout as the object that ``shmio-layout --json`` prints, without ``byte_order``.
 
-        What only tag tables and status areas have is left out of the layouts that have none.
+        Keys for tag tables and status areas are left out if they have no value.
         """
         described: dict[str, object] = {
             "name": self.name,
@@ -330,7 +333,7 @@ class Layout:
         return described
 
     def to_json(self) -> bytes:
-        """Return canonical JSON: :meth:`describe` and ``byte_order``, keys in fixed order, no white space, UTF-8."""
+        """Return :meth:`describe` and ``byte_order`` as canonical JSON: fixed order of keys, no white space, UTF-8."""
         return self._json
 
     @cached_property
@@ -358,7 +361,7 @@ def _describe(register: Register) -> Mapping[str, object]:
 
 
 class _Sorted:
-    """Sorted paths with their indices in the layout; all paths below a structure are adjacent."""
+    """The paths of a layout in sorted order, with their indices; paths below a structure are adjacent."""
 
     def __init__(self, paths: Iterable[str]) -> None:
         ordered = sorted((path, index) for index, path in enumerate(paths))
@@ -366,13 +369,13 @@ class _Sorted:
         self._indices = [index for _, index in ordered]
 
     def below(self, prefix: str) -> tuple[int, ...]:
-        """Return the indices of the paths below the prefix, ascending."""
+        """Return the ascending indices of the paths below the prefix."""
         start = bisect_left(self._paths, f"{prefix}/")
         stop = bisect_left(self._paths, f"{prefix}0", start)  # "0" follows "/" in Unicode
         return tuple(sorted(self._indices[start:stop]))
 
     def first(self, path: str) -> int | None:
-        """Return the index of the path, or else of the first path below it."""
+        """Return the index of the path, or else of the first path below it; None if there is neither."""
         for at in (bisect_left(self._paths, path), bisect_left(self._paths, f"{path}/")):
             if at < len(self._paths) and f"{self._paths[at]}/".startswith(f"{path}/"):
                 return self._indices[at]
@@ -380,7 +383,7 @@ class _Sorted:
 
 
 def status_bytes(registers: int) -> int:
-    """Return the size of a status area: a code of 4 and a time of 8 bytes for each register, aligned to 8."""
+    """Return the size of a status area in bytes: 4 for each register's code, padded to 8, then 8 for each time."""
     return -(-4 * registers // 8) * 8 + 8 * registers
 
 
@@ -390,7 +393,7 @@ def shape_of(dims: Dims) -> tuple[int, ...]:
 
 
 def flat_index(dims: Dims, index: tuple[int, ...]) -> int:
-    """Return the place of an array element, given its declared indices; the last index runs fastest."""
+    """Return the position in an array, from 0, of the element with these declared indices; the last runs fastest."""
     flat = 0
     for i, (low, high) in zip(index, dims, strict=True):
         flat = flat * (high - low + 1) + i - low
@@ -398,7 +401,7 @@ def flat_index(dims: Dims, index: tuple[int, ...]) -> int:
 
 
 def index_at(dims: Dims, flat: int) -> tuple[int, ...]:
-    """Return the declared indices of an array element, given its place: the reverse of :func:`flat_index`."""
+    """Return the declared indices of the element at a position in an array: undo :func:`flat_index`."""
     index: tuple[int, ...] = ()
     for low, high in reversed(dims):
         flat, place = divmod(flat, high - low + 1)

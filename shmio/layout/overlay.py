@@ -1,7 +1,7 @@
 """Registers over a data block: names for bits, parts, slices and typed views of its registers.
 
-Such a register has no bytes of its own. It lies where the block has what it names, so whoever reads
-or writes one of both reads or writes the other.
+Such a register has no bytes of its own. It shares the bytes of the part of the block that it names,
+so reading or writing the register reads or writes that part.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ _PARTS: Final = {1: "B", 2: "W", 4: "D"}
 
 
 def overlay_register(base: Layout, path: str, over: str, kind: tuple[ElementType, Dims] | None = None) -> Register:
-    """Return the register with a path that lies over a part of a block.
+    """Return a register that lies over a part of a block.
 
     Args:
         base: The layout of the block.
         path: Path of the new register.
-        over: Canonical path of what it names: a register of the block, an element, a slice, a bit
-            or another part of an integer.
-        kind: The type of the new register; None for that of what it names. Another type is a view
-            of the bytes from there on.
+        over: Canonical path of the part that it names: a register of the block, an element, a
+            slice, or a bit or another part of an integer.
+        kind: The type of the new register, and its bounds; None: those of the named part. With
+            another type, the register is a view of the bytes from the start of the part on.
 
     Raises:
-        PathError: The block has nothing of this name.
-        ValueError: The type does not fit there.
+        PathError: The block has no such part.
+        ValueError: The type does not fit the bytes of the part.
 
     """
     named = find(base, over)
@@ -63,14 +63,20 @@ def overlay_register(base: Layout, path: str, over: str, kind: tuple[ElementType
 
 
 def needed(layout: Layout, register: Register) -> set[str]:
-    """Return the paths of the layout's registers without which a register, element or part cannot be read."""
+    """Return the paths of those registers of the layout that must be known to read a register, element or part.
+
+    These are the register itself, or the one that contains it, and the register over which that
+    lies.
+    """
     over = _over(layout, register)
     paths = [path for path in holders(over) if path in layout.by_path] if over else []
     return {holder(layout, register), *paths[:1]}
 
 
 def names_in(layout: Layout, patterns: Iterable[str]) -> list[Register]:
-    """Return the registers over the block that patterns name, but not those whose bits they name by the block, too.
+    """Return the registers over the block that patterns name.
+
+    Leave out those of which the patterns name all bits by registers of the block, too.
 
     Raises:
         PathError: A pattern is malformed, or names a part that its register does not have.
@@ -93,7 +99,7 @@ def _over(layout: Layout, register: Register) -> str:
 
 
 def _bits(base: Layout, path: str, over: str, named: Register, whole: Register, dims: Dims) -> Register:
-    """Return a BOOL, or a row of them, over bytes."""
+    """Return an array of BOOL over bytes; raise ValueError if it does not fit."""
     if not dims:
         raise ValueError(f"type: a BOOL needs the address of a bit, such as {shorten(over)}.%X0")
     if len(dims) > 1 or whole.element.size > 1:
@@ -106,7 +112,7 @@ def _bits(base: Layout, path: str, over: str, named: Register, whole: Register, 
 
 
 def _room(base: Layout, named: Register, over: str) -> int:
-    """Return how many bytes a view may have that begins there: to the end of the array, slice or integer."""
+    """Return the most bytes that a view over a part may have: up to the end of its array, slice or integer."""
     if named.dims or not _is_element(base, named) or names_part(over):
         return named.size
     array = base.registers[base.by_path[_array_of(base, named.path)]]

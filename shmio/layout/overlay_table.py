@@ -1,8 +1,8 @@
 """Compile tag tables that lie over a data block: names for its bits, parts, slices and views.
 
-Such a table is given beside the block's source: ``layout = "db201.db"``, ``tags = "names.toml"``. It has the
-same forms as every tag table (``tags.py``), but addresses are paths of the block, and types may be
-left out. In TOML::
+A source names such a table beside the block's source: ``layout = "db201.db"``, ``tags =
+"names.toml"``. The table has the same formats as every tag table (``tags.py``), but its addresses
+are paths in the block, and types may be left out. In TOML::
 
     block = "DB201"               # needed if the sources hold several blocks
     [registers]
@@ -55,7 +55,7 @@ class OverlayTable:
     """A table over a data block, as read from its file."""
 
     def __init__(self, file: str, data: bytes) -> None:
-        """Read the file; LayoutError: it is no table."""
+        """Read the file; raise LayoutError if it is not a tag table."""
         self.file = file
         report = Report([file])
         if file.lower().endswith(tag_sheets.SUFFIXES):
@@ -69,7 +69,7 @@ class OverlayTable:
             self._registers, self.line_of = table.registers, Lines(data.decode()).line_of
 
     def apply(self, layout: Layout, report: Report) -> Layout:
-        """Return the layout with the table's registers behind those that it has; report errors."""
+        """Return the layout with the table's registers appended; report errors."""
         placer = _Placer(self, layout, report)
         with suppress(TooManyErrors):
             for key, given in self._registers.items():
@@ -100,7 +100,7 @@ class _Placer:
             raise TooManyErrors
 
     def check_names(self) -> None:
-        """Report paths that begin with the path of a register, or differ from others only in case."""
+        """Report paths that lie below a register, or that differ from other paths only in case."""
         names = {register.path for register in self._layout.registers} | self._found.keys()
         in_lower_case = {register.path.lower(): register.path for register in self._layout.registers}
         for path, key in self._keys.items():
@@ -114,7 +114,7 @@ class _Placer:
                 head = head.rpartition("/")[0]
 
     def layout(self) -> Layout:
-        """Return the layout with the registers that were found."""
+        """Return the layout with the placed registers appended."""
         return replace(self._layout, registers=(*self._layout.registers, *self._found.values()))
 
     def _register(self, key: str, entry: _Entry) -> Register:
@@ -142,7 +142,7 @@ class _Placer:
         return msgspec.structs.replace(register, comment=entry.comment, unit=entry.unit, writable=entry.writable)
 
     def _over(self, address: str) -> str:
-        """Return an address as a canonical path of the block; PathError."""
+        """Return an address as a canonical path of the block; raise PathError if it is not a path."""
         base = self._layout.base
         text = block_path(address.strip(), base)
         if is_address(text) and text not in base.by_path:
@@ -158,7 +158,7 @@ class _Placer:
 
 
 def _entry(given: object) -> _Entry:
-    """Return the entry of one register; ValueError if it is wrong."""
+    """Read the entry of one register; raise ValueError if it is wrong."""
     if isinstance(given, str):
         return _Entry(given)
     known = _Entry.__struct_fields__
@@ -173,7 +173,7 @@ def _entry(given: object) -> _Entry:
 
 
 def _refuse_conversions(entry: _Entry, layout: Layout) -> None:
-    """Raise ValueError if the entry has a column of registers that have bytes of their own."""
+    """Raise ValueError if the entry has a column that is only for registers with bytes of their own."""
     if entry.initial is not None:
         raise ValueError(f"initial: the initial values are those of {layout.name}; leave it out")
     for name in ("scale", "deadband"):
@@ -185,7 +185,7 @@ def _refuse_conversions(entry: _Entry, layout: Layout) -> None:
 
 
 def _example(layout: Layout) -> str:
-    """Return a path of the block as an example."""
+    """Return a path of the block, as an example for messages."""
     for register in layout.own:
         if register.type == "BYTE":
             return f"{'/'.join((register.path, *(str(low) for low, _ in register.dims)))}.%X0"
@@ -195,14 +195,15 @@ def _example(layout: Layout) -> str:
 def lay_tables(
     tables: list[OverlayTable], layouts: list[Layout], blocks: list[str], report: Report, *, chosen: bool
 ) -> list[Layout]:
-    """Return layouts with the tables that lie over them; report errors.
+    """Return the layouts with the registers of the tables that lie over them; report errors.
 
     Args:
         tables: The tables.
         layouts: The layouts that were compiled.
         blocks: Names of all data blocks of the sources.
-        report: Where errors go.
-        chosen: Whether the caller has named the blocks that it wants.
+        report: The report to which errors are added.
+        chosen: Whether the caller chose blocks by name. Then a table that names no block may lie
+            over several.
 
     """
     for table in tables:

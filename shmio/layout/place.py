@@ -1,14 +1,14 @@
-"""Place declarations: give each member its offset, by Siemens' rules for blocks with standard access.
+"""Compute the offset of each declared member, by Siemens' rules for blocks with standard access.
 
 - BOOL takes the next bit; anything else begins at the next whole byte.
 - One-byte types take the next byte; all wider types, strings included, begin at an even byte.
 - Arrays and structures begin at an even byte and are padded to an even length.
-- In an instance of a function block, each section (inputs, outputs, in-outs, static members) does
-  the same. An in-out of a structured type is a POINTER to the caller's argument.
+- So do the sections of an instance of a function block: inputs, outputs, in-outs, static members.
+  An in-out of a structured type is a POINTER to the caller's argument.
 
-Each type is placed once, however often it is used. The size of the expansion is computed and
-checked before ``emit.py`` expands anything. ``docs/reference/layout-rules.md`` gives the rules with
-their evidence.
+Each type is placed once, however often it is used. Before ``emit.py`` expands the structures to
+registers, this module checks the size of the result. ``docs/reference/layout-rules.md`` gives the
+rules with their evidence.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _SIZE = 'type_bytes = {{ "{name}" = … }} in the configuration, --type-bytes "{
 
 @dataclass(frozen=True, slots=True)
 class Leaf:
-    """A register: an elementary type or an array of one; ``size`` in bytes, without padding."""
+    """The type of a register: elementary, or an array; ``size`` in bytes, without padding."""
 
     element: ElementType
     dims: Dims
@@ -83,7 +83,7 @@ class Repeat:
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """A member with its place in its structure: ``offset`` in bytes, ``bit`` for a single BOOL."""
+    """A member of a structure, and its ``offset`` there in bytes; ``bit`` is None except for a single BOOL."""
 
     segment: str
     member: Member
@@ -94,7 +94,7 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """Size of an expansion: registers, their elements, characters of their texts, structures."""
+    """What the expansion of a type yields: numbers of registers, elements, characters and structures."""
 
     registers: int = 0
     elements: int = 0
@@ -102,7 +102,7 @@ class Cost:
     structures: int = 0
 
     def plus(self, inner: Cost, times: int, text_each: int) -> Cost:
-        """Return this cost plus ``times`` the inner one.
+        """Return this cost plus ``times`` the cost ``inner``.
 
         ``text_each`` is the number of characters by which each inner register's path gets longer.
         """
@@ -116,10 +116,10 @@ class Cost:
 
 @dataclass(frozen=True, slots=True)
 class _Extent:
-    """Space that a member takes.
+    """The space that a member takes, and the cost of its expansion.
 
-    ``size`` (with padding) and ``align`` are in bytes, ``cost`` is the size of its expansion, and
-    ``height`` the number of structure levels below it.
+    ``size`` (with padding) and ``align`` are in bytes. ``height`` is the number of levels of
+    structures in the member's type.
     """
 
     size: int
@@ -129,7 +129,7 @@ class _Extent:
 
 
 def _extent_of(placed: Leaf | Group | Repeat) -> _Extent:
-    """Return the space that a placed type takes as a member."""
+    """Return the extent of a member that has this placed type."""
     if isinstance(placed, Leaf):
         cost = Cost(1, math.prod(placed.shape))
         if placed.dims:
@@ -158,7 +158,7 @@ class Placer:
         self._global = self._constants = constants
         self._report = report
         self.placed: dict[str, Group | None] = {}
-        """Placed types by name in lower case, with None for a type with errors."""
+        """The placed types by name in lower case; None for a type with errors."""
         self._open: dict[str, str] = {}  # names of the types that are being placed, by key
 
     def block(self, struct: Struct, constants: Constants) -> Group | None:
@@ -209,7 +209,7 @@ class Placer:
         return Group(fields, _round_up(_round_up(bits, 8) // 8, 2), cost, height) if good else None
 
     def named(self, name: Named) -> ElementType | Group | None:
-        """Look up a type, elementary or defined by the user; report an error and return None."""
+        """Look up a type, elementary or defined by the user; after an error report it and return None."""
         try:
             return self._named(name, 0)
         except BoundFault as fault:
@@ -329,12 +329,12 @@ class Placer:
         )
 
     def _refuse(self, position: Position, message: str) -> None:
-        """Report an error."""
+        """Report an error at this position."""
         self._report.add(position.error(message))
 
 
 def _opaque(name: Named, size: int) -> Group:
-    """Return a structure of which only the size is known."""
+    """Return a structure of ``size`` bytes whose members are unknown."""
     at = name.position
     member = Member("bytes", Array(((0, size - 1),), Named("BYTE", False, at), at), "", None, at)
     leaf = Leaf(BYTE, ((0, size - 1),), size)

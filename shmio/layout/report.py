@@ -11,7 +11,7 @@ MAX_WARNINGS = 1000
 
 
 class TooManyErrors(ShmioError):  # noqa: N818  (a signal to stop, never seen outside the compiler)
-    """``MAX_ERRORS`` errors have been found; the rest of the sources is not read."""
+    """The compiler has found ``MAX_ERRORS`` errors, and does not read the rest of the sources."""
 
 
 class Report:

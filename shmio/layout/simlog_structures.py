@@ -1,6 +1,6 @@
 """Structures for which SimlogAPI version 1 has messages (``proto/simlog_v1.proto``).
 
-A tag table uses them as types. In a data block, a structure is recognised by its members, in any
+A tag table uses their names as types. In a data block, they are recognised by their members, in any
 order and case.
 """
 
@@ -18,7 +18,7 @@ Elementary = Literal["float", "uint32", "uint64", "string"]
 MAX_JOINTS: Final = 64
 MAX_POINTS: Final = 512
 MAX_REGISTERS: Final = 4096
-"""Limit for one structure; the longest trajectory in a tag table has fewer."""
+"""Maximum number of registers in one structure; the longest trajectory of a tag table has fewer."""
 
 
 class Member(NamedTuple):
@@ -27,7 +27,7 @@ class Member(NamedTuple):
     name: str
     type: str
     many: Literal["", "joints", "points"] = ""
-    """"joints" or "points": an array with an element for each of these; "": not an array."""
+    """"joints" or "points": the member is an array with an element for each of them; "": no array."""
     needed: bool = True
     """True if a structure must have this member to be recognised."""
 
@@ -87,13 +87,13 @@ _INDEX = re.compile(r"-?[0-9]{1,10}")
 
 
 def members(text: str) -> dict[str, str] | None:
-    """Return a tag table's structure type as member types by path; None for any other type.
+    """Return the types of a structure's members, by path; None if ``text`` is no type of structure.
 
-    Lengths follow the name: ``SafetyZone`` has none, ``JointTrajectoryPoint[6]`` has joints,
-    ``JointTrajectory[6, 20]`` has joints and points.
+    Some names are followed by numbers: ``JointTrajectoryPoint[6]`` has 6 joints, and
+    ``JointTrajectory[6, 20]`` has 6 joints and 20 points.
 
     Raises:
-        ValueRangeError: Lengths are missing, too many, or too large.
+        ValueRangeError: Numbers are missing, too many, or too large.
 
     """
     match = _TYPE.fullmatch(text.strip())
@@ -129,9 +129,9 @@ Found = Mapping[str, "Register | Found | Sequence[Found]"]
 
 
 def recognise(path: str, registers: Sequence[Register]) -> tuple[str, Found] | None:
-    """Return the shape in ``CONTENTS`` that these registers form, with its members, or None.
+    """Return the structure in ``CONTENTS`` that these registers form, with its members, or None.
 
-    They must have all needed members of the shape, with matching types, and no others.
+    The registers must be all needed members of the structure, with matching types, and no others.
     """
     if not 0 < len(registers) <= MAX_REGISTERS:
         return None
@@ -147,9 +147,9 @@ _Parts = Sequence[tuple[Sequence[str], Register]]
 
 
 def _match(shape: str, parts: _Parts) -> Found | None:
-    """Return the members of a shape, or None if the registers do not fit it.
+    """Return the members of the structure ``shape``, or None if the registers do not fit it.
 
-    ``parts`` has the path of each register as names in lower case.
+    ``parts`` has, for each register, the names of its path in lower case, and the register.
     """
     groups = _by_name(parts)
     if groups.keys() - {member.name for member in SHAPES[shape]}:

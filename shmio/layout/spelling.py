@@ -23,7 +23,7 @@ _INDEX = re.compile(r"-?[0-9]+(?:\.\.-?[0-9]+)?|\*")
 
 
 def may_be_tia_spelling(text: str) -> bool:
-    """Return whether text has a character that is typical of TIA Portal's spelling."""
+    """Return whether a text has a character that is typical of TIA Portal's spelling."""
     return _SIGNS.search(text) is not None
 
 
@@ -43,8 +43,8 @@ def block_path(text: str, layout: Layout) -> str:
 def topic_path(text: str, layouts: Mapping[str, Layout], default: str | None) -> str:
     """Return a topic in shmio's spelling: a path that may name its source and a direction.
 
-    The data block's own name, with which TIA Portal's paths begin, stands for its source.
-    Text that names nothing is returned unchanged.
+    Paths of TIA Portal begin with the name of the data block, which stands for its source. Text
+    that names nothing is returned unchanged.
     """
     if not may_be_tia_spelling(text) or _is_topic(text, layouts, default):
         return text
@@ -81,7 +81,7 @@ def _is_block(name: str, layout: Layout) -> bool:
 
 
 def _escaped(name: str) -> str:
-    """Encode the names ``in`` and ``out`` only, because others may be encoded already."""
+    """Encode the names ``in`` and ``out``; return any other name unchanged, because it may be encoded already."""
     return encode_segment(name) if name in ("in", "out") else name
 
 

@@ -28,14 +28,14 @@ _NUMBER: Final = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[
 
 
 class Sheet(NamedTuple):
-    """The registers of a table, and the row of each."""
+    """The registers of a table, and the number of each one's row; both by path."""
 
     registers: Mapping[str, object]
     rows: Mapping[str, int]
 
 
 def read_sheet(file: str, data: bytes, report: Report, needed: Sequence[str] = ("path", "type")) -> Sheet:
-    """Read a table, and add its errors to the report; ``needed`` are the columns that each row must fill."""
+    """Read a table, and add its errors to the report; each row must fill the ``needed`` columns."""
     try:
         rows, comma = _rows_of(file, data)
         return _sheet(file, rows, report, needed, decimal_comma=comma)
@@ -48,7 +48,7 @@ def read_sheet(file: str, data: bytes, report: Report, needed: Sequence[str] = (
 
 
 def _rows_of(file: str, data: bytes) -> tuple[Iterable[tuple[int, Sequence[str]]], bool]:
-    """Return the numbered rows, and whether numbers have a decimal comma, or raise ValueError."""
+    """Return the numbered rows, and whether numbers have a decimal comma; raise ValueError for a bad file."""
     if file.lower().endswith(".xlsx"):
         return read_rows(data, _sheet_of_tags), False
     try:
@@ -63,7 +63,7 @@ def _rows_of(file: str, data: bytes) -> tuple[Iterable[tuple[int, Sequence[str]]
 
 
 def _numbered(reader: Iterator[list[str]]) -> Iterator[tuple[int, Sequence[str]]]:
-    """Yield the rows of a CSV file with the lines on which they begin."""
+    """Yield each row of a CSV file with the number of the line on which it begins."""
     line = 1
     for row in reader:
         yield line, row
@@ -82,7 +82,7 @@ def _sheet(
     *,
     decimal_comma: bool,
 ) -> Sheet:
-    """Convert rows to entries as of a TOML table; raise ValueError if the header is wrong."""
+    """Convert rows to entries like those of a TOML table; raise ValueError if the header is wrong."""
     rows = iter(rows)
     _, header = next(rows, (1, ()))
     columns = _columns([cell.strip().lower() for cell in header], needed)
@@ -133,7 +133,7 @@ def _columns(header: Sequence[str], needed: Sequence[str]) -> list[str]:
 
 
 def _entry(cells: Mapping[str, str], *, decimal_comma: bool) -> dict[str, object]:
-    """Return a row's cells as an entry of a TOML table; raise ValueError if one is wrong."""
+    """Return a row's cells as an entry like those of a TOML table; raise ValueError if a cell is wrong."""
     entry: dict[str, object] = {name: cells[name] for name in COLUMNS[1:5] if name in cells}
     if "initial" in cells:
         real = cells.get("type", "").upper() in ("REAL", "LREAL")
@@ -152,7 +152,7 @@ def _entry(cells: Mapping[str, str], *, decimal_comma: bool) -> dict[str, object
 
 
 def _with_point(text: str, decimal_comma: bool) -> str:
-    """Return a number with a decimal point."""
+    """Return a number with a decimal point instead of its decimal comma."""
     return text.replace(",", ".") if decimal_comma and text.count(",") == 1 and "." not in text else text
 
 

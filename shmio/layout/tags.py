@@ -10,16 +10,17 @@ A table is a TOML file, or a sheet (``tag_sheets.py``) with the same columns. In
     "lamps" = { type = "ARRAY[1..8] OF BOOL", initial = [true] }
     "safetyzones/Z1" = "SafetyZone"
 
-Keys are paths as in topics. Types are those of S7, or structures of known shape, whose members
-become registers. Values lie in the order of the file, each at a multiple of its size, in the byte
-order ``byte_order`` (default: little, as on this machine); a single BOOL takes a byte of its own.
-The initial values of an array are one list, in the order of its elements.
+Keys are paths as in topics. Types are those of S7, or known structures (``simlog_structures.py``),
+whose members become registers. The block has the values in the order of the file, each at a
+multiple of its size, and in the byte order ``byte_order`` (default: little, as on this machine). A
+single BOOL takes a byte of its own. The initial values of an array are one list, in the order of
+its elements.
 
-``address`` says where the device has the value, in the notation of the source's connector. With
-``scale = factor`` or ``scale = [factor, offset]``, the connector computes the value from the
-device's number: number * factor + offset. ``deadband`` is the change of the value up to which the
-connector may keep the old value. ``writable = true`` does what naming the register in the source's
-``writable`` does.
+``address`` is the address of the value in the device, in the notation of the source's connector.
+With ``scale = factor`` or ``scale = [factor, offset]``, the connector computes the value from the
+device's number: number * factor + offset. ``deadband`` is the largest change of the value that the
+connector may ignore. ``writable = true`` has the same effect as naming the register in the
+source's ``writable``.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ class _Tag(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class _Table(msgspec.Struct, forbid_unknown_fields=True):
-    """Content of a tag table's file."""
+    """Content of a TOML file with a tag table."""
 
     registers: Annotated[dict[str, object], msgspec.Meta(min_length=1, max_length=MAX_REGISTERS)]
     name: Annotated[str, msgspec.Meta(min_length=1, max_length=128)] = ""
@@ -96,10 +97,10 @@ class _Table(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def compile_tags(file: str, data: bytes, report: Report) -> Layout:
-    """Compile one tag table; warnings stay in the report.
+    """Compile one tag table; add warnings to the report.
 
     Raises:
-        LayoutError: The table is wrong; ``diagnostics`` has everything found.
+        LayoutError: The table is wrong; ``diagnostics`` has all errors and warnings.
     """
     if file.lower().endswith(tag_sheets.SUFFIXES):
         return _compile_sheet(file, data, report)
@@ -109,13 +110,13 @@ def compile_tags(file: str, data: bytes, report: Report) -> Layout:
 
 
 def _compile_sheet(file: str, data: bytes, report: Report) -> Layout:
-    """Compile a table of a CSV file or a spreadsheet; LayoutError as for :func:`compile_tags`."""
+    """Compile a table in a CSV file or a spreadsheet; raise LayoutError as :func:`compile_tags` does."""
     sheet = read_sheet(file, data, report)
     return _place_table(file, _Table(dict(sheet.registers)), report, lambda path: sheet.rows.get(path, 1))
 
 
 def read_sheet(file: str, data: bytes, report: Report, needed: Sequence[str] = ("path", "type")) -> tag_sheets.Sheet:
-    """Return the rows of a CSV file or a spreadsheet; LayoutError: they are wrong."""
+    """Read the rows of a CSV file or a spreadsheet; raise LayoutError if any are wrong."""
     if len(data) > MAX_SOURCE_BYTES:
         report.add(Diagnostic(file, 1, 1, f"the file is larger than {MAX_SOURCE_BYTES} bytes"))
         report.raise_errors()
@@ -129,22 +130,21 @@ def place_tags(name: str, registers: Mapping[str, object], byte_order: ByteOrder
 
     Args:
         name: Name of the block.
-        registers: For each path what a tag table would have: the type, or a dict with the keys of
-            a table entry.
+        registers: Entries by path, as in a tag table: the type, or a dict with the keys of an entry.
         byte_order: Byte order of the values.
 
     Returns:
         The layout.
 
     Raises:
-        LayoutError: A register is wrong; each of the ``diagnostics`` begins with the path.
+        LayoutError: A register is wrong; the message of each diagnostic begins with the path.
     """
     places = {path: place for place, path in enumerate(registers, 1)}
     return _place_table(name, _Table(dict(registers), name, byte_order), Report([name]), places.__getitem__)
 
 
 def read_toml(file: str, data: bytes, report: Report, kind: type[_Read]) -> _Read:
-    """Return the content of a table's file; LayoutError: it cannot be read."""
+    """Return the content of a TOML file as ``kind``; raise LayoutError if it cannot be read."""
     found = _read(file, data, report, kind)
     report.raise_errors()
     if found is None:
@@ -153,7 +153,7 @@ def read_toml(file: str, data: bytes, report: Report, kind: type[_Read]) -> _Rea
 
 
 def _read(file: str, data: bytes, report: Report, kind: type[_Read]) -> _Read | None:
-    """Return the file's content; after an error report it and return None."""
+    """Return the file's content as ``kind``; after an error report it and return None."""
     if len(data) > MAX_SOURCE_BYTES:
         report.add(Diagnostic(file, 1, 1, f"the file is larger than {MAX_SOURCE_BYTES} bytes"))
         return None
@@ -176,7 +176,7 @@ def _read(file: str, data: bytes, report: Report, kind: type[_Read]) -> _Read | 
 
 
 def _syntax_error(file: str, text: str, error: Exception) -> Diagnostic:
-    """Return tomllib's error as a diagnostic with its place."""
+    """Return an error of tomllib as a diagnostic with line and column."""
     where = _PLACE.search(str(error))
     if where is None:
         number = _LONG_NUMBER.search(text)
@@ -187,19 +187,19 @@ def _syntax_error(file: str, text: str, error: Exception) -> Diagnostic:
         hint = "; write a path in quotes" if str(error).startswith("Expected '='") else ""
         return Diagnostic(file, line, column, f"{_PLACE.sub('', explain_toml(error, text))}{hint}")
     while line > 1 and not _KEY.match(lines[line - 1]):
-        line -= 1  # tomllib gives the end of the value
+        line -= 1  # tomllib reports the end of the value
     key = shorten(lines[line - 1].partition("=")[0].strip())
     return Diagnostic(file, line, 1, f"{key}: given twice; write a path with a dot in quotes")
 
 
 class Lines:
-    """Finds the line of a key of a table on demand."""
+    """Finds the line of a table's key, searching the text only when first asked."""
 
     def __init__(self, text: str) -> None:
         self._text = text
 
     def line_of(self, key: str) -> int:
-        """Return the last line on which a search finds the key, or 1."""
+        """Return the last line on which the key occurs; 1 if it is not found."""
         return self._found.get(key, 1)
 
     @cached_property
@@ -224,7 +224,7 @@ def _place_table(file: str, table: _Table, report: Report, line_of: Callable[[st
     ``line_of`` returns the line of a key, for diagnostics.
 
     Raises:
-        LayoutError: A register is wrong; ``diagnostics`` has everything found.
+        LayoutError: A register is wrong; ``diagnostics`` has all errors and warnings.
     """
     placer = _Placer(file, report, line_of)
     with suppress(TooManyErrors):
@@ -281,7 +281,7 @@ class _Placer:
         self._report.add(Diagnostic(self._file, self._line_of(key), 1, message, severity))
 
     def _place_all(self, key: str, tag: _Tag) -> None:
-        """Place a register, or the members of a structure."""
+        """Place the register of an entry; if its type is a structure, place its members."""
         if key.rpartition("/")[2] in ("in", "out"):
             raise PathError("the path ends in a direction; leave that out: each register has both")
         inside = members(tag.type)
@@ -323,7 +323,7 @@ class _Placer:
 
 
 def _scale(tag: _Tag, element: ElementType) -> tuple[float, float] | None:
-    """Return (factor, offset), or None; ValueError if the type cannot be scaled."""
+    """Return (factor, offset); None if there is no scale. Raise ValueError if it is wrong or does not suit the type."""
     if tag.scale is None:
         return None
     factor, offset = tag.scale if isinstance(tag.scale, tuple) else (tag.scale, 0.0)
@@ -335,7 +335,7 @@ def _scale(tag: _Tag, element: ElementType) -> tuple[float, float] | None:
 
 
 def _deadband(tag: _Tag, element: ElementType) -> float:
-    """Return the dead-band; ValueError if the type has none."""
+    """Return the dead-band; raise ValueError if it is wrong, or if the type cannot have one."""
     if tag.deadband and element.base not in NUMBERS:
         raise ValueError(f"deadband: a {element.base} has no dead-band, only numbers have")
     if not math.isfinite(tag.deadband):
@@ -344,7 +344,7 @@ def _deadband(tag: _Tag, element: ElementType) -> float:
 
 
 def _tag(key: str, given: object) -> _Tag:
-    """Return the entry of one register; ValueError if it is wrong."""
+    """Read the entry of one register; raise ValueError if it is wrong."""
     if isinstance(given, str):
         return _Tag(given)
     if isinstance(given, dict) and (others := given.keys() - set(_Tag.__struct_fields__)):
@@ -377,7 +377,7 @@ def _check_length(initial: str, shape: tuple[int, ...]) -> None:
 
 
 def parse_type(text: str) -> tuple[ElementType, Dims]:
-    """Return the element type and the array bounds; ValueError if the text is no type."""
+    """Return the element type and the array bounds; raise ValueError if the text is not a type."""
     dims: list[tuple[int, int]] = []
     if array := _ARRAY.fullmatch(text.strip()):
         for part in array[1].split(","):
@@ -409,7 +409,7 @@ def _align(element: ElementType) -> int:
 
 
 def _literal(value: _Scalar | list[_Scalar], element: ElementType) -> str:
-    """Return an initial value as an S7 literal; text for a number or a time already is one."""
+    """Return an initial value as an S7 literal; the text of a number or a time already is such a literal."""
     if isinstance(value, list):
         return f"[{', '.join(_literal(item, element) for item in value)}]"
     if isinstance(value, str):

@@ -7,9 +7,9 @@ the direction, the path may end in a part of a register:
 - ``Outputs/13.%X0``: a bit of an integer, as in STEP 7's slice access; bit 0 is the lowest.
   ``.%B1`` is a byte, ``.%W0`` a word, ``.%D0`` a double word; number 0 is the least significant.
 
-A member's name never ends in such a part: its ``%`` would be encoded.
+These parts cannot be confused with the name of a member, where ``%`` would be encoded.
 
-A leading slash is accepted, and so is ``<SCHEME>://``, whose scheme is a source's name in any case.
+A topic may begin with a slash, or with ``<SCHEME>://``, whose scheme is a source's name in any case.
 In a member's name ``/ % + #`` are percent-encoded, and so is the first letter of a member named
 exactly ``in`` or ``out``.
 """
@@ -47,15 +47,15 @@ _ESCAPE = re.compile(r"%([0-9A-Fa-f]{2})?")
 _RESERVED = re.compile(r"[/%+#]")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 _NOT_PLAIN = re.compile(r"[%+#\x00-\x09\x0b-\x1f\x7f]|//|^/|/$|(?:^|/)(?:in|out)(?:/|$)", re.MULTILINE)
-"""Finds what a path without percent-encoding cannot contain."""
+"""Finds what cannot occur in a canonical path without percent-encoding."""
 
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """A register's path within a source, and a direction if one was named.
+    """The parts of a topic: a source, a path within the source, and a direction if the text has one.
 
     ``path`` is in canonical encoding, and "" if the text names only the source. ``named`` is False
-    if the text names no source, so that the default one applies.
+    if the text names no source; ``source`` is then the default source.
     """
 
     source: str
@@ -84,7 +84,7 @@ def decode_segment(segment: str) -> str:
     """
     if "%" not in segment:
         return segment
-    if _PART.fullmatch(segment):  # never a name: its % could not be decoded
+    if _PART.fullmatch(segment):  # not a name, where % would be encoded
         raise PathError(
             f"{shorten(segment)}: a bit or another part of a register is allowed only at the end of a register's path"
         )
@@ -130,7 +130,7 @@ def canonical_path(path: str, *, parts: bool = False) -> str:
 
 
 def check_canonical(paths: Sequence[str]) -> None:
-    """Check that paths are in canonical encoding, quickly if they need no encoding.
+    """Check that paths are in canonical encoding. This is fast for paths without encoded characters.
 
     Raises:
         PathError: A path is not in its canonical form.
@@ -199,7 +199,7 @@ def _source_of_scheme(scheme: str, sources: Collection[str]) -> str:
 
 
 def _which(first: str, sources: Collection[str]) -> str:
-    """Return the error text for a path that does not begin with a source although it must."""
+    """Return a message for a path that must begin with a source, but begins with ``first``."""
     if not sources:
         return "there is no source"
     some = [f"{source}/…" for source in sources][:_SOURCES_SHOWN]
@@ -208,12 +208,12 @@ def _which(first: str, sources: Collection[str]) -> str:
 
 
 def look_up(layout: Layout, topic: Topic) -> Register:
-    """Return the register of a topic, as :func:`find`; a PathError also names the source."""
+    """Return the register of a topic, as :func:`find` does; a PathError also names the source."""
     return _with_source_in_errors(layout, topic, find)
 
 
 def look_up_each(layout: Layout, topic: Topic) -> list[Register]:
-    """Return the registers of a topic, as :func:`find_each`; a PathError also names the source."""
+    """Return the registers of a topic, as :func:`find_each` does; a PathError also names the source."""
     return _with_source_in_errors(layout, topic, lambda layout, path: list(find_each(layout, path)))
 
 
@@ -232,7 +232,7 @@ def find(layout: Layout, path: str) -> Register:
     """Return the register, element, slice, bit or other part that a canonical path names.
 
     Raises:
-        PathError: There is none; the message suggests similar names.
+        PathError: The layout has nothing at this path; the message suggests similar paths.
 
     """
     index = layout.by_path.get(path)
@@ -283,10 +283,10 @@ def part_of(layout: Layout, register: Register, kind: str, number: int) -> Regis
 def slice_of(layout: Layout, array: Register, leading: tuple[int, ...], low: int, high: int) -> Register:
     """Return the elements ``low`` to ``high`` of an array's last dimension as one register.
 
-    ``leading`` has the indices of the other dimensions.
+    ``leading`` are the indices in the other dimensions.
 
     Raises:
-        PathError: The array has no such row, or lacks some of these elements.
+        PathError: The array has no such row, or the row lacks some of these elements.
 
     """
     path = "/".join((array.path, *map(str, leading), f"{low}..{high}"))
@@ -315,7 +315,7 @@ def names_part(path: str) -> bool:
 
 
 def holders(path: str) -> Iterator[str]:
-    """Yield a canonical path and the paths that contain it: elements, arrays, structures."""
+    """Yield a canonical path, then the paths of what contains it: element, array, structures."""
     yield path
     if part := _PART.fullmatch(path):
         path = part["head"]
@@ -325,7 +325,7 @@ def holders(path: str) -> Iterator[str]:
 
 
 def holder(layout: Layout, register: Register) -> str:
-    """Return the path of the layout's register that contains a register from :func:`find`."""
+    """Return the path of the layout's register that is or contains ``register``, a result of :func:`find`."""
     return next(path for path in holders(register.path) if path in layout.by_path)
 
 
@@ -333,7 +333,7 @@ def find_each(layout: Layout, path: str) -> Iterator[Register]:
     """Yield the register that a canonical path names, or each element of the slice it names.
 
     Raises:
-        PathError: There is none; see :func:`find`.
+        PathError: The layout has nothing at this path: see :func:`find`.
 
     """
     register = find(layout, path)
@@ -347,7 +347,7 @@ def find_each(layout: Layout, path: str) -> Iterator[Register]:
 
 
 def _array(layout: Layout, path: str) -> tuple[Register, tuple[int, ...]] | None:
-    """Split a path into a register and trailing indices, or return None."""
+    """Split a path into a register and the indices after its path; return None if this is impossible."""
     indices: tuple[int, ...] = ()
     while (index := layout.by_path.get(path)) is None:
         path, _, last = path.rpartition("/")
@@ -396,7 +396,7 @@ def near(layout: Layout, path: str) -> list[str]:
 
 
 def _where_it_ends(layout: Layout, path: str) -> tuple[str, str, list[str]]:
-    """Return the longest prefix that is a structure, the next segment, and its members' names."""
+    """Return the longest prefix that is a structure, the segment after it, and the structure's members."""
     known, below = path, tuple[int, ...]()
     while known and not below:
         known = known.rpartition("/")[0]
@@ -408,5 +408,5 @@ def _where_it_ends(layout: Layout, path: str) -> tuple[str, str, list[str]]:
 
 
 def shorten(text: str, limit: int = 120) -> str:
-    """Return text cut to a length that fits an error message."""
+    """Return a text, cut to at most ``limit`` characters, for error messages."""
     return text if len(text) <= limit else f"{text[: limit - 1]}…"

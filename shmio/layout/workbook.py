@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from openpyxl import Workbook
 
 MAX_UNPACKED_BYTES: Final = 64 << 20
-"""Maximum size of all parts of a workbook, unpacked: a small archive can unpack to a huge one."""
+"""Maximum size of all parts of a workbook when unpacked, because a small archive may contain huge parts."""
 MAX_PARTS: Final = 1000
 MAX_COLUMNS: Final = 64
 MAX_ROWS: Final = 1 << 20
@@ -31,7 +31,7 @@ Row = tuple[int, list[str]]
 
 
 class WorkbookError(ShmioError):
-    """A workbook cannot be read; the message says why. ``row`` is 1 if the error is in no row."""
+    """A workbook cannot be read; the message says why. ``row`` is 1 if the error concerns no row."""
 
     def __init__(self, message: str, row: int = 1) -> None:
         super().__init__(message)
@@ -39,13 +39,14 @@ class WorkbookError(ShmioError):
 
 
 def read_rows(data: bytes, choose: Callable[[list[str]], str | None]) -> list[Row]:
-    """Return the rows of one sheet, without empty ones.
+    """Return the rows of one sheet, without empty rows.
 
-    Cells right of column ``MAX_COLUMNS`` are not read. Formulas give the values that Excel saved.
+    Cells right of column ``MAX_COLUMNS`` are ignored. The value of a formula is the one that Excel
+    saved.
 
     Args:
         data: Contents of the file.
-        choose: Function that gets the names of the sheets, and returns the one to read or None.
+        choose: Returns the name of the sheet to read, given all names; None if it is missing.
 
     Raises:
         WorkbookError: openpyxl is missing, or the file is not a workbook, too large, or lacks the
@@ -112,6 +113,6 @@ def _text(cell: object, row: int, column: int) -> str:
 
 
 def _letters(column: int) -> str:
-    """Return the letters of a column, which is counted from 0 and below 702."""
+    """Return the letters of a column, given its number from 0 to 701."""
     first, second = divmod(column, 26)
     return (chr(ord("A") + first - 1) if first else "") + chr(ord("A") + second)

@@ -1,1 +1,1 @@
-"""The addresses of tag tables, for each protocol but S7: what a device calls a register."""
+"""Addresses in tag tables, which tell where a device has a register; one module for each protocol but S7."""

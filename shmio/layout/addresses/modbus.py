@@ -1,9 +1,10 @@
 """Addresses of Modbus registers in tag tables, and the words that a value takes there.
 
 An address is ``[unit N] TABLE NUMBER[.BIT] [TYPE]``: ``holding 100``, ``unit 2 input 7``, ``coil 3``,
-``holding 100.3``, ``holding 100 UINT``. Numbers count from 0, as in the protocol. The numbers of
-manuals, which count from 1 and begin with the digit of their table, are read, too: ``40101`` and
-``400101`` are ``holding 100``. TYPE is the type in the device, if it is not that of the register.
+``holding 100.3``, ``holding 100 UINT``. Numbers count from 0, as in the protocol. An address may
+also be a number as in manuals, which count from 1 and put the digit of the table first: ``40101``
+and ``400101`` mean ``holding 100``. TYPE is the type in the device; it may be left out if it is
+that of the register.
 """
 
 from __future__ import annotations
@@ -57,14 +58,14 @@ _CODES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Where a device has the first element of a register.
+    """The place of a register's first element in a device.
 
     Attributes:
-        unit: Unit id behind a gateway; None: the source's default.
+        unit: Unit id of the device behind a gateway; None: the source's default.
         table: The table.
         number: Number in the table, from 0.
         bit: Bit of the word, 0 to 15; None: the whole word.
-        kind: Type in the device.
+        kind: Type of the element in the device.
 
     """
 
@@ -137,7 +138,7 @@ def _check(address: Address, register: Register, text: str) -> None:
 
 
 class WordCodec:
-    """Converts an element between its words in the device and its value in the register."""
+    """Converts elements of one register: words of the device to values, and values to words."""
 
     def __init__(self, address: Address, register: Register, word_order: Order, byte_order: Order) -> None:
         self._text = address.kind.base == "STRING"
@@ -151,7 +152,7 @@ class WordCodec:
         self._name = address.kind.name
 
     def decode(self, data: bytes) -> Scalar:
-        """Return the value of an element's words, as the device sent them."""
+        """Return an element's value; ``data`` are its words as the device sent them."""
         data = self.ordered(data)
         if self._text:
             return data[: self._length].partition(b"\0")[0].decode("latin-1")
@@ -160,7 +161,7 @@ class WordCodec:
         return round(value) if self._whole and math.isfinite(value) else value
 
     def encode(self, value: Scalar) -> bytes:
-        """Return the words for a value of the register; ValueError if the device's type cannot hold it."""
+        """Return a value as words to send; raise ValueError if the device's type cannot hold it."""
         if self._text:
             data = str(value).encode("latin-1", "replace")
             if len(data) > self._bytes:
@@ -175,7 +176,7 @@ class WordCodec:
             raise ValueError(f"{value} does not fit the device's {self._name}") from None
 
     def ordered(self, data: bytes) -> bytes:
-        """Swap bytes and words, from the device's order to big-endian or back."""
+        """Convert words from the device's order of bytes and words to big-endian, or back."""
         if not (self._swap_bytes or self._swap_words):
             return data
         words = [data[at : at + 2] for at in range(0, len(data), 2)]

@@ -7,9 +7,10 @@ A node id is ``ns=3;s=Speed`` or ``nsu=http://maker/device;i=1001``, as in OPC 1
 that is 0; ``&`` precedes one of the characters ``/ . < > : # ! &`` in a name (OPC 10000-4, annex
 A.2).
 
-A member of a structure has the address of the structure's node, a ``#``, and the way to the member:
-``ns=3;s=Pump#Motor.Speed``, ``/Objects/2:Line#[0].Forces``. In the way, ``&`` precedes one of the
-characters ``. [ ] # &`` in a name. In a text identifier, ``##`` stands for ``#``.
+The address of a structure's member is the address of the structure's node, a ``#``, and the steps
+to the member: ``ns=3;s=Pump#Motor.Speed``, ``/Objects/2:Line#[0].Forces``. After the ``#``, ``&``
+precedes one of the characters ``. [ ] # &`` in a name. In a text identifier, ``##`` stands for
+``#``.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from dataclasses import dataclass
 from typing import Final
 
 MAX_STEPS: Final = 64
-"""Maximum number of steps of a browse path, and of the way to a member."""
+"""Maximum number of steps of a browse path, and maximum number of steps to a member."""
 _MAX_NAME: Final = 4096  # characters of a text identifier (OPC 10000-3, section 8.2.4)
 _EXAMPLE: Final = "write a node id such as ns=3;s=Speed or nsu=http://maker/device;i=1001, or a browse path such as "
 _NODE: Final = re.compile(
@@ -38,7 +39,7 @@ _STEP: Final = re.compile(r"(?:([0-9]{1,5}):)?((?:[^/.<>:#!&]|&[/.<>:#!&])+)")
 
 @dataclass(frozen=True, slots=True)
 class NodeAddress:
-    """A node id; ``namespace`` is the number of its namespace, or its URI."""
+    """A node id; ``namespace`` is the number or the URI of its namespace."""
 
     namespace: int | str
     identifier: int | str | uuid.UUID | bytes
@@ -53,11 +54,11 @@ class BrowsePath:
 
 Address = NodeAddress | BrowsePath
 Member = tuple[str | tuple[int, ...], ...]
-"""The way from a structure to a member: the names of members, and the indices of elements."""
+"""The steps from a structure to a member; each is a member's name, or the indices of an element."""
 
 
 def parse(text: str) -> Address:
-    """Return the address of a node.
+    """Parse the address of a node.
 
     Raises:
         ValueError: The text is neither a node id nor a browse path.
@@ -70,10 +71,13 @@ def parse(text: str) -> Address:
 
 
 def parse_member(text: str) -> tuple[Address, Member]:
-    """Return the address of a node, and the way to a member of its structure; empty for the node's whole value.
+    """Parse the address of a node, or of a member of its structure.
+
+    Returns:
+        The address of the node, and the steps to the member; no steps for the node's whole value.
 
     Raises:
-        ValueError: The text is neither a node id nor a browse path, or the way is wrong.
+        ValueError: The text is neither a node id nor a browse path, or the steps are malformed.
 
     """
     text = text.strip()
@@ -98,12 +102,12 @@ def parse_member(text: str) -> tuple[Address, Member]:
 
 
 def node_text(text: str) -> str:
-    """Return a node id as an address has it."""
+    """Return a node id as it is written in an address: with ``##`` for ``#``."""
     return text.replace("#", "##")
 
 
 def member_text(member: Member) -> str:
-    """Return the way to a member as an address has it, with its ``#``; empty for the whole value."""
+    """Return the part of an address from the ``#`` on; empty if ``member`` has no steps."""
     steps = [
         "." + re.sub(r"([.\[\]#&])", r"&\1", one) if isinstance(one, str) else f"[{','.join(map(str, one))}]"
         for one in member
@@ -112,7 +116,7 @@ def member_text(member: Member) -> str:
 
 
 def _member(text: str, way: str | None) -> Member:
-    """Return the steps to a member. ValueError: the way is wrong."""
+    """Parse the steps to a member, ``way``; raise ValueError if they are malformed."""
     steps: list[str | tuple[int, ...]] = []
     at = 0
     while way and at < len(way):
@@ -130,12 +134,12 @@ def _member(text: str, way: str | None) -> Member:
 
 
 def escaped_uri(uri: str) -> str:
-    """Return the URI of a namespace as an address has it."""
+    """Return the URI of a namespace as it is written in an address: with ``%25`` and ``%3B``."""
     return uri.replace("%", "%25").replace(";", "%3B")
 
 
 def unescaped_uri(text: str) -> str:
-    """Return the URI that an address has; see :func:`escaped_uri`."""
+    """Return the URI of a namespace, from its spelling in an address: undo :func:`escaped_uri`."""
     return text.replace("%3B", ";").replace("%3b", ";").replace("%25", "%")
 
 

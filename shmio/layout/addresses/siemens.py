@@ -21,10 +21,10 @@ _INDEX: Final = re.compile(r"-?[0-9]+")
 
 
 def node_address(layout: Layout, register: Register) -> NodeAddress:
-    """Return the node of a register of a data block.
+    """Return the node id of a register of a data block.
 
-    A path tells an array's index and a member whose name is a number apart only by that: such a name
-    must be given with its address in a tag table.
+    Each segment of the path that is a number counts as the index of an array. If it is the name of
+    a member, the result is wrong; then a tag table must give the register's address.
     """
     parts: list[str] = [f'"{layout.name}"']
     indices: list[str] = []

@@ -1,4 +1,4 @@
-"""Result of an import: the tags for a tag table, and what was left out and why."""
+"""Result of an import: the tags for a tag table, and the items that were left out, with the reasons."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class ImportingError(ShmioError):
 
 @dataclass
 class Found:
-    """The tags of a file, in its order.
+    """The tags of a file, in the order of the file.
 
     Attributes:
-        kind: Name of the format, for messages.
-        tags: Tag-table entry for each path.
+        kind: What the file contains, for messages, such as ``tags of KEPServerEX``.
+        tags: Entries of the tag table, by path.
         remarks: Remarks about the file as a whole.
 
     """
@@ -39,12 +39,12 @@ class Found:
     _heads: set[str] = field(default_factory=set)
 
     def add(self, names: tuple[str, ...], kind: str, **columns: object) -> None:
-        """Add a tag, or skip it if a tag table cannot have it.
+        """Add a tag, or skip it if a tag table cannot contain it.
 
         Args:
             names: The segments of the path, as the vendor spells them.
             kind: Type in the tag table.
-            columns: Other columns of the tag table; those with None or "" are left out.
+            columns: Values of other columns of the tag table; None, "" and False are left out.
 
         """
         shown = "/".join(names)
@@ -74,7 +74,7 @@ class Found:
         return None
 
     def skip(self, name: str, why: str) -> None:
-        """Record that an item of the file is left out, and why."""
+        """Record that the item ``name`` of the file is left out, with the reason ``why``."""
         self._skipped.setdefault(why, []).append(name)
 
     @property
@@ -83,7 +83,7 @@ class Found:
         return self._skipped
 
     def report(self) -> Iterator[str]:
-        """Yield the lines of the report."""
+        """Yield lines for the user: the number of tags, the skipped items with reasons, the remarks."""
         yield f"imported {len(self.tags)} tag{'s' * (len(self.tags) != 1)} from {self.kind}"
         for why, names in self._skipped.items():
             shown = ", ".join(shorten(name, 60) for name in names[:_NAMES_SHOWN])
@@ -92,11 +92,11 @@ class Found:
         yield from self.remarks
 
     def to_toml(self, source: str, *, writable: bool) -> str:
-        """Return the tag table.
+        """Return the tag table as TOML.
 
         Args:
-            source: Name of the file, for the first line.
-            writable: True to make the tags writable that the vendor's tool lets others write.
+            source: Name of the imported file, for the first line.
+            writable: Whether to make those tags writable that are writable in the vendor's tool.
 
         """
         lines = [f"# {printable(self.kind)}, imported from {printable(source)}", "[registers]"]

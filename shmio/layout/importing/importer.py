@@ -22,7 +22,7 @@ def import_tags(data: bytes) -> Found:
         data: Contents of the file, as the vendor's tool wrote it.
 
     Returns:
-        The tags, and what was left out.
+        The tags, and the items that were left out.
 
     Raises:
         ImportingError: The file has an unknown format, is damaged, or is too large.

@@ -21,7 +21,7 @@ _ARRAY: Final = re.compile(r"(.*?)\s*\[([0-9]{1,6})\]")
 
 
 def read(data: bytes) -> Found:
-    """Return the tags; raise ImportingError if the file is not an export of tags."""
+    """Return the tags of the file; raise ImportingError if it is not such an export."""
     text = decode(data).text
     first = text.partition("\n")[0]
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=max(",;\t", key=first.count))
@@ -69,7 +69,12 @@ def _add(found: Found, row: Mapping[str, str]) -> None:
 
 
 def _scale(row: Mapping[str, str]) -> tuple[list[float] | None, str]:
-    """Return [factor, offset] and the scaled type; raise ValueError if scaling is not linear."""
+    """Return [factor, offset] and the type of the scaled value; None and "" if there is no scaling.
+
+    Raises:
+        ValueError: The scaling is not linear.
+
+    """
     how = row.get("scaling", "").lower()
     if how in ("", "none"):
         return None, ""

@@ -31,7 +31,7 @@ _MAX_DEPTH: Final = 100
 
 
 class _Model:
-    """The nodes of a file by node id, as the file writes it."""
+    """The nodes of a file, by node id as written in the file."""
 
     def __init__(self, root: Element) -> None:
         self.aliases = {name: f"i={number}" for name, number in _NAMES.items()}
@@ -62,7 +62,7 @@ class _Model:
         return self.aliases.get(name, name)
 
     def way(self, key: str) -> tuple[list[str], str]:
-        """Return the names from the topmost object to a node, and why it is left out, or ""."""
+        """Return the names from the topmost object down to a node, and why to leave the node out, or ""."""
         names: list[str] = []
         while key in self.nodes and len(names) <= _MAX_DEPTH:
             node = self.nodes[key]
@@ -74,7 +74,7 @@ class _Model:
         return (names, "") if len(names) <= _MAX_DEPTH else (names, "its references form a loop")
 
     def type_of(self, kind: str) -> str | None:
-        """Return the S7 type of a data type, which may be derived from a known one, or None."""
+        """Return the S7 type for a data type or for its nearest known supertype; None if there is none."""
         key = self.real(kind or "i=24")
         for _ in range(_MAX_DEPTH):
             known = _BUILT_IN.get(int(key[2:])) if re.fullmatch(r"i=[0-9]{1,9}", key) else None
@@ -84,7 +84,7 @@ class _Model:
         return None
 
     def address(self, key: str) -> str:
-        """Return a node id with its namespace's URI: servers number namespaces differently."""
+        """Return a node id with the URI of its namespace, because servers number namespaces differently."""
         match = _NODE.fullmatch(key)
         if match is None or int(match[1]) >= len(self.uris):
             return node_text(key)
@@ -129,7 +129,7 @@ def _add(found: Found, model: _Model, key: str, node: Element) -> None:
 
 
 def _elements(node: Mapping[str, str]) -> str | None:
-    """Return ``ARRAY[0..9] OF `` for an array, "" for a scalar, None for other ranks."""
+    """Return ``ARRAY[0..9] OF `` for an array, "" for a scalar, None for an array without fixed lengths."""
     rank = node.get("ValueRank", "-1")
     if rank == "-1":
         return ""

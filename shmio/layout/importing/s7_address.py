@@ -11,9 +11,10 @@ _IN_A_BLOCK: Final = re.compile(r"DB ?([0-9]{1,5})\.DB([XBWD]) ?([0-9]{1,5})(?:\
 
 
 def from_classic(address: str) -> str | None:
-    """Return ``%IW64`` for ``IW 64`` or ``EW 64``, or None if this is not the address of a value.
+    """Return an address in TIA Portal's notation: ``%IW64`` for ``IW 64`` or ``EW 64``.
 
-    Peripheral inputs and outputs, such as ``PIW 256``, become ``%IW256:P``.
+    Peripheral inputs and outputs, such as ``PIW 256``, become ``%IW256:P``. Return None if the text
+    is not the address of a value.
     """
     text = " ".join(address.upper().split())
     if match := _IN_A_BLOCK.fullmatch(text):
@@ -34,7 +35,7 @@ def from_classic(address: str) -> str | None:
 
 
 def in_block(number: int, offset: int, bit: int | None, element_bytes: int) -> str:
-    """Return the address of a value of a data block, such as ``%DB5.DBW4``."""
+    """Return the address of a value in data block ``number``, such as ``%DB5.DBW4``."""
     if bit is not None:
         return f"%DB{number}.DBX{offset}.{bit}"
     width = {1: "B", 2: "W", 4: "D"}.get(element_bytes)
@@ -42,5 +43,5 @@ def in_block(number: int, offset: int, bit: int | None, element_bytes: int) -> s
 
 
 def value_type(kind: str) -> str:
-    """Return the type of a tag's value; for timers and counters it is not the tag's type."""
+    """Return the type of the value of a tag of type ``kind``: S5TIME for TIMER, WORD for COUNTER, else ``kind``."""
     return {"TIMER": "S5TIME", "COUNTER": "WORD"}.get(kind.upper(), kind)

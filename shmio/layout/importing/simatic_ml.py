@@ -20,7 +20,7 @@ _ARRAY: Final = re.compile(r"Array\[([-0-9., ]+)\] of (.+)", re.IGNORECASE)
 
 
 def read(root: Element) -> Found:
-    """Return the tags of all tag tables and global data blocks; raise ImportingError if none."""
+    """Return the tags of all tag tables and global data blocks; raise ImportingError if there are none."""
     found = Found("XML of TIA Portal Openness")
     tables, blocks = list(root.iter("SW.Tags.PlcTagTable")), list(root.iter("SW.Blocks.GlobalDB"))
     if not tables and not blocks:
@@ -54,7 +54,7 @@ def _add_tag(found: Found, tag: Element) -> None:
 
 
 def _add_block(found: Found, block: Element, prefix: tuple[str, ...]) -> None:
-    """Add the registers of a block: write its members as source text, and compile that."""
+    """Add the registers of a block, by compiling source text that declares its members."""
     name, number = _attribute(block, "Name"), _attribute(block, "Number")
     section = block.find("AttributeList/Interface/Sections/Section[@Name='Static']")
     if section is None:

@@ -12,12 +12,12 @@ from shmio.layout.importing.s7_address import from_classic, value_type
 from shmio.layout.source.file import decode
 
 FIRST: Final = "126,"
-"""Beginning of each line of an ``.asc`` file; columns of 24, 12, 10 and 80 characters follow."""
+"""Start of each line of an ``.asc`` file; columns of 24, 12, 10 and 80 characters follow."""
 _Symbol = tuple[str, str, str, str]
 
 
 def read(data: bytes) -> Found:
-    """Return the symbols that have a value; raise ImportingError if it is not a symbol table."""
+    """Return the symbols that stand for values; raise ImportingError if the file is not a symbol table."""
     text = decode(data).text
     found = Found("a symbol table of STEP 7")
     for line, (name, address, kind, comment) in _symbols(text):
@@ -32,7 +32,7 @@ def read(data: bytes) -> Found:
 
 
 def _symbols(text: str) -> Iterator[tuple[int, _Symbol]]:
-    """Yield number and symbol of each line; raise ImportingError if one has other columns."""
+    """Yield the number and the symbol of each line; raise ImportingError if a line has other columns."""
     if text.startswith(FIRST):
         for line, row in enumerate(text.splitlines(), 1):
             if row.strip("\x1a\0 "):
@@ -65,7 +65,7 @@ def _stripped(name: str, address: str, kind: str, comment: str) -> _Symbol:
 
 
 def _type_of(address: str) -> str:
-    """Return a type for an address, because an assignment list (``.seq``) has no types."""
+    """Return a type that fits an address; used because an assignment list (``.seq``) has no types."""
     if address[1] in "TC":
         return "TIMER" if address[1] == "T" else "COUNTER"
     return {"B": "BYTE", "W": "WORD", "D": "DWORD"}.get(address[2], "BOOL")

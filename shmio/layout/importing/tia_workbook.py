@@ -13,7 +13,7 @@ _NEEDED: Final = ("name", "data type", "logical address")
 
 
 def read(data: bytes) -> Found:
-    """Return the tags of the sheet ``PLC Tags``; raise ImportingError if there is none."""
+    """Return the tags of the sheet ``PLC Tags``; raise ImportingError if there is no such sheet."""
     try:
         rows = read_rows(data, lambda names: SHEET if SHEET in names else None)
     except WorkbookError as error:

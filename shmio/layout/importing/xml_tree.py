@@ -13,7 +13,7 @@ MAX_DEPTH: Final = 200
 
 
 def parse(data: bytes) -> Element:
-    """Return the root element, with all element names stripped of their namespaces.
+    """Return the root element. Element names in the tree have no namespaces.
 
     Raises:
         ImportingError: The data is not XML, has a document type, or is too large or too deep.

@@ -1,1 +1,1 @@
-"""Values in the memory of an S7 controller: their addresses, and their conversion. Pure."""
+"""Addresses and conversion of values in the memory of an S7 controller. No I/O."""

@@ -1,8 +1,8 @@
 """Addresses of values in an S7 controller, as tag tables name them.
 
-``DB201.DBX0.1``, ``DB201.DBW4``, ``%IW256``, ``%M3.7``, ``T5``; ``%`` may be left out, and the German
-letters E, A and Z stand for I, Q and C. A type may follow that the controller's number has, where
-the register has another one: ``DB1.DBW4 INT``.
+Examples are ``DB201.DBX0.1``, ``DB201.DBW4``, ``%IW256``, ``%M3.7`` and ``T5``. ``%`` may be left
+out, and the German letters E, A and Z stand for I, Q and C. If the number in the controller has
+another type than the register, its type follows: ``DB1.DBW4 INT``.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ class Area(IntEnum):
 
     @property
     def numbered(self) -> bool:
-        """True if an address is a number, of a timer or counter, not that of a byte."""
+        """True for timers and counters: an address is a number, and not the offset of a byte."""
         return self in (Area.COUNTER, Area.TIMER)
 
     @property
     def read_only(self) -> str:
-        """Why nothing can be written to the area; empty if that is possible."""
+        """Why the area cannot be written to; empty if it can."""
         return _READ_ONLY.get(self, "")
 
 
@@ -62,7 +62,7 @@ _OF_COUNTERS: Final = frozenset({"WORD", "INT", "UINT"})
 
 
 class Address(NamedTuple):
-    """Where a controller has a value."""
+    """The place of a value in a controller, and its type there."""
 
     area: Area
     db: int
@@ -72,9 +72,9 @@ class Address(NamedTuple):
     bit: int | None
     """The bit of a single BOOL; None for all other types."""
     kind: ElementType
-    """Type of the number, or of each element, in the controller."""
+    """Type of the value, or of each element, in the controller."""
     size: int
-    """Bytes that the value has in the controller."""
+    """Size of the value in the controller, in bytes."""
 
     @property
     def text(self) -> str:
@@ -91,7 +91,7 @@ class Address(NamedTuple):
 
 
 def is_of_cpu(text: str) -> bool:
-    """Return whether an address is that of a value of the CPU itself, not in its memory."""
+    """Return whether an address names a value of the CPU itself, and not one in its memory."""
     return text.strip().lower().startswith(CPU)
 
 
@@ -104,7 +104,7 @@ def parse(register: Register) -> Address:
     """Return the address of a register.
 
     Raises:
-        ValueError: It has none, or one that does not fit its type.
+        ValueError: The register has no address, or one that does not fit its type.
 
     """
     text = register.address.strip()

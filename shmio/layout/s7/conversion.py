@@ -41,7 +41,10 @@ class Conversion:
         ) and element.base != "BOOL"
         plain = element.base == "BOOL" or element.size == 1 or bool(scalar_codec(element, byte_order).plain)
         self.swapped = 0 if self._converted or not plain else 1 if byte_order == "big" else element.size
-        """Bytes of an element that the image has in the reverse order; 0: only values can be converted."""
+        """Size of an element in bytes if the image has its bytes in reverse order; 1: in the same order.
+
+        0: the value must be decoded and encoded again.
+        """
         self._in = replace(
             register, type=address.kind.name, offset=0, bit=address.bit if not register.dims else register.bit,
             size=address.size, partial=False,
@@ -51,7 +54,7 @@ class Conversion:
     def image_bytes(self, data: bytes) -> bytes | None:
         """Convert the register's bytes from the controller's form to the image's.
 
-        Return None if they do not represent a value.
+        Return None if the bytes do not represent a value.
         """
         if self.address.bit is not None:
             bit = data[0] >> self.address.bit & 1
@@ -67,7 +70,7 @@ class Conversion:
         return bytes(image)
 
     def _number(self, data: bytes) -> Value:
-        """Return the value of bytes of the controller."""
+        """Decode the controller's bytes to a value of the register."""
         if self.address.area.numbered and self.register.type != "WORD":
             return _scaled(_bcd(data, self.address.area), self._from_device)
         return _scaled(codec(self._in, "big").decode(data), self._from_device)
@@ -78,12 +81,15 @@ class Conversion:
         return value if self.register.type in ("REAL", "LREAL") or isinstance(value, int | str) else round(value)
 
     def device_bytes(self, image: bytes, first: int, count: int) -> tuple[int, bytes]:
-        """Return the controller's bytes for elements of a register, and their offset from its start.
+        """Convert elements of the register to the controller's form.
 
         Args:
             image: The register's bytes in the image.
             first: The first element.
             count: The number of elements.
+
+        Returns:
+            The offset from the start of the value in the controller, and the bytes.
 
         Raises:
             ValueError: The bytes are not a valid value, or the controller cannot hold it.
@@ -118,10 +124,10 @@ class Conversion:
             raise ValueError(f"the controller cannot hold {value!r} as {self.address.kind.name}") from None
 
     def device_bit(self, byte: int) -> int:
-        """Return the controller's byte, from the start of the value, of a byte of the register.
+        """Return the offset in the controller's value for the offset ``byte`` in the register.
 
         Raises:
-            ValueError: The controller has no such bits.
+            ValueError: The value must be decoded and encoded, so its bits cannot be written.
 
         """
         if not self.swapped:
@@ -155,7 +161,7 @@ def _scaled(value: Value, convert: Callable[[Any], Any]) -> Value:
 
 
 def _bcd(data: bytes, area: Area) -> Value:
-    """Return a counter's value, or a timer's in ms; both have three BCD digits."""
+    """Decode a counter, or a timer to ms; both have three BCD digits."""
     word = int.from_bytes(data, "big")
     digits = [word >> shift & 0xF for shift in (8, 4, 0)]
     if max(digits) > 9:
@@ -167,7 +173,7 @@ def _bcd(data: bytes, area: Area) -> Value:
 
 
 def _to_bcd(value: Value, area: Area) -> bytes:
-    """Return the bytes of a counter, or of a timer with its value in ms.
+    """Encode the value of a counter, or of a timer in ms.
 
     Raises:
         ValueRangeError: The value has more than three digits.

@@ -1,7 +1,7 @@
 """Whole numbers and constants of a source.
 
-Bounds of arrays, lengths of strings, and indices are whole numbers, constants, or sums and products
-of both, as in classic SCL. The parser reads them with these functions. When a declaration is
+Bounds of arrays and lengths of strings are whole numbers, constants, or sums and products of both,
+as in classic SCL. The parser reads them with the functions of this module. When a declaration is
 placed, ``Constants`` evaluates them, and replaces names of constants in initial values.
 """
 
@@ -45,7 +45,7 @@ def bounds(at: Cursor) -> Bounds:
 
 
 def string_length(at: Cursor, base: str) -> Bound:
-    """Read ``[length]`` after STRING or WSTRING, if there is one."""
+    """Read ``[length]`` after STRING or WSTRING; return the default length if it is missing."""
     if not (at.token.is_punct("[") or at.token.is_punct("(")):
         return DEFAULT_STRING
     closing = "]" if at.advance().text == "[" else ")"
@@ -81,7 +81,7 @@ def bound(at: Cursor, what: str) -> Bound:
 
 
 def integer(at: Cursor, what: str) -> int:
-    """Read a whole number: a literal, not a constant or an expression."""
+    """Read a whole number that is a literal, and not a constant or an expression."""
     token = at.token
     value = bound(at, what)
     if not isinstance(value, int):
@@ -129,7 +129,7 @@ _MAX_CONSTANT = 260  # characters of a constant's value: a STRING of full length
 
 
 class BoundFault(ShmioError):  # noqa: N818  (the placer reports it; it never leaves the compiler)
-    """A bound cannot be computed."""
+    """The value of a bound cannot be computed."""
 
     def __init__(self, diagnostic: Diagnostic) -> None:
         super().__init__(diagnostic.message)
@@ -142,7 +142,7 @@ class Constants:
     def __init__(self, declared: Iterable[ConstantDeclaration] = (), outer: Constants | None = None) -> None:
         self._declared = {declaration.name.lower(): declaration for declaration in declared}
         self._outer = outer
-        self._numbers: dict[str, int] = {}  # cache, because constants may refer to each other often
+        self._numbers: dict[str, int] = {}  # cache: many constants may refer to one
 
     def find(self, name: str) -> ConstantDeclaration | None:
         """Return the constant with this name, in any case, or None."""
@@ -158,7 +158,7 @@ class Constants:
         """Return the value of a bound.
 
         Raises:
-            BoundFault: A constant is unknown or unsuitable, or the value exceeds 32 bits.
+            BoundFault: A constant is unknown or not a whole number, or the value exceeds 32 bits.
         """
         if isinstance(bound, int):
             return bound

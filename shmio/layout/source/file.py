@@ -1,8 +1,8 @@
 """Decode the bytes of a source file, and recognise files that are not sources.
 
-TIA Portal writes UTF-8 with a byte order mark, STEP 7 classic writes the Windows code page of its
-PC, and some editors write UTF-16 with a mark. Without a mark, bytes that are not UTF-8 are read as
-Windows-1252.
+TIA Portal writes UTF-8 with a byte order mark, STEP 7 classic uses the Windows code page of its PC,
+and some editors write UTF-16 with a mark. Files without a mark are read as UTF-8 or, if they are
+not in UTF-8, as Windows-1252.
 """
 
 from __future__ import annotations
@@ -38,9 +38,10 @@ _SEPARATORS: Final = re.compile(r"[;,\t]")
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """Text of a source.
+    """The text of a source.
 
-    ``problem`` is a warning (an error if ``fatal``) about the bytes at ``line`` and ``column``.
+    ``problem`` is a warning (an error if ``fatal``) about the bytes at ``line`` and ``column``;
+    empty if there is none.
     """
 
     text: str
@@ -51,7 +52,7 @@ class Decoded:
 
 
 def decode(data: bytes) -> Decoded:
-    """Decode a source by its byte order mark, as UTF-8, or as Windows-1252."""
+    """Decode a source: by its byte order mark, or else as UTF-8, or else as Windows-1252."""
     mark, encoding = next(((mark, name) for mark, name in _MARKS if data.startswith(mark)), (b"", "utf-8"))
     data = data[len(mark) :]
     try:
@@ -74,7 +75,7 @@ def _place(before: str) -> tuple[int, int]:
 
 
 def foreign(file: str, data: bytes) -> str:
-    """Return a message with the kind of the file and the remedy, or "" if it may be a source."""
+    """Return a message that names the kind of a file and the remedy; "" if the file may be a source."""
     name = file.lower()
     head = data[:HEAD_BYTES]
     if head.startswith((_ZIP, _OLD_OFFICE)) or name.endswith((".xlsx", ".xls", ".ods")):

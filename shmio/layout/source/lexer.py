@@ -1,9 +1,9 @@
 """Split source text into tokens, and read them with a cursor.
 
-The lexer knows one rule of the grammar: the text after ``TITLE =`` is free and ends with the line.
-Comments are not tokens: each is stored in the token before it on the same line. Invalid characters
-become a token of kind ``FAULT``, which is an error only if the parser reads it: the code of a
-function block may contain anything.
+The lexer knows one rule of the grammar: the text after ``TITLE =`` may be anything and ends with
+the line. Comments are not tokens; the token before a comment on the same line stores it. Invalid
+characters become a token of kind ``FAULT``. This is an error only if the parser reads the token,
+because the code of a function block, which the parser skips, may contain anything.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def _attach(tokens: list[Token], line: int, comment: str) -> None:
 
 
 def _problem(kind: Kind, content: str) -> str:
-    """Return the error in a token, or ""."""
+    """Return a message about the error in a token, or "" if it has none."""
     if kind is Kind.PUNCT and content == "'":
         return "the string that begins here has no closing quote on its line"
     if kind is Kind.PUNCT and content == '"':
@@ -167,7 +167,7 @@ _MAX_INITIAL = 65_536
 
 
 class SyntaxFault(ShmioError):  # noqa: N818  (the parser reports and goes on; it never leaves the compiler)
-    """The source violates the grammar at this place."""
+    """The source violates the grammar."""
 
     def __init__(self, diagnostic: Diagnostic) -> None:
         super().__init__(diagnostic.message)
@@ -175,9 +175,9 @@ class SyntaxFault(ShmioError):  # noqa: N818  (the parser reports and goes on; i
 
 
 class Cursor:
-    """Reads the tokens of one file in order; it never passes the last one, ``Kind.END``.
+    """Reads the tokens of one file in order, and stays at the last one, ``Kind.END``.
 
-    A ``FAULT`` token is reported when the cursor reaches it, and never becomes the current token.
+    The cursor reports a ``FAULT`` token when it reaches the token, and goes on to the next one.
     """
 
     def __init__(self, file: str, text: str, tokens: list[Token], report: Report) -> None:
@@ -185,7 +185,7 @@ class Cursor:
         self.report = report
         self._text = text
         self._tokens = tokens
-        self._absent: set[str] = set()  # keywords that do not occur again: no second search
+        self._absent: set[str] = set()  # keywords that do not occur again; do not search them twice
         self.index = 0
         self.token = tokens[0]
         self._pass_faults()
@@ -204,11 +204,11 @@ class Cursor:
         return self.token.kind is Kind.END
 
     def fault(self, token: Token, message: str) -> SyntaxFault:
-        """Return an error about a token, for the caller to raise."""
+        """Create an error about a token, for the caller to raise."""
         return SyntaxFault(self.at(token).error(message))
 
     def expected(self, what: str) -> SyntaxFault:
-        """Return an error, for the caller to raise, about an unexpected current token."""
+        """Create the error "expected ``what``, found the current token", for the caller to raise."""
         return self.fault(self.token, f"expected {what}, found {self.token}")
 
     def advance(self) -> Token:
@@ -225,9 +225,9 @@ class Cursor:
         self.token = self._tokens[index]
 
     def skip_to(self, word: str) -> bool:
-        """Go to this keyword without reporting faults before it.
+        """Go to the next keyword ``word``, without reporting faults before it, and return True.
 
-        If the keyword does not follow, stay and return False.
+        If the keyword does not occur again, stay and return False.
         """
         if word not in self._absent:
             for index in range(self.index, len(self._tokens)):
@@ -274,14 +274,14 @@ class Cursor:
             raise self.expected(word)
 
     def names_member(self) -> bool:
-        """Return whether the next token shows that the current word is a name and not a keyword."""
+        """Return whether the current word is a name and not a keyword, as the next token shows."""
         following = self._tokens[min(self.index + 1, len(self._tokens) - 1)]
         return self.token.kind is Kind.WORD and following.kind is Kind.PUNCT and following.text in (":", "{", ",")
 
     def words(self) -> str:
-        """Step over the words and numbers on this line and return them as written, with spaces.
+        """Step over the words and numbers on this line, and return them as one name with spaces.
 
-        Tabs and comments between them become spaces, because they are not part of a name.
+        Tabs and comments between the words become spaces.
         """
         first = last = self.advance()
         name = first.text
@@ -292,15 +292,15 @@ class Cursor:
         return name
 
     def last_comment(self, start: int) -> str:
-        """Return the last comment on the tokens from ``start`` up to the current one."""
+        """Return the last comment that the tokens from ``start`` up to the current one store."""
         comments = [token.comment for token in self._tokens[start : self.index] if token.comment]
         return comments[-1] if comments else ""
 
     def value(self) -> str:
         """Step over a value, up to the ``;`` that ends it, and return it as written.
 
-        Within brackets, a value may span lines. Outside brackets, a new line without a comma before
-        it means that the ``;`` is missing.
+        Within brackets, a value may span lines. Outside brackets, a line may end within the value
+        only after a comma; otherwise the ``;`` is missing.
         """
         first = last = self.token
         start, depth = self.index, 0

@@ -52,14 +52,14 @@ _PLAIN = re.compile(r"\w+")
 
 
 def parse(file: str, text: str, tokens: list[Token], report: Report) -> Unit:
-    """Parse one file; report errors and leave the wrong declarations out of the result."""
+    """Parse one file. Report errors, and leave wrong declarations out of the result."""
     return _Parser(Cursor(file, text, tokens, report)).unit()
 
 
 class _Declarations:
-    """Reads declarations at a cursor.
+    """Reads the declarations at a cursor.
 
-    ``interface`` is True for declarations of a function block, whose names have no spaces.
+    ``interface`` is True in a function block, where names have no spaces.
     """
 
     def __init__(self, cursor: Cursor) -> None:
@@ -69,7 +69,7 @@ class _Declarations:
     def sections(self) -> tuple[Struct, tuple[ConstantDeclaration, ...]]:
         """Read a body, which is one STRUCT or several sections; return its members and constants.
 
-        The members of a function block are in the order in which its instances store them.
+        Return the members of a function block in the order in which its instances store them.
         """
         position = self.at.position
         if self.at.accept_word("STRUCT"):
@@ -135,7 +135,7 @@ class _Declarations:
         return tuple(members)
 
     def stops(self) -> bool:
-        """Return whether a list of members ends here although its end keyword is missing."""
+        """Return whether a list of members ends at the current token although its end keyword is missing."""
         token = self.at.token
         return token.kind is Kind.END or (token.is_word(*_STOPS) and not self.at.names_member())
 
@@ -156,7 +156,7 @@ class _Declarations:
                     return
 
     def attributes(self) -> dict[str, str]:
-        """Read ``{ name := 'value'; … }`` into names in upper case and values without quotes."""
+        """Read ``{ name := 'value'; … }``; return values without quotes, by name in upper case."""
         opening = self.at.advance()
         values: dict[str, str] = {}
         while not self.at.accept("}"):
@@ -206,7 +206,7 @@ class _Declarations:
         return self.at.advance().text if self.interface else self.at.words(), position, False
 
     def body_type(self) -> Type:
-        """Read the name of a type that stands in place of a data block's body."""
+        """Read the name of the type that a data block has instead of a body."""
         return self._type(0)
 
     def _type(self, depth: int) -> Type:
@@ -284,7 +284,7 @@ class _Parser:
 
     @contextmanager
     def collecting(self, *, resume: bool = True) -> Iterator[Report]:
-        """Collect the errors of one declaration separately: they count only if the declaration is used.
+        """Collect the errors of one declaration in their own report: they count only if it is used.
 
         With ``resume``, skip to the next declaration after a syntax error.
         """
@@ -383,7 +383,7 @@ class _Parser:
         return name, token.kind is Kind.QUOTED
 
     def header(self, header: _Header | None = None) -> _Header:
-        """Read the lines between a block's name and its body; add to the properties in ``header``."""
+        """Read the lines between a block's name and its body; add their properties to ``header``."""
         header = header or _Header()
         while True:
             if self.at.token.is_punct("{"):

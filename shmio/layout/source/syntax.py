@@ -37,7 +37,7 @@ class Constant:
 class Sum:
     """A constant expression: signed terms, each a product of factors.
 
-    It is not nested, so that no depth must be limited.
+    Sums do not nest, so their depth needs no limit.
     """
 
     terms: tuple[tuple[int, tuple[int | Constant, ...]], ...]
@@ -82,7 +82,7 @@ Type = Named | Struct | Array
 
 
 class Section(Enum):
-    """Section in which a member is declared, in the order of a function block's instance."""
+    """The section that declares a member; the instance of a function block has this order of sections."""
 
     INPUT = "VAR_INPUT"
     OUTPUT = "VAR_OUTPUT"
@@ -117,7 +117,7 @@ class ConstantDeclaration:
 
 @dataclass(frozen=True, slots=True)
 class Assignment:
-    """``target := value;`` after BEGIN; ``target`` has names and index lists as written."""
+    """``target := value;`` after BEGIN; ``target`` consists of names and index lists as written."""
 
     target: tuple[str | tuple[int, ...], ...]
     value: str
@@ -128,7 +128,7 @@ class Assignment:
 class TypeDeclaration:
     """TYPE … END_TYPE, or the interface of a FUNCTION_BLOCK.
 
-    ``faults`` has its errors, which matter only where the type is used.
+    ``faults`` are its errors. Those of a function block matter only if its type is used.
     """
 
     name: str
@@ -144,7 +144,7 @@ class TypeDeclaration:
 class BlockDeclaration:
     """DATA_BLOCK … END_DATA_BLOCK; ``body`` may be the name of a function block or a user type.
 
-    ``faults`` has its errors and warnings, which matter only if the block is compiled.
+    ``faults`` are its errors and warnings, which matter only if the block is compiled.
     """
 
     name: str

@@ -1,17 +1,17 @@
 """System data types whose layout has a public source.
 
-They are declared here as a user would declare them, and the placement rules give their addresses.
-For each type these agree with the length or the addresses that its source states.
-``docs/reference/layout-rules.md`` lists them.
+This module declares them as a user would, and the placement rules give their addresses. For each
+type, these agree with the length or the addresses that the public source states.
+``docs/reference/layout-rules.md`` lists the types.
 
-- ErrorStruct, CREF, NREF: Siemens' help on GET_ERROR has the members, the one on system data types the lengths.
+- ErrorStruct, CREF, NREF: members in Siemens' help on GET_ERROR, lengths in the help on system data types.
 - TCON_Param, TADDR_Param: Siemens' help on open user communication has every byte.
-- SSL_HEADER: Siemens' help on RDSYSST, length in the one on system data types.
+- SSL_HEADER: members in Siemens' help on RDSYSST, length in the help on system data types.
 - SFB 0 to 5: the simulator awlsim has the interfaces; its tests state the addresses of SFB 0.
 
-For IEC_TIMER and similar types only the length is public, not the places of the members: they
-become bytes without meaning. Any other system type is an error unless the configuration gives its
-size.
+For IEC_TIMER and similar types, only the length is public, and not the places of the members. Such
+a type becomes an array of bytes. Any other system type is an error unless the configuration gives
+its size.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ _REFUSED = {
 
 @cache
 def declarations() -> Mapping[str, TypeDeclaration]:
-    """Return the types that can be placed, by name in lower case."""
+    """Return the system types whose members are known, by name in lower case."""
     texts = [_TYPES, *(_TIMER.format(name=name) for name in _TIMERS)]
     for names, inputs, outputs, edges in _COUNTERS:
         texts += (_COUNTER.format(name=name, inputs=inputs, outputs=outputs, edges=edges) for name in names)

@@ -1,7 +1,7 @@
 """Convert exactly between ISO 8601 text and nanoseconds since 1970-01-01.
 
-Python's ``datetime`` ends at microseconds, but LDT and DTL have nanoseconds; therefore this module
-uses whole numbers and text. S7 has no time zones, and neither has this module.
+This module uses whole numbers and text, because LDT and DTL have nanoseconds and Python's
+``datetime`` has only microseconds. Like S7, it knows no time zones.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _MOMENT = re.compile(
 
 
 def days(year: int, month: int, day: int) -> int | None:
-    """Return the days from 1970-01-01 to a date, or None if there is no such day."""
+    """Return the number of days from 1970-01-01 to a date; None if there is no such date."""
     try:
         return date(year, month, day).toordinal() - EPOCH
     except ValueError:
@@ -36,9 +36,9 @@ def days(year: int, month: int, day: int) -> int | None:
 
 
 def parse_moment(text: str) -> int | None:
-    """Parse a date, with or without a time, into nanoseconds since 1970; None for any other text.
+    """Convert a date, with or without a time, to nanoseconds since 1970; None for any other text.
 
-    Accepts ``2024-02-29``, ``2024-02-29T12:00:00.5`` and S7's ``2024-2-29-12:00:00.5``.
+    Accept ``2024-02-29``, ``2024-02-29T12:00:00.5`` and S7's ``2024-2-29-12:00:00.5``.
     """
     match = _MOMENT.fullmatch(text)
     day = days(int(match[1]), int(match[2]), int(match[3])) if match else None
@@ -52,12 +52,12 @@ def parse_moment(text: str) -> int | None:
 
 
 def format_day(day: int) -> str:
-    """Return the ISO text of a day, given in days since 1970."""
+    """Return a day, given in days since 1970, as ISO text."""
     return date.fromordinal(EPOCH + day).isoformat()
 
 
 def format_moment(ns: int, digits: int) -> str:
-    """Return the ISO text of nanoseconds since 1970, with this many decimals of the second."""
+    """Return a time, given in nanoseconds since 1970, as ISO text; seconds have ``digits`` decimals."""
     day, rest = divmod(ns, NS_PER_DAY)
     second, fraction = divmod(rest, NS_PER_SECOND)
     clock = f"{second // 3600:02}:{second // 60 % 60:02}:{second % 60:02}"

@@ -19,8 +19,8 @@ POINTER, ANY                         str, the bytes in hexadecimal
 An array is a list; with several dimensions, a list of lists.
 
 Bytes that are not a valid value of the type (month 13, a BCD digit above 9, a STRING longer than
-its maximum) decode to None: a controller may hold such bytes, and one bad register must not make a
-whole frame unreadable. Encoding never writes them.
+its maximum) decode to None. A controller may hold such bytes, and one bad register must not make a
+whole frame unreadable. Encoding never creates such bytes.
 
 Formats: Siemens, "STEP 7 Professional", chapter "Data types".
 """
@@ -51,9 +51,9 @@ _S5_BASES_MS = (10, 100, 1000, 10_000)
 
 
 class ScalarCodec(Protocol):
-    """Codec of one element.
+    """Decodes and encodes one element.
 
-    ``plain`` is the ``struct`` format if that alone decodes the value, else empty.
+    ``plain`` is the format of ``struct`` if unpacking is all that decoding takes; else empty.
     """
 
     plain: str
@@ -69,7 +69,7 @@ class RegisterCodec(Protocol):
     """Decodes and encodes one register of a frame; ``codec`` returns it."""
 
     def decode(self, data: Buffer) -> Value:
-        """Return the register's value in a frame; None (or None elements) for invalid bytes."""
+        """Return the register's value in a frame; invalid bytes of a scalar or an element are None."""
 
     def encode_into(self, value: object, frame: bytearray | memoryview) -> None:
         """Write the value into a frame; after an error the frame is unchanged.
@@ -84,7 +84,7 @@ class RegisterCodec(Protocol):
 
 @lru_cache(maxsize=65_536)
 def codec(register: Register, byte_order: ByteOrder = "big") -> RegisterCodec:
-    """Return the register's codec; it is cached."""
+    """Return the codec of a register. Results are cached."""
     if register.type == "BOOL":
         return _BoolArray(register) if register.dims else _Bool(register)
     return _Array(register, byte_order) if register.dims else _Single(register, byte_order)
@@ -107,7 +107,7 @@ class _Bool:
 
 
 class _Single:
-    """Codec of any other elementary value."""
+    """Codec of a scalar of any type except BOOL."""
 
     def __init__(self, register: Register, byte_order: ByteOrder) -> None:
         self._scalar = scalar_codec(register.element, byte_order)
@@ -121,7 +121,7 @@ class _Single:
 
 
 class _Array:
-    """Codec of an array of any type but BOOL; it unpacks all numbers at once."""
+    """Codec of an array of any type except BOOL; it unpacks numbers all at once."""
 
     def __init__(self, register: Register, byte_order: ByteOrder) -> None:
         element = register.element
@@ -144,7 +144,7 @@ class _Array:
 
     def encode_into(self, value: object, frame: bytearray | memoryview) -> None:
         if self._row is not None and isinstance(value, list | tuple) and {float, int}.issuperset(map(type, value)):
-            with suppress(struct.error, OverflowError):  # the loop below reports the wrong element
+            with suppress(struct.error, OverflowError):  # the loop below finds the wrong element and raises its error
                 frame[self._offset : self._stop] = self._row.pack(*value)
                 return
         image = bytearray(frame[self._offset : self._stop])
@@ -154,7 +154,7 @@ class _Array:
 
 
 class _BoolArray:
-    """Codec of an array of BOOL: eight bits to a byte, and each row begins at a new byte."""
+    """Codec of an array of BOOL, which has eight bits in a byte and begins each row at a new byte."""
 
     def __init__(self, register: Register) -> None:
         self._name, self._shape = register.path, register.shape
@@ -268,7 +268,7 @@ class _Number:
 
 
 def bounds(code: str, limit: int | None = None) -> tuple[float, float]:
-    """Return the least and greatest number of a ``struct`` code; ``limit`` lowers the greatest."""
+    """Return the least and greatest number that a ``struct`` code can hold; ``limit`` lowers the greatest."""
     if code in "fd":
         most = REAL_MAX if code == "f" else sys.float_info.max
         return -most, most
@@ -278,7 +278,7 @@ def bounds(code: str, limit: int | None = None) -> tuple[float, float]:
 
 
 class _Text:
-    """Codec of CHAR and WCHAR: one character in one code unit."""
+    """Codec of CHAR and WCHAR, which hold one character in one code unit."""
 
     plain = ""
 
@@ -296,7 +296,7 @@ class _Text:
 
 
 class _String:
-    """Codec of STRING and WSTRING: maximum length, actual length, characters."""
+    """Codec of STRING and WSTRING, which hold a maximum length, the actual length, and characters."""
 
     plain = ""
 
@@ -306,7 +306,7 @@ class _String:
         self._encoding, self._unit = encoding, unit
 
     def decode(self, data: Buffer, offset: int) -> str | None:
-        # Use the declared length: the maximum length in the data is 0 until the controller
+        # Use the declared length, because the maximum length in the data is 0 until the controller
         # sets it.
         actual = self._head.unpack_from(data, offset)[1]
         if actual > self._length:
@@ -323,7 +323,7 @@ class _String:
 
 
 class _S5Time:
-    """Codec of S5TIME: a BCD number of 0-999, and a time base in bits 12 and 13."""
+    """Codec of S5TIME, which holds a BCD number of 0-999, and a time base in bits 12 and 13."""
 
     plain = ""
 
@@ -346,7 +346,7 @@ class _S5Time:
 
 
 class _Opaque:
-    """Codec of POINTER and ANY: hexadecimal text."""
+    """Codec of POINTER and ANY; their values are hexadecimal text."""
 
     plain = ""
 
@@ -534,7 +534,7 @@ def to_bool(value: object, name: str) -> bool:
     """Return the value as a bool; accept 0 and 1.
 
     Raises:
-        ValueRangeError: The value is anything else.
+        ValueRangeError: The value is neither a bool nor 0 or 1.
     """
     if isinstance(value, bool) or (not isinstance(value, str) and value in (0, 1)):
         return bool(value)
@@ -542,10 +542,10 @@ def to_bool(value: object, name: str) -> bool:
 
 
 def _encode_text(value: object, encoding: str, name: str) -> bytes:
-    """Return text in the type's encoding.
+    """Encode a text.
 
     Raises:
-        ValueRangeError: The value is not text, or has a character that the encoding lacks.
+        ValueRangeError: The value is not a text, or has a character that the encoding lacks.
     """
     if not isinstance(value, str):
         raise ValueRangeError(f"{name}: expected text, found {brief(value)}")
@@ -556,12 +556,12 @@ def _encode_text(value: object, encoding: str, name: str) -> bytes:
 
 
 def out_of_range(value: object, name: str, least: object, most: object) -> ValueRangeError:
-    """Return the error for a value outside the type's range."""
+    """Create the error for a value outside the range of its type."""
     return ValueRangeError(f"{name}: {brief(value)} is out of range {least}..{most}")
 
 
 def brief(value: object) -> str:
-    """Return a value's text, short enough for a message; a huge integer is not converted."""
+    """Return a value as a short text for a message; for a huge integer, the number of its bytes."""
     if isinstance(value, int) and not -(1 << 128) < value < 1 << 128:
         return f"an integer of {math.ceil(value.bit_length() / 8)} bytes"
     text = repr(value)

@@ -13,8 +13,8 @@ LDT, DTL                      ``M8[ns]``
 POINTER, ANY                  ``V6``, ``V10``
 ============================  ==========================================================================
 
-Values have native byte order; an array register is a field with a shape. Bytes that are not a
-valid value of their type become NaT or empty text.
+Values have native byte order. The field of an array register has the array's shape. Bytes that are
+not a valid value of their type become NaT or empty text.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from shmio.layout.values.codec import MAX_LTOD_NS, MAX_TOD_MS
 
 Bytes = npt.NDArray[np.uint8]
 Array = npt.NDArray[Any]
-# From (…, size) bytes of an element to (…) values.
+# Converts bytes of shape (…, size of an element) to values of shape (…).
 _Decode = Callable[[Bytes], Array]
 
 # fmt: off
@@ -60,8 +60,7 @@ class FrameCodec:
         self.dtype = np.dtype([(register.path, *_field(register)) for register in registers])
         order = ">" if layout.byte_order == "big" else "<"
         plain = [register for register in registers if register.type in _PLAIN]
-        # Both the frame and the result are viewed as records with the same fields, so that one
-        # assignment converts all of them.
+        # Views of frame and result as records with the same fields: one assignment converts them all.
         runs = _runs(plain, self.dtype)
         self._plain_in = _record([(order + kind, count, start) for kind, count, start, _ in runs], layout.size)
         self._plain_out = _record([(kind, count, start) for kind, count, _, start in runs], self.dtype.itemsize)
@@ -76,13 +75,13 @@ class FrameCodec:
         """Decode n frames.
 
         Args:
-            frames: The bytes of n frames, or an array of uint8 with the shape (n, size).
+            frames: The bytes of n frames, or a uint8 array of shape (n, size).
 
         Returns:
             A structured array of shape (n,) with a field for each register, named by its path.
 
         Raises:
-            ValueError: The size is not that of whole frames of the layout.
+            ValueError: The bytes are not whole frames of the layout.
         """
         raw = np.asarray(frames, np.uint8) if isinstance(frames, np.ndarray) else np.frombuffer(frames, np.uint8)
         if raw.ndim == 1 and self.size and raw.size % self.size == 0:
@@ -106,7 +105,7 @@ class FrameCodec:
 
 
 def _runs(plain: list[Register], dtype: np.dtype[Any]) -> list[tuple[str, int, int, int]]:
-    """Join neighbours of one type into runs (type, elements, offset in frame, offset in result)."""
+    """Join adjacent registers of one type into runs (type, elements, offset in frame, offset in result)."""
     fields: Mapping[str, Any] = dtype.fields or {}
     runs: list[tuple[str, int, int, int]] = []
     ends = kind_before = None
@@ -191,7 +190,7 @@ def _not_negative(values: Array) -> Array:
 
 
 def _bcd(values: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """Return the numbers of two BCD digits, and whether both are valid digits."""
+    """Return the numbers that bytes of two BCD digits encode, and whether both digits are valid."""
     tens, ones = values.astype(np.int64) >> 4, values.astype(np.int64) & 0xF
     return tens * 10 + ones, (tens <= 9) & (ones <= 9)
 
@@ -236,7 +235,7 @@ def _dtl(raw: Bytes, order: str) -> Array:
 
 
 def _text(units: Array, actual: Array) -> Array:
-    """Replace code points (…, length) after the actual length by NUL; all if it is invalid."""
+    """Replace code points (…, length) after the actual length by NUL; if that is invalid, replace all."""
     length = units.shape[-1]
     inside = (np.arange(length) < actual[..., None]) & (actual <= length)[..., None]
     return np.ascontiguousarray(np.where(inside, units, 0).astype(np.uint32))
@@ -252,7 +251,7 @@ def _wide_text(words: Array, length: int) -> Array:
     points = _text(words[..., 2:], words[..., 1])
     if not ((points >= 0xD800) & (points <= 0xDFFF)).any():
         return points.view(f"U{length}")[..., 0]
-    # Surrogate pairs shorten the text. They are rare, so such texts are converted one by one.
+    # A surrogate pair is one character, so the text gets shorter. Such texts are rare; convert each alone.
     flat = points.reshape(-1, length).astype("<u2")
     actual = np.where(words[..., 1] <= length, words[..., 1], 0).reshape(-1)
     texts = [bytes(row[:n]).decode("utf-16-le", "replace") for row, n in zip(flat, actual, strict=True)]

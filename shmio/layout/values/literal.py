@@ -1,4 +1,4 @@
-"""Read S7 literals, from sources and from users, into values, and write values as literals.
+"""Convert S7 literals, from sources and from users, to values, and values to literals.
 
 ``16#FF``, ``INT#-5``, ``1.5e3``, ``TRUE``, ``T#1h30m``, ``S5T#10s``, ``D#2024-02-29``, ``TOD#12:00:00``,
 ``DT#2024-02-29-12:00:00``, ``'text$N'``, ``WSTRING#'…'``, and arrays ``[1, 2, 5(0)]`` of any of these.
@@ -90,7 +90,7 @@ _WRITTEN = {
     "LDT": "LDT",
     "DTL": "DTL",
 }
-"""Prefix of the literal in which people read a value of these types."""
+"""Prefix of the literals that :func:`literal_text` writes, by type."""
 
 
 def default_text(element: ElementType) -> str:
@@ -99,7 +99,7 @@ def default_text(element: ElementType) -> str:
 
 
 def parse_literal(text: str, register: Register, byte_order: ByteOrder = "big") -> Value:
-    """Return the value of a literal for this register.
+    """Convert a literal to a value for a register.
 
     Array elements that the literal leaves out have their type's default.
 
@@ -116,7 +116,7 @@ def parse_literal(text: str, register: Register, byte_order: ByteOrder = "big") 
 
 
 def scalar_literal(text: str, element: ElementType, byte_order: ByteOrder = "big") -> Scalar:
-    """Return the value of one literal.
+    """Convert a literal to a value of an elementary type.
 
     Raises:
         ValueRangeError: The text is not a literal of the type, or is out of range.
@@ -193,7 +193,7 @@ def _classic(text: str, base: str) -> int | None:
 
 
 def _duration(text: str) -> int | None:
-    """Return a duration in nanoseconds, or None if it is malformed or finer than that."""
+    """Return a duration in nanoseconds; None if it is malformed or not a whole number of them."""
     sign = -1 if text.startswith("-") else 1
     text = text.lstrip("+-")
     total, position = Fraction(0), 0
@@ -272,7 +272,7 @@ def _literal_text(value: Value, element: ElementType) -> str:
 
 
 def _without_zeros(clock: str) -> str:
-    """Remove trailing zeros: ``12:00:00.500`` becomes ``12:00:00.5``."""
+    """Remove trailing zeros of a fraction: ``12:00:00.500`` becomes ``12:00:00.5``."""
     return clock.rstrip("0").rstrip(".") if "." in clock else clock
 
 
@@ -289,10 +289,10 @@ def _duration_text(ns: int, finest: str) -> str:
 
 
 def split_array(text: str, shape: tuple[int, ...]) -> list[tuple[int, int, str]]:
-    """Return (first element, number, text) of each value in an array literal, in order.
+    """Split an array literal into values; return (first element, number of elements, text) of each.
 
-    The literal is ``[1, 2, 3(0)]``, the same without brackets, or has each row in brackets. Values
-    beyond the end of the array are left out.
+    The literal has the form ``[1, 2, 3(0)]``, with or without the brackets, or has each row in
+    brackets. Values beyond the end of the array are left out.
     """
     runs: list[tuple[int, int, str]] = []
     _fill(text, shape, 0, runs)
@@ -329,7 +329,7 @@ def _fill(text: str, shape: tuple[int, ...], start: int, runs: list[tuple[int, i
 
 
 def split_items(text: str) -> Iterator[str]:
-    """Split at the commas that are outside brackets, strings and quoted names."""
+    """Split a text at the commas outside brackets, strings and quoted names."""
     depth, start, quote = 0, 0, ""
     position = 0
     while position < len(text):

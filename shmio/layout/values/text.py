@@ -1,7 +1,7 @@
 """Convert values to and from the text of SimlogAPI version 1.
 
-A number's text is the shortest that reads back as the same value of the register's type: ``0.1``
-for a REAL. Reading also accepts numbers as Java prints them.
+A number becomes the shortest text from which the register's type gets the same value: ``0.1`` for a
+REAL. In the other direction, numbers may also be as Java prints them.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,4})?
 _NON_FINITE = {"nan": math.nan} | {
     f"{sign}{word}": -math.inf if sign == "-" else math.inf for sign in ("", "+", "-") for word in ("inf", "infinity")
 }
-"""Values by their texts that are not numbers, in lower case because case is ignored."""
+"""NaN and infinities by their texts in lower case; the case of a text does not matter."""
 
 
 def wire_type(register: Register) -> WireType:
-    """Return version 1's name for the type of the register, or of its elements."""
+    """Return the name that version 1 has for the type of a register or of its elements."""
     base = register.element.base
     if base == "BOOL":
         return "bool"
@@ -54,7 +54,7 @@ def to_text(value: Value, register: Register) -> str:
 
 
 def texts(register: Register) -> Callable[[Value], str]:
-    """Return a function that is ``to_text`` for one register, for repeated use."""
+    """Return a function that converts values of one register as ``to_text`` does, but faster."""
     element = register.element
     return _real_text if element.base == "REAL" and not register.dims else partial(_text, element)
 
@@ -70,7 +70,7 @@ def _real_text(value: Any) -> str:
 
 
 def shortest(value: float, element: ElementType) -> float:
-    """Return the float with the fewest digits for the same REAL; an LREAL is unchanged."""
+    """Return the float that has the fewest digits and is the same REAL; an LREAL is unchanged."""
     return _shortest_real(value) if element.base == "REAL" and math.isfinite(value) else value
 
 
@@ -81,7 +81,7 @@ def _shortest_real(value: float) -> float:
 
 
 def from_text(text: str, register: Register) -> Value:
-    """Return the value of a text: the reverse of ``to_text``; also accepts Java's numbers.
+    """Convert a text to a value: undo ``to_text``. Numbers may also be as Java prints them.
 
     Raises:
         ValueRangeError: The text is not a value of the register's type, or is out of range.
@@ -103,7 +103,7 @@ def from_text(text: str, register: Register) -> Value:
 
 
 def json_value(value: Value, element: ElementType) -> Value:
-    """Return a value for JSON: a REAL with the fewest digits; NaN and infinities as text."""
+    """Convert a value for JSON: give a REAL the fewest digits, and make NaN and infinities text."""
     if isinstance(value, list):
         return [json_value(item, element) for item in value]
     if isinstance(value, float):
@@ -112,7 +112,7 @@ def json_value(value: Value, element: ElementType) -> Value:
 
 
 def _finite_or_not(value: object) -> object:
-    """Convert the texts that ``json_value`` writes for NaN and infinities back to floats."""
+    """Convert a text that ``json_value`` returns for NaN or an infinity back to a float."""
     if isinstance(value, list):
         return [_finite_or_not(item) for item in value]
     return _NON_FINITE.get(value.lower(), value) if isinstance(value, str) else value

@@ -1,4 +1,4 @@
-"""Values that a user has typed: JSON or an S7 literal."""
+"""Read values that a user has typed, as JSON or as an S7 literal."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _QUOTED: Final = frozenset({"CHAR", "WCHAR", "STRING", "WSTRING"})
 def read_value(text: str, register: Register) -> Value:
     """Convert JSON or an S7 literal to a value for a register.
 
-    The literal of an array must have all elements, because missing ones would be written as zero.
+    A literal of an array must have all elements, because missing elements would be written as 0.
 
     Raises:
         ValueRangeError: The text is not a value, or does not fit the register.
@@ -43,7 +43,7 @@ def read_value(text: str, register: Register) -> Value:
 
 def _literal(text: str, register: Register) -> Value:
     if register.dims:
-        # The second, larger shape shows whether there are too many elements.
+        # With the second, larger shape, too many elements show as another number.
         given = [
             sum(count for _, count, _ in split_array(text, shape))
             for shape in (register.shape, tuple(length + 1 for length in register.shape))

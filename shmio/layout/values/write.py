@@ -1,7 +1,7 @@
-"""Writes to a block: bytes, or a bit without its neighbours.
+"""Writes to a block: of whole bytes, or of one bit of a byte.
 
-Functions here turn new values into writes, find the bits that registers have, and name the registers
-whose bits writes set, by paths that :func:`shmio.layout.topic.find` reads.
+The functions of this module convert new values to writes, find the bits of registers, and return
+the paths of the registers that writes set. :func:`shmio.layout.topic.find` reads these paths.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from shmio.layout.values.codec import codec
 class Write(NamedTuple):
     """A change to bytes of a block.
 
-    With ``mask`` 0, all of ``data`` is written from ``offset`` on. Otherwise ``mask`` has one bit
-    set, ``data`` is one byte, and only that bit of the byte at ``offset`` takes its value.
+    If ``mask`` is 0, all of ``data`` is written from ``offset`` on. Otherwise ``mask`` has one bit
+    set, and ``data`` is one byte; only that bit of the byte at ``offset`` is written.
     """
 
     offset: int
@@ -33,10 +33,10 @@ class Write(NamedTuple):
 
 
 def encode(register: Register, value: object, byte_order: ByteOrder = "big") -> list[Write]:
-    """Return the writes that set a register, an array or a part of one to a value.
+    """Return the writes that set a register, or a part of a register, to a value.
 
-    There is one write, or more for a slice of bits. An array of bits is written as whole bytes,
-    because no register uses the rest of a row's last byte.
+    A slice of bits may need several writes, anything else needs one. An array of bits is written as
+    whole bytes, because no other register uses the rest of a row's last byte.
 
     Raises:
         ValueRangeError: The value does not fit the register.
@@ -66,7 +66,7 @@ def apply(write: Write, image: bytearray | memoryview) -> None:
 
 
 def bits_of(register: Register) -> bytes:
-    """Return a mask of ``size`` bytes with the bits that :func:`encode` writes."""
+    """Return a mask of ``register.size`` bytes in which the bits that :func:`encode` writes are set."""
     if register.partial:
         bits = (1 << register.count) - 1 << (register.bit or 0)
         return bits.to_bytes(register.size, "little")
@@ -85,7 +85,7 @@ def covering(registers: Iterable[Register], size: int) -> bytes:
 
 
 def cover(layout: Layout, patterns: Iterable[str]) -> bytes:
-    """Return an image of the block in which the bits of all registers that match are set.
+    """Return an image of the block in which the bits of all registers that patterns name are set.
 
     Raises:
         PathError: A pattern is malformed, or names a part that its register does not have.
@@ -99,7 +99,7 @@ def cover(layout: Layout, patterns: Iterable[str]) -> bytes:
 
 
 def chosen(layout: Layout, pattern: str) -> Iterator[Register]:
-    """Yield the registers that a path or a pattern names; a slice as its elements.
+    """Yield the registers that a path or a pattern names; for a slice, yield its elements.
 
     Raises:
         PathError: The pattern is malformed, or names a part that its register does not have.
@@ -124,9 +124,9 @@ def chosen(layout: Layout, pattern: str) -> Iterator[Register]:
 
 
 def merge(image: bytes | bytearray, mask: bytes | bytearray, ranges: Iterable[tuple[int, int]]) -> list[Write]:
-    """Return the fewest writes that copy the masked bits of an image to a block.
+    """Return writes, as few as possible, that copy the masked bits of an image to a block.
 
-    Only the bytes in the ``ranges`` (start, stop) are copied.
+    They copy only bytes in the ``ranges`` (start, stop).
     """
     writes: list[Write] = []
     for start, stop in _joined(ranges):
@@ -145,7 +145,7 @@ def merge(image: bytes | bytearray, mask: bytes | bytearray, ranges: Iterable[tu
 
 
 def _joined(ranges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the ranges in order, with those that touch joined."""
+    """Return the ranges in order; join ranges that overlap or touch."""
     joined: list[tuple[int, int]] = []
     for start, stop in sorted(ranges):
         if joined and start <= joined[-1][1]:
@@ -169,7 +169,7 @@ def elements(layout: Layout, register: Register) -> Iterator[Register]:
 
 
 def _fill_rows(mask: bytearray, register: Register) -> None:
-    """Set the whole last byte of each row of bits in which all declared bits are set."""
+    """Set all bits of each byte of a BOOL array in which all bits of the array are set."""
     own = bytearray(register.size)
     for flat in range(register.count):
         byte, bit = element_position(register.element, register.shape, flat)
@@ -183,10 +183,10 @@ def _fill_rows(mask: bytearray, register: Register) -> None:
 
 
 def paths_of(layout: Layout, writes: Iterable[Write], most: int | None = None) -> list[str]:
-    """Return the paths of the bits that writes set, in address order, at most ``most``.
+    """Return the paths of what writes set, in address order; at most ``most`` paths.
 
-    A register that is written in part is named by slices, elements, bytes or bits. A type without
-    parts, such as REAL, is named as a whole. Bytes outside the block or of no register are skipped.
+    For a register that is written in part, return paths of slices, elements, bytes or bits; if its
+    type has no parts, as REAL, return its own path. Skip bytes that belong to no register.
     """
     bits = bytearray(layout.size)
     overlapping: set[int] = set()
@@ -200,7 +200,7 @@ def paths_of(layout: Layout, writes: Iterable[Write], most: int | None = None) -
 
 
 def path_at(layout: Layout, offset: int) -> str:
-    """Return the path of the register or array element at a byte, or an empty string."""
+    """Return the path of the register or array element that has a byte; "" if there is none."""
     for index in _overlapping(layout, offset, offset + 1):
         register = layout.own[index]
         if not register.dims or register.bit is not None:
@@ -232,7 +232,7 @@ def _register_paths(layout: Layout, register: Register, bits: bytearray) -> Iter
 
 
 def _share(register: Register, bits: bytearray) -> bytes:
-    """Return the bits that belong to a register."""
+    """Return the bytes of a register from the image ``bits``, without bits of other registers."""
     there = bytes(bits[register.offset : register.offset + register.size])
     if register.bit is None or register.dims:
         return there
@@ -240,7 +240,7 @@ def _share(register: Register, bits: bytearray) -> bytes:
 
 
 def _touched_elements(array: Register, share: bytes) -> range:
-    """Return a range of elements that includes all those with some of these bits."""
+    """Return a range of elements that includes each element of which ``share`` has a bit."""
     first, stop = len(share) - len(share.lstrip(b"\0")), len(share.rstrip(b"\0"))
     if array.bit is None:
         return range(first // array.element.stride, min(array.count, -(-stop // array.element.stride)))
@@ -250,7 +250,7 @@ def _touched_elements(array: Register, share: bytes) -> range:
 
 
 def _element_paths(layout: Layout, array: Register, share: bytes, bits: bytearray) -> Iterator[str]:
-    """Yield the paths of an array's elements; neighbours within its last dimension form a slice."""
+    """Yield the paths of the written elements; adjacent elements of a row form a slice."""
     run: list[tuple[int, ...]] = []
     for flat in _touched_elements(array, share):
         index = index_at(array.dims, flat)
@@ -274,9 +274,9 @@ def _run_path(layout: Layout, array: Register, run: list[tuple[int, ...]]) -> st
 
 
 def _part_paths(layout: Layout, register: Register, share: bytes) -> Iterator[str]:
-    """Yield the paths of an integer's bits, least significant first.
+    """Yield the paths of an integer's written bits, least significant first.
 
-    Whole bytes, words and double words are named as such.
+    If all bits of a byte, word or double word are written, yield its path instead.
     """
     ascending = share[::-1] if layout.byte_order == "big" else share
     at = 0
