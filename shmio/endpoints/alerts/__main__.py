@@ -24,13 +24,13 @@ from shmio.worker import BEAT_S, Worker
 MAX_NOTE: Final = 300
 """Maximum length of the status note, in characters."""
 WRITE_S: Final = 1.0
-"""Maximum time to wait for the disk at the end, in s."""
+"""Maximum time, in s, that :meth:`Alerts.close` waits for the disk."""
 
 log = logging.getLogger("shmio.alerts")
 
 
 class Settings(msgspec.Struct):
-    """The section that the process receives."""
+    """The configuration that this process receives."""
 
     alert: list[Alert]
     mqtt: Mqtt | None
@@ -38,7 +38,10 @@ class Settings(msgspec.Struct):
 
 
 class Alerts:
-    """Watches and notifies. Use it from one thread: call :meth:`run_once` repeatedly, then :meth:`close`."""
+    """Evaluates the alerts, and delivers their notices.
+
+    Use it from one thread: call :meth:`run_once` repeatedly, then :meth:`close`.
+    """
 
     def __init__(self, worker: Worker, settings: Settings) -> None:
         segment = worker.segment
@@ -85,7 +88,7 @@ class Alerts:
             self.report()
 
     def report(self) -> None:
-        """Write counters and note to the process table."""
+        """Write the counters and the status note to the process table."""
         monitor, dispatcher = self._monitor, self._dispatcher
         active = [one.alert.title for one in monitor.alerts if one.active]
         counters = (
@@ -112,7 +115,7 @@ class Alerts:
 
     def _save(self) -> None:
         self._monitor.changed = False
-        self._waiting = self._dispatcher.waiting_count  # first: a change during the next lines is seen later
+        self._waiting = self._dispatcher.waiting_count  # first: the next turn notices a later change
         alerts = {
             one.alert.title: AlertState(
                 digest(one.alert), one.alert.severity, one.alert.text, one.finding.reason, one.lifecycle.progress
@@ -123,7 +126,7 @@ class Alerts:
 
 
 def run(worker: Worker) -> None:
-    """Watch and notify until the worker is stopped."""
+    """Serve the alerts until the worker is stopped."""
     rate_limit = LogRateLimit()
     log.addFilter(rate_limit)
     try:

@@ -1,4 +1,4 @@
-"""Runs a program for a notice: without a shell, with limits of time and output."""
+"""Runs a program for each notice, without a shell, and limits its time and output."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from shmio.endpoints.alerts.sender import DeliveryError
 from shmio.logs import printable
 
 MAX_AT_ONCE: Final = 4
-"""Maximum number of commands that run at the same time, of all alerts."""
+"""Maximum number of commands, of all alerts together, that run at the same time."""
 MAX_OUTPUT_BYTES: Final = 8192
-"""Maximum amount of a command's output that goes to the log. The rest is read, and dropped."""
+"""Maximum amount of a command's output that goes to the log. The rest is discarded."""
 LEAVE_S: Final = 1.0
 """Maximum time for which a running command may continue when this process stops, in s."""
 
@@ -28,31 +28,31 @@ log = logging.getLogger("shmio.alerts")
 
 
 class Command:
-    """Runs a program with the notice as JSON on its standard input, and in its environment.
+    """Runs a program that gets the notice as JSON on its standard input, and as environment variables.
 
-    The program has its own session. If it takes too long, all its processes in that session's group
-    are killed.
+    The program runs in a session of its own. If it takes too long, its whole process group is
+    killed.
     """
 
-    once = True  # it is unknown what a program did that was interrupted
+    once = True  # nobody knows what an interrupted program has already done
 
     def __init__(self, arguments: Sequence[str], timeout_s: float) -> None:
-        """Prepare to run a program with these arguments, the first being its name."""
+        """Prepare to run a program; the first of the arguments is its name."""
         self.text = f"command {arguments[0]}"
         self._arguments, self._timeout_s = list(arguments), timeout_s
         self._stopping = threading.Event()
         self._stop = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
 
     def stop(self) -> None:
-        """Let a running command go on for at most ``LEAVE_S``."""
+        """Let a running command continue for at most ``LEAVE_S``."""
         self._stopping.set()
         os.eventfd_write(self._stop, 1)
 
     def deliver(self, notice: Notice) -> None:
-        """Run the program, and log its output.
+        """Run the program, wait until it ends, and log its output.
 
         Raises:
-            DeliveryError: It could not be started, failed, or took too long.
+            DeliveryError: The program could not be started, failed, or took too long.
 
         """
         stdin = os.memfd_create("notice")  # not a pipe: a program that does not read cannot block us
@@ -112,7 +112,7 @@ class Command:
 
 
 class _Output:
-    """Copies the beginning of a program's output to the log."""
+    """Collects the start of a program's output, and logs it at the end."""
 
     def __init__(self, process: subprocess.Popen[bytes], alert: str) -> None:
         assert process.stdout is not None  # noqa: S101  it is a pipe
@@ -124,7 +124,7 @@ class _Output:
         os.set_blocking(self.descriptor, False)
 
     def read(self) -> bool:
-        """Read what is there, at most 64 kB; return False at the end of the output."""
+        """Read the available output, at most 64 KiB. Return False at the end of the output."""
         try:
             data = os.read(self.descriptor, 1 << 16)
         except BlockingIOError:
@@ -134,7 +134,7 @@ class _Output:
         return bool(data)
 
     def close(self) -> None:
-        """Log the output."""
+        """Close the pipe, and log the output."""
         self._pipe.close()
         for line in self._kept.decode(errors="replace").splitlines():
             if line.strip():

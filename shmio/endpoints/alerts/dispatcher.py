@@ -1,4 +1,4 @@
-"""Hands the notices of alerts to their actions, and knows which actions fail."""
+"""Passes notices to the actions of their alerts, and collects the problems of these actions."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LEAVE_S: Final = 2.0
 
 
 class Dispatcher:
-    """All actions of all alerts. Use it from one thread."""
+    """Runs the actions of all alerts. Use it from one thread."""
 
     def __init__(
         self,
@@ -39,8 +39,8 @@ class Dispatcher:
             alerts: The alerts.
             mqtt: The section ``[mqtt]``; None if no alert publishes.
             segment: The instance's segment.
-            selector: Selects the sockets that are ready.
-            wake: Called in any thread when :meth:`run_once` must run, or the notices that wait have changed.
+            selector: The connection to the MQTT broker registers its socket here.
+            wake: Called, from any thread, when :meth:`run_once` must run or :attr:`waiting` has changed.
             waiting: Notices that an earlier process could not deliver.
 
         """
@@ -60,7 +60,7 @@ class Dispatcher:
             queued(self._publisher, alerts, waiting.mqtt)
 
     def put(self, alert: Alert, notice: Notice) -> None:
-        """Begin to deliver a notice by each action of its alert."""
+        """Start to deliver a notice through each action of its alert."""
         for senders in (self._commands, self._webhooks):
             if sender := senders.get(alert.title):
                 sender.put(notice)
@@ -68,7 +68,7 @@ class Dispatcher:
             self._publisher.put(alert, notice)
 
     def run_once(self) -> float:
-        """Do what is due, and return after how many seconds to call this again."""
+        """Do what is due. Return the time in s after which to call this again."""
         return 1.0 if self._publisher is None else self._publisher.run_once()
 
     @property
@@ -82,7 +82,7 @@ class Dispatcher:
 
     @property
     def waiting_count(self) -> int:
-        """Number of these notices."""
+        """Number of notices in :attr:`waiting`."""
         count = sum(sender.waiting_count for sender in self._senders())
         return count if self._publisher is None else count + self._publisher.waiting_count
 
@@ -93,12 +93,12 @@ class Dispatcher:
 
     @property
     def problem(self) -> str:
-        """The problems of the actions, as text; empty if there are none."""
+        """The present problems of the actions, as text; empty if there are none."""
         problems = [sender.problem for sender in self._senders()]
         return "; ".join(filter(None, [*problems, self._publisher.problem if self._publisher else ""]))
 
     def close(self) -> None:
-        """End all actions within ``LEAVE_S``. What was not delivered stays in :attr:`waiting`."""
+        """End all actions within ``LEAVE_S``. Undelivered notices stay in :attr:`waiting`."""
         for sender in self._senders():
             sender.stop()
         until_s = time.monotonic() + LEAVE_S

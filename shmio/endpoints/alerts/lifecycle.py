@@ -1,6 +1,6 @@
-"""Decides when an alert becomes active, when it ends, and which of these changes give a notice.
+"""Decides when an alert becomes active, when it ends, and which of these changes a notice reports.
 
-No I/O, no clock.
+This module does no I/O and reads no clock.
 """
 
 from __future__ import annotations
@@ -13,24 +13,24 @@ import msgspec
 
 
 class Change(StrEnum):
-    """What a notice reports."""
+    """The change of an alert that a notice reports."""
 
     ACTIVE = "active"
     RESOLVED = "resolved"
 
 
 class Progress(msgspec.Struct):
-    """How far an alert is: what must outlive a restart of the process. Times are those of the instance's clock."""
+    """The part of an alert's state that must survive a restart of the process. Times are instance times."""
 
     active: bool = False
     since_ns: int = 0
     """When the alert last became active."""
     announced: bool = False
-    """True if a notice has reported that the alert is active now."""
+    """True if a notice has reported the present activation."""
     notice_ns: int | None = None
     """When the last notice of an activation was made."""
     suppressed: int = 0
-    """Number of activations since then without a notice."""
+    """Number of activations without a notice since :attr:`notice_ns`."""
     notices: int = 0
     """Number of notices so far, of both kinds."""
 
@@ -48,17 +48,17 @@ class Lifecycle:
     for_ns: int
     every_ns: int
     resolved: bool
-    """True if the end of an announced activation gives a notice, too."""
+    """True if a notice also reports the end of an announced activation."""
     progress: Progress
     held_ns: int | None = None
     """Since when the condition has been true; None if it is not, or the alert is active."""
 
     def observe(self, holds: bool | None, now_ns: int) -> Iterator[Change]:
-        """Evaluate the condition's present value, and yield the notices to send.
+        """Process the condition's present value, and yield the changes to report.
 
         Args:
             holds: Whether the condition is true; None: unknown.
-            now_ns: The instance's clock.
+            now_ns: The present instance time.
 
         """
         yield from self.advance(now_ns)
@@ -80,7 +80,7 @@ class Lifecycle:
         progress.announced = False
 
     def advance(self, now_ns: int) -> Iterator[Change]:
-        """Do what is due by time, and yield the notices to send."""
+        """Process the time that has passed, and yield the changes to report."""
         progress = self.progress
         if self.held_ns is not None and now_ns >= self.held_ns + self.for_ns:
             self.held_ns, progress.active, progress.since_ns = None, True, now_ns
@@ -92,7 +92,7 @@ class Lifecycle:
 
     @property
     def due_ns(self) -> int | None:
-        """When :meth:`advance` has something to do; None: at no known time."""
+        """Instance time at which to call :meth:`advance`, in ns; None: it has nothing to wait for."""
         progress = self.progress
         if self.held_ns is not None:
             return self.held_ns + self.for_ns

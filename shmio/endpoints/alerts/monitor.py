@@ -1,4 +1,4 @@
-"""Follows the sources and processes that alerts watch, and makes notices of their changes."""
+"""Follows the sources and processes that alerts watch, and creates a notice when an alert changes."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from shmio.segment.doorbell import TURN_NS, Relay
 
 TURN_S: Final = TURN_NS / 1e9
 LOOK_S: Final = 0.1
-"""Interval in s at which the process table is checked, which has no doorbell."""
+"""Interval in s at which the monitor checks the process table, because no doorbell announces its changes."""
 CATCH_UP_S: Final = 2.0
-"""If more time than this is unread, in s, the monitor skips to the newest frame."""
+"""If a source's unread frames span more than this time, in s, the monitor skips to the newest frame."""
 BATCH: Final = 500
-"""Maximum number of frames to read from one source in a turn."""
+"""Maximum number of frames that one turn reads from one source."""
 
 log = logging.getLogger("shmio.alerts")
 
@@ -38,11 +38,11 @@ class WatchedAlert:
         self.alert = alert
         self.watch = watch
         self.seen: bool | None = None
-        """Whether the alert's condition was true at its last evaluation."""
+        """Result of the condition's last evaluation; None: unknown."""
         self.holds: bool | None = None
-        """Whether it was true when it was last known."""
+        """The condition's last known result; None: it was never known."""
         self.finding = Finding()
-        """What the alert saw when that last changed."""
+        """What the alert saw when :attr:`holds` last changed."""
         self.lifecycle = Lifecycle(round(alert.for_s * 1e9), round(alert.every_s * 1e9), alert.resolved, progress)
 
     @property
@@ -61,14 +61,14 @@ class Monitor:
         progress: Mapping[str, Progress],
         selector: selectors.BaseSelector,
     ) -> None:
-        """Start to follow the sources.
+        """Start following the sources that the alerts watch.
 
         Args:
             segment: The instance's segment.
             alerts: The alerts.
-            progress: The state of alerts that an earlier process has watched, by name.
-            selector: The monitor registers descriptors that are ready when a source has published.
-                Their ``data`` is to be called then.
+            progress: The state that an earlier process saved for its alerts, by name.
+            selector: The monitor registers a descriptor for each source here, which becomes ready
+                when the source publishes. The caller must then call the ``data`` of its key.
 
         """
         self._segment, self._selector = segment, selector
@@ -76,9 +76,9 @@ class Monitor:
             WatchedAlert(alert, progress.get(alert.title, Progress()), make_watch(alert, segment)) for alert in alerts
         ]
         self.changed = True
-        """Set when the state of an alert has changed; the user of this object resets it."""
+        """True once the state of an alert has changed, until the caller resets it."""
         self.suppressed = 0
-        """Number of activations without a notice, since the process started."""
+        """Number of suppressed activations that notices have reported since the process started."""
         self.done = 0
         """Number of the last step of virtual time whose frames have all been evaluated."""
         self._missed = 0
@@ -95,8 +95,8 @@ class Monitor:
         return self._missed + sum(follower.missed for follower in self._followers.values())
 
     def run_once(self) -> tuple[list[tuple[WatchedAlert, Notice]], bool]:
-        """Evaluate what is new. Return notices, and whether there are more frames."""
-        clock = self._segment.clock.read()  # before the frames, so that those of a finished step are evaluated
+        """Evaluate new frames and states. Return the new notices, and whether more frames are waiting."""
+        clock = self._segment.clock.read()  # before the frames, so that they include all of a finished step
         if self._segment.refresh() or self._blocks is not self._segment.blocks:
             self._bind()
         self._now_ns = clock.present_ns
@@ -115,7 +115,7 @@ class Monitor:
         return notices, more
 
     def pause_s(self) -> float:
-        """Return the time in s until the next turn, if no source publishes."""
+        """Return how long to wait, in s, before the next :meth:`run_once` if no source publishes."""
         clock = self._segment.clock.read()
         due_ns = min((due for one in self.alerts if (due := one.lifecycle.due_ns) is not None), default=None)
         if due_ns is None or clock.virtual:
@@ -123,7 +123,7 @@ class Monitor:
         return min(TURN_S, max(0.0, (due_ns - clock.present_ns) / 1e9))
 
     def close(self) -> None:
-        """Stop following."""
+        """Stop following the sources."""
         for relay in self._relays.values():
             self._selector.unregister(relay.descriptor)
             relay.stop()
@@ -134,7 +134,7 @@ class Monitor:
     # ---- frames ------------------------------------------------------------------------------------------------------
 
     def _bind(self) -> None:
-        """Find registers and sources again, after a reload."""
+        """Look up registers and sources again after a reload."""
         for one in self.alerts:
             if not isinstance(one.watch, ProcessWatch):
                 one.watch = make_watch(one.alert, self._segment)
@@ -168,10 +168,10 @@ class Monitor:
         return frames, more
 
     def _time_ns(self, source: str, frame: Frame, clock: Clock) -> int:
-        """Return the time of the instance's clock at which to evaluate a frame.
+        """Return the instance time at which to evaluate a frame: usually the frame's own time.
 
-        Frames of devices do not follow the instance's clock once it was stepped, and those of a
-        replay may have the clock of the recording.
+        Two kinds of frames are evaluated at the present time. Frames of a replay may have times of
+        the recording. Frames of devices do not follow the instance's clock once it was stepped.
         """
         block = self._followers[source].block
         follows = block.attributes.stepped if clock.virtual or clock.offset_ns else True
@@ -194,7 +194,7 @@ class Monitor:
             yield from self._evaluate([one], now_ns)
 
     def _check_processes(self) -> list[tuple[WatchedAlert, Notice]]:
-        """Check the process table, and sources that have no frame yet."""
+        """Evaluate the alerts that watch processes, or the quality of sources without a frame."""
         now_s = time.monotonic()
         if now_s < self._looked_s + LOOK_S:
             return []
@@ -214,7 +214,7 @@ class Monitor:
         for one in alerts:
             holds = one.watch.evaluate(self._followers)
             if holds is one.seen and one.lifecycle.due_ns is None:
-                continue  # as at almost every frame
+                continue  # nothing has changed, as at almost every frame
             one.seen = holds
             if holds is not None and holds is not one.holds:
                 one.holds, one.finding = holds, one.watch.describe(self._followers)

@@ -17,7 +17,7 @@ class Notice(msgspec.Struct, kw_only=True, frozen=True):
     """A report that an alert has become active, or has ended.
 
     Attributes:
-        id: Identifies the notice, so that a receiver can ignore one that comes twice.
+        id: Identifies the notice, so that a receiver can ignore a notice that arrives twice.
         instance: Name of the instance.
         alert: Name of the alert.
         state: Whether the alert is active, or has ended.
@@ -25,13 +25,13 @@ class Notice(msgspec.Struct, kw_only=True, frozen=True):
         text: Text of the alert, as configured.
         watches: What the alert watches: its condition, processes or sources.
         reason: The values, states or qualities that caused the change, as text.
-        values: Value by path, of the registers in the condition.
+        values: Values of the registers in the condition, by path.
         injected: True if an injection has changed one of these values.
         provenance: Where the values come from.
         clock_s: The instance's clock at the change, in s.
         since_s: The instance's clock when the alert became active, in s.
         time: When the notice was made, in UTC (RFC 3339).
-        suppressed: Number of activations without a notice since the last notice.
+        suppressed: Number of activations without a notice since the last notice of an activation.
 
     """
 

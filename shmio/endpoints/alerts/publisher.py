@@ -1,4 +1,4 @@
-"""Publishes notices at the instance's MQTT broker."""
+"""Publishes notices through the instance's MQTT broker."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class _Entry(NamedTuple):
 
 
 class Publisher:
-    """Publishes the notices of all alerts in order, over a connection of its own.
+    """Publishes the notices of all alerts in order, over its own connection to the broker.
 
     Use it from one thread. A notice waits until the broker has acknowledged it.
     """
@@ -35,13 +35,13 @@ class Publisher:
     def __init__(
         self, settings: Mqtt, segment: Segment, selector: selectors.BaseSelector, wake: Callable[[], object]
     ) -> None:
-        """Prepare to connect; :meth:`run_once` connects.
+        """Prepare the connection; :meth:`run_once` connects.
 
         Args:
-            settings: The section ``[mqtt]``, without an own broker's passwords.
+            settings: The section ``[mqtt]``, without the passwords of the instance's own broker.
             segment: The instance's segment.
-            selector: Selects the sockets that are ready.
-            wake: Called by a thread that needs :meth:`run_once` to run.
+            selector: The connection registers its socket here.
+            wake: Called, from any thread, when :meth:`run_once` must run.
 
         """
         clean = msgspec.structs.replace(settings, session_expiry_s=0)
@@ -70,11 +70,11 @@ class Publisher:
 
     @property
     def waiting_count(self) -> int:
-        """Number of these notices."""
+        """Number of notices in :attr:`waiting`."""
         return len(self._sent) + len(self._queue)
 
     def put(self, alert: Alert, notice: Notice) -> None:
-        """Add a notice. If too many wait, drop the oldest."""
+        """Queue a notice. If too many are queued, drop the oldest."""
         if len(self._queue) == MAX_WAITING:
             self._queue.popleft()
             self._dropped += 1
@@ -82,7 +82,7 @@ class Publisher:
         self._queue.append(_Entry(notice, message))
 
     def run_once(self) -> float:
-        """Do what is due, and return after how many seconds to call this again."""
+        """Do what is due. Return the time in s after which to call this again."""
         connection = self._connection
         rest_s = connection.run_once()
         while self._sent and not connection.is_unacknowledged(self._sent[0].message):
@@ -94,7 +94,7 @@ class Publisher:
         return rest_s
 
     def _return(self) -> None:
-        """Send the unacknowledged notices again as soon as there is a connection."""
+        """Queue the unacknowledged notices again, so that they are sent over the next connection."""
         self._queue.extendleft(reversed(self._sent))
         self._sent.clear()
 
@@ -104,7 +104,7 @@ class Publisher:
 
 
 def queued(publisher: Publisher, alerts: Iterable[Alert], notices: Sequence[Notice]) -> None:
-    """Add the notices that an earlier process could not publish."""
+    """Queue the notices that an earlier process could not publish, if their alerts still publish."""
     by_name = {alert.title: alert for alert in alerts if alert.mqtt_topic is not None}
     for notice in notices:
         if notice.alert in by_name:

@@ -1,4 +1,4 @@
-"""Delivers notices in order, each action in a thread of its own, so that none waits for another."""
+"""Delivers notices in order. Each action has its own thread, so that no action waits for another."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from shmio.errors import EndpointError
 MAX_WAITING: Final = 100
 """Maximum number of notices that wait for one action. If there are more, the oldest is dropped."""
 RETRY: Final = Backoff(1.0, 60.0, jitter=0.2)
-"""The waits before the next attempt to deliver a notice."""
+"""Waiting times before further attempts to deliver a notice."""
 GIVE_UP_S: Final = 3600.0
 """A notice that cannot be delivered within this time, in s, is dropped."""
 
@@ -33,24 +33,24 @@ class DeliveryError(EndpointError):
 
 
 class Action(Protocol):
-    """What an alert does with a notice."""
+    """A way to deliver the notices of an alert, such as a command or a webhook."""
 
     text: str
-    """The action as text, for messages, without secrets."""
+    """Description of the action for messages; it contains no secrets."""
 
     once: bool
-    """True if a notice must never be delivered again, even if it is not known whether it arrived."""
+    """True if no notice may be delivered twice, even if nobody knows whether the first attempt succeeded."""
 
     def deliver(self, notice: Notice) -> None:
-        """Deliver a notice, within a limit of time.
+        """Deliver a notice, or fail within a limited time.
 
         Raises:
-            DeliveryError: It could not be delivered.
+            DeliveryError: The notice could not be delivered.
 
         """
 
     def stop(self) -> None:
-        """End :meth:`deliver` soon. Any thread may call it."""
+        """Make a running :meth:`deliver` end soon. Any thread may call this."""
 
 
 class Sender:
@@ -65,12 +65,12 @@ class Sender:
         Args:
             alert: Name of the alert.
             action: The action.
-            on_change: Called in any thread when :attr:`waiting` or :attr:`problem` has changed.
+            on_change: Called, from any thread, when :attr:`waiting` or :attr:`problem` has changed.
             waiting: Notices that an earlier process could not deliver.
-            turns: Entered for each attempt, to limit how many are made at the same time; None: no
+            turns: Context manager that each attempt enters, to limit simultaneous attempts; None: no
                 limit.
-            retry: The waits between attempts.
-            give_up_s: How long to try, in s.
+            retry: The waiting times between attempts.
+            give_up_s: How long to retry, in s.
 
         """
         self.problem = ""
@@ -94,11 +94,11 @@ class Sender:
 
     @property
     def waiting_count(self) -> int:
-        """Number of these notices."""
+        """Number of notices in :attr:`waiting`."""
         return len(self._waiting)
 
     def put(self, notice: Notice) -> None:
-        """Add a notice. It never blocks."""
+        """Queue a notice, without blocking. If too many are queued, drop the oldest."""
         with self._condition:
             if len(self._waiting) == MAX_WAITING:
                 self._drop(f"more than {MAX_WAITING} notices wait; the oldest are dropped")
@@ -112,7 +112,7 @@ class Sender:
             self._thread.start()
 
     def stop(self) -> None:
-        """Request the thread to end. The notices that it has not delivered stay in :attr:`waiting`."""
+        """Request the thread to end. Undelivered notices stay in :attr:`waiting`."""
         with self._condition:
             self._stopping = True
             self._condition.notify()
@@ -144,13 +144,13 @@ class Sender:
                 self._rest(self._retry.wait_s(attempts - 1))
 
     def _await(self) -> bool:
-        """Wait for a notice. Return False if the thread is to end instead."""
+        """Wait for a notice. Return False if the thread must end."""
         with self._condition:
             self._condition.wait_for(lambda: self._waiting or self._stopping)
             return not self._stopping
 
     def _begin(self) -> Notice | None:
-        """Return the next notice; None: the thread is to end."""
+        """Return the next notice, or None if the thread must end."""
         with self._condition:
             if self._stopping:
                 return None
@@ -194,7 +194,7 @@ class Sender:
         self._on_change()
 
     def _remove(self, notice: Notice) -> None:
-        if self._waiting and self._waiting[0] is notice:  # else it was dropped meanwhile
+        if self._waiting and self._waiting[0] is notice:  # else put() has dropped the notice meanwhile
             self._waiting.popleft()
 
     def _drop(self, problem: str) -> None:

@@ -1,6 +1,6 @@
-"""The file with the state of the alerts, so that a restart of their process repeats no notice.
+"""The file that keeps the state of the alerts, so that a restart of their process repeats no notice.
 
-The web page and the figures for Prometheus read it, too.
+The web page and the metrics for Prometheus read this file, too.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from shmio.endpoints.alerts.notice import Notice
 from shmio.segment import Segment
 
 FILE_NAME: Final = "alerts.json"
-"""The file's name; it is in the folder of the logs."""
+"""Name of the file, in the directory of the logs."""
 MAX_BYTES: Final = 64 << 20
 
 log = logging.getLogger("shmio.alerts")
 
 
 class AlertState(msgspec.Struct):
-    """The state of one alert. ``digest`` identifies what it watches."""
+    """The state of one alert. ``digest`` identifies what the alert watches."""
 
     digest: str
     severity: str
@@ -39,7 +39,7 @@ class AlertState(msgspec.Struct):
 
 
 class Waiting(msgspec.Struct):
-    """Notices that could not be delivered yet, by the kind of action."""
+    """Notices that are not delivered yet, by the kind of action."""
 
     command: list[Notice] = []
     mqtt: list[Notice] = []
@@ -47,14 +47,14 @@ class Waiting(msgspec.Struct):
 
 
 class State(msgspec.Struct):
-    """The state of all alerts by name. It belongs to one run of the instance, that with this epoch."""
+    """The state of all alerts, by name, in one run of the instance. ``epoch`` identifies the run."""
 
     epoch: int = 0
     alerts: dict[str, AlertState] = {}
     waiting: Waiting = msgspec.field(default_factory=Waiting)
 
     def progress(self, alerts: list[Alert]) -> dict[str, Progress]:
-        """Return the state of those alerts that still watch the same."""
+        """Return the saved progress, by name, of the alerts that still watch what they did."""
         return {
             alert.title: self.alerts[alert.title].progress
             for alert in alerts
@@ -66,13 +66,13 @@ _DECODER: Final = msgspec.json.Decoder(State)
 
 
 def digest(alert: Alert) -> str:
-    """Return a text that changes with what the alert watches."""
+    """Return a hash of what the alert watches, to detect that a new configuration has changed it."""
     watched = alert.when, alert.processes, alert.states, alert.sources, alert.qualities
     return hashlib.sha256(msgspec.json.encode(watched)).hexdigest()[:16]
 
 
 def read_state(file: Path, epoch: int) -> State:
-    """Read the state of this run of the instance; an empty one if there is none, or it is damaged."""
+    """Return the state in a file; an empty state if the file is missing, damaged, or of another run."""
     with suppress(OSError, msgspec.MsgspecError):
         with file.open("rb") as stream:
             state = _DECODER.decode(stream.read(MAX_BYTES))
@@ -82,7 +82,7 @@ def read_state(file: Path, epoch: int) -> State:
 
 
 class StateWriter:
-    """Writes the newest state to the file, in a thread, because a disk may hang."""
+    """Writes the newest state to the file. A thread does this, because a disk may hang."""
 
     def __init__(self, file: Path) -> None:
         self.problem = ""
@@ -95,14 +95,14 @@ class StateWriter:
         self._thread.start()
 
     def write(self, state: State) -> None:
-        """Write this state soon."""
+        """Make the thread write this state soon. It replaces a state that is not written yet."""
         data = msgspec.json.encode(state)
         with self._condition:
             self._newest = data
             self._condition.notify()
 
     def close(self, timeout_s: float) -> None:
-        """Write the last state, and end the thread, waiting at most ``timeout_s``."""
+        """Let the thread write the last state and end; wait for that at most ``timeout_s``."""
         with self._condition:
             self._stopping = True
             self._condition.notify()
@@ -127,7 +127,7 @@ class StateWriter:
 
 
 def _replace(file: Path, data: bytes) -> None:
-    """Write a file that only this user may read. A reader sees the old or the new content."""
+    """Replace a file at once: a reader sees the old or the new content. Only this user may read it."""
     new = file.with_name(f".{file.name}.new")
     descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     with open(descriptor, "wb") as stream:  # noqa: PTH123  a descriptor
@@ -136,10 +136,10 @@ def _replace(file: Path, data: bytes) -> None:
 
 
 def alert_states(folders: Mapping[str, str], segment: Segment) -> Mapping[str, AlertState]:
-    """Return the state of all alerts by name, as their process has last written it.
+    """Return the state of all alerts, by name, as their process last wrote it.
 
     Args:
-        folders: The folders in which the instance writes files, by purpose.
+        folders: The directories in which the instance writes files, by purpose.
         segment: The instance's segment.
 
     """

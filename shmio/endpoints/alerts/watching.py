@@ -19,11 +19,11 @@ from shmio.segment.block import FrameFollower, Layouts
 log = logging.getLogger("shmio.alerts")
 
 Followers = Mapping[str, FrameFollower]
-"""The follower of each source that any alert watches. Its ``frame`` is the present one."""
+"""The follower of each source that any alert watches, by name. Its ``frame`` is the frame to evaluate."""
 
 
 class Finding(NamedTuple):
-    """What an alert sees, for its notices. ``reason`` has the rest as text."""
+    """What an alert saw, in the fields that its notices have. ``reason`` describes it as text."""
 
     reason: str = ""
     values: Mapping[str, Number | None] = {}
@@ -35,7 +35,7 @@ class Watch(Protocol):
     """What an alert watches."""
 
     sources: Collection[str]
-    """The sources whose frames matter."""
+    """Names of the sources whose frames :meth:`evaluate` needs."""
 
     def evaluate(self, followers: Followers) -> bool | None:
         """Return whether the alert's condition is true; None: unknown.
@@ -44,11 +44,11 @@ class Watch(Protocol):
         """
 
     def describe(self, followers: Followers) -> Finding:
-        """Return what the last :meth:`evaluate` has seen."""
+        """Return what the last :meth:`evaluate` saw."""
 
 
 class RegisterWatch:
-    """A condition over registers, with the values that consumers see.
+    """Watches a condition over registers, with the values that consumers see.
 
     The values of a source with bad quality are unknown.
     """
@@ -64,7 +64,7 @@ class RegisterWatch:
         self._values: list[Number | None] = []
 
     def evaluate(self, followers: Followers) -> bool | None:
-        """Evaluate the condition."""
+        """Evaluate the condition with the values of the present frames."""
         if self._condition is None:
             return None
         values: list[Number | None] = []
@@ -76,7 +76,7 @@ class RegisterWatch:
         return self._condition.expression.evaluate(values, self._memory)
 
     def describe(self, followers: Followers) -> Finding:
-        """Return the values in the condition."""
+        """Return the values of the registers in the condition."""
         if self._condition is None:
             return Finding()
         kinds, injected = set(), False
@@ -98,7 +98,7 @@ def _known(follower: FrameFollower | None) -> Frame | None:
 
 
 class QualityWatch:
-    """The quality of sources. The condition is true if any of them has one of the given qualities."""
+    """Watches the quality of sources. The condition is true if any of them has one of the given qualities."""
 
     def __init__(self, patterns: Collection[str], qualities: Collection[str], blocks: Mapping[str, Block]) -> None:
         globs = [Glob(pattern) for pattern in patterns]
@@ -106,11 +106,11 @@ class QualityWatch:
         self._qualities = qualities
 
     def evaluate(self, followers: Followers) -> bool | None:
-        """Compare the present qualities."""
+        """Return whether any source has one of the qualities; None: no source matches."""
         return any(self._meets(followers[name]) for name in self.sources) if self.sources else None
 
     def describe(self, followers: Followers) -> Finding:
-        """Return the qualities that meet the alert's; all, if none does."""
+        """Describe the sources that have one of the qualities; all sources if none has."""
         present = {name: followers[name] for name in self.sources}
         met = {name: one for name, one in present.items() if self._meets(one)} or present
         texts = (f"{name} is {one.quality}{f': {one.reason}' if one.reason else ''}" for name, one in met.items())
@@ -122,9 +122,9 @@ class QualityWatch:
 
 
 class ProcessWatch:
-    """The state of processes. The condition is true if any of them is in one of the given states.
+    """Watches the state of processes. The condition is true if any of them is in one of the given states.
 
-    A process that has crashed is in ``backoff`` until it runs again, also while it is being started.
+    A crashed process counts as in ``backoff`` until it runs again, even while it is starting.
     """
 
     sources: Collection[str] = ()
@@ -137,7 +137,7 @@ class ProcessWatch:
         """State and note of each process, by name."""
 
     def evaluate(self, _followers: Followers) -> bool | None:
-        """Compare the present states."""
+        """Return whether any process is in one of the states; None: no process matches."""
         supervised = self._segment.supervised
         self._present = {}
         for slot in self._segment.processes:
@@ -152,7 +152,7 @@ class ProcessWatch:
         return any(phase in self._states for phase, _ in self._present.values()) if self._present else None
 
     def describe(self, _followers: Followers) -> Finding:
-        """Return the states that are among the alert's; all, if none is."""
+        """Describe the processes that are in one of the states; all processes if none is."""
         met = {name: one for name, one in self._present.items() if one[0] in self._states} or self._present
         return Finding(
             "; ".join(f"{name} is in state {phase}{f': {note}' if note else ''}" for name, (phase, note) in met.items())
@@ -160,11 +160,11 @@ class ProcessWatch:
 
 
 RESTARTING: Final = "restarting"
-"""The supervisor's note about a process whose restart was requested."""
+"""The supervisor's note about a process that somebody has requested to restart."""
 
 
 def make_watch(alert: Alert, segment: Segment) -> Watch:
-    """Return what an alert watches."""
+    """Create the watch of what an alert's configuration names."""
     if alert.when is not None:
         return RegisterWatch(alert.when, segment.blocks)
     if alert.sources:

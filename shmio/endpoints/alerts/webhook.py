@@ -51,12 +51,12 @@ class Webhook:
         """
         timeout_s = self._alert.webhook_timeout_s
         self._late = False
-        timer = threading.Timer(timeout_s, self._time_out)  # a time-out of a socket begins again with each byte
+        timer = threading.Timer(timeout_s, self._time_out)  # a socket's own time-out starts again with each byte
         timer.daemon = True
         timer.start()
         try:
             self._post(notice)
-        except ConfigError as error:  # a file has changed since the check
+        except ConfigError as error:  # a file has changed since the configuration was checked
             raise DeliveryError(str(error), again=True) from None
         except (OSError, http.client.HTTPException) as error:
             if self._late or isinstance(error, TimeoutError):
@@ -90,7 +90,7 @@ class Webhook:
         connection.request("POST", path, notice.json(), headers)
         with connection.getresponse() as response:
             status, reason = response.status, response.reason[:100]
-        if self._late:  # the end of the connection looks like the end of the answer's headers
+        if self._late:  # to http.client, the end of the connection looks like the end of the headers
             raise TimeoutError
         if 300 <= status < 400:
             where = (response.getheader("Location") or "elsewhere")[:200]
@@ -109,7 +109,7 @@ class Webhook:
             made = None if self._connection is None else self._connection.sock
             if made is not None:
                 with suppress(OSError):
-                    socket.socket.shutdown(made, socket.SHUT_RDWR)  # not that of TLS, which is for its own thread only
+                    socket.socket.shutdown(made, socket.SHUT_RDWR)  # only its own thread may call shutdown() of TLS
 
 
 def _why(error: Exception) -> str:

@@ -24,7 +24,7 @@ log = logging.getLogger("shmio.mqtt")
 
 
 def run(worker: Worker) -> None:
-    """Run the bridge or the broker, as the worker's name says, until the worker is stopped."""
+    """Run the bridge or the broker, depending on the worker's name, until the worker is stopped."""
     rate_limit = LogRateLimit()
     log.addFilter(rate_limit)
     try:
@@ -69,7 +69,7 @@ def run_broker(worker: Worker) -> None:
                 "may publish everything, even values",
                 settings.listen,
             )
-            from shmio.endpoints.mqtt.broker import amqtt  # noqa: PLC0415  needs the extra, and is large
+            from shmio.endpoints.mqtt.broker import amqtt  # noqa: PLC0415  this import needs the extra, and is large
 
             asyncio.run(amqtt.serve(worker, settings, place))
     finally:

@@ -115,7 +115,7 @@ class Bridge:
         # When clients see that we are online, they may send commands at once.
         self.connection.is_ready = lambda: self.command_connection.ready
         self._recalled: frozenset[str] | None = None
-        """Topics whose retained messages the bridge asked the broker for; None: not asked yet."""
+        """The topics in use when the bridge asked for the broker's retained messages; None: it has not asked yet."""
         self._behind: set[Feed] = set()
         self._rest_s = 0.0
         """Maximum time for which :meth:`run_once` may wait for events, in s."""
@@ -192,7 +192,7 @@ class Bridge:
                 yield max(0.0, (due_ns - feed.block.now_ns()) / 1e9)
 
     def _turn_connections(self) -> float:
-        """Run both connections, and return after how many seconds to run them again."""
+        """Run both connections. Return the time in s after which to run them again."""
         connection = self.connection
         rest_s = min(self.command_connection.run_once(connection.at), connection.run_once())
         if connection.problem and not connection.up:
@@ -354,7 +354,7 @@ class Bridge:
         for channel in feed.all():
             self._channels.pop(channel.topic, None)
         cleared = {channel.topic: ClearedTopic(channel.topic) for channel in feed.all() if channel.topic not in stay}
-        self._cleared |= cleared  # they are deleted again after each connect, as the broker may be away now
+        self._cleared |= cleared  # deleted again after each connect, because the broker may be away now
         self.outbox.mark_all(cleared.values())
         del self._feeds[feed.block.source], self._clients[feed.block.source]
         self._missed += feed.missed

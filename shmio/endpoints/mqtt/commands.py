@@ -1,4 +1,4 @@
-"""Commands: receives them on ``/in`` topics, sends them to their sources, and publishes results."""
+"""Receives commands on ``/in`` topics, sends them to their sources, and publishes their results."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from shmio.segment import DONE, Block, EventKind
 from shmio.segment.commands import End, worst
 
 REPLIES: Final = "shmio/results"
-"""Beginning, after the prefix, of the response topics that clients may choose for results.
+"""Start of the response topics, after the prefix, that clients may choose for results.
 
-With any other response topic, a client could make the bridge write values or publish false values.
+If clients could choose any topic, they could make the bridge write values or publish false values.
 """
 OUTPUTS: Final = ("/out", "/frames")
 RETAINED: Final = "a retained command is not carried out; publish commands without the retain flag"
 MAX_SHOWN: Final = 400
-"""Maximum number of bytes of a payload that the audit log gets. It shows fewer characters."""
+"""Maximum number of bytes of a payload that the audit log receives. It may shorten them further."""
 MAX_CORRELATION_BYTES: Final = 1024
 MAX_TOPIC_BYTES: Final = 65535 - len("/result")
 """Maximum length of a command's topic, in bytes.
@@ -60,7 +60,7 @@ class CommandClient:
         """
         self.block = block
         self.depths = _depths(block.layout)
-        """The different numbers of segments of the paths of this source."""
+        """The numbers of segments that the paths of this source's registers and elements have, in ascending order."""
         self._source_writer = SourceWriter(block, writer)
         self._source_writer.prepare()
         self._pending = InFlightTable(writer)
@@ -98,7 +98,7 @@ class CommandClient:
         self._pending.add(ticket, cost, partial(_report, done), attempt=attempt)
 
     def poll(self) -> None:
-        """Read new events, and end the commands whose outcome is known or overdue."""
+        """Read new events, and complete the commands whose outcome is known or overdue."""
         while (event := self._events.poll()) is not None:
             self._pending.on_event(event)
         if self._events.take_missed():
@@ -130,7 +130,7 @@ def command_filters(prefix: str, clients: Iterable[CommandClient]) -> list[str]:
 
 
 def output_filters(prefix: str, clients: Iterable[CommandClient]) -> list[str]:
-    """Return topic filters that match values of these sources, also those of earlier bridges."""
+    """Return topic filters that match the values of these sources, including values of earlier bridges."""
     found = []
     for one in clients:
         base = f"{prefix}/{one.block.source}"
@@ -159,7 +159,7 @@ class CommandReceiver:
         Args:
             prefix: Prefix of all topics.
             rules: The configuration's rules for topics.
-            clients: The clients of the current sources, by name.
+            clients: The command client of each current source, by the source's name.
             answer: Called with the message of each result.
             broker: Returns the name of the present broker.
 
@@ -220,7 +220,7 @@ class _Reply:
         self._qos = min(1, message.qos)
         self._answer = answer
         self.asked = ""
-        """The response topic, if any. MQTT does not say who sent the command; this is the only hint."""
+        """Text with the response topic; empty if there is none. It is the only hint at who sent the command."""
         properties = vars(message.properties) if message.properties is not None else {}
         self._correlation: bytes | None = properties.get("CorrelationData")
         wanted = properties.get("ResponseTopic")

@@ -32,7 +32,7 @@ log = logging.getLogger("shmio.mqtt")
 MAX_FRAMES_PER_TURN: Final = 8
 """Maximum number of frames that are read before the bridge does other work."""
 CATCH_UP_S: Final = 3.0
-"""Time in s by which the bridge may be behind, but by no more than half the ring.
+"""Maximum time in s by which the bridge may be behind. It may not be behind by more than half the ring, either.
 
 If it is further behind, it skips to the newest frame.
 """
@@ -65,7 +65,7 @@ class Feed:
         self.step_driven = False
         """True if values are published only by steps.
 
-        This is so while time is virtual, if the block is on the instance's clock.
+        That is the case while time is virtual, if the block follows the instance's clock.
         """
         self.command_client = CommandClient(block, writer)
         base = f"{prefix}/{block.source}"
@@ -81,7 +81,7 @@ class Feed:
         """The channels that are published as injected."""
         self._covered = self._injected
         self._injection_sequence = 0
-        """Sequence number of the list of injections from which ``_covered`` was made."""
+        """Sequence number of the list of injections from which ``_covered`` was computed."""
         self._scan = ChangeScan([register for register, _ in chosen], block.statuses)
         self._outbox = outbox
         self._limited: dict[ValueChannel | FramesChannel, None] = {}
@@ -176,7 +176,7 @@ class Feed:
         self._outbox.mark_all(self.all())
 
     def resend(self) -> None:
-        """Publish all topics again, after the changes that were kept during an outage."""
+        """Publish the current state of all topics again, after the changes that were kept during an outage."""
         self._limited.clear()
         self._outbox.resend(self.all())
 
@@ -185,7 +185,7 @@ class Feed:
         return [self.status, *self.channels, *([self.frames] if self.frames else [])]
 
     def _is_due(self, channel: ValueChannel | FramesChannel, frame: Frame) -> bool:
-        """Return whether to publish a change now, because no rate limit or dead-band applies."""
+        """Return whether a change may be published now: no rate limit or dead-band holds it back."""
         if not channel.limited:
             return True
         if channel in self._limited or channel.due_ns > self.block.now_ns():

@@ -34,7 +34,7 @@ class _Entry(NamedTuple, Generic[Item]):
 
 
 class Backlog(Generic[Item]):
-    """A bounded memory with several rows of items. Each row is first in, first out.
+    """A store of limited size with several rows of items. Each row is first in, first out.
 
     When the backlog is full, the oldest item of all rows is dropped.
     """
@@ -199,7 +199,7 @@ class Outbox:
             self.mark(channel)
 
     def resend(self, channels: Iterable[Channel]) -> None:
-        """Send the current state of these topics, after the backlog."""
+        """Queue the current state of these topics. It is sent after the backlog."""
         if self._connection.up:
             self._waiting |= dict.fromkeys(channels)
             if not self._catching_up:
@@ -212,7 +212,7 @@ class Outbox:
             self._results_waiting.append((message, properties))
 
     def lose(self, unacknowledged: Iterable[Message]) -> None:
-        """After a lost connection, keep its unacknowledged messages and the waiting changes."""
+        """Move unacknowledged messages and waiting changes to the backlog, because the connection was lost."""
         for message in reversed(list(unacknowledged)):
             if message.keep:
                 self._backlog.put_back(message._replace(retain=False), _size(message))

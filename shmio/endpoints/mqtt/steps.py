@@ -1,4 +1,4 @@
-"""Delivers steps of virtual time. Each step waits until the broker acknowledges its changes."""
+"""Delivers steps of virtual time. Each step waits until the broker acknowledges the step's changes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class StepDelivery:
     """Delivers steps to the broker. Use it only in the bridge's thread."""
 
     def __init__(self, clock: ClockPage, index: int, topic: str, connection: BrokerConnection, outbox: Outbox) -> None:
-        """Make each step from now on wait for this process.
+        """From now on, make each step wait for this process.
 
         Args:
             clock: The clock page.
@@ -45,7 +45,7 @@ class StepDelivery:
         clock.deliver(index, self.done)  # from now on each step waits for this process
 
     def poll(self, feeds: Collection[Feed]) -> Collection[Feed]:
-        """Begin to deliver a new step, or finish a delivery. Set which feeds publish only by steps.
+        """Start to deliver a new step, or finish a delivery. Update which feeds publish only by steps.
 
         Returns:
             The feeds that no longer publish only by steps. They may have unread frames.
@@ -80,7 +80,7 @@ class StepDelivery:
     def _over(self, marker: StepMarker) -> bool:
         """Return whether the delivery has ended.
 
-        It ends by the broker's acknowledgement, by a time-out, or with the connection.
+        It ends when the broker acknowledges the step, after a time-out, or when the connection ends.
         """
         if not self._connection.up:
             return True

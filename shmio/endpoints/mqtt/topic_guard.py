@@ -21,7 +21,7 @@ PAUSE: Final = Backoff(0.1, 5.0)
 CALM_PAUSES: Final = 4
 """Number of pauses without a correction after which the pauses are short again."""
 CALM_S: Final = 60.0
-"""Time in s after which a break is short again."""
+"""Time in s without a break, after which the next break is short again."""
 MOST_WAITING: Final = 1000
 """Maximum number of topics to correct. If there are more, all topics are published again."""
 MAX_FOREIGN_MESSAGES: Final = 2000
@@ -65,14 +65,14 @@ class TopicGuard:
         self._on_break = False
 
     def begin(self) -> None:
-        """Begin after a connect. All topics are published then, so there is nothing to correct."""
+        """Start to watch after a connect. The bridge then publishes all topics, which makes corrections obsolete."""
         if not self._on_break:
             self._waiting.clear()
             self._everything = False
             self._owner.watch()
 
     def report(self, topic: str) -> None:
-        """Note that another client has published a wrong value on a topic."""
+        """Record that another client has published a wrong value on a topic."""
         if self._on_break:  # sent before we unsubscribed
             return
         now_s = self._now_s()
@@ -94,7 +94,7 @@ class TopicGuard:
             self._waiting[topic] = None
 
     def run_once(self) -> float:
-        """Correct what is due, and return after how many seconds to call this again."""
+        """Correct the topics that are due. Return the time in s after which to call this again."""
         now_s = self._now_s()
         if self._on_break:
             if now_s < self._until_s:

@@ -30,7 +30,7 @@ _ToJson = Callable[[bytes], Any]
 
 
 def output_topic(prefix: str, source: str, path: str = "") -> str:
-    """Return the topic of a source's register or structure; without path, of the whole source."""
+    """Return the topic of a source's register or structure, or of the whole source if ``path`` is empty."""
     return f"{prefix}/{source}/{path}/out" if path else f"{prefix}/{source}/out"
 
 
@@ -53,7 +53,7 @@ class TopicRules:
         self._rules = [(Glob(pattern), rule) for pattern, rule in rules if not names_part(pattern)]
 
     def of(self, source: str, path: str) -> MqttTopic:
-        """Return the rule of a register, bit or slice."""
+        """Return the rule that applies to a register, bit or slice."""
         full = f"{source}/{path}"
         return self._parts.get(full) or self._first(full)[1]
 
@@ -116,7 +116,7 @@ class Channel(Protocol):
 
 
 class _RuledChannel:
-    """A topic that has a rule of the configuration."""
+    """A topic to which a rule of the configuration applies."""
 
     json = False
 
@@ -131,7 +131,7 @@ class _RuledChannel:
         self._pause_ns = round(1e9 / rule.max_rate_hz) if rule.max_rate_hz else 0
 
     def moved(self, _image: bytes) -> bool:
-        """Return whether a change exceeds the dead-band, or there is no dead-band."""
+        """Return whether the value has moved by more than the dead-band; always True without one."""
         return True
 
     def _pause(self) -> None:
@@ -173,7 +173,7 @@ class RegisterChannel(_RuledChannel):
         return None if area is None else area.quality(image, area.index(self._register))
 
     def message(self, *, late: bool = False) -> Message:
-        """Make the message. Without a good value, a text is empty, and JSON has the reason."""
+        """Make the message. While the value is bad, a text payload is empty, and a JSON payload has the reason."""
         return self._message(self._json(late=late) if self.json else self._text(), late=late)
 
     def _text(self) -> bytes:
@@ -233,7 +233,7 @@ class StructureChannel(_RuledChannel):
         self._indices = [] if area is None else area.indices(registers)
 
     def message(self, *, late: bool = False) -> Message:
-        """Make the message. While the quality is bad, it has the last known values.
+        """Make the message. While the quality is bad, the message has the last known values.
 
         If the source gives each register a status, the message has the worst of their qualities.
         """
@@ -274,14 +274,14 @@ class StatusChannel:
         self.topic = topic
         self._follower = follower
 
-    def message(self, *, late: bool = False) -> Message:  # noqa: ARG002  it is sent again when the broker is back
+    def message(self, *, late: bool = False) -> Message:  # noqa: ARG002  sent again when the broker is back
         """Make the message from the current state."""
         follower = self._follower
         return status(self.topic, follower.quality, follower.reason, follower.missed, follower.frame)
 
 
 class BridgeStatusChannel:
-    """The topic of the bridge's status. Its message is ``online``; the will is ``offline``."""
+    """The topic of the bridge's status. Its message is ``online``; the connection's will is ``offline``."""
 
     def __init__(self, topic: str) -> None:
         self.topic = topic
@@ -363,10 +363,10 @@ def _apart(new: Value, old: Value, deadband: float) -> bool:
 
 
 def _members(parts: Sequence[tuple[list[str], Register]], layout: Layout) -> _ToJson:
-    """Return the function that makes a JSON object of an image.
+    """Return a function that converts an image to a JSON object.
 
     Args:
-        parts: Each register, with the names of its path below this object.
+        parts: Each register, after the names in its path below this object.
         layout: The layout of the block.
 
     """

@@ -17,14 +17,14 @@ from shmio.logs import LogRateLimit
 from shmio.worker import BEAT_S, Worker
 
 LOGGERS: Final = ("shmio.opcua", "asyncua", "asyncio")
-"""Loggers whose lines clients can cause; their rate is limited."""
+"""Loggers that clients can flood. The rate of their lines is limited."""
 
 
 def run(worker: Worker) -> None:
     """Serve clients until the worker is stopped."""
     if importlib.util.find_spec("asyncua") is None:
         raise ConfigError(EXTRA)
-    logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # it logs each client's every request
+    logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # it logs every request of every client
     limits = {name: LogRateLimit(one_kind=name != "shmio.opcua") for name in LOGGERS}
     for name, limit in limits.items():
         logging.getLogger(name).addFilter(limit)
@@ -36,7 +36,7 @@ def run(worker: Worker) -> None:
 
 
 async def _serve(worker: Worker) -> None:
-    from shmio.endpoints.opcua.endpoint import Endpoint  # noqa: PLC0415  it needs the extra
+    from shmio.endpoints.opcua.endpoint import Endpoint  # noqa: PLC0415  this import needs the extra
 
     loop = asyncio.get_running_loop()
     stopping = asyncio.Event()

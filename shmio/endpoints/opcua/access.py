@@ -1,4 +1,4 @@
-"""Access control: accounts, certificates, and the roles of clients."""
+"""Access control: identifies clients by accounts and certificates, and gives them roles."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ MAX_PASSWORD = 1024
 
 @dataclass(frozen=True)
 class User:
-    """A client that has logged in, or an anonymous client. ``name`` is for messages.
+    """An identified client. ``name`` is its account, a name in its certificate, or ``anonymous``.
 
-    ``kind`` says by what it has logged in: ``account``, ``certificate`` or ``anonymous``.
+    ``kind`` is how the client has identified itself: ``account``, ``certificate`` or ``anonymous``.
     """
 
     name: str
@@ -39,14 +39,14 @@ class Access:
         """Read accounts and trusted certificates.
 
         Raises:
-            ConfigError: The file of a token or of a certificate is not usable.
+            ConfigError: A token file or a certificate file is unusable.
 
         """
         self._accounts: Sequence[Secret] = read_tokens(config.account, "opcua.account")
         self._clients = config.client
         self._trusted = [one for name in config.trusted for one in read_certificates("opcua.trusted", Path(name))]
         self.asks_certificates = bool(config.trusted)
-        """True if only clients with a trusted certificate may open a channel."""
+        """True if a client needs a trusted certificate to open an encrypted channel."""
         guarded = bool(config.account or config.client)
         self.anonymous = frozenset(config.anonymous if config.anonymous is not None else () if guarded else ROLES)
 
@@ -54,7 +54,7 @@ class Access:
         """Return the user with these credentials, or None if they are wrong or give no role.
 
         Args:
-            name: Name of the account; None: an anonymous client, or one with a certificate.
+            name: Name of the account; None: the client has no account.
             password: Password of the account.
             certificate: The certificate of the user or of the client, as DER.
 
@@ -74,7 +74,7 @@ class Access:
         return User(who, frozenset(roles), kind) if roles else None
 
     def _account(self, name: str, password: str) -> Secret | None:
-        """Return the account with this name and password, in a time that depends on neither."""
+        """Return the account with this name and password. The time that this takes depends on neither."""
         shown = digest(password[:MAX_PASSWORD].encode())
         found = None
         for account in self._accounts:
@@ -97,7 +97,7 @@ class Access:
         return [name for name in dict.fromkeys(names) if name]
 
     def trusts(self, certificate: bytes) -> bool:
-        """Return whether a certificate is valid now, and trusted itself or issued by one that is."""
+        """Return whether a certificate is valid now, and is itself trusted or issued by a trusted authority."""
         try:
             shown = x509.load_der_x509_certificate(certificate)
             now = datetime.now(UTC)
@@ -109,7 +109,7 @@ class Access:
 
 
 def _issued(issuer: x509.Certificate, shown: x509.Certificate, now: datetime) -> bool:
-    """Return whether an authority's certificate has issued another one."""
+    """Return whether ``issuer`` is the presently valid certificate of an authority that issued ``shown``."""
     try:
         authority = issuer.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
     except x509.ExtensionNotFound:

@@ -1,4 +1,4 @@
-"""The certificate files of the section ``[opcua]``."""
+"""Reads the files of certificates and keys that the section ``[opcua]`` names."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MIN_KEY_BITS: Final = 2048
 
 
 def read_certificates(key: str, file: Path) -> list[x509.Certificate]:
-    """Return the certificates of a PEM or DER file. ConfigError: the file is unusable."""
+    """Return the certificates in a PEM or DER file. Raise ConfigError if the file is unusable."""
     data = _read(key, file)
     try:
         if b"-----BEGIN" in data:
@@ -28,10 +28,10 @@ def read_certificates(key: str, file: Path) -> list[x509.Certificate]:
 
 
 def read_identity(opcua: OpcUa) -> tuple[x509.Certificate, rsa.RSAPrivateKey] | None:
-    """Return the server's certificate and key, or None if it has none.
+    """Return the server's certificate and key, or None if none are configured.
 
     Raises:
-        ConfigError: A file is unusable, or the key is not that of the certificate.
+        ConfigError: A file is unusable, or the key does not belong to the certificate.
 
     """
     if opcua.certificate is None or opcua.key is None:

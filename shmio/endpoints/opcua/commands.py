@@ -1,4 +1,4 @@
-"""Sends clients' writes to one source, and waits for their outcomes."""
+"""Sends the commands of clients to one source, and waits for their outcomes."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from shmio.segment import Block
 from shmio.segment.commands import End, worst
 
 ROOM_S: Final = 2.0
-"""Maximum time for which a write waits until fewer commands are in flight."""
+"""Maximum time in s that a command waits until fewer commands are in flight."""
 
 
 class CommandClient:
-    """Sends commands to one source. Use it only in the event loop's thread, once it is created."""
+    """Sends commands to one source. After its creation, use it only in the event loop's thread."""
 
     def __init__(self, block: Block, writer: int) -> None:
         """Prepare to send commands. For a large layout this takes seconds."""
@@ -32,14 +32,14 @@ class CommandClient:
         self._room = asyncio.Event()
 
     def is_writable(self, register: Register) -> bool:
-        """Return whether the configuration allows writing all of a register, an element or a part."""
+        """Return whether the configuration allows clients to write the whole register, element or part."""
         return self._source_writer.is_writable(register)
 
     async def write(self, register: Register, value: object, attempt: Attempt | None = None) -> End:
-        """Write a value, and wait for the outcome.
+        """Write a value, wait for the outcome, and return it.
 
         Args:
-            register: The register.
+            register: The register, element or part.
             value: The value.
             attempt: The command's entry in the audit log.
 
@@ -53,7 +53,7 @@ class CommandClient:
         return await self._sent(self._source_writer.submit({register.path: value}), cost, attempt)
 
     async def lift(self, injection: int) -> End:
-        """Lift an injection. CommandError: the command was not sent."""
+        """Lift an injection, and return the outcome. Raise CommandError if the command was not sent."""
         cost = CommandCost.of(())
         with Attempt("lift", {"source": self.block.source, "injection": injection}) as attempt:
             await self._await_room(cost)
@@ -81,7 +81,7 @@ class CommandClient:
         return worst(await answer)
 
     def poll(self) -> None:
-        """Read new events, and end the commands whose outcome is known or overdue."""
+        """Read new events, and complete the commands whose outcome is known or overdue."""
         while (event := self._events.poll()) is not None:
             self._in_flight.on_event(event)
         if self._events.take_missed():

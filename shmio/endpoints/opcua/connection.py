@@ -1,4 +1,4 @@
-"""A client's connection: the framing, the secure channel and the order of requests, with limits."""
+"""Handles a client's connection: splits messages, opens the secure channel, processes requests, within limits."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ MAX_SESSIONS: Final = 100
 MAX_CHUNK_BYTES: Final = 65_535
 MAX_MESSAGE_BYTES: Final = 4 << 20
 MAX_WAITING: Final = 32
-"""Maximum number of waiting messages. Beyond it, the endpoint does not read from the connection."""
+"""Maximum number of received messages that wait. Beyond it, the endpoint stops reading from the connection."""
 MAX_UNSENT_BYTES: Final = 1 << 20
-"""Maximum number of bytes that wait for a client. Beyond it, its requests are not processed."""
+"""Maximum number of unsent bytes for a client. Beyond it, the endpoint stops processing its requests."""
 STUCK_S: Final = 30.0
-"""Time after which a client that does not read is disconnected."""
+"""Time in s after which the endpoint disconnects a client that does not read."""
 ACTIVATION_S: Final = 10.0
-"""Time limit for a new client to activate a session."""
+"""Time limit in s for a new client to activate a session."""
 
 _KINDS: Final = (b"HEL", b"OPN", b"MSG", b"CLO")
 _IDS = ua.ObjectIds
@@ -53,7 +53,7 @@ _SERVED: Final = frozenset({
     _IDS.DeleteMonitoredItemsRequest_Encoding_DefaultBinary,
     _IDS.PublishRequest_Encoding_DefaultBinary, _IDS.RepublishRequest_Encoding_DefaultBinary,
 })  # fmt: skip
-"""The services that a session may use. The endpoint refuses all others, which could change the address space."""
+"""The services that a session may use. The endpoint refuses the others; some could change the address space."""
 
 log = logging.getLogger("shmio.opcua")
 
@@ -72,7 +72,7 @@ class Processor(UaProcessor):
         self._pass.set()
 
     def can_send(self) -> bool:
-        """True if the client reads its messages."""
+        """Return whether messages can be sent: the connection is open, and the client reads."""
         return self._pass.is_set() and not self._transport.is_closing()
 
     def pause(self) -> None:
@@ -80,11 +80,11 @@ class Processor(UaProcessor):
         self._pass.clear()
 
     def resume(self) -> None:
-        """Process requests again."""
+        """Continue to process requests."""
         self._pass.set()
 
     async def proceed(self) -> None:
-        """Wait until the client reads its messages."""
+        """Wait while processing is paused."""
         await self._pass.wait()
 
     def publish(self, result: ua.PublishResult, request: Any) -> None:
@@ -95,7 +95,7 @@ class Processor(UaProcessor):
         self.send_response(request.requesthdr.RequestHandle, request.seqhdr, response)
 
     def open_secure_channel(self, algohdr: Any, seqhdr: Any, body: Any) -> None:
-        """Open or renew a channel. If the configuration requires it, check the client's certificate."""
+        """Open or renew a channel. If the configuration requires trusted certificates, check the client's."""
         access = self.iserver.access
         certificate = self._connection.security_policy.peer_certificate
         if self.encrypted and access.asks_certificates and not (certificate and access.trusts(certificate)):
@@ -124,13 +124,13 @@ class Processor(UaProcessor):
     async def _serve(self, typeid: Any, requesthdr: Any, seqhdr: Any, body: Any) -> bool:
         kind = typeid.Identifier if typeid.NamespaceIndex == 0 else None
         if kind not in _WITHOUT_SESSION:
-            # A channel without security is always allowed, but only to read which endpoints there are.
+            # Every client may open a channel without security to ask which endpoints there are.
             if not self.encrypted and not self.iserver.plain_text:
                 raise ServiceError(Fault.BadSecurityPolicyRejected)
             if kind not in _SESSIONS and kind not in _SERVED:
                 raise ServiceError(Fault.BadServiceUnsupported)
         if kind == _IDS.CreateSessionRequest_Encoding_DefaultBinary and self.session is not None:
-            await self.session.close_session()  # asyncua would never remove it
+            await self.session.close_session()  # asyncua would never remove the old session
             self.session = None
         elif kind == _IDS.ActivateSessionRequest_Encoding_DefaultBinary:
             return await self._activate(typeid, requesthdr, seqhdr, body)
@@ -202,7 +202,7 @@ class Protocol(OPCUAProtocol):
         self._stuck: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Accept a connection, if there are not too many."""
+        """Accept a connection, unless there are too many."""
         counted: Any = _CountedTransport(transport, self.iserver.counters)
         super().connection_made(counted)
         if self.transport is None:  # refused
@@ -212,20 +212,20 @@ class Protocol(OPCUAProtocol):
         self.transport.set_write_buffer_limits(high=MAX_UNSENT_BYTES)
 
     def connection_lost(self, ex: BaseException | None) -> None:
-        """Clean up."""
+        """Stop the timer, and let the library clean up."""
         if self._stuck is not None:
             self._stuck.cancel()
         if self.transport is not None:
             super().connection_lost(ex)
 
     def pause_writing(self) -> None:
-        """Stop processing requests of a client that does not read, and disconnect it after a while."""
+        """Stop processing requests of a client that does not read, and disconnect it after ``STUCK_S``."""
         if self.processor is not None:
             self.processor.pause()
         self._stuck = asyncio.get_running_loop().call_later(STUCK_S, self._drop, "it does not read what it is sent")
 
     def resume_writing(self) -> None:
-        """Process requests again."""
+        """Process requests again, now that the client reads."""
         if self._stuck is not None:
             self._stuck.cancel()
             self._stuck = None
@@ -273,7 +273,7 @@ class Protocol(OPCUAProtocol):
                 )  # fmt: skip
                 self._fail(Fault.BadTcpInternalError if header.MessageType == b"HEL" else Fault.BadDecodingError)
                 break
-            await asyncio.sleep(0)  # others come next
+            await asyncio.sleep(0)  # let other connections proceed
         if self.transport is not None:
             self.transport.close()
 

@@ -1,4 +1,4 @@
-"""The endpoint: follows all sources, serves their nodes, and applies changes of a reload."""
+"""The endpoint: follows all sources, serves their nodes, and adds and removes sources after reloads."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Endpoint:
     """Serves a segment. Use it only in the event loop's thread."""
 
     def __init__(self, segment: Segment, slot: ProcessSlot, config: OpcUa) -> None:
-        """Read certificates and accounts; :meth:`start` begins to serve.
+        """Read certificates and accounts. :meth:`start` starts the server.
 
         Raises:
             ConfigError: A file is not usable.
@@ -37,7 +37,7 @@ class Endpoint:
         self._reading: asyncio.Task[list[SourceNode]] | None = None
 
     async def start(self) -> None:
-        """Create the nodes, and begin to listen. EndpointError: the address cannot be used."""
+        """Create the nodes, and start to listen. Raise EndpointError if the address cannot be used."""
         await self.server.init()
         self.server.iserver.catch_up = self.poll
         self._stepping = Stepping(self._segment)
@@ -58,7 +58,7 @@ class Endpoint:
         return shared.sessions, shared.subscriptions.items, counted.writes, counted.refused, counted.sent_bytes
 
     def poll(self) -> None:
-        """Read all new frames."""
+        """Read all new frames of all sources."""
         for source in tuple(self.sources.values()):
             while source.feed.poll():
                 pass
@@ -66,7 +66,7 @@ class Endpoint:
     # ---- sources that come and go ------------------------------------------------------------------------------------
 
     def follow_reloads(self) -> None:
-        """Add and remove sources after a reload; a thread reads their layouts, which may take seconds."""
+        """Add and remove sources after a reload. A thread reads new layouts, because that may take seconds."""
         if self._reading is not None and self._reading.done():
             reading, self._reading = self._reading, None
             self._add(reading.result())

@@ -1,4 +1,4 @@
-"""Follows one source's block: keeps the newest frame, and marks the watches that it changes."""
+"""Follows one source's block: keeps its newest frame, and notifies the watches of variables that changed."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ log = logging.getLogger("shmio.opcua")
 MAX_FRAMES_PER_TURN: Final = 8
 """Maximum number of frames to read before the endpoint does other work."""
 CATCH_UP_S: Final = 3.0
-"""If the endpoint is further behind than this, or than half of the ring, it skips to the newest frame."""
+"""If the endpoint is further behind than this time in s, or half of the ring, it skips to the newest frame."""
 
 
 class Listener(Protocol):
-    """A monitored item."""
+    """What a watch notifies of changes: a monitored item."""
 
     every: bool
     """True if the item also reports frames in which only the time has changed."""
     queues: bool
-    """True if the item queues more values than the newest."""
+    """True if the item queues several values, not only the newest."""
 
     def changed(self) -> None:
-        """Note that the value has changed."""
+        """Handle a change of the variable."""
 
 
 class Watch:
@@ -67,7 +67,7 @@ class Watch:
         self.feed.count()
 
     def renew(self, get: Callable[[], ua.DataValue] | None) -> None:
-        """Use another function for values after a reload; None: the variable no longer exists."""
+        """Replace the function that returns the value, after a reload; None: the variable no longer exists."""
         self.gone = get is None
         self._get = _unknown if get is None else get
         self.changed()
@@ -106,7 +106,7 @@ def _unknown() -> ua.DataValue:
 
 
 class Feed:
-    """Follows one source. Use it only in the event loop's thread, once it is created."""
+    """Follows one source. After its creation, use it only in the event loop's thread."""
 
     def __init__(self, block: Block, writer: int, namespace: str) -> None:
         """Create the feed. For a large layout this takes seconds.
@@ -121,7 +121,7 @@ class Feed:
         self.follower = FrameFollower(block, catch_up_s=CATCH_UP_S)
         self.commands = CommandClient(block, writer)
         self.turn_ns = min(TURN_NS, block.stale_ns)
-        """Interval for checks without a doorbell, in ns: a frame that becomes stale rings no doorbell."""
+        """Interval in ns at which to poll without a doorbell: none rings when a frame becomes stale."""
         self._scan = _scan(block)
         self._index = {register.path: index for index, register in enumerate(block.layout.registers)}
         self._by_register: dict[int, dict[str, Watch]] = {}
@@ -138,7 +138,7 @@ class Feed:
 
     @property
     def watches(self) -> list[Watch]:
-        """All watches of this source that have listeners, or had some."""
+        """All watches of this source."""
         return [*(one for found in self._by_register.values() for one in found.values()), *self._details.values()]
 
     # ---- values ------------------------------------------------------------------------------------------------------
@@ -155,7 +155,7 @@ class Feed:
         )
 
     def injected(self) -> Sequence[Any]:
-        """Return the injections over ``/out``, if the newest frame shows any."""
+        """Return the present ``/out`` injections; none if the newest frame shows no injection."""
         frame = self.follower.frame
         if frame is None or frame.effective is None:
             return ()
@@ -176,19 +176,19 @@ class Feed:
         return found[path]
 
     def watch_detail(self, key: str, get: Callable[[], ua.DataValue]) -> Watch:
-        """Return the watch of a property, which is compared after each frame."""
+        """Return the watch of a property. After each frame, the feed checks whether the property has changed."""
         if key not in self._details:
             self._details[key] = Watch(self, key, get)
             self._shown[key] = self._details[key].encoded
         return self._details[key]
 
     def adopt(self, watch: Watch, path: str | None, get: Callable[[], ua.DataValue] | None) -> None:
-        """Continue a watch of the block that this one replaces.
+        """Take over a watch after a reload, from the feed that this feed replaces.
 
         Args:
             watch: The watch.
-            path: Path of its register; None: it watches a property.
-            get: Returns its value; None: the variable no longer exists.
+            path: Path of the watch's register; None: it watches a property.
+            get: Returns the variable's value; None: the variable no longer exists.
 
         """
         watch.feed = self
@@ -290,7 +290,7 @@ _NONE: Final[dict[str, Watch]] = {}
 
 
 def _scan(block: Block) -> ChangeScan:
-    """Return a scan for changes of values, and of status codes if the block has them."""
+    """Return a scan that finds changed values, and changed status codes if the block has them."""
     area = status_area(block.layout)
     if area is None:
         return ChangeScan(block.layout.registers)

@@ -1,4 +1,4 @@
-"""Methods that clients call: to step virtual time, and to lift injections."""
+"""Methods that clients can call to step virtual time and to lift injections."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from shmio.local.time_control import Coordinator
 from shmio.segment import EventKind, Segment
 
 PATIENCE_S: Final = 2.0
-"""Maximum time for which a step waits until another program releases the time."""
+"""Maximum time in s that a step waits for another program to release control of the clock."""
 
 
 class Stepping:
-    """Steps the instance's time for clients. Use it only in the event loop's thread."""
+    """Steps virtual time for clients. Use it only in the event loop's thread."""
 
     def __init__(self, segment: Segment) -> None:
         self.lock = asyncio.Lock()
@@ -29,11 +29,11 @@ class Stepping:
         self._coordinator = Coordinator(segment)
 
     async def step(self, length_ms: float) -> list[ua.Variant]:
-        """Step by ``length_ms``, or by the step size if that is 0; return the step's number and time.
+        """Make a step of ``length_ms``; 0: of the step size. Return the step's number and its time in s.
 
         Raises:
             ServiceError: The length is not valid.
-            ShmioError: Time is real, another program moves it, or the step failed.
+            ShmioError: Time is real, another program controls the clock, or the step failed.
 
         """
         if not math.isfinite(length_ms) or length_ms < 0:
@@ -53,7 +53,7 @@ class Stepping:
 
 
 def add_step(root: Node, stepping: Stepping) -> None:
-    """Give the instance's object a method that steps its time."""
+    """Add a method that steps virtual time to the instance's object."""
     method = Method(root, "Step", "control", "Steps virtual time; it returns when all sources are done", stepping.step)
     method.inputs = [_argument("Length", ua.ObjectIds.Double, "in ms; 0: the step size")]
     method.outputs = [
@@ -64,7 +64,7 @@ def add_step(root: Node, stepping: Stepping) -> None:
 
 
 def add_injections(source: SourceNode) -> None:
-    """Give a source's object a list of its injections, and methods that lift them."""
+    """Add a list of a source's injections, and methods that lift them, to the source's object."""
     block, commands = source.feed.block, source.feed.commands
 
     def present() -> dict[int, str]:

@@ -34,14 +34,14 @@ class Node:
     node_class = ua.NodeClass.Object
     type_definition = ua.ObjectIds.FolderType
     reference = ua.ObjectIds.Organizes
-    """The reference from the parent to this node."""
+    """Type of the reference from the parent to this node."""
 
     def __init__(self, node_id: ua.NodeId, name: str, parent: Node | None) -> None:
         self.id, self.name, self.parent = node_id, name, parent
         self.children: dict[str, Node] = {}
 
     def all_children(self) -> Iterator[Node]:
-        """Yield the nodes below this one."""
+        """Yield the nodes directly below this one."""
         yield from self.children.values()
 
     def description(self, *, forward: bool = True, reference: int | None = None) -> ua.ReferenceDescription:
@@ -109,7 +109,7 @@ class Node:
 
 
 class VariableNode(Node):
-    """A variable."""
+    """A variable: a node with a value."""
 
     node_class = ua.NodeClass.Variable
     type_definition = ua.ObjectIds.BaseDataVariableType
@@ -157,18 +157,18 @@ class RegisterNode(VariableNode):
         self.feed, self.register = feed, register
 
     @property
-    def data_type(self) -> ua.NodeId:  # computed here, fixed in others
-        """The data type."""
+    def data_type(self) -> ua.NodeId:  # a property here, an attribute in other classes
+        """Data type of the register, or of its elements."""
         return ua.NodeId(values.data_type(self.register).value)
 
     @property
     def sizes(self) -> list[int]:  # type: ignore[override]
-        """The sizes of the dimensions."""
+        """The sizes of an array's dimensions; empty for a scalar."""
         return values.dimensions(self.register)
 
     @property
     def period_ms(self) -> float:  # type: ignore[override]
-        """The time between two cycles of the source."""
+        """The time between two cycles of the source, in ms."""
         return self.feed.block.period_ns / 1e6
 
     @property
@@ -197,7 +197,7 @@ class RegisterNode(VariableNode):
                 yield make(self, name)
 
     def property_named(self, name: str) -> Node | None:
-        """Return one of the properties."""
+        """Return the property with this name, or None if there is none."""
         make = PROPERTIES.get(name)
         return None if make is None or (name == UNIT and not self.register.unit) else make(self, name)
 
@@ -225,7 +225,7 @@ class Property(VariableNode):
         return ua.DataValue(self._get())
 
     def watch(self) -> Watch | None:
-        """Return the watch of the property's changes, if it can change."""
+        """Return the watch of the property's changes, or None if it never changes."""
         return None if self._watch is None else self._watch(str(self.id.Identifier), self.value)
 
 
@@ -264,7 +264,7 @@ PROPERTIES: Final[dict[str, Callable[[RegisterNode, str], Property]]] = {
 
 
 class Method(Node):
-    """A method."""
+    """A method that clients with ``role`` may call."""
 
     node_class = ua.NodeClass.Method
     type_definition = 0
@@ -288,7 +288,7 @@ class Method(Node):
                 yield found
 
     def property_named(self, name: str) -> Node | None:
-        """Return the property that describes the input or output arguments, if there are any."""
+        """Return the property that describes the input or output arguments, or None if there are none."""
         arguments = {"InputArguments": self.inputs, "OutputArguments": self.outputs}.get(name)
         if not arguments:
             return None
@@ -307,7 +307,7 @@ class Method(Node):
 
 
 class _Arguments(Property):
-    """The property that describes a method's arguments; its name is one of the standard."""
+    """The property that describes a method's arguments. Its browse name is in the standard's namespace."""
 
     def description(self, *, forward: bool = True, reference: int | None = None) -> ua.ReferenceDescription:
         found = super().description(forward=forward, reference=reference)
@@ -342,7 +342,7 @@ class SourceNode(Node):
 
     @property
     def comment(self) -> str:
-        """Description of the source's block and connector."""
+        """The source's connector, and the name of its layout."""
         return f"{self.feed.block.attributes.connector}: {self.feed.block.layout.name}"
 
     def _add(self, register: Register) -> None:
@@ -366,11 +366,11 @@ def _id(source: str, path: str) -> ua.NodeId:
 
 
 def child_id(owner: Node, name: str) -> ua.NodeId:
-    """Return the id of a property or a method; no path contains its ``#``."""
+    """Return the node id of a property or method. No path contains the ``#`` that separates its name."""
     head = "" if owner.id == ROOT else owner.id.Identifier
     return ua.NodeId(f"{head}#{name}", NAMESPACE)
 
 
 def bad(code: int) -> ua.DataValue:
-    """Return a value without content, with a bad status."""
+    """Return an empty value with this bad status code."""
     return ua.DataValue(StatusCode=ua.StatusCode(code))

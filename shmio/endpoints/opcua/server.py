@@ -59,7 +59,7 @@ log = logging.getLogger("shmio.opcua")
 
 @dataclass
 class Counters:
-    """Counts of what clients have done, and of what they were sent."""
+    """Counts the writes of clients, refused requests, and the bytes that clients were sent."""
 
     writes: int = 0
     refused: int = 0
@@ -95,7 +95,7 @@ class InternalServer(LibraryInternalServer):
         self.space = Space(self.instance, self.aspace)
 
     async def stop(self) -> None:
-        """Stop at once. The library's own method would wait for its clock."""
+        """Stop at once. The library's own method would first wait for its clock task."""
         if self.time_task is not None:
             self.time_task.cancel()
             await asyncio.wait((self.time_task,))
@@ -103,7 +103,7 @@ class InternalServer(LibraryInternalServer):
         await super().stop()
 
     def create_session(self, name: str, user: Any = None, external: bool = False) -> InternalSession:  # noqa: ARG002
-        """Create a session, if there are not too many."""
+        """Create a session. Raise ServiceError if there are too many."""
         if len(self._external_sessions) >= MAX_SESSIONS:
             raise ServiceError(ua.StatusCodes.BadTooManySessions)
         return Session(self, self.aspace, self.subscription_service, name, external=external)
@@ -121,7 +121,7 @@ class InternalServer(LibraryInternalServer):
         return user
 
     def decrypt_user_token(self, isession: Any, token: ua.UserNameIdentityToken) -> tuple[str, str]:
-        """Return the name and the password that a client sends."""
+        """Return the name and the decrypted password in a client's token."""
         name, secret = token.UserName or "", token.Password or b""
         if not token.EncryptionAlgorithm:
             if not isession.trusted_channel:
@@ -136,12 +136,12 @@ class InternalServer(LibraryInternalServer):
         nonce = plain[4 + length - len(isession.nonce) : 4 + length]
         if (
             length < len(isession.nonce) or nonce != isession.nonce
-        ):  # an attacker has recorded the message and sent it again
+        ):  # an attacker may have recorded the message and sent it again
             raise ServiceError(ua.StatusCodes.BadIdentityTokenInvalid)
         return name, plain[4 : 4 + length - len(isession.nonce)].decode()
 
     def verify_x509_token(self, isession: Any, token: ua.X509IdentityToken, signature: ua.SignatureData) -> bytes:
-        """Check that a client has the key of its certificate."""
+        """Check that a client's certificate is trusted, and that the client has its key."""
         if signature.Algorithm == _SHA1:
             raise ServiceError(ua.StatusCodes.BadIdentityTokenInvalid)
         if not self.access.trusts(token.CertificateData):
@@ -150,7 +150,7 @@ class InternalServer(LibraryInternalServer):
 
 
 class _Listener(BinaryServer):
-    """Accepts connections."""
+    """Accepts connections, and creates a :class:`Protocol` for each."""
 
     def _make_protocol(self) -> OPCUAProtocol:
         return Protocol(
@@ -189,7 +189,7 @@ class Server(Library):
             self._application_uri = application_uri(identity[0]) or self._application_uri
             policies += _ENCRYPTING
         self.set_security_policy(policies)
-        self._permission_ruleset = None  # each service asks for its role
+        self._permission_ruleset = None  # each service itself checks the client's role
         tokens: list[type] = []
         if self.iserver.access.anonymous or config.client:
             tokens.append(ua.AnonymousIdentityToken)
@@ -216,7 +216,7 @@ class Server(Library):
             await self.get_node(node).write_value(most, ua.VariantType.UInt32)
 
     async def start(self) -> None:
-        """Begin to listen. EndpointError: the address cannot be used."""
+        """Start to listen. Raise EndpointError if the address cannot be used."""
         await self._setup_server_nodes()
         await self.iserver.start()
         listener = _Listener(self.iserver, self.address.host, self.address.port, self.limits)

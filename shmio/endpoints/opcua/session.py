@@ -1,4 +1,4 @@
-"""A client's session: its services, with the role and the limits of each."""
+"""A client's session: serves its requests, after checks of its role and of limits."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from shmio.layout.topic import shorten
 from shmio.segment import DONE, EventKind
 
 MAX_NODES: Final = 10_000
-"""Maximum number of nodes, items or paths in a request; the server says so in its OperationLimits."""
+"""Maximum number of nodes, items or paths in a request. The server publishes it in its OperationLimits."""
 MAX_WRITES: Final = 1_000
 MAX_CALLS: Final = 10
 MAX_RESPONSE_BYTES: Final = 8 << 20
@@ -46,7 +46,7 @@ _OUTCOMES: Final = {
 """The status code of a failed write, by its outcome."""
 
 _ACTIONS: Final = {"LiftAll": "lift"}
-"""The actions of methods in the audit log, if these are not their names."""
+"""The audit log's names of methods' actions, where they are not the methods' names in lower case."""
 
 log = logging.getLogger("shmio.opcua")
 
@@ -54,7 +54,7 @@ Fault = ua.StatusCodes
 
 
 class Session(InternalSession):
-    """A session. Use it only in the event loop's thread."""
+    """A client's session, with the services that it may use. Use it only in the event loop's thread."""
 
     iserver: Any  # InternalServer of the module server, which imports this one
     user: Any
@@ -66,7 +66,7 @@ class Session(InternalSession):
             self.auth_token = ua.NodeId(secrets.token_bytes(32), 0, ua.NodeIdType.ByteString)
             self.iserver.register_external_session(self)
         self.trusted_channel = False
-        """True if the channel is encrypted, so that the client may send a password as plain text."""
+        """True if the client may send its password as plain text: the channel is encrypted, or stays on this host."""
         self._continuations: dict[bytes, Any] = {}
 
     @property
@@ -76,7 +76,7 @@ class Session(InternalSession):
 
     @property
     def actor(self) -> Actor:
-        """Who the client is, for the audit log."""
+        """The client's identity for the audit log."""
         host, port, *_ = self.name if isinstance(self.name, tuple) else (str(self.name), 0)
         origin = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
         if not isinstance(self.user, User) or self.user.kind == "anonymous":
@@ -111,7 +111,7 @@ class Session(InternalSession):
             trail.record("sign in", {}, "done", who=trail.Acting(self.actor, "opcua"))
         return result
 
-    async def close_session(self, delete_subs: bool = True) -> None:  # noqa: ARG002  it always ends them
+    async def close_session(self, delete_subs: bool = True) -> None:  # noqa: ARG002  the subscriptions always end
         """End the session and its subscriptions. No other session can take these over."""
         self._continuations.clear()
         if self.external:
@@ -183,7 +183,7 @@ class Session(InternalSession):
         return results
 
     def _portion(self, references: Any, most: int, room: int) -> ua.BrowseResult:
-        """Return as many references as fit. A continuation point keeps the rest."""
+        """Return as many references as fit. A continuation point holds the rest."""
         found = list(islice(references, min(most, room)))
         result = ua.BrowseResult(ua.StatusCode(), None, found)
         following = next(references, None)
@@ -196,7 +196,7 @@ class Session(InternalSession):
         return result
 
     async def translate_browsepaths_to_nodeids(self, params: list[ua.BrowsePath]) -> list[ua.BrowsePathResult]:
-        """Return the nodes at the ends of paths."""
+        """Return the nodes at the end of each path."""
         if not self.external:
             return await super().translate_browsepaths_to_nodeids(params)
         self.need("read")
@@ -237,7 +237,7 @@ class Session(InternalSession):
         path = f"{node.feed.block.source}/{node.register.path}" if isinstance(node, RegisterNode) else str(asked.NodeId)
         with trail.Attempt("write", {path: _value(asked)}) as attempt:
             code = await self._carry_out(asked, attempt)
-            attempt.end("refused", ua.StatusCode(code).name)  # unless the command has ended it
+            attempt.end("refused", ua.StatusCode(code).name)  # no effect if the command has ended the attempt
         return code
 
     async def _carry_out(self, asked: ua.WriteValue, attempt: trail.Attempt) -> int:
@@ -329,7 +329,7 @@ class Session(InternalSession):
         found.can_send = callback.__self__.can_send
 
     def sent(self, result: ua.PublishResult, request: Any, subscription: Subscription) -> None:
-        """Send a publication."""
+        """Send a subscription's publication, as the answer to a Publish request."""
         subscription.pub_result_callback.__self__.publish(result, request)
 
     def modify_subscription(self, params: ua.ModifySubscriptionParameters) -> ua.ModifySubscriptionResult:
@@ -339,7 +339,7 @@ class Session(InternalSession):
         return ua.ModifySubscriptionResult(found.interval_ms, found.lifetime, found.keep_alive)
 
     async def set_publishing_mode(self, params: ua.SetPublishingModeParameters) -> list[ua.StatusCode]:
-        """Switch publishing on or off."""
+        """Switch publishing of subscriptions on or off."""
         _bound(params.SubscriptionIds, MAX_NODES)
 
         def switch(number: int) -> None:
@@ -365,7 +365,7 @@ class Session(InternalSession):
         return [ua.TransferResult(ua.StatusCode(Fault.BadSubscriptionIdInvalid)) for _ in params.SubscriptionIds]
 
     def publish(self, acks: Iterable[ua.SubscriptionAcknowledgement] | None = None) -> tuple[int, list[ua.StatusCode]]:
-        """Process a client's acknowledgements."""
+        """Process a client's acknowledgements. Return the number of its subscriptions, and a status for each."""
         own = self.iserver.subscriptions
         mine = own.of(self)
         if not mine:
@@ -381,7 +381,7 @@ class Session(InternalSession):
         return len(mine), results
 
     def republish(self, params: ua.RepublishParameters) -> ua.NotificationMessage:
-        """Send a message again."""
+        """Return an unacknowledged message, to send it again."""
         return self.iserver.subscriptions.find(params.SubscriptionId, self).republish(params.RetransmitSequenceNumber)
 
     async def create_monitored_items(self, params: ua.CreateMonitoredItemsParameters) -> list[Any]:
@@ -410,7 +410,7 @@ class Session(InternalSession):
         return results
 
     async def modify_monitored_items(self, params: ua.ModifyMonitoredItemsParameters) -> list[Any]:
-        """Change monitored items."""
+        """Change the parameters of monitored items."""
         _bound(params.ItemsToModify, MAX_NODES)
         found = self.iserver.subscriptions.find(params.SubscriptionId, self)
         results = list[Any]()
@@ -436,7 +436,7 @@ class Session(InternalSession):
 
 
 MAX_ITEMS_PER_REQUEST: Final = 50_000
-"""Maximum number of items that are deleted at once: as many as a session can have."""
+"""Maximum number of items that one request may delete: as many as a session can have."""
 
 
 def _value(asked: ua.WriteValue) -> Any:
@@ -499,7 +499,7 @@ def _plain(given: ua.Variant | None, register: Register) -> Any:
 
 
 def _part(value: ua.DataValue, text: str) -> ua.DataValue:
-    """Return a part of an array of one dimension, or of a text: ``2`` or ``2:5`` (OPC 10000-4, section 7.27)."""
+    """Return the part of a one-dimensional array that ``2`` or ``2:5`` selects (OPC 10000-4, section 7.27)."""
     first, colon, last = text.partition(":")
     if not (first.isdecimal() and (last.isdecimal() if colon else True)) or len(text) > 20:
         return bad(Fault.BadIndexRangeInvalid)

@@ -1,4 +1,4 @@
-"""The address space: the standard's own nodes, which asyncua has, and those of the instance."""
+"""The address space: the nodes of the standard, which asyncua provides, and those of the instance."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ class Space:
         standard[OBJECTS].references.append(self.root.description())
 
     def add(self, source: SourceNode) -> None:
-        """Add a source. It continues the watches of a previous source with the same name."""
+        """Add a source. It takes over the watches of the previous source with the same name."""
         before = self.sources.get(source.name)
         self.sources[source.name] = self.root.children[source.name] = source
         if before is not None:
             self._move(before.feed, source)
 
     def remove(self, name: str) -> None:
-        """Remove a source. Clients that monitor its variables get the status that they are unknown."""
+        """Remove a source. Clients that monitor its variables get the status BadNodeIdUnknown."""
         source = self.sources.pop(name)
         del self.root.children[name]
         for watch in source.feed.watches:
@@ -67,7 +67,7 @@ class Space:
     # ---- look up -----------------------------------------------------------------------------------------------------
 
     def find(self, node_id: ua.NodeId) -> Node | None:
-        """Return the node of the instance with an id, also for elements, slices and bits of registers."""
+        """Return the instance's node with this id, or None. Elements, slices and bits of registers have ids, too."""
         if node_id.NamespaceIndex != NAMESPACE:
             return None
         if node_id == ROOT:
@@ -99,7 +99,7 @@ class Space:
         except PathError:
             return None
         if register.path != path:
-            return None  # one node has one id
+            return None  # each node has only one id
         holder: Node | None = None
         above = path
         while holder is None:
@@ -109,11 +109,11 @@ class Space:
         return RegisterNode(ua.NodeId(f"{source.name}/{path}", NAMESPACE), name, holder, source.feed, register)
 
     def knows(self, node_id: ua.NodeId) -> bool:
-        """Return whether there is such a node."""
+        """Return whether a node has this id."""
         return self.find(node_id) is not None or node_id in self._standard
 
     def read(self, node_id: ua.NodeId, attribute: int, roles: Roles) -> ua.DataValue:
-        """Return an attribute of a node."""
+        """Return an attribute of a node as a client with these roles sees it."""
         node = self.find(node_id)
         if node is not None:
             return node.read(attribute, roles)
@@ -168,7 +168,7 @@ class Space:
         """Return the nodes at the end of a path of browse names.
 
         Raises:
-            ServiceError: There is no such start, or a name is empty.
+            ServiceError: The start does not exist, or a name is empty.
 
         """
         if not elements or any(not element.TargetName or not element.TargetName.Name for element in elements):

@@ -76,8 +76,8 @@ class Item:
 
         Args:
             asked: The requested parameters.
-            slowest_ms: The publishing interval, which a sampling interval of -1 means.
-            fastest_ms: The source's period.
+            slowest_ms: The publishing interval; it replaces a requested sampling interval of -1.
+            fastest_ms: The source's period, the shortest sampling interval.
 
         Returns:
             The revised sampling interval in ms, and the revised length of the queue.
@@ -119,7 +119,7 @@ class Item:
         self._status_only = asked.Trigger == ua.DataChangeTrigger.Status
 
     def changed(self) -> None:
-        """Record that the variable has changed."""
+        """Handle a change of the variable: prepare to send the value, if it passes the filter."""
         if self.mode == ua.MonitoringMode.Disabled:
             return
         if (self._deadband or self._status_only) and not self._matters():
@@ -246,7 +246,7 @@ class Subscription:
         self.keep_alive = min(asked.RequestedMaxKeepAliveCount or MAX_KEEP_ALIVE, MAX_KEEP_ALIVE)
         self.lifetime = min(max(asked.RequestedLifetimeCount or MAX_LIFETIME, 3 * self.keep_alive), MAX_LIFETIME)
         self.most = min(asked.MaxNotificationsPerPublish or MAX_NOTIFICATIONS, MAX_NOTIFICATIONS)
-        if self._timer is not None:  # the new interval counts from now on, also if the old one was long
+        if self._timer is not None:  # the new interval starts now, even if the old one was long
             self._timer.cancel()
             self._due_s = asyncio.get_running_loop().time()
             self._schedule()
@@ -254,7 +254,7 @@ class Subscription:
     # ---- publishing --------------------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Begin to publish."""
+        """Start to publish."""
         self._due_s = asyncio.get_running_loop().time()
         self._schedule()
 
@@ -277,16 +277,16 @@ class Subscription:
         self._idle = not self.dirty
 
     def mark(self, item: Item) -> None:
-        """Record that an item has values to send.
+        """Record that an item has values to send. Publish them at once if the last interval had no changes.
 
         If a source changes its values as often as the subscription publishes, some changes come just
-        after the end of an interval. With the wait for the next end, the newest values would replace
+        after the end of an interval. If they waited for the next end, newer values would replace
         them.
         """
         self.dirty[item] = None
         if self._idle:
             self._idle = False
-            asyncio.get_running_loop().call_soon(self._publish_early)  # when all of the frame are marked
+            asyncio.get_running_loop().call_soon(self._publish_early)  # after all changes of the frame are marked
 
     def _publish_early(self) -> None:
         if self._timer is None:
@@ -304,7 +304,7 @@ class Subscription:
         return self._first or (self.enabled and bool(self.dirty)) or self._silent >= self.keep_alive
 
     async def publish_results(self, request: Any) -> bool:
-        """Answer a Publish request if a publication is late. Return whether it was late."""
+        """Answer a Publish request at once if a publication waits for one. Return whether one waited."""
         self._idle_intervals = 0
         if not self._wants():
             return False
@@ -357,7 +357,7 @@ class Subscription:
         return Fault.Good if self._kept.pop(number, None) else Fault.BadSequenceNumberUnknown
 
     def republish(self, number: int) -> ua.NotificationMessage:
-        """Return a message again. ServiceError: the subscription no longer keeps it."""
+        """Return an unacknowledged message. Raise ServiceError if the subscription no longer keeps it."""
         if number not in self._kept:
             raise ServiceError(Fault.BadMessageNotAvailable)
         return self._kept[number][0]
@@ -375,7 +375,7 @@ class Subscription:
     def add(
         self, watch: Watch, asked: ua.MonitoredItemCreateRequest, fastest_ms: float
     ) -> ua.MonitoredItemCreateResult:
-        """Monitor a variable. ServiceError: the filter is not supported."""
+        """Monitor a variable. Raise ServiceError if the filter is not supported."""
         mode = ua.MonitoringMode(asked.MonitoringMode)
         item = Item(self, self._next_item, watch, asked.RequestedParameters.ClientHandle, mode)
         interval_ms, size = item.revise(asked.RequestedParameters, self.interval_ms, fastest_ms)
@@ -386,14 +386,14 @@ class Subscription:
         return ua.MonitoredItemCreateResult(ua.StatusCode(), item.id, interval_ms, size)
 
     def modify(self, asked: ua.MonitoredItemModifyRequest, fastest_ms: float) -> ua.MonitoredItemModifyResult:
-        """Change an item's parameters. ServiceError: there is no such item, or its filter is not supported."""
+        """Change an item's parameters. Raise ServiceError if the item does not exist, or its filter is unsupported."""
         item = self._item(asked.MonitoredItemId)
         interval_ms, size = item.revise(asked.RequestedParameters, self.interval_ms, fastest_ms)
         item.watch.feed.count()
         return ua.MonitoredItemModifyResult(ua.StatusCode(), interval_ms, size)
 
     def set_mode(self, number: int, mode: ua.MonitoringMode) -> None:
-        """Change an item's mode. ServiceError: there is no such item."""
+        """Change an item's mode. Raise ServiceError if the item does not exist."""
         item = self._item(number)
         before, item.mode = item.mode, mode
         if mode == ua.MonitoringMode.Disabled:
@@ -406,7 +406,7 @@ class Subscription:
             self.dirty.pop(item, None)
 
     def remove(self, number: int) -> None:
-        """Stop monitoring a variable. ServiceError: there is no such item."""
+        """Stop monitoring a variable. Raise ServiceError if the item does not exist."""
         item = self._item(number)
         item.clear()
         item.watch.remove(item)
@@ -436,14 +436,14 @@ class Subscriptions:
         return [one for one in self.subscriptions.values() if one.owner is owner]
 
     def find(self, number: int, owner: Any) -> Subscription:
-        """Return a subscription of a session. ServiceError: the session has no such subscription."""
+        """Return a subscription of a session. Raise ServiceError if the session has no such subscription."""
         found = self.subscriptions.get(number)
         if found is None or found.owner is not owner:
             raise ServiceError(Fault.BadSubscriptionIdInvalid)
         return found
 
     def create(self, owner: Any, asked: ua.CreateSubscriptionParameters) -> Subscription:
-        """Create a subscription, which is not started yet. ServiceError: there are too many."""
+        """Create a subscription, without starting it. Raise ServiceError if there are too many."""
         if len(self.subscriptions) >= MAX_SUBSCRIPTIONS or len(self.of(owner)) >= MAX_SUBSCRIPTIONS_PER_SESSION:
             raise ServiceError(Fault.BadTooManySubscriptions)
         number, self._next = self._next, self._next + 1

@@ -40,7 +40,7 @@ _TYPES: Final = {
     ua.VariantType.Double: ("LREAL",),
 }
 _TYPE_OF: Final = {name: found for found, names in _TYPES.items() for name in names}
-"""The data type of each elementary type; all others are texts, as everywhere in shmio."""
+"""The OPC UA data type of each elementary type. The values of all other types are texts."""
 
 _UNITS: Final = {
     "%": "P1", "1/min": "RPM", "1/s": "C97", "A": "AMP", "Hz": "HTZ", "K": "KEL", "N": "NEW", "Nm": "NU", "Pa": "PAL",
@@ -56,7 +56,7 @@ _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def data_type(register: Register) -> ua.VariantType:
-    """Return the data type of a register or of its elements."""
+    """Return the OPC UA data type of a register or of its elements."""
     return _TYPE_OF.get(register.element.base, ua.VariantType.String)
 
 
@@ -77,7 +77,7 @@ def variant(register: Register, value: Value) -> ua.Variant:
 
 
 def unit(text: str, namespace: str) -> ua.EUInformation:
-    """Return a unit. A unit without a UNECE code is in the instance's namespace."""
+    """Return a unit as OPC UA sends it. A unit without a UNECE code is in the instance's namespace."""
     code = _UNITS.get(text)
     name = ua.LocalizedText(text)
     if code is None:
@@ -86,7 +86,7 @@ def unit(text: str, namespace: str) -> ua.EUInformation:
 
 
 def moment(ns: int) -> datetime:
-    """Return a time as OPC UA sends it."""
+    """Return a time, given in ns since 1970, as OPC UA sends it."""
     return _EPOCH + timedelta(microseconds=ns // 1000)
 
 
@@ -108,9 +108,9 @@ def register_state(follower: FrameFollower, register: Register, injected: Sequen
     """Return the present state of a register, an element or a part.
 
     Args:
-        follower: Follows the block, and knows the last frame.
+        follower: Follows the source's block, and has its newest frame.
         register: The register, element or part.
-        injected: The injections over ``/out`` that the frame shows.
+        injected: The ``/out`` injections that the frame shows.
     """
     block, frame = follower.block, follower.frame
     code = block_status(block, frame)

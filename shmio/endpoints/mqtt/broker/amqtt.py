@@ -90,7 +90,7 @@ async def _serve(broker: Broker, reader: StreamReader, writer: StreamWriter) -> 
 
 
 async def _until_version(reader: StreamReader) -> bytes:
-    """Read the beginning of a CONNECT packet, up to the version of the protocol."""
+    """Read the start of a CONNECT packet, up to the version of the protocol."""
     head = await reader.readexactly(2)
     while head[-1] & 0x80 and len(head) < 5:  # the packet's length has one to four bytes
         head += await reader.readexactly(1)

@@ -27,7 +27,7 @@ STOP_S: Final = 3.0
 MAX_PACKET_BYTES: Final = 1 << 21
 MAX_QUEUED_MESSAGES: Final = 100_000
 MAX_QUEUED_BYTES: Final = 64 << 20
-"""Maximum size of the queue for a slow client, in bytes. The client loses newer messages."""
+"""Maximum size of the queue for a slow client, in bytes. Beyond it, the client loses newer messages."""
 MAX_LEVELS: Final = 64
 """Maximum number of levels in the path of a register that can be written by MQTT."""
 READERS: Final = MqttAccount(roles=["read"])

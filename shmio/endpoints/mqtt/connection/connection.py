@@ -48,7 +48,7 @@ FEW_IN_FLIGHT: Final = 4
 The broker may send that many commands in one turn, and each takes time.
 """
 HEAD_BYTES: Final = 128
-"""Maximum size of the parts of a packet other than topic and payload."""
+"""Maximum size of the parts of a packet other than topic and payload, in bytes."""
 OFTEN: Final = 4
 OFTEN_S: Final = 60.0
 """If ``OFTEN`` connections are lost within this time, in s, the problem names a likely cause."""
@@ -157,7 +157,7 @@ class ConnectionProblems:
 
 
 def is_watched(message: MQTTMessage) -> bool:
-    """Return whether another client has sent a message on one of the bridge's own topics."""
+    """Return whether a message is another client's message on one of the bridge's own topics."""
     return _WATCHED in (vars(message.properties) if message.properties else {}).get("SubscriptionIdentifier", ())
 
 
@@ -180,8 +180,8 @@ class BrokerConnection:
 
         Args:
             policy: Chooses the broker and the waits.
-            selector: Selects the sockets that are ready.
-            wake: Called by a thread that needs :meth:`run_once` to run.
+            selector: The connection registers its socket here.
+            wake: Called, from any thread, when :meth:`run_once` must run.
             will: Returns the will for each CONNECT.
             most: Maximum number of unacknowledged messages, in each direction.
 
@@ -190,7 +190,7 @@ class BrokerConnection:
         self.is_ready: Callable[[], bool] = lambda: True
         """Called after CONNACK until it returns True. Only then, the connection is ``up``."""
         self.came_up = False
-        """Set when the connection comes up; the user of this object resets it."""
+        """True once the connection has come up, until the caller resets it."""
         self.on_lost: Callable[[list[Message]], None] = lambda _: None
         """Called with the unacknowledged messages when the connection is lost."""
         self.problems = ConnectionProblems()
@@ -244,7 +244,7 @@ class BrokerConnection:
     # ---- the loop ----------------------------------------------------------------------------------------------------
 
     def run_once(self) -> float:
-        """Do what is due, and return after how many seconds to call this again."""
+        """Do what is due. Return the time in s after which to call this again."""
         now_s = time.monotonic()
         if self._attempt is not None and self._attempt.over:
             self._take(self._attempt)
@@ -339,7 +339,7 @@ class BrokerConnection:
                 f"broker {self._target} refuses our subscription, so no command can arrive: {refused[0]}"
             )
 
-    # ---- dropping it -------------------------------------------------------------------------------------------------
+    # ---- dropping the connection -------------------------------------------------------------------------------------
 
     def drop(self, problem: str, *, politely: bool = False) -> None:
         """Drop the connection, or the attempt that waits for CONNACK.
@@ -347,7 +347,7 @@ class BrokerConnection:
         Args:
             problem: Reason for the drop.
             politely: Whether to send DISCONNECT, so that the broker does not publish the will. Do
-                not set this in a callback.
+                not set this in a callback of the client.
 
         """
         problem = f"broker {self._target}: {problem}"
@@ -501,8 +501,8 @@ class CommandConnection:
         Args:
             settings: The configuration's ``[mqtt]`` section.
             client_id: The client id of this connection.
-            selector: Selects the sockets that are ready.
-            wake: Called by a thread that needs :meth:`run_once` to run.
+            selector: The connection registers its socket here.
+            wake: Called, from any thread, when :meth:`run_once` must run.
             filters: Returns the topic filters to subscribe to for commands.
             answers: Returns the topic filters to subscribe to for the results of commands.
 
@@ -532,7 +532,7 @@ class CommandConnection:
             at: The broker that receives the values; None: there is no connection for values.
 
         Returns:
-            After how many seconds to call this again.
+            The time in s after which to call this again.
 
         """
         if at is not self._at:

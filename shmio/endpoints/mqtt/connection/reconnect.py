@@ -1,4 +1,4 @@
-"""Decides which broker to try next, and how long to wait before."""
+"""Decides which broker to try next, and how long to wait before the attempt."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from shmio.config import Mqtt
 from shmio.config.mqtt import brokers
 
 RECONNECT: Final = Backoff(0.25, 15.0, jitter=0.5)
-"""Waits before the next attempt to connect.
+"""Waiting times before the next attempt to connect.
 
 They vary at random, so that the bridges of a plant do not all reconnect at the same time.
 """
 RECONNECT_OWN: Final = Backoff(0.25, 0.5, jitter=0.5)
-"""Waits before the next attempt to connect to the instance's own broker.
+"""Waiting times before the next attempt to connect to the instance's own broker.
 
 They are short, because this broker is on this host and is restarted at once.
 """
@@ -70,7 +70,7 @@ class ReconnectPolicy:
         self.reset_failures()
 
     def retry_same(self) -> None:
-        """Choose the same broker again next time."""
+        """Make :meth:`next` return the same broker again."""
         self._next -= 1
 
     def next(self) -> Target:

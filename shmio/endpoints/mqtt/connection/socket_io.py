@@ -20,12 +20,13 @@ from shmio.endpoints.mqtt.connection.attempt import close_socket
 BATCH: Final = 32
 """Maximum number of messages in a batch.
 
-The messages of a batch share TCP segments. The first message is sent when the last has been made.
+The messages of a batch share TCP segments. The first message waits until the last has been made.
 """
 PACKETS: Final = 4
 """Maximum number of packets that are read before the bridge does other work.
 
-One call of paho may read a packet for each unacknowledged message, which takes hardly any time.
+It may be exceeded: one call of paho may read a packet for each unacknowledged message. That takes
+hardly any time.
 """
 
 
@@ -48,7 +49,7 @@ class SocketIo:
         Args:
             client: The paho client.
             made: The client's socket.
-            selector: Selects the sockets that are ready.
+            selector: This object registers the socket here.
             on_failure: Called with the reason when reading or writing fails.
 
         """
@@ -59,7 +60,7 @@ class SocketIo:
         self._packets = 0
         """Number of received packets for which one of the client's callbacks was called."""
         client.on_socket_register_write = lambda *_: None  # from now on this object writes, not paho
-        _set(made, socket.TCP_NODELAY, 1)  # a batch does not wait for the acknowledgement of the one before
+        _set(made, socket.TCP_NODELAY, 1)  # a batch does not wait for TCP's acknowledgement of the previous batch
         selector.register(made, selectors.EVENT_READ, self._serve)
 
     def counting(self, callback: Callable[..., None]) -> Callable[..., None]:
@@ -72,7 +73,7 @@ class SocketIo:
         return counted
 
     def run_once(self) -> float:
-        """Read what the selector cannot see, and return the time in s until the next call."""
+        """Read data that the selector cannot see. Return the time in s after which to call this again."""
         if self._unseen():
             self._serve(selectors.EVENT_READ)
         self.push()
@@ -106,7 +107,7 @@ class SocketIo:
     def _read(self) -> MQTTErrorCode:
         """Read a few packets.
 
-        Without a limit, paho reads a packet for each unacknowledged message.
+        One call of paho may read several, so this may read more than ``PACKETS``.
         """
         before, most = -1, self._packets + PACKETS
         code = MQTTErrorCode.MQTT_ERR_SUCCESS
@@ -122,7 +123,7 @@ class SocketIo:
         lost.
         """
         client = self._client
-        # Otherwise paho would call it for each message of QoS 0, which is slow.
+        # Otherwise paho would call on_publish for each message of QoS 0, which is slow.
         acknowledged, client.on_publish = client.on_publish, None
         _set(made, socket.TCP_CORK, 1)
         code = client.loop_write()

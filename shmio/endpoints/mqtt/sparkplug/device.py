@@ -60,7 +60,7 @@ class Device:
         self._follower = follow(block)
 
     def set_metrics(self, metrics: Sequence[Metric]) -> None:
-        """Set the metrics of the device's registers and elements, in their order."""
+        """Set the metric of each of :attr:`parts`, in the same order."""
         self._metrics = metrics
 
     @property

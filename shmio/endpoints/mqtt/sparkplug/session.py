@@ -1,6 +1,7 @@
 """Publishes an instance as an edge node of Sparkplug B.
 
-It has its own connection, because a connection has only one will, and the bridge has another will.
+The edge node has its own connection, because a connection has only one will, and the bridge's connection
+has another will.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ log = logging.getLogger("shmio.mqtt")
 
 
 class DeviceBacklog(Backlog[list[Sample]]):
-    """The samples of each device's frames, in order."""
+    """A backlog with a row for each device: the samples of its frames, in order."""
 
     def keep(self, device: str, samples: list[Sample]) -> None:
         """Keep the samples of one frame."""
@@ -116,8 +117,8 @@ class Session:
             settings: The configuration's ``[mqtt]`` section.
             sparkplug: The configuration's ``[mqtt.sparkplug]`` section.
             segment: The instance's shared memory.
-            selector: Selects the sockets that are ready.
-            wake: Called by a thread that needs :meth:`run_once` to run.
+            selector: The connection registers its socket here.
+            wake: Called, from any thread, when :meth:`run_once` must run.
 
         Raises:
             PathError: A pattern is not valid.
@@ -133,7 +134,7 @@ class Session:
         self.connection.on_lost = self._lose
         self._host = None if sparkplug.primary_host is None else PrimaryHost(sparkplug.primary_host)
         self._host_lost = False
-        """True if the host went offline after the births. When it returns, it does not know them."""
+        """True if the host went offline after the births. When it returns, it needs new births."""
         self._until_s = 0.0
         """Deadline for the host to announce itself. Then the session tries the next broker."""
         self._elements = sparkplug.elements
@@ -199,7 +200,7 @@ class Session:
             self._birth()
 
     def run_once(self) -> float:
-        """Do what is due, and return after how many seconds to call this again."""
+        """Do what is due. Return the time in s after which to call this again."""
         if not self._defined:
             self._define()
         if self.connection.problem and not self.connection.up:
@@ -294,7 +295,7 @@ class Session:
         return True
 
     def _lose(self, _unacknowledged: Sequence[Message]) -> None:
-        """After a lost connection, keep the changes that waited to be sent."""
+        """Move the waiting changes to the backlog, because the connection was lost."""
         for name, device in self._devices.items():
             waiting = self._waiting[name]
             if waiting and device.alive:
