@@ -1,4 +1,4 @@
-"""Addresses to listen on: ``host:port`` with IPv6 in brackets, or UNIX sockets as ``unix:PATH``."""
+"""Addresses to listen on: ``host:port`` (IPv6 in brackets), or ``unix:PATH`` for a UNIX socket."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from shmio.errors import ConfigError
 
 UNIX: Final = "unix:"
 MAX_PATH_BYTES: Final = 107
-"""Maximum length of a UNIX socket's path in bytes: sun_path has 108, with the final zero (unix(7))."""
+"""Maximum length in bytes of a UNIX socket's path: ``sun_path`` holds 108, including the final zero (unix(7))."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Address:
     def loopback(self) -> bool:
         """True if only this host can reach the address.
 
-        The only name for which this holds is ``localhost``.
+        Any host name except ``localhost`` counts as reachable from other hosts.
         """
         if self.host == "localhost":
             return True

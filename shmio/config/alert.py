@@ -1,4 +1,4 @@
-"""Rules of the sections ``[[alert]]``."""
+"""Checks the sections ``[[alert]]``, and makes their paths absolute."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _DEPENDENT: Final = {
     "webhook_ca": "webhook",
     "insecure": "webhook",
 }
-"""Keys that need another key."""
+"""Keys that are allowed only beside another key, with that key."""
 
 
 def alert_faults(config: Config) -> Iterator[str]:
-    """Yield each fault that can be found without layouts and without the host."""
+    """Yield each fault of the alerts that the configuration alone shows, without layouts and the host's files."""
     if len(config.alert) > MAX_ALERTS:
         yield f"alert: there are {len(config.alert)} alerts, but at most {MAX_ALERTS} are allowed"
         return
@@ -57,7 +57,7 @@ def alert_faults(config: Config) -> Iterator[str]:
 
 
 def resolve_alert(alert: Alert, config: Config) -> None:
-    """Make the paths of an alert absolute. The name of a program without a folder stays as it is."""
+    """Make the paths of an alert absolute. A program's name without a slash stays as it is."""
     if alert.command and "/" in alert.command[0]:
         alert.command = [str(config.path(alert.command[0])), *alert.command[1:]]
     for field in ("webhook_header_file", "webhook_ca"):
@@ -69,7 +69,7 @@ def parse_webhook(url: str) -> SplitResult:
     """Split the URL of a webhook.
 
     Raises:
-        ConfigError: It cannot be used.
+        ConfigError: The URL cannot be used for a webhook.
 
     """
     try:

@@ -1,4 +1,4 @@
-"""Campaigns: files of declared injections, and of what is expected of signals."""
+"""Reads campaign files, which declare injections and what is expected of signals."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def read_campaign(file: Path) -> list[Declaration]:
 
 
 def parse_campaign(tables: dict[str, Any]) -> list[Declaration]:
-    """Return the declarations in a campaign's tables, such as ``{"injection": [{"name": …}]}``.
+    """Return the injections declared in a campaign's tables, such as ``{"injection": [{"name": …}]}``.
 
     Raises:
         ConfigError: A table is invalid; the message begins with its key.

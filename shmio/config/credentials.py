@@ -1,6 +1,6 @@
 """Credentials: the gRPC endpoint's bearer tokens, and MQTT passwords.
 
-Only the owner of their files may have access to them. Messages never quote a secret.
+Only its owner may have access to a file with credentials. Messages never quote a secret.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ MIN_TOKEN_BYTES: Final = 20
 MAX_TOKEN_BYTES: Final = 1024
 MAX_PASSWORDS_BYTES: Final = 1 << 20
 ROUNDS: Final = 101
-"""Number of PBKDF2 rounds, as mosquitto up to 2.0 uses.
+"""Number of PBKDF2 rounds, the same as in mosquitto up to 2.0.
 
-A password is checked once per connection.
+The broker checks a password once per connection.
 """
 _KEY: Final = "mqtt.password_file"
 _HASH: Final = re.compile(r"\$[0-9a-z-]{1,16}\$")
@@ -46,7 +46,7 @@ class Secret(NamedTuple):
 
 
 def read_tokens(tokens: Sequence[Token], section: str = "grpc.token") -> tuple[Secret, ...]:
-    """Read the tokens that the configuration names.
+    """Return name, roles and digest of each token in the configuration.
 
     Args:
         tokens: The sections of the tokens.
@@ -93,7 +93,7 @@ def read_password(name: str, key: str = _KEY) -> str:
 
     Raises:
         ConfigError: The file cannot be used, or its first line is empty; the message never quotes
-            it.
+            the password.
 
     """
     password = _read_passwords(name, key).split("\n", 1)[0].rstrip("\r")
@@ -137,8 +137,8 @@ def read_accounts(name: str, roles: Sequence[MqttAccount] = ()) -> dict[str, str
         roles: Accounts that must have a line.
 
     Raises:
-        ConfigError: A line is invalid or missing. The message names its number, and never quotes
-            it.
+        ConfigError: The file cannot be used, or a line is invalid or missing. The message has the
+            number of an invalid line, and never quotes a password.
 
     """
     accounts: dict[str, str] = {}
@@ -178,7 +178,7 @@ def hashed(password: str) -> str:
 
 
 def _is_hash(secret: str) -> bool:
-    """Return whether mosquitto accepts a hash: ``$7$ROUNDS$SALT$DIGEST`` or ``$6$SALT$DIGEST``."""
+    """Return whether a text is a hash for mosquitto: ``$7$ROUNDS$SALT$DIGEST`` or ``$6$SALT$DIGEST``."""
     fields = secret.split("$")
     try:
         pbkdf2 = fields[:2] == ["", "7"] and len(fields) == 5 and 0 < int(fields[2]) <= 10_000_000
@@ -206,14 +206,14 @@ def _read_secret(key: str, name: str, most_bytes: int, *, instead: str) -> bytes
     """Return the beginning of a file that contains a secret, at most ``most_bytes`` bytes.
 
     Args:
-        key: The configuration key at the beginning of messages.
+        key: The beginning of messages: the configuration key and the path.
         name: Path of the file.
         most_bytes: Maximum number of bytes to read.
         instead: How to replace a secret that others could have read, for the message.
 
     Raises:
-        ConfigError: The file cannot be read, or others have access to it; the message never quotes
-            it.
+        ConfigError: The file cannot be read, or other users have access to it; the message never
+            quotes its contents.
 
     """
     try:

@@ -1,4 +1,4 @@
-"""Rules for declared injections that need no layout. They apply to all files with declarations."""
+"""Checks declared injections of any file, as far as possible without a layout."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from shmio.errors import ConfigError
 
 MAX_DECLARATIONS: Final = 256
 """Maximum number of declarations in one file."""
-MAX_DIMENSIONS: Final = 6  # of an array; as in layout/model.py, which cannot be imported here
+MAX_DIMENSIONS: Final = 6  # of an array; the same as in layout/model.py, which cannot be imported here
 
 
 @dataclass(frozen=True)
 class Keys:
-    """The keys of an operation.
+    """The keys that an operation takes, besides those of every injection.
 
     Attributes:
         needed: Required keys.
-        choice: Sets of keys, of which exactly one must be given completely.
+        choice: Alternative sets of keys; exactly one set must be given, and completely.
         free: Optional keys.
 
     """
@@ -68,7 +68,8 @@ def check_declarations(declarations: Sequence[Declaration]) -> None:
     """Check declarations, as far as possible without a layout.
 
     Raises:
-        ConfigError: The first fault; the message begins with the key.
+        ConfigError: A declaration is faulty; the message describes the first fault, and begins
+            with its key.
 
     """
     for fault in declaration_faults(declarations):

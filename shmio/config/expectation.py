@@ -1,4 +1,4 @@
-"""Rules for expectations that need no layout."""
+"""Checks the expectations of a campaign, as far as possible without a layout."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MAX_EXPECTATIONS: Final = 256
 
 
 class Form(NamedTuple):
-    """The keys of a form besides the one that distinguishes it."""
+    """The keys of a form of expectation, besides the key that marks the form."""
 
     needed: tuple[str, ...] = ()
     free: tuple[str, ...] = ()
@@ -27,12 +27,12 @@ FORMS: Final[Mapping[str, Form]] = {
     "max_rate": Form(("signal",)),
     "like": Form(("signal",), ("tolerance", "tolerance_s")),
 }
-"""The forms of an expectation, by the key that distinguishes each."""
+"""The forms that an expectation can have, by the key that marks each form."""
 _KEYS: Final = tuple(dict.fromkeys(key for name, form in FORMS.items() for key in (name, *form.needed, *form.free)))
 
 
 def form_of(expectation: Expectation) -> str:
-    """Return the name of the form of an expectation that has no faults."""
+    """Return the name of an expectation's form. The expectation must have no faults."""
     return next(name for name in FORMS if getattr(expectation, name) is not None)
 
 

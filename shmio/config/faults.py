@@ -1,4 +1,4 @@
-"""Collects the faults of a configuration, up to a limit, as messages with their lines."""
+"""Collects the faults of a configuration, up to a limit, as messages with line numbers."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ MAX_PARTS: Final = 64
 """Maximum number of dotted parts of a key, because the parser's time grows with their square."""
 MAX_LINE: Final = 80
 MAX_HINTED: Final = 100
-"""Length in characters up to which a similar word is suggested for an unknown one."""
+"""Maximum length in characters of an unknown word for which a similar word is suggested."""
 MAX_SHOWN: Final = 1_000
 MAX_CHARACTERS: Final = 500
 """Maximum number of characters of a message.
 
-A message may quote text that is as long as the file.
+Without this limit, a message could quote text that is as long as the file.
 """
 _KEY: Final = re.compile(r"[A-Za-z0-9_-]+(?:\[[0-9]+\]|\.[A-Za-z0-9_-]+)*(?=[:\s])")
 _PLACE: Final = re.compile(r"\b(source|emulator|injection|expect|alert)\[([0-9]+)\]")
@@ -93,10 +93,7 @@ def too_long(text: str, most: int = MAX_KEY) -> int:
 
 
 class Lines:
-    """Finds the line of each key by the key's name in messages, such as ``source[0].host``.
-
-    It reads the text once, and finds all keys.
-    """
+    """The line of each key in a TOML text, by the key's name in messages, such as ``source[0].host``."""
 
     def __init__(self, text: str, most: int = MAX_KEY) -> None:
         self._most = most
@@ -109,9 +106,9 @@ class Lines:
         self._read(text)
 
     def of(self, key: str) -> int:
-        """Return the line of a key; if unknown, that of the innermost table around it.
+        """Return the line of a key; if it is unknown, the line of the innermost known table around it.
 
-        If unknown, 0.
+        0 if no table around it is known either.
         """
         while key:
             if key in self._lines:
@@ -175,9 +172,9 @@ class Lines:
         return table
 
     def _resolve(self, parts: list[str], table: str, last: str | None = None) -> str:
-        """Return the full key of these parts.
+        """Return the full name of a key in ``table``, with the index of the latest table where a name repeats.
 
-        If several tables have the same name, the last one is meant.
+        ``last`` is a further part of the name, which gets no index.
         """
         key = table
         for part in parts:
@@ -201,7 +198,7 @@ def _bare(token: str) -> str:
 
 
 def explain(error: ValidationError, key: str = "") -> str:
-    """Return msgspec's error as ``key: what is wrong``; ``key`` is that of the value to convert."""
+    """Return msgspec's error as ``key: what is wrong``; ``key`` is the key of the converted value."""
     text, _, at = str(error).partition(" - at `$")
     path = f"{key}{at.rstrip('`')}".lstrip(".")
     missing = re.search(r"missing required field `([^`]*)`", text)
@@ -241,10 +238,7 @@ def decode(data: bytes, place: str) -> str:
 
 
 def near(word: str, names: Iterable[str]) -> list[str]:
-    """Return a list with the most similar name, regardless of case.
-
-    An empty list if none is similar.
-    """
+    """Return a list with only the name most similar to ``word``, ignoring case; empty if none is similar."""
     folded = {name.lower(): name for name in names}
     found = difflib.get_close_matches(word.lower(), folded, 1) if len(word) <= MAX_HINTED else []
     return [folded[found[0]]] if found else []
@@ -264,7 +258,7 @@ def meant(word: str, names: Iterable[str]) -> str:
 
 
 def explain_toml(error: Exception, text: str) -> str:
-    """Return the TOML parser's message with the line. For frequent mistakes, add the correction."""
+    """Return the TOML parser's message with the text of the faulty line, and the remedy for frequent mistakes."""
     if isinstance(error, ValueError) and not isinstance(error, TOMLDecodeError):  # int() refuses so many digits
         return "a number has too many digits"
     place = _POSITION.search(str(error))
@@ -308,13 +302,13 @@ def named(message: str, tables: Mapping[str, Any]) -> str:
 
 
 def locate(message: str, file: str, lines: Lines) -> tuple[int, str]:
-    """Return the line of a message about a file, and the message without the name of the file.
+    """Return the line of ``file`` that a message is about, and the message without the file's name.
 
-    The line is 0 if the message is about the whole file. If it is about another file, the line is 0
-    and the message complete.
+    The line is 0 if the message is about the whole file. For a message about another file, return 0
+    and the unchanged message.
 
     Args:
-        message: As :class:`Faults` makes it.
+        message: A message of :class:`Faults`.
         file: Path of the file, as in the message.
         lines: The lines of the file's keys.
 
@@ -343,7 +337,10 @@ class Faults:
         self._layout: LayoutError | None = None
         self.count = 0
         self.places: Mapping[str, Sequence[int]] = {}
-        """By kind of section, the index in the file of each section that is still being checked."""
+        """For each kind of section, the indices in the file of the sections that passed the first check.
+
+        The later checks number only these sections; :meth:`add` replaces their numbers by these indices.
+        """
 
     @cached_property
     def _lines(self) -> Lines:
@@ -373,12 +370,12 @@ class Faults:
             self._note(f"{self._file}{f':{line}' if line else ''}: {text}", line)
 
     def lies_in(self, file: str, table: str, lines: Mapping[str, int]) -> None:
-        """Record that these keys of a table come from ``file``, so that faults name this file.
+        """Record that some keys of a table come from another file, so that faults name that file.
 
         Args:
             file: The other file, relative to the folder of the configuration.
             table: The table that has the keys.
-            lines: The line of each key in ``file``.
+            lines: The line of each of these keys in ``file``.
 
         """
         for name, line in lines.items():
@@ -421,7 +418,7 @@ class Faults:
 
         Raises:
             ConfigError: There are faults; the message has a line for each fault and warning.
-            LayoutError: The only fault is that of a layout.
+            LayoutError: All faults are those of one layout.
 
         """
         if not self.count:
@@ -435,7 +432,7 @@ class Faults:
 
 
 def _shortened(message: str) -> str:
-    """Return a message; if it is too long, without its middle."""
+    """Return a message, with its middle cut out if it is too long."""
     if len(message) <= MAX_CHARACTERS:
         return message
     return f"{message[: MAX_CHARACTERS // 2]} … {message[-MAX_CHARACTERS // 2 :]}"

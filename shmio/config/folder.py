@@ -27,7 +27,7 @@ _MEANING: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Obstacle:
-    """The reason why a folder cannot be written, with the remedy.
+    """Why a folder is not writable, with the remedy.
 
     ``full`` is True if the disk is full, which may change at any time.
     """
@@ -37,7 +37,7 @@ class Obstacle:
 
 
 def unwritable(folder: Path) -> Obstacle | None:
-    """Return why no file can be created in a folder; None if one can.
+    """Return why files cannot be created in a folder; None if they can.
 
     If the folder does not exist yet, its nearest existing parent is checked. No file is left
     behind. The call may take long on a slow file system.

@@ -1,4 +1,4 @@
-"""Rules for listening addresses, tokens and roles."""
+"""Checks the addresses to listen on, tokens and roles, and makes the paths of ``[grpc]`` absolute."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def check_listening(config: Config, catching: Callable[[], AbstractContextManage
 
 
 def resolve(grpc: Grpc, config: Config) -> None:
-    """Make the paths in the section absolute."""
+    """Make the paths in ``[grpc]`` absolute."""
     for token in grpc.token:
         if token.token_file is not None:
             token.token_file = str(config.path(token.token_file))
@@ -57,8 +57,8 @@ def encrypted(grpc: Grpc, address: Listening) -> bool:
 def takes_tokens(grpc: Grpc, address: Listening) -> bool:
     """Return whether an address accepts tokens.
 
-    It does if nobody can read them on the network, or if the configuration allows tokens in plain
-    text.
+    It does if nobody can read the tokens on the network, or if the configuration allows tokens in
+    plain text.
     """
     return encrypted(grpc, address) or parse_address(address.listen).loopback or address.tokens_in_plain_text
 

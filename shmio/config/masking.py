@@ -1,7 +1,8 @@
 """Masks secrets in the text of a configuration, so that it can be shown to others.
 
-shmio's own keys name files with secrets, or have hashes of them. The keys of a connector of another
-package may have the secret itself. Therefore the name of a key decides. In doubt, text is masked.
+The values of shmio's own keys are files with secrets, or hashes of secrets. A key of another package's
+connector may have the secret itself. Therefore the name of a key decides whether its value is masked.
+In doubt, it is.
 """
 
 from __future__ import annotations
@@ -19,26 +20,26 @@ _PARTS: Final = re.compile(
     r"password|passwd|passphrase|passcode|pwd|secret|token|credential|authorization|bearer|sha256|psk"
 )
 _WHOLE: Final = frozenset({"webhook"})
-"""Whole names of keys. The address of a webhook often contains a secret."""
+"""Keys that may have a secret only if this is their whole name. The URL of a webhook often contains a secret."""
 _NO_SECRETS: Final = frozenset({"tokens_in_plain_text"})
 _PATH_SUFFIXES: Final = ("_file", "_path", "_dir")
 _KEY_FILES: Final = re.compile(r"""["']?[^"']*\.(?:pem|key|der|crt|p8)["']?""", re.IGNORECASE)
-"""The value of a plain ``key`` that is a path, as in shmio's own sections."""
+"""Matches a path, which is not masked as the value of a key with the name ``key``, as in shmio's own sections."""
 _WORD: Final = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 _USER: Final = re.compile(r"(?<=://)[^\s/\"']*(?=@)")
 _ASSIGNED: Final = re.compile(r"(?<![A-Za-z0-9_-])([A-Za-z0-9_-]++)[\"']?\s*+(?:=(?!=)|:(?!//))\s*(?=\S)")
 _EQUATED: Final = re.compile(r"(?<![A-Za-z0-9_-])([A-Za-z0-9_-]++)[\"']?\s*+=(?!=)\s*(?=\S)")
 _MIN_QUOTED: Final = 4
-"""Number of characters from which on a secret is searched for in messages."""
+"""Minimum number of characters of a secret that is masked wherever a message quotes it."""
 _BEFORE_EQUALS: Final = re.compile(r"[ \t]*=")
 _OWN_TABLES: Final = frozenset({("grpc", "token")})
-"""Tables whose name would hide all of their keys, although their secret keys have names of their own."""
+"""Tables that are not masked as a whole, although their names suggest a secret: the names of their keys decide."""
 
 
 def is_secret(key: str) -> bool:
     """Return whether a key of this name, without its table, may have a secret as its value.
 
-    A plain ``key`` may have one, or the path of a file: its value decides.
+    The value of a key with the name ``key`` may also be the path of a file. The value then decides.
     """
     folded = key.lower()
     if folded in _NO_SECRETS or folded.endswith(_PATH_SUFFIXES):
@@ -49,7 +50,7 @@ def is_secret(key: str) -> bool:
 
 
 def mask_value(key: str, value: Any) -> Any:
-    """Return a value of a parsed configuration in which secrets are masked.
+    """Return a value of a parsed configuration with its secrets masked.
 
     Args:
         key: Name of its key.
@@ -70,7 +71,7 @@ def mask_value(key: str, value: Any) -> Any:
 
 
 def mask_line(line: str, assigned: re.Pattern[str] = _ASSIGNED) -> str:
-    """Return a line with the user information of URLs, and all that follows a secret key, masked.
+    """Return a line in which the user information of URLs, and all that follows a secret key, is masked.
 
     Args:
         line: The line.
@@ -93,10 +94,10 @@ class Masked:
     _secrets: list[str] = field(default_factory=list)
 
     def hide(self, message: str) -> str:
-        """Return a message, which may quote the original text, without its secrets."""
+        """Return a message without the secrets that it may quote from the original text."""
         for secret in self._secrets:
             message = message.replace(secret, MASK)
-        return mask_line(message, _EQUATED)  # a colon ends the name of the key that a message is about
+        return mask_line(message, _EQUATED)  # in messages, a colon follows the faulty key
 
 
 def mask(text: str) -> Masked:
@@ -116,7 +117,7 @@ def mask(text: str) -> Masked:
 
 
 class _Masker:
-    """Goes through the tokens of a file, and finds those that are secrets."""
+    """Finds the secrets among the tokens of a TOML text."""
 
     def __init__(self, text: str) -> None:
         self._text = text
@@ -125,19 +126,19 @@ class _Masker:
         self._depth = 0
         """Depth of brackets in a value."""
         self._hidden: int | None = None
-        """Depth at which a secret value began; None outside of one."""
+        """Depth of brackets at which the current secret value began; None outside secret values."""
         self._awaited = False
-        """True if a secret value has not begun yet. It may be in the next line, although TOML has it in the same."""
+        """True between a secret key and its value. The value may be in the next line, although TOML forbids that."""
         self._plain_key = False
-        """True if this value belongs to a key named ``key``, whose paths are shown."""
+        """True if the current value belongs to a key with the name ``key``; its value is shown if it is a path."""
         self._table_hidden = False
         self._header = False
         self._start = True
         self.secrets: set[str] = set()
-        """The values that are replaced."""
+        """The secret values found so far."""
 
     def replaced(self) -> Iterable[tuple[int, int, str]]:
-        """Yield the beginning and the end of each part to replace, and what replaces it."""
+        """Yield the start, the end and the replacement of each part of the text to mask."""
         for match in TOKEN.finditer(self._text):
             piece = match[0]
             if piece == "\n":
@@ -186,7 +187,7 @@ class _Masker:
                 self._hidden = None
         elif first != ".":
             self._parts.append(piece.strip("\"'"))
-            if self._start and piece.endswith(":") and is_secret(piece[:-1]):  # a slip for =
+            if self._start and piece.endswith(":") and is_secret(piece[:-1]):  # a colon by mistake for =
                 self._hidden, self._awaited = self._depth, True
         self._start = False
 
@@ -205,7 +206,7 @@ class _Masker:
 
     @staticmethod
     def _covered(piece: str) -> str:
-        """Return what replaces a secret. It has as many lines."""
+        """Return the replacement of a secret, which has as many lines as the secret."""
         lines = "\n" * piece.count("\n")
         return f'"{MASK}"{lines}' if piece[0] in "\"'" else MASK
 

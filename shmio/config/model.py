@@ -33,7 +33,7 @@ FormName = Literal["box", "cylinder", "sphere"]
 AlongName = Literal["x", "y", "z"]
 UnitName = Literal["deg", "rad", "mm", "m"]
 TypeBytes = Annotated[dict[Text, Annotated[int, Meta(ge=1, le=1 << 20)]], Meta(max_length=1000)]
-"""For types whose members are unknown: the size in bytes by type name."""
+"""Sizes in bytes of types whose members are unknown, by type name."""
 RealtimePriority = Annotated[int, Meta(ge=1, le=99)]
 """Priority under the scheduling policy SCHED_FIFO (sched(7))."""
 
@@ -62,9 +62,9 @@ class Instance(Section):
 class Source(Section):
     """``[[source]]``: a producer of registers.
 
-    ``options`` are the connector's own keys. ``texts`` are the keys from the ``properties`` file
-    that the table does not override; their values are text, whatever their type. The connector
-    knows the types, and checks both.
+    ``options`` are the connector's own keys in the table. ``texts`` are the keys of the
+    ``properties`` file that the table does not override; their values are still text. The types of
+    both are checked with the connector's options.
     """
 
     name: Name
@@ -141,7 +141,7 @@ class Client(Section):
 
     @property
     def patterns(self) -> list[str]:
-        """Globs that the certificate's common name or one of its alternative names must match."""
+        """Globs; one of them must match the certificate's common name or one of its alternative names."""
         return [self.subject] if isinstance(self.subject, str) else self.subject
 
 
@@ -173,7 +173,10 @@ class Grpc(Section):
 
     @property
     def listening(self) -> dict[str, Listening]:
-        """All addresses by key. Those of ``listen`` have the roles of unauthenticated clients."""
+        """All addresses to listen on, by configuration key, with the roles of unauthenticated clients.
+
+        On addresses of ``listen``, such clients have all roles, or none if the endpoint is guarded.
+        """
         roles = [] if self.guarded else list(ROLES)
         found = {
             f"grpc.listen[{index}]": Listening(
@@ -188,7 +191,7 @@ class Grpc(Section):
 
 
 class Trigger(Section):
-    """``[recorder.trigger]``: records only the time around moments at which a condition is true."""
+    """``[recorder.trigger]``: limits recording to the time around moments at which a condition is true."""
 
     when: Text
     before_s: Annotated[float, Meta(ge=0, le=3600)] = 10.0
@@ -341,8 +344,8 @@ class Sparkplug(Section):
 class MqttAccount(Section):
     """``[[mqtt.account]]``: the roles of an account of shmio's own broker.
 
-    Without ``name``, it applies to clients without an account. ``publish`` lists filters of topics
-    on which the role ``write`` may publish, in addition to commands.
+    Without ``name``, the section applies to clients without an account. ``publish`` lists topic
+    filters on which an account with the role ``write`` may publish, in addition to commands.
     """
 
     roles: Texts
@@ -396,10 +399,10 @@ class Metrics(Section):
 
 
 class Web(Metrics):
-    """``[web]``: the address of the web page, which also has what ``[metrics]`` has.
+    """``[web]``: the address of the web page, which also serves the figures of ``[metrics]``.
 
-    ``roles`` are those of users who show no token. Its tokens are those of ``[[grpc.token]]``. ``scene`` is the file
-    that describes the cell in 3D (``scene.py``).
+    ``roles`` are the roles of users without a token; the page accepts the tokens of
+    ``[[grpc.token]]``. ``scene`` is the file that describes the cell in 3D (``scene.py``).
     """
 
     roles: Annotated[list[Text], Meta(max_length=len(ROLES))] | None = None
@@ -488,7 +491,7 @@ class Config(Section):
     folder: str = "."
 
     def path(self, text: str) -> Path:
-        """Return a path of the configuration as an absolute path."""
+        """Return the absolute path of a path in the configuration."""
         return (Path(self.folder) / text).resolve()
 
     @property

@@ -1,4 +1,4 @@
-"""Rules of the section ``[mqtt]``: the broker's address, its accounts' roles, and topic names."""
+"""Checks the section ``[mqtt]``: the broker's address, its accounts' roles, and topic names."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def brokers(mqtt: Mqtt) -> list[Address]:
     """Return the addresses of the external brokers, in the order in which to try them.
 
     Raises:
-        ConfigError: An address is wrong.
+        ConfigError: An address is invalid.
 
     """
     port = mqtt.port or (PORT if mqtt.tls is None else TLS_PORT)
@@ -203,7 +203,7 @@ def _check_filter(key: str, topics: str, own: Sequence[str]) -> None:
 
 
 def _overlap(one: Sequence[str], other: Sequence[str]) -> bool:
-    """Return whether some topic matches both filters."""
+    """Return whether a topic can match both filters, which are given as lists of levels."""
     if ["#"] in (list(one[:1]), list(other[:1])):
         return True
     if not one or not other:
@@ -215,7 +215,7 @@ def check_publish_topic(key: str, topic: str, mqtt: Mqtt, config: Config) -> Non
     """Check a topic on which the instance publishes something other than its registers.
 
     Raises:
-        ConfigError: It is not a topic, or it is one of those of the bridge.
+        ConfigError: The text is not the name of a topic, or the bridge uses this topic.
 
     """
     if len(topic) > MAX_PREFIX or set("+#").intersection(topic) or topic.startswith("$") or _is_no_text(topic):

@@ -1,4 +1,4 @@
-"""Rules of the section ``[opcua]``."""
+"""Checks the section ``[opcua]``, and makes its paths absolute."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def _check_roles(opcua: OpcUa) -> None:
 
 
 def resolve_opcua(opcua: OpcUa, config: Config) -> None:
-    """Make the paths in the section absolute."""
+    """Make the paths in ``[opcua]`` absolute."""
     for field in ("certificate", "key"):
         if name := getattr(opcua, field):
             setattr(opcua, field, str(config.path(name)))
@@ -86,7 +86,7 @@ def check_library() -> None:
     """Check that the library for OPC UA is installed.
 
     Raises:
-        ConfigError: It is not.
+        ConfigError: The library is not installed.
 
     """
     if importlib.util.find_spec("asyncua") is None:

@@ -148,7 +148,7 @@ def read_text(file: Path, remedy: str = "") -> str:
 
     Args:
         file: The file.
-        remedy: What to say if there is no such file, after the reason.
+        remedy: Text to append to the message if the file does not exist.
 
     Raises:
         ConfigError: The file cannot be read, is too large, or is not UTF-8.
@@ -172,7 +172,7 @@ def parse(file: Path, text: str) -> dict[str, Any]:
     """Parse TOML text.
 
     Raises:
-        ConfigError: It is not TOML, a key is too long, or tables are nested too deeply.
+        ConfigError: The text is not TOML, a key is too long, or tables are nested too deeply.
 
     """
     if line := too_long(text):
@@ -189,9 +189,9 @@ def parse(file: Path, text: str) -> dict[str, Any]:
 
 
 def _depth(value: Any) -> int:
-    """Return how deeply tables and lists are nested.
+    """Return how deeply tables and lists are nested; at most ``MAX_DEPTH + 1``.
 
-    This works without recursion, because there is no limit to the depth.
+    The function is not recursive, because the depth of a file is unlimited.
     """
     depth, level = 0, [value]
     while level and depth <= MAX_DEPTH:
@@ -301,10 +301,10 @@ class Structure:
     def __init__(
         self, faults: Faults, whole: type[Section], kinds: Mapping[str, type[Section]], several: Collection[str]
     ) -> None:
-        """Create the structure of one kind of file.
+        """Describe the tables of one kind of file.
 
         Args:
-            faults: Takes the faults.
+            faults: Where to add the faults.
             whole: The type of the file.
             kinds: The type of each table, by its dotted name without indices.
             several: Names of the tables that may repeat.
@@ -314,10 +314,7 @@ class Structure:
         self._whole, self._kinds, self._several = whole, kinds, several
 
     def sections(self, tables: dict[str, Any]) -> tuple[dict[str, Any], dict[str, list[int]]]:
-        """Return the sections without faults.
-
-        For those that may repeat, also their indices in the file.
-        """
+        """Return the sections without faults and, for those that may repeat, their indices in the file."""
         sound: dict[str, Any] = {}
         places: dict[str, list[int]] = {}
         hinted = self._unknown(tables, "", "")
@@ -410,7 +407,7 @@ class Structure:
 
 
 class _ConfigStructure(Structure):
-    """Also checks what only ``supervisor.toml`` has: sources, whose connectors have keys of their own."""
+    """Checks ``supervisor.toml``, in which a source may also have keys of its connector."""
 
     def __init__(
         self, faults: Faults, folder: Path, broken: dict[int, tuple[str, dict[str, Any], dict[str, str]]]
@@ -420,7 +417,7 @@ class _ConfigStructure(Structure):
         self._broken = broken
 
     def sections(self, tables: dict[str, Any]) -> tuple[dict[str, Any], dict[str, list[int]]]:
-        """Return the sections without faults, and a section ``instance`` in any case."""
+        """Return the sections without faults; if ``instance`` is not among them, with a substitute for it."""
         sound, places = super().sections(tables)
         sound.setdefault("instance", {"name": "unnamed"})
         return sound, places
@@ -484,19 +481,19 @@ def _unknown(key: str, known: Sequence[str]) -> str:
 
 
 def unknown_option(index: int, key: str, known: list[str]) -> str:
-    """Return the message for a key of ``source[index]`` that the connector does not know either."""
+    """Return the message for a key of ``source[index]`` that neither shmio nor the connector knows."""
     names = [*known, *_known(Source)]
     remedy = hint(key, names, f"the connector knows: {', '.join(known)}")
     return f"source[{index}].{key}: unknown key; {remedy}"
 
 
 def check_text(value: Any, key: str) -> None:
-    """Check that texts contain no control characters, which file names and terminals cannot take.
+    """Check that texts contain no control characters, which harm file names and terminals.
 
     A type with a pattern would be simpler, but makes msgspec 0.22 crash when Python exits.
 
     Raises:
-        ConfigError: A text contains one.
+        ConfigError: A text contains a control character.
 
     """
     for fault in text_faults(value, key):

@@ -1,4 +1,4 @@
-"""The description of a cell in 3D, a file that ``[web]`` names: docs/reference/scene.md explains each key."""
+"""Reads the file that describes a cell in 3D, which ``[web]`` names; docs/reference/scene.md explains its keys."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from shmio.config.model import AlongName, FormName, JointTypeName, Name, Section
 from shmio.config.read import Structure, convert, parse, read_text
 
 MAX_BODIES: Final = 500
-"""Maximum number of bodies, with those of all copies."""
+"""Maximum number of bodies, including those of all copies."""
 MAX_SHAPES: Final = 2_000
-"""Maximum number of shapes, with those of all copies."""
+"""Maximum number of shapes, including those of all copies."""
 
 Length = Annotated[float, Meta(gt=0, le=1e6)]
 Coordinate = Annotated[float, Meta(ge=-1e6, le=1e6)]
@@ -30,7 +30,7 @@ _PLACEHOLDER: Final = re.compile(r"\{([A-Za-z0-9_-]+)\}")
 
 
 class Shape(Section):
-    """``[[body.shape]]``: something visible of a body."""
+    """``[[body.shape]]``: a visible part of a body."""
 
     form: FormName
     size_mm: Size | None = None
@@ -45,7 +45,7 @@ class Shape(Section):
 
 
 class Joint(Section):
-    """``[body.joint]``: a register that turns or moves the body."""
+    """``[body.joint]``: how the value of a register turns or moves the body."""
 
     type: JointTypeName
     register: Text
@@ -69,7 +69,7 @@ class Body(Section):
 
 
 class Template(Section):
-    """``[[template]]``: bodies that copies repeat."""
+    """``[[template]]``: a group of bodies, which each ``[[copy]]`` repeats."""
 
     name: Name
     body: list[Body] = []
@@ -96,7 +96,7 @@ class Floor(Section):
 
 
 class Camera(Section):
-    """``[camera]``: from where the picture is seen first."""
+    """``[camera]``: the initial viewpoint."""
 
     target_mm: Vector | None = None
     distance_mm: Length | None = None
@@ -105,7 +105,7 @@ class Camera(Section):
 
 
 class Scene(Section):
-    """The whole file."""
+    """The contents of the whole file."""
 
     body: list[Body] = []
     template: list[Template] = []
@@ -148,7 +148,7 @@ _UNITS: Final[Mapping[str, tuple[UnitName, ...]]] = {"revolute": ("deg", "rad"),
 
 
 def examine_scene(file: Path) -> tuple[Scene, Faults]:
-    """Read a description, and collect its faults, as far as they can be found without registers.
+    """Read the description of a cell, and collect the faults that can be found without knowing the registers.
 
     Returns:
         The scene, which is complete only if there are no faults, and the faults.
@@ -174,7 +174,7 @@ def examine_scene(file: Path) -> tuple[Scene, Faults]:
 
 
 def bodies(scene: Scene) -> Iterator[tuple[str, Body]]:
-    """Yield all bodies that the file declares, also those of templates, each with its key."""
+    """Yield all bodies in the file, including those of templates, each with its key."""
     for index, body in enumerate(scene.body):
         yield f"body[{index}]", body
     for place, template in enumerate(scene.template):
@@ -191,7 +191,7 @@ def filled(text: str, values: Mapping[str, str]) -> str:
     """Return a text of a template with the values of a copy in place of ``{name}``.
 
     Raises:
-        KeyError: The copy does not have a value of this name.
+        KeyError: The copy has no value of this name.
 
     """
     return _PLACEHOLDER.sub(lambda match: values[match[1]], text)

@@ -1,4 +1,4 @@
-"""The PEM files of the TLS tables: reads and tests them, and makes TLS contexts."""
+"""Reads and tests the PEM files of the TLS tables, and makes TLS contexts from them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class TlsFiles(NamedTuple):
 
 
 def read_tls(tls: Tls) -> TlsFiles:
-    """Read and test the gRPC endpoint's PEM files. With a bad file, gRPC would report a busy port.
+    """Read and test the gRPC endpoint's PEM files: gRPC would report a bad file as a busy port.
 
     Raises:
         ConfigError: A file cannot be used; the message names its key.
@@ -82,7 +82,7 @@ def server_context(tls: MqttTls, where: str = "mqtt.tls.") -> ssl.SSLContext:
 
 
 class _Socket(ssl.SSLSocket):
-    """A TLS socket that closes itself if the handshake fails, as its creator cannot do it then."""
+    """A TLS socket that closes itself if the handshake fails, because its creator then has no reference to it."""
 
     def do_handshake(self, block: bool = False) -> None:
         try:
@@ -97,7 +97,7 @@ def _identify(context: ssl.SSLContext, tls: MqttTls, where: str) -> None:
     certificate, key = str(tls.certificate), str(tls.key)
     for field, name in (("certificate", certificate), ("key", key)):
         try:
-            with open(name, "rb"):  # noqa: PTH123  to tell which of both it is
+            with open(name, "rb"):  # noqa: PTH123  to tell which of the two files is bad
                 pass
         except OSError as error:
             raise ConfigError(f"{where}{field}: {name}: {error.strerror}") from None
@@ -154,8 +154,5 @@ def _refuse_to_ask() -> str:
 
 
 def _detail(error: ssl.SSLError) -> str:
-    """Return the reason of the TLS library in brackets, to append to a message.
-
-    "" if there is none.
-    """
+    """Return the TLS library's reason in brackets, to append to a message; "" if it gives none."""
     return f" ({error.reason})" if error.reason else ""

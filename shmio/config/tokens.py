@@ -1,4 +1,4 @@
-"""Splits the text of a TOML file into tokens, also if it has faults."""
+"""Splits the text of a TOML file into tokens, even if it has faults."""
 
 from __future__ import annotations
 
@@ -10,4 +10,4 @@ TOKEN: Final = re.compile(
     r"""|\[\[|\]\]|[\[\]{}=.,\n]|[^\s"'\#\[\]{}=.,]+""",
     re.DOTALL,
 )
-"""Matches a comment, a string, a bracket, a sign, a newline, or a bare word. Strings may lack their end."""
+"""Matches a comment, a string, a bracket, a sign, a newline, or a bare word. Strings need not be terminated."""

@@ -66,10 +66,10 @@ def listened_on(path: str) -> bool:
 
 
 class SocketFile:
-    """The file of a socket: this process creates it, and removes it when it stops listening."""
+    """The file of a UNIX socket, which this process creates, and removes when it stops listening."""
 
     def __init__(self, path: str, gid: int | None) -> None:
-        """Set the path. Only this user may connect, and the members of the group ``gid`` if it is given."""
+        """Set the path, and the group whose members may connect; if ``gid`` is None, only this user may connect."""
         self._path = path
         self._gid = gid
         self._inode = 0

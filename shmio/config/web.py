@@ -1,4 +1,4 @@
-"""Rules of the sections ``[web]`` and ``[metrics]``."""
+"""Checks the sections ``[web]`` and ``[metrics]``, and makes their paths absolute."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def check_web(config: Config) -> None:
 
 
 def http_sections(config: Config) -> list[tuple[str, Metrics]]:
-    """Return the sections of the HTTP endpoint that the configuration has, each with its name."""
+    """Return those of the sections ``[metrics]`` and ``[web]`` that the configuration has, each with its name."""
     return [(key, section) for key, section in (("metrics", config.metrics), ("web", config.web)) if section]
 
 
@@ -59,7 +59,7 @@ def _check_roles(web: Web, address: Address, config: Config) -> None:
 
 
 def resolve_web(config: Config) -> None:
-    """Make the paths in the sections absolute."""
+    """Make the paths in ``[metrics]`` and ``[web]`` absolute."""
     for _, section in http_sections(config):
         for field in ("certificate", "key", "scene"):
             if name := getattr(section, field, None):
@@ -73,7 +73,7 @@ def check_library(section: str = "metrics") -> None:
         section: Name of the section that needs them, for the message.
 
     Raises:
-        ConfigError: One of them is not.
+        ConfigError: A library is not installed.
 
     """
     if any(importlib.util.find_spec(name) is None for name in _LIBRARIES):
