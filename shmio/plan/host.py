@@ -1,4 +1,4 @@
-"""Checks what a configuration needs from the host, and what it allows other users of the host."""
+"""Checks what a configuration needs from the host, and finds what it lets other users of the host do."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ MAX_NAMES: Final = 3
 
 
 def check_host(config: Config, catching: Callable[[], AbstractContextManager[None]]) -> list[str]:
-    """Check group, priorities, folders, TLS files and tokens; return warnings. Nothing is created.
+    """Check group, priorities, folders, libraries and other files; return warnings. Nothing is created.
 
     ``catching`` returns a context manager that collects a ConfigError instead of raising it.
     """
@@ -165,10 +165,7 @@ def _check_folder(key: str, folder: Path) -> list[str]:
 
 
 def exposure(config: Config) -> str | None:
-    """Return a line that says what other users of this host may do without logging in.
-
-    None if nothing.
-    """
+    """Return a line that says what other users of this host may do without logging in; None if nothing."""
     ways = [*_open_grpc(config), *_open_mqtt(config), *_open_opcua(config), *_open_web(config)]
     users = other_users() if ways else []
     if not users:

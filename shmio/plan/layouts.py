@@ -33,7 +33,7 @@ class LayoutFiles:
 
         If the files declare several blocks, the key ``block`` or ``number`` chooses one. Errors in
         the other blocks are then ignored. With ``optimized``, the section can use a block with
-        optimized access, so that there is no warning about this.
+        optimized access, so do not warn about it.
 
         Raises:
             ConfigError: A file or block is missing, or no block is chosen.
@@ -120,7 +120,7 @@ def _choose(
 
 
 def read_program(paths: Iterable[Path], key: str = "") -> compiler.Program:
-    """Read files, which may use the types of each other.
+    """Read source files, which may use types of each other, as one program.
 
     Raises:
         ConfigError: A file cannot be read; the message begins with ``key``.

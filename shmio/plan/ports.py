@@ -30,7 +30,7 @@ def check_listening(config: Config) -> None:
     Port 0, which stands for any free port, is never shared.
 
     Raises:
-        ConfigError: One of these conditions is not met.
+        ConfigError: A host name cannot be resolved, or two addresses share a port.
 
     """
     listening = [(f"emulator[{i}].listen", emulator.listen) for i, emulator in enumerate(config.emulator)]
@@ -71,7 +71,7 @@ def check_ports(plan: Plan) -> None:
 
 
 def taken(plan: Plan) -> Iterator[str]:
-    """Yield a message for each address of the plan that is in use. It names the program, if known.
+    """Yield a message for each address of the plan that is in use, with the program that uses it, if known.
 
     Other faults of an address are reported by the process that listens there.
     """
@@ -120,7 +120,7 @@ def _places(address: Address) -> list[tuple[int, tuple[Any, ...]]]:
 
 
 def _hosts(address: Address) -> set[str]:
-    """Return all addresses of a host, in the form in which /proc/net/tcp has them."""
+    """Return all addresses of a host, in the form of /proc/net/tcp."""
     return {
         _words(socket.inet_pton(family, str(place[0]).partition("%")[0])).removeprefix(_MAPPED)
         for family, place in _places(address)
@@ -128,7 +128,7 @@ def _hosts(address: Address) -> set[str]:
 
 
 def _share(hosts: set[str], others: set[str]) -> bool:
-    """Return whether listeners on the same port of two sets of hosts conflict. [::] includes IPv4."""
+    """Return whether listeners on these two sets of addresses conflict if the port is the same. [::] includes IPv4."""
     if hosts & others or _ANY in hosts | others:
         return True
     ours, theirs = ({host for host in all_ if len(host) == len(_ANY_IPV4)} for all_ in (hosts, others))

@@ -156,7 +156,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
 
 
 def _spelled(config: Config, layouts: dict[str, Layout]) -> Config:
-    """Return the configuration with paths in shmio's spelling, where it has that of TIA Portal."""
+    """Return the configuration with its paths in shmio's spelling; it may have them as TIA Portal spells them."""
     default = next(iter(layouts)) if len(layouts) == 1 else None
 
     def topics(patterns: str | list[str]) -> str | list[str]:
@@ -190,7 +190,7 @@ def _spelled_source(source: Source, layout: Layout) -> Source:
 
 
 def _warn_besides(config: Config, layouts: dict[str, Layout], faults: Faults) -> None:
-    """Add warnings about patterns, although there are faults, for sources whose layout is known."""
+    """Although there are faults, add warnings about the patterns of those sources whose layout is known."""
     names = [source.name for source in config.source]
     for index, source in enumerate(config.source):
         if source.name in layouts and names.count(source.name) == 1:
@@ -201,10 +201,7 @@ def _warn_besides(config: Config, layouts: dict[str, Layout], faults: Faults) ->
 
 
 def peer(source: Source) -> str:
-    """Return the device of a checked source: a URL, host:port, or the host alone.
-
-    "" if it has none.
-    """
+    """Return the address of a checked source's device: a URL, host:port, or the host; "" if it has no device."""
     if url := source.options.get("url"):
         return str(url)
     host, port = source.options.get("host"), source.options.get("port")
@@ -234,7 +231,7 @@ def _check_alert(key: str, alert: Alert, config: Config, layouts: dict[str, Layo
 
 
 def _check_emulator(index: int, emulator: Emulator, config: Config, files: LayoutFiles) -> tuple[Served, ...]:
-    """Return the blocks and tag tables that an emulator serves, beginning with that of its program."""
+    """Check an emulator; return the blocks and tag tables that it serves. Its program runs on the first."""
     key = f"emulator[{index}]"
     if emulator.kind not in KINDS:
         raise ConfigError(
@@ -323,7 +320,7 @@ def _check_numbers(key: str, layouts: Sequence[Layout]) -> None:
     """Check that each block has a number. The compiler ensures that numbers are unique.
 
     Raises:
-        ConfigError: A block has none.
+        ConfigError: A block has no number.
 
     """
     for layout in layouts:
@@ -338,10 +335,7 @@ def _check_numbers(key: str, layouts: Sequence[Layout]) -> None:
 
 
 def _odd(config: Config, layouts: dict[str, Layout], faults: Faults) -> list[str]:
-    """Return warnings about settings that are probably not intended.
-
-    Add faults for invalid patterns.
-    """
+    """Return warnings about settings of sources that are probably not intended; add faults for invalid patterns."""
     odd = []
     for index, source in enumerate(config.source):
         key, layout = f"source[{index}]", layouts[source.name]
@@ -357,10 +351,7 @@ def _odd(config: Config, layouts: dict[str, Layout], faults: Faults) -> list[str
 
 
 def _odd_patterns(key: str, source: Source, layout: Layout, faults: Faults) -> Iterator[str]:
-    """Yield warnings about patterns of a source that match no register.
-
-    Add faults for invalid ones.
-    """
+    """Yield warnings about patterns of a source that match no register; add faults for invalid patterns."""
     for name, patterns in (("writable", source.writable), ("allow_nonfinite", source.allow_nonfinite)):
         for pattern in patterns:
             try:
@@ -403,7 +394,7 @@ def _check_part(path: str, layouts: dict[str, Layout]) -> None:
     """Check that the bit, slice or other part that the path names exists.
 
     Raises:
-        PathError: It does not exist.
+        PathError: The part does not exist.
 
     """
     topic = parse_topic(path, layouts, None)
@@ -494,7 +485,7 @@ def _not_emulated(config: Config) -> Iterator[str]:
 
 
 def _unread(emulated: dict[str, tuple[Served, ...]]) -> Iterator[str]:
-    """Yield warnings about initial values of a layout that an emulator does not understand."""
+    """Yield warnings about initial values in layouts that the emulators do not understand."""
     for name, served in emulated.items():
         for text in (text for one in served for text in initial_value_warnings(one.layout)):
             yield f"emulator {name!r}: {text}"

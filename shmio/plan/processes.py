@@ -27,20 +27,20 @@ RANKS: Final[Mapping[str, int]] = {
 }
 """Order of start by kind: emulators first, then sources, then endpoints, then the alerts.
 
-The alerts stop first, so that the stop of the others is no alert.
+The alerts stop first, so that stopping the others raises no alert.
 The recorder starts before the sources and stops after them, so that it records all their frames and
 events.
 """
 
 BROKER: Final = "broker"
-"""The process of shmio's own MQTT broker, of kind mqtt.
+"""Name of the process of shmio's own MQTT broker; its kind is mqtt.
 
-It starts before the bridge and stops after it, so that the bridge can disconnect properly.
+The broker starts before the bridge and stops after it, so that the bridge can disconnect properly.
 """
 
 
 ALERTS: Final = "alerts"
-"""The process of the alerts."""
+"""Name of the process that sends the alerts."""
 
 
 def rank(name: str, kind: str) -> int:
@@ -92,11 +92,12 @@ class Job:
     rules: dict[str, Any] | None = None
     log_format: str = "text"
     audit: AuditSettings | None = None
-    """Where the process writes who did what; None: nowhere."""
+    """The audit log, to which the process writes who did what; None if there is none."""
     connection: dict[str, Any] | None = None
     """The part of a source's section that says how to connect to its device.
 
-    While it stays the same, the process can change without a new connection. None: it cannot.
+    While this part stays the same, the process can follow other changes without a new connection.
+    None if the process can follow no change.
     """
 
     def connects_like(self, other: Job) -> bool:
@@ -171,11 +172,11 @@ class Plan:
     """The instance time at which the clock starts, if a recording is replayed; else None."""
     log_format: str = "text"
     audit: AuditSettings | None = None
-    """Where the processes write who did what; None: nowhere."""
+    """The audit log, to which the processes write who did what; None if there is none."""
 
     @property
     def processes(self) -> list[ProcessSpec]:
-        """The slots of the process table."""
+        """The entries of the process table."""
         return [ProcessSpec(job.name, job.kind) for job in self.jobs]
 
     @property
@@ -219,7 +220,8 @@ def make_plan(
         register_options: For sources that can change without a new connection, by source name: the name
             of the connector's class, and the keys of ``options`` that may then change.
         origin: The clock's origin in a replayed recording; None if there is none.
-        recordings: The directory of the configured recorder, also if the mode leaves it out; None if there is none.
+        recordings: The directory of the configured recorder, even if it does not run in this mode; None if there is
+            no recorder.
         scene: The cell in 3D, which the web page draws; None if the configuration has none.
 
     Raises:
@@ -300,7 +302,7 @@ def make_plan(
 
 
 def audit_settings(config: Config) -> AuditSettings | None:
-    """Return where the instance writes who did what; None: nowhere."""
+    """Return the settings of the instance's audit log; None if it has none."""
     section = config.instance
     if not section.audit:
         return None
@@ -328,7 +330,7 @@ def _folders(config: Config) -> dict[str, str]:
 
 
 def _alerts(config: Config, log_dir: Path) -> dict[str, Any]:
-    """Return the section of the alerts, with that of the MQTT bridge if an alert publishes."""
+    """Return what the alerts' process needs: the alerts, and the MQTT bridge's section if an alert publishes."""
     publishes = config.mqtt is not None and any(alert.mqtt_topic for alert in config.alert)
     bridge = _mqtt(config.mqtt)[-1][2] if config.mqtt is not None and publishes else None
     return {
@@ -339,10 +341,10 @@ def _alerts(config: Config, log_dir: Path) -> dict[str, Any]:
 
 
 def _mqtt(mqtt: Mqtt) -> list[tuple[str, str, dict[str, Any]]]:
-    """Return the section of the bridge, and that of the broker if it is shmio's own.
+    """Return name, kind and section of the bridge's process and, if it is shmio's own, of the broker's.
 
-    Each contains only the keys that its process needs. A change of a key then replaces only that
-    process.
+    Each section contains only the keys that its process needs. If a key changes, only that process is
+    then restarted.
     """
     section = msgspec.to_builtins(mqtt)
     listen, accounts = section.pop("listen"), section.pop("account")

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from shmio.connectors.replay.recording import Recording
 
 LEAD_NS: Final = 2_000_000_000
-"""Time in ns by which the clock starts before the recording, if possible.
+"""How long before the start of the recording the clock starts, in ns, if possible.
 
-The processes start in this time.
+In this time, the processes start.
 """
 
 
@@ -35,8 +35,8 @@ class Replayed(NamedTuple):
 class Recordings:
     """Opens the recordings that a configuration plays.
 
-    The last one stays open, so that sources of the same recording that follow each other share it.
-    Use it as a context manager.
+    The last recording stays open, so that consecutive sources of the same recording share it. Use an
+    object as a context manager.
     """
 
     def __init__(self) -> None:
@@ -47,7 +47,7 @@ class Recordings:
         """Return the recording in these files. The next call may close it.
 
         Raises:
-            RecordingError: It cannot be opened.
+            RecordingError: The recording cannot be opened.
 
         """
         from shmio.connectors.replay.recording import Recording  # noqa: PLC0415  most configurations play none

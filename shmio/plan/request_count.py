@@ -13,10 +13,10 @@ from shmio.layout.values.write import bits_of, cover
 def source_requests(source: Source, layout: Layout) -> CycleRequests | None:
     """Return what a source requests from its device in a cycle.
 
-    None if the source has no device, or its connector does not report it.
+    None if the source has no device, or its connector does not count its requests.
 
     Args:
-        source: A source that was checked.
+        source: A checked source.
         layout: The layout of the source's block.
 
     """

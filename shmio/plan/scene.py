@@ -1,4 +1,4 @@
-"""Makes the scene that a page draws of its description: copies of templates, the tree of bodies, and registers."""
+"""Makes the scene that the web page draws from its description: copies templates, sorts bodies, checks registers."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ def check_scene(config: Config, layouts: Mapping[str, Layout], faults: Faults, *
     Args:
         config: The checked configuration.
         layouts: The layout of each source, by source name.
-        faults: Takes the faults.
-        replayed: Whether a recording takes the place of the sources. It need not have all registers: a body without
-            its register stands still.
+        faults: Where to add the faults.
+        replayed: Whether a recording replaces the sources. The recording need not have all registers: a body
+            without its register stands still.
 
     """
     if config.web is None or config.web.scene is None:
@@ -75,7 +75,7 @@ def check_scene(config: Config, layouts: Mapping[str, Layout], faults: Faults, *
 
 
 def _drawn_all(scene: Scene, layouts: Mapping[str, Layout], faults: Faults, *, replayed: bool) -> list[dict[str, Any]]:
-    """Return all bodies as the page draws them, each after its parent, which it names by its index; -1: none."""
+    """Return all bodies as the page draws them, parents first; ``parent`` is the parent's index, or -1."""
     placed = _expanded(scene, faults)
     ordered = [] if faults else _ordered(placed, faults)
     indices = {one.name: index for index, one in enumerate(ordered)}
@@ -90,7 +90,7 @@ def _drawn_all(scene: Scene, layouts: Mapping[str, Layout], faults: Faults, *, r
 
 
 def _expanded(scene: Scene, faults: Faults) -> list[_Placed]:
-    """Return the bodies of the file and of all copies."""
+    """Return the bodies of the file, and those of all copies."""
     placed = [
         _Placed(f"body[{index}]", body.name, body.parent, body, body.label) for index, body in enumerate(scene.body)
     ]
@@ -135,7 +135,7 @@ def _copied(key: str, copy: Copy, place: int, template: Template, faults: Faults
 
 
 def _ordered(placed: list[_Placed], faults: Faults) -> list[_Placed]:
-    """Return the bodies so that each comes after its parent."""
+    """Return the bodies in an order in which each comes after its parent."""
     names: dict[str, _Placed] = {}
     for one in placed:
         first = names.setdefault(one.name, one)
@@ -195,7 +195,7 @@ def _shape(shape: Shape) -> dict[str, Any]:
 
 
 def _moved(joint: Joint, layouts: Mapping[str, Layout]) -> dict[str, Any]:
-    """Return a joint with its register's whole path.
+    """Return a joint as the page uses it, with the full path of its register.
 
     Raises:
         PathError: There is no such register, or it is not a number.

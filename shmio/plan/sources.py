@@ -30,7 +30,7 @@ PATIENCE_S: Final = 60.0
 
 
 class Sources(NamedTuple):
-    """Results of the check of the sources, by source name."""
+    """What :func:`check_sources` finds, by source name."""
 
     layouts: dict[str, Layout]
     computed: list[str]
@@ -46,11 +46,8 @@ class Sources(NamedTuple):
 def check_sources(config: Config, files: LayoutFiles, recordings: Recordings, faults: Faults) -> Sources:
     """Check each source with its connector, and add the problems to ``faults``.
 
-    The function also completes ``options`` of each source: it then contains all keys, with values of
-    the right types.
-
-    Returns:
-        The layouts and the kinds of the sources.
+    The function also completes the ``options`` of each source. They then contain all keys, with values
+    of the right types.
     """
     found = Sources({}, [], [], {}, {})
     inputs: dict[int, tuple[str, ...]] = {}
@@ -124,7 +121,7 @@ def _check_source(
 
 
 def note_options(index: int, connector: str, options: dict[str, Any], texts: dict[str, str], faults: Faults) -> None:
-    """Add the faults in a source's connector keys; ``index`` is the source's index in the file."""
+    """Add to ``faults`` those of a source's connector and its keys; ``index`` is the source's index in the file."""
     key = f"source[{index}]"
     if what := registry.clash(connector):
         faults.add(f"{key}.connector: {what}")
@@ -145,7 +142,7 @@ def note_options(index: int, connector: str, options: dict[str, Any], texts: dic
 
 
 def _options(key: str, source: Source, faults: Faults) -> msgspec.Struct | None:
-    """Return the connector's checked options; None if they have faults, which are added."""
+    """Return the connector's checked options; if they have faults, add these and return None."""
     before = faults.count
     note_options(int(key[7:-1]), source.connector, source.options, source.texts, faults)
     if faults.count > before:
@@ -160,7 +157,7 @@ def _options(key: str, source: Source, faults: Faults) -> msgspec.Struct | None:
 
 
 def _filled(kind: type[msgspec.Struct], source: Source) -> msgspec.Struct | None:
-    """Return the options with placeholders for missing texts; None if they have other faults."""
+    """Return the options with placeholders for missing keys; None if that leaves faults."""
     fields = msgspec.structs.fields(kind)
     known = {field.encode_name for field in fields}
     given = {key: value for key, value in (source.texts | source.options).items() if key in known}
@@ -198,10 +195,7 @@ def _recorded(key: str, source: Source, config: Config, recordings: Recordings) 
 
 
 def _model(key: str, source: Source, config: Config, files: LayoutFiles) -> tuple[Layout, tuple[str, ...]]:
-    """Return the layout of a simulation and its inputs.
-
-    The layout comes from files or from its model.
-    """
+    """Return the layout of a simulation's block, from files or from its model, and the paths of its inputs."""
     source.options["folder"] = str(config.path(source.options["folder"]))
     layout = None if source.layout is None else files.get(key, source, None)
     return describe(key, msgspec.convert(source.options, Simulation.Options), layout)
@@ -215,9 +209,9 @@ def describe(
     A separate process imports the model.
 
     Args:
-        key: The section.
-        options: What the process needs.
-        layout: The layout; None: that of the model's declarations.
+        key: The section in the configuration, for messages.
+        options: The model, its parameters and its folder.
+        layout: The layout of the block; None if the model's declarations define it.
         name: The key in the section that names the model.
 
     Raises:
@@ -255,7 +249,7 @@ def _check_connections(
     """Check that each connection goes from a register of a source to an input that fits it.
 
     Raises:
-        ConfigError: A connection does not.
+        ConfigError: A connection is invalid.
 
     """
     for path, topic in connections.items():

@@ -2,6 +2,6 @@
 
 ``policy`` has the graph of states and makes the decisions, without I/O. ``process`` starts and
 signals one process, ``fleet`` carries out the decisions, and ``main`` runs the loop. ``health``
-publishes the state. ``takeover`` and ``reload`` change an instance to match its plan. ``control``
-receives requests.
+publishes the state. ``takeover`` and ``reload`` change an instance to match its plan.
+``local_commands`` writes to the audit log what local programs do. ``shmio.control`` receives requests.
 """

@@ -1,4 +1,4 @@
-"""Compares an instance with a plan: what has to change, why, and what cannot change."""
+"""Compares an instance with a plan: finds what has to change and why, and what cannot change while it runs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from shmio.supervisor.fleet import Fleet, digest
 class Changes:
     """The differences between an instance and a plan, as names.
 
-    ``replaced`` processes stop and start. ``changed`` sources keep their process and its connection.
+    The processes in ``replaced`` are restarted. The sources in ``changed`` keep their process and its
+    connection. ``add`` has the blocks to create, and ``retire`` those to remove.
     """
 
     kept: tuple[str, ...]
@@ -115,11 +116,11 @@ def _shown(value: object) -> str:
 MAX_REASONS: Final = 8
 """Maximum number of reasons that are given for the restart of one process."""
 MAX_VALUE: Final = 60
-"""Number of characters from which on a changed value is not shown."""
+"""Maximum number of characters of a changed value that is shown."""
 
 
 def preview(plan: Plan, running: Plan, epoch: int, fleet: Fleet, segment: Segment) -> dict[str, list[str]]:
-    """Return what a change of the running instance to the plan would do, in lines by kind. Nothing is changed.
+    """Return what applying the plan to the running instance would do, as lines by kind of change. Change nothing.
 
     Raises:
         SegmentError: There is no room for new processes or blocks.
@@ -141,7 +142,7 @@ def preview(plan: Plan, running: Plan, epoch: int, fleet: Fleet, segment: Segmen
 
 
 def _reasons(name: str, plan: Plan, running: Plan, fleet: Fleet) -> list[str]:
-    """Return why a process is replaced. Secrets are masked."""
+    """Return why a process has to be restarted or changed. Secrets are masked."""
     managed = fleet.named(name)
     old, new = (next((job for job in one.jobs if job.name == name), None) for one in (running, plan))
     blocks = [next((block for block in one.blocks if block.source == name), None) for one in (running, plan)]
@@ -175,7 +176,7 @@ def _text(value: Any) -> str:
 
 
 def _block_differences(old: BlockSpec, new: BlockSpec) -> Iterator[str]:
-    """Yield what differs in a source's block, except for what a key of the source says."""
+    """Yield the differences of a source's block that do not show in the source's keys."""
     if old.layout.hash != new.layout.hash:
         before, after = ({one.path: one for one in block.layout.registers} for block in (old, new))
         added, gone = after.keys() - before.keys(), before.keys() - after.keys()
@@ -187,7 +188,7 @@ def _block_differences(old: BlockSpec, new: BlockSpec) -> Iterator[str]:
 
 
 def _changed_injections(plan: Plan, running: Plan) -> Iterator[str]:
-    """Yield a line for each declared injection that comes, changes or goes."""
+    """Yield a line for each declared injection that is created, changed or lifted."""
     before = {block.source: injections_by_name(block.declared) for block in running.blocks}
     for block in plan.blocks:
         yield from injection_changes(block.source, before.get(block.source, {}), injections_by_name(block.declared))
@@ -201,7 +202,7 @@ def injections_by_name(document: bytes) -> dict[str, Declaration]:
 def injection_changes(
     source: str, before: Mapping[str, Declaration], after: Mapping[str, Declaration]
 ) -> Iterator[str]:
-    """Yield a line for each injection that differs."""
+    """Yield a line for each injection of a source that is created, changed or lifted."""
     for name in {**before, **after}:
         if before.get(name) != after.get(name):
             what = "created" if name not in before else "changed" if name in after else "lifted"

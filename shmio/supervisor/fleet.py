@@ -25,7 +25,7 @@ from shmio.supervisor.process import AdoptedProcess, ChildProcess, describe_end
 TICK_S: Final = 0.1
 """Interval in s at which heartbeats are checked."""
 _LOST: Final = {"mqtt": ("dropped", "changes"), "alerts": ("failed", "notices")}
-"""Counter of what a process loses while it has a problem, and its name in messages, by kind."""
+"""For each kind of process, the counter of what it loses while it has a problem, and what messages call that."""
 
 log = logging.getLogger("shmio.supervisor")
 
@@ -62,7 +62,7 @@ class ManagedProcess:
         """The process's job.
 
         Raises:
-            LookupError: The process has none, because it was adopted only to be stopped.
+            LookupError: The process has no job, because it was adopted only to be stopped.
 
         """
         if self._job is None:
@@ -107,7 +107,7 @@ class ManagedProcess:
             self.child.reread()
 
     def reports(self, activity: Activity) -> bool:
-        """Return whether the present process has reported this activity last."""
+        """Return whether the latest report of the present process has this activity."""
         report = self.slot.report
         return self.child is not None and report.pid == self.child.pid and report.activity is activity
 
@@ -137,10 +137,7 @@ class ManagedProcess:
         return f"; see its log, {self.job.log_file}; the host may be overloaded" if late else ""
 
     def listen(self) -> None:
-        """Read the problem that the process reports.
-
-        When a problem ends, log this and what was lost.
-        """
+        """Read the problem that the process reports; when a problem has ended, log how much was lost."""
         running = self.life.state is State.RUNNING
         complaint = complaint_of(self.slot.kind, self.slot.report.note) if running else ""
         lost = _LOST.get(self.slot.kind, ("missed", "frames and events"))
@@ -154,7 +151,7 @@ class ManagedProcess:
     def quiet_ns(self, elapsed_ns: int) -> int:
         """Return the time in ns since the last heartbeat, without pauses of the supervisor itself."""
         beat_ns = self.slot.heartbeat_ns
-        # The first look at a running process also starts the count.
+        # The first check of a running process also starts the count.
         fresh = beat_ns != self._beat_ns or self.life.state is not State.RUNNING
         self._beat_ns = beat_ns
         self._quiet_ns = 0 if fresh else self._quiet_ns + elapsed_ns
@@ -215,7 +212,7 @@ def brief(error: Exception) -> str:
 
 
 class Fleet:
-    """All processes of a segment by name. The data of each selector key is the function to call."""
+    """All processes of a segment. Each pidfd in the selector has, as its data, the function to call."""
 
     def __init__(
         self, segment: Segment, selector: selectors.BaseSelector, limits: Limits, modules: Mapping[str, str]
@@ -241,7 +238,7 @@ class Fleet:
         """Return the process with this name.
 
         Raises:
-            KeyError: There is none.
+            KeyError: No process has this name.
 
         """
         return self._managed[name]
@@ -263,7 +260,7 @@ class Fleet:
         """Give a running process the description of another job.
 
         Raises:
-            OSError: This is not possible.
+            OSError: The process has ended, or its description cannot be replaced.
 
         """
         if managed.child is None:
@@ -272,7 +269,7 @@ class Fleet:
         managed.child.describe_again(job.describe_again(*place, time.monotonic_ns()))
 
     def follow(self, managed: ManagedProcess, job: Job) -> None:
-        """Let a process that waits continue with the job that it was offered."""
+        """Let a paused process continue with the job that it was offered."""
         managed.slot.digest = digest(job.identify(self._segment.instance, self._segment.header.epoch))
         managed.follow(job)
 
@@ -291,7 +288,7 @@ class Fleet:
         self._apply_all(policy.to_start(self.ranked), Event.START)
 
     def stop_due(self) -> None:
-        """If all processes are to stop, stop those that are next in the order."""
+        """Stop the processes that are next in the order of stopping. Call this until all have stopped."""
         self._apply_all(policy.to_stop(self.ranked), Event.STOP)
 
     def _apply_all(self, indices: list[int], event: Event) -> None:
@@ -301,8 +298,8 @@ class Fleet:
 
     def check(self, now_ns: int) -> None:
         """Check all heartbeats and time limits."""
-        # A pause of the supervisor (host suspended, container paused) is one of all processes: it does
-        # not count.
+        # If the supervisor was paused (host suspended, container paused), so were all processes: this time
+        # does not count.
         elapsed_ns = min(now_ns - self._ticked_ns, round(2 * TICK_S * 1e9))
         self._ticked_ns = now_ns
         for managed in self:
@@ -326,8 +323,8 @@ class Fleet:
     def _evict(self, managed: ManagedProcess) -> None:
         """Kill a foreign process that occupies the slot of one of our processes.
 
-        A dead supervisor started it just before its own end, so that the take-over did not find it.
-        Do not wait for the end of the process.
+        An earlier supervisor started it just before its own end, so the take-over did not find it. This
+        method does not wait until the process has ended.
         """
         if managed.child is None:
             return
@@ -337,7 +334,7 @@ class Fleet:
         worker = stale_segment.holder(managed.slot, self._segment.shared)
         if worker is None:
             return
-        if worker.pid not in spared:  # the child may have taken the role since the check above
+        if worker.pid not in spared:  # our child may have occupied the slot since the check above
             log.warning(
                 "the slot of %s is occupied by pid %d, which no supervisor knows: this process is killed",
                 managed.name,
@@ -395,5 +392,5 @@ class Fleet:
 
 
 def digest(description: bytes) -> bytes:
-    """Return the SHA-256 digest of a process description, which is used for comparing."""
+    """Return the SHA-256 digest of a process description, to compare it with another."""
     return hashlib.sha256(description).digest()

@@ -1,7 +1,4 @@
-"""Assesses the state of the instance.
-
-Publishes it to the segment, the service manager and the log.
-"""
+"""Assesses the state of the instance, and publishes it to the segment, the service manager and the log."""
 
 from __future__ import annotations
 
@@ -29,7 +26,7 @@ QUALITY_S: Final = 0.5
 LOOK_S: Final = 5.0
 """Interval in s at which the folder of the log files is checked."""
 SILENT_S: Final = 15.0
-"""Time in s without an answer from the disk that counts as a problem."""
+"""Time in s after which a disk that does not answer counts as a problem."""
 
 _SOCKET, _WATCHDOG_USEC, _WATCHDOG_PID = NOTIFY_VARIABLES
 
@@ -127,7 +124,7 @@ class Health:
         logs: LogFolder,
         on_state: Callable[[InstanceState], None],
     ) -> None:
-        """Create it. ``on_state`` is called with each new state of the instance."""
+        """Create the object, which calls ``on_state`` with each new state of the instance."""
         self._segment = segment
         self._fleet = fleet
         self._notifier = notifier

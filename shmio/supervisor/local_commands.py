@@ -1,10 +1,10 @@
-"""Writes to the audit log what programs on this host do to the instance by its shared memory.
+"""Writes to the audit log what programs on this host do to the instance through its shared memory.
 
-Nobody serves these programs, so nobody but their sources sees their commands, and a source must not
-wait for a disk. A thread of the supervisor reads the sources' events instead, which have the number
-of each command, and in it the pid of the program. Other processes of the instance write their
-entries themselves; only if one was killed before it knew the outcome of a command, the entry is made
-here.
+No endpoint serves these programs. Only the sources receive their commands, and a source must not
+wait for a disk. Therefore a thread of the supervisor reads the sources' events. They have the number
+of each command, which contains the pid of the program. The instance's own processes write their
+entries themselves. If one of them was killed before it knew the outcome of a command, this module
+writes the entry.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ if TYPE_CHECKING:
     from shmio.segment.explain import Explained, Explainer
 
 TURN_S: Final = 0.05
-"""Pause between two turns in s. An event ring takes longer to fill."""
+"""Pause in s between two turns; it is shorter than the time in which an event ring fills."""
 LIVELY_S: Final = 0.005
 """Pause after a turn in which a block had many events."""
 LIVELY: Final = 256
-"""Number of a block's events in a turn that are many."""
+"""More events than this of a block in a turn are many."""
 MAX_READ: Final = 1024
-"""Maximum number of a block's events that are read before those of the other blocks."""
+"""Maximum number of a block's events to read in one turn, so that the other blocks have theirs."""
 MAX_OPEN: Final = 4096
-"""Maximum number of commands of a block whose ends are awaited."""
+"""Maximum number of commands of a block whose outcome is awaited."""
 CLOSE_S: Final = 2.0
-"""How long the end waits for the thread, in s."""
+"""Longest time in s to wait for the end of the thread."""
 RESTARTED: Final = "the source was restarted before it told the outcome"
 
 _KINDS: Final = {writer: kind for kind, writer in WRITERS.items()}
@@ -51,7 +51,7 @@ log = logging.getLogger("shmio.audit")
 
 
 class Programs:
-    """Knows the programs that may change the instance: its own processes and others."""
+    """The programs that may change the instance: its own processes and others."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
@@ -60,7 +60,7 @@ class Programs:
         self._ended: dict[int, bool] = {}
 
     def look(self) -> None:
-        """Look at the process table. Call this often: a program may be gone when its events are read."""
+        """Read the process table. Call this often: a program may have ended before its events are read."""
         self._ended.clear()
         self._own |= {slot.report.pid for slot in self._segment.processes}
         for slot in self._segment.processes.external:
@@ -72,7 +72,7 @@ class Programs:
             self._others.clear()
 
     def is_own(self, pid: int, writer: int | None = None) -> bool:
-        """Return whether a process is one of the instance; these write their own entries."""
+        """Return whether a process belongs to the instance; such processes write their entries themselves."""
         return pid in self._own or writer in _KINDS
 
     def has_ended(self, pid: int) -> bool:
@@ -95,7 +95,7 @@ class Programs:
 
 
 def _uid_of(pid: int, told: int | None) -> int | None:
-    """Return the user of a process; ``told`` if it has ended."""
+    """Return the uid of a process; if the process has ended, ``told``, the uid that it reported."""
     try:
         return Path(f"/proc/{pid}").stat().st_uid
     except OSError:
@@ -103,7 +103,7 @@ def _uid_of(pid: int, told: int | None) -> int | None:
 
 
 class _OpenCommand:
-    """The events of a command, until its end is known."""
+    """The events of a command that is not known to be over."""
 
     def __init__(self) -> None:
         self.events: list[Event] = []
@@ -111,7 +111,7 @@ class _OpenCommand:
         self._ended: set[int] = set()
 
     def add(self, event: Event) -> bool:
-        """Add an event; return whether the end of the command may be known now."""
+        """Add an event; return whether the command may be over now."""
         self.events.append(event)
         if event.kind == EventKind.ACCEPTED:
             self._accepted.add(event.item)
@@ -121,7 +121,7 @@ class _OpenCommand:
 
     @property
     def over(self) -> bool:
-        """True if each accepted item has an end."""
+        """True if each accepted item has an outcome, or the last event is not the outcome of a write."""
         return self._accepted <= self._ended or self.events[-1].kind not in _WRITES
 
 
@@ -129,7 +129,7 @@ class BlockCommands:
     """Follows the commands to one block. Use it from one thread."""
 
     def __init__(self, block: Block, programs: Programs, after: int) -> None:
-        """Begin after the event with number ``after``."""
+        """Start reading after the event with the number ``after``."""
         self.block = block
         self._programs = programs
         self._cursor = block.events.cursor(after=after)
@@ -152,7 +152,7 @@ class BlockCommands:
             if missed := self._cursor.take_missed():
                 self._lose(missed, event.number)
             self._take(event)
-        if count < MAX_READ:  # no further event of these commands is there
+        if count < MAX_READ:  # all events have been read, so these commands have no others yet
             self._end([key for key in self._ending if self._open[key].over])
             self._ending.clear()
             self._follow_replay()
@@ -183,7 +183,7 @@ class BlockCommands:
             self._ending[key] = None
 
     def _end(self, keys: Iterable[tuple[int, int, int]], missing: str = "") -> None:
-        """Make the entries of commands; ``missing`` says why some outcomes are not known."""
+        """Write the entries of commands; ``missing`` says why some outcomes are unknown."""
         for key in keys:
             events = self._open.pop(key).events
             if events[0].kind == EventKind.INJECTED and not self._is_whole(events):
@@ -192,7 +192,7 @@ class BlockCommands:
                 continue
             _, writer, number = key
             pid = pid_of(number)
-            if self._programs.is_own(pid, writer):  # it has made the entry, unless it was killed just now
+            if self._programs.is_own(pid, writer):  # it has written the entry, unless it was killed before
                 wanted = events[-1].number > self._present and self._programs.has_ended(pid)
             else:
                 wanted = True
@@ -211,7 +211,7 @@ class BlockCommands:
         return True
 
     def _record_safely(self, events: Sequence[Event], who: Acting, number: int, missing: str) -> None:
-        """Make the entry of a command, even if its events cannot be explained."""
+        """Write the entry of a command, even if its events cannot be explained."""
         try:
             self._record(events, who, number, missing)
         except Exception as error:
@@ -261,7 +261,7 @@ class BlockCommands:
         return self._explainer.explain(event)
 
     def _follow_replay(self) -> None:
-        """Make an entry if a program has moved the replay. Of several requests in a turn, it is the last."""
+        """Write an entry if a program has asked to move the replay; of several requests in a turn, for the last."""
         playhead = self.block.playhead
         if playhead is None or (asked := playhead.asks(self._asked)) is None:
             return
@@ -273,7 +273,7 @@ class BlockCommands:
 
 
 class TimeChanges:
-    """Follows who moves the instance's time. Use it from one thread."""
+    """Writes to the audit log which programs move the instance's time. Use it from one thread."""
 
     def __init__(self, segment: Segment, programs: Programs) -> None:
         self._clock = segment.clock
@@ -281,7 +281,7 @@ class TimeChanges:
         self._before = self._clock.last_written()
 
     def turn(self) -> None:
-        """Make entries for what has changed. Several steps of a turn have one entry."""
+        """Write entries for all changes since the last turn. All steps of a turn share one entry."""
         before, now = self._before, self._clock.last_written()
         if now == before:
             return
@@ -309,15 +309,15 @@ def _changes(before: Clock, now: Clock) -> Iterable[tuple[str, Mapping[str, Any]
 
 
 class LocalCommands:
-    """Follows all sources of an instance in a thread."""
+    """Writes to the audit log, in a thread, what local programs do to all sources of an instance."""
 
     def __init__(self, instance: str, after: Mapping[str, int] | None) -> None:
-        """Begin.
+        """Start the thread.
 
         Args:
             instance: Name of the instance.
             after: For each source, the number of the last event that an earlier supervisor has recorded.
-                For other sources, it begins with the oldest event.
+                Other sources are read from their oldest event on.
 
         """
         self._segment = Segment.open(instance)
@@ -331,7 +331,7 @@ class LocalCommands:
         self._thread.start()
 
     def close(self) -> None:
-        """Read what is there, and end."""
+        """Read the remaining events, and end the thread."""
         self._stopping.set()
         self._thread.join(CLOSE_S)
         if not self._thread.is_alive():

@@ -36,9 +36,9 @@ from shmio.supervisor.takeover import take_over
 START_TICK_S: Final = 0.01
 """Interval in s of checks while a process starts: the process's report cannot wake the supervisor."""
 MAX_ADDRESSES: Final = 16
-"""Largest number of a process's listening addresses in an answer."""
+"""Maximum number of a process's listening addresses in an answer."""
 ACTIONS: Final = {Stop: "down", Restart: "restart", Reload: "reload"}
-"""The action of each request in the audit log."""
+"""What the audit log calls each request."""
 NAME_S: Final = 1.0
 """Interval in s at which to check that the segment still exists under its name."""
 
@@ -203,7 +203,7 @@ class Supervisor:
             answer.ok(config=str(plan.config_file), read_ns=read_ns, log_dir=str(plan.log_dir), listen=listen)
 
     def _audit(self, request: Request, peer: Peer) -> Callable[[str], None]:
-        """Return a function that writes what a client asked for, and the outcome, to the audit log."""
+        """Write a client's request to the audit log; return a function that writes its outcome."""
         action, what = ACTIONS[type(request)], {"process": request.name} if isinstance(request, Restart) else {}
         with trail.acting(self._actor(peer), SUPERVISOR):
             attempt = trail.Attempt(action, what)

@@ -137,7 +137,7 @@ class Limits:
     start_s: float = 20.0
     """Time-out from the start of a process until it reports that it runs."""
     start_most_s: float = 60.0
-    """The same time-out for a process that had to wait for a processor most of this time."""
+    """The same time-out for a process that has waited for a processor at least half of the time."""
     hang_s: float = 5.0
     """Longest time without a heartbeat, while the process runs."""
     grace_s: float = 5.0
@@ -148,7 +148,7 @@ class Limits:
     """Time after which a running process counts as stable: its earlier crashes no longer count."""
     backoff: Backoff = RESTART
     start_attempts: int = 3
-    """If a process has never run, the number of its crashes that makes the instance's start fail."""
+    """Number of crashes of a process that has never run, at which the instance's start fails."""
     settle_s: float = 3.0
     """Longest time to wait for the sources' first frames before the instance counts as started."""
     plan_s: float = 60.0
@@ -334,7 +334,7 @@ def start_failure(life: Life, limits: Limits) -> str | None:
 def start_over(
     processes: Ranked, qualities: Sequence[Quality | None], since_ns: int, now_ns: int, limits: Limits
 ) -> bool:
-    """Return whether the instance has started: all processes ran, and all sources have a quality.
+    """Return whether the instance has started: all processes ran, and all sources have frames or are late.
 
     Args:
         processes: Rank and state of each process.

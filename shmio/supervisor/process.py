@@ -1,4 +1,4 @@
-"""One process, started or adopted: signals it, watches it by its pidfd, and describes its end."""
+"""Starts or adopts one process, signals it, watches it by its pidfd, and describes its end."""
 
 from __future__ import annotations
 
@@ -219,7 +219,7 @@ def child_environment() -> dict[str, str]:
     library.)
     """
     environment = dict(os.environ, PYTHONFAULTHANDLER="1")
-    # gRPC prints a line for each bad handshake, which any client may send, into a log that would not even rotate then.
+    # Otherwise gRPC prints a line for each bad handshake of any client, and the log would not rotate.
     environment.setdefault("GRPC_VERBOSITY", "NONE")
     for name in NOTIFY_VARIABLES:  # a child must not notify the service manager
         environment.pop(name, None)

@@ -25,7 +25,7 @@ from shmio.supervisor.policy import Event, Limits, State
 PAUSE_S: Final = 6.0
 """Time-out in s until a source whose registers change waits for its new block; then it is restarted."""
 FOLLOW_S: Final = 20.0
-"""Time-out in s until it runs with its new block; then it is restarted."""
+"""Time-out in s until such a source runs with its new block; then it is restarted."""
 _SETTLED = (State.RUNNING, State.BACKOFF, State.FATAL, State.STOPPED)
 
 
@@ -42,7 +42,7 @@ class _Followers:
         self._jobs = {job.name: job for job in jobs}
         self._pids: dict[str, int] = {}
         self.failed: dict[str, str] = {}
-        """Why the others are restarted, by name."""
+        """Why the other sources are restarted, by name."""
         self._deadline_s = time.monotonic() + PAUSE_S
         for job in jobs:
             managed = fleet.named(job.name)
@@ -55,7 +55,7 @@ class _Followers:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of those that are not restarted."""
+        """The names of the sources that are not restarted."""
         return tuple(self._pids)
 
     def _fail(self, name: str, why: str) -> None:
@@ -64,7 +64,7 @@ class _Followers:
         log.warning("%s is restarted, as it cannot keep its connection: %s", name, why)
 
     def _all(self, activity: Activity) -> bool:
-        """Return whether all that are left have reported an activity; drop those that have ended or are late."""
+        """Return whether all remaining sources have reported an activity; give up those that ended or are late."""
         done = True
         for name, pid in list(self._pids.items()):
             managed = self._fleet.named(name)
@@ -78,17 +78,17 @@ class _Followers:
         return done
 
     def paused(self) -> bool:
-        """Return whether all that are left wait for their blocks."""
+        """Return whether all remaining sources wait for their new blocks."""
         return self._all(Activity.PAUSED)
 
     def go_on(self) -> None:
-        """Let them continue, after the segment has been changed."""
+        """Let the remaining sources continue, after the segment has been changed."""
         self._deadline_s = time.monotonic() + FOLLOW_S
         for name in self._pids:
             self._fleet.follow(self._fleet.named(name), self._jobs[name])
 
     def running(self) -> bool:
-        """Return whether all that are left run again. Those that take too long are restarted."""
+        """Return whether all remaining sources run again. Restart those that have ended or take too long."""
         before = self.names
         done = self._all(Activity.RUNNING)
         for name in set(before) - set(self._pids):
@@ -151,10 +151,7 @@ class InstanceChange:
 
     @property
     def stuck(self) -> str:
-        """A text about processes that do not end although the change waits for their end.
-
-        "" if none.
-        """
+        """A text about the processes that do not end although the change waits for them; "" if none."""
         leaving = [] if self._stopped else [self._fleet.named(name) for name in self._leaving]
         return "; ".join(f"{managed.name}: {managed.life.note}" for managed in leaving if managed.life.stuck)
 
@@ -310,7 +307,7 @@ class Reloader:
         self._planning, self._answer = _PendingPlan(self._replan, self._limits.plan_s), answer
 
     def preview(self, answer: Answer) -> None:
-        """Make a new plan, and answer what its reload would do. This never delays a reload.
+        """Make a new plan, and answer what a reload would do with it. This never delays a reload.
 
         Requests that come while a plan is made share the next plan, because the files may have
         changed since the present one was begun.
@@ -346,7 +343,7 @@ class Reloader:
         self._previewing, self._previewers = _PendingPlan(self._replan, self._limits.plan_s), answers
 
     def _follow_preview(self, planning: _PendingPlan) -> None:
-        """Answer if the plan is made or late. While its thread hangs, no other is started."""
+        """Answer the clients if the plan is complete or late. While its thread hangs, start no other."""
         if not (planning.over or planning.late):
             return
         answers, self._previewers = self._previewers, []

@@ -1,4 +1,4 @@
-"""Checks before an instance starts: it does not run, and its ports and its log folder are free."""
+"""Checks before a start that the instance does not run, and that its ports and its log folder are free."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def _refuse_second(plan: Plan) -> None:
 
 
 def _whose(plan: Plan) -> str:
-    """Return the end of a message: which file the running instance was started from, and what to do."""
+    """Return the end of a message: the file from which the running instance was started, and what to do."""
     down = f"shmio-supervisor down --instance {plan.instance} stops it"
     with suppress(ShmioError), Segment.open(plan.instance) as segment:
         if segment.config not in (None, plan.config_file):

@@ -22,7 +22,7 @@ _START_AGAIN: Final = "the old processes are stopped, and the instance is starte
 
 @dataclass
 class TakenOver:
-    """The segment of a dead supervisor, locked by this one now, and its processes that continue."""
+    """The segment of a dead supervisor, which this supervisor has locked, and the processes that continue."""
 
     segment: Segment
     children: list[tuple[ProcessSlot, AdoptedProcess]] = field(default_factory=list)
