@@ -52,7 +52,7 @@ MERGE_S: Final = 1.0
 MAX_MERGED: Final = 1000
 """Maximum number of different actions whose repetitions are merged. Others get an entry for each repetition."""
 RETRY_S: Final = 1.0
-"""Pause in s before the next attempt after a write has failed."""
+"""Pause before a failed write is repeated, in s."""
 CLOSE_S: Final = 2.0
 """How long a process that ends waits until its last entries are written, in s."""
 

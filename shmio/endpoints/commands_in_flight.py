@@ -27,7 +27,7 @@ Done = Callable[[Sequence[End]], None]
 
 
 def in_words(end: End) -> str:
-    """Return a failed outcome as text."""
+    """Return a failed outcome as text: its kind and reason."""
     kind, reason = end
     return f"{kind}: {reason}"
 
@@ -56,7 +56,7 @@ class InFlightCommand:
     """A command in flight.
 
     Attributes:
-        incarnation: How often the source's process had been started when the command was sent.
+        incarnation: How many times the source's process had been started when the command was sent.
         until_ns: Deadline for the outcomes, in ns of the monotonic clock.
         cost: The queue space and the events that the command may need.
         values: For each value, the indices of its items in the command.

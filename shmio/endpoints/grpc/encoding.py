@@ -51,7 +51,7 @@ class SourceImage(BlockImage, Protocol):
 
 
 Encode = Callable[[BlockImage], Sized | None]
-"""Encodes an image as a message, or returns None if the bytes are not a valid value.
+"""Function that encodes an image as a message, or returns None if the bytes are not a valid value.
 
 ``len`` of the message is its size in bytes.
 """

@@ -14,7 +14,7 @@ from shmio.segment import Block
 
 
 class TimeTopic(Enum):
-    """The time topics, which belong to no source; the values are canonical paths."""
+    """The time topics, which belong to no source. The values are the topics' canonical paths."""
 
     STEP = "simlog/step"
     """Number of each step, sent after all values of the step."""

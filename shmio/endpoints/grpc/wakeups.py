@@ -26,7 +26,7 @@ class WakeUp:
     """
 
     def __init__(self, word: WakeSource, name: str, turn_ns: int = TURN_NS) -> None:
-        """Start to wait for changes.
+        """Start waiting for changes.
 
         Args:
             word: The word in shared memory.

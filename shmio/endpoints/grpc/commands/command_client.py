@@ -205,7 +205,7 @@ class CommandClient:
             declaration: The injection, which the source runs itself.
             follower: Receives the injection's events.
             done: Called once, with the outcome.
-            keep: Keep the injection after this process has ended.
+            keep: Whether to keep the injection after this process has ended.
 
         Returns:
             The injection's number.

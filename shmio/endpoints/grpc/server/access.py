@@ -270,8 +270,8 @@ def holder_of(
 def client_of(peer: str, token: str | None) -> str:
     """Return the name under which a client's calls count towards its limits.
 
-    It is the name of the client's token. Without a token, it is the client's host, or for a client
-    on this host its connection.
+    This is the name of the client's token. Without a token, it is the client's host; for a client
+    on this host, it is the connection.
     """
     if token is not None:
         return f"token {token}"

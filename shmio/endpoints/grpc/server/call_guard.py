@@ -84,7 +84,7 @@ class CallLimits:
     """Limits on open connections and calls, on all addresses together.
 
     When fewer than ``reserve`` calls are free, only clients with fewer than ``share`` calls may
-    open another. So a client that opens thousands of calls leaves room for the others.
+    open another call. So a client that opens thousands of calls leaves room for the others.
     """
 
     connections: int = 2048
@@ -299,7 +299,10 @@ class CallGuard(grpc.aio.ServerInterceptor):
 
 
 def _record_end(call: _Call, reason: str) -> None:
-    """Record that a call has failed, unless it needs only the role read, or its refusal is recorded already."""
+    """Record in the audit log that a call has failed.
+
+    Record nothing if the call needs only the role ``read``, or if its refusal is recorded already.
+    """
     if NEEDS.get(call.method) != READ and not call.acting.refused:
         trail.record(action_of(call.method), {"call": call.method}, "refused", reason, who=call.acting)
 

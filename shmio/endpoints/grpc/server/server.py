@@ -42,7 +42,7 @@ OPTIONS = [
 
 
 class Server:
-    """Serves all services on each listening address, each guarded by a :class:`CallGuard`."""
+    """Serves all services on each listening address, where a :class:`CallGuard` checks the calls."""
 
     def __init__(
         self, services: Mapping[str, dict[str, grpc.RpcMethodHandler[Any, Any]]], calls: OpenCalls | None = None
@@ -152,7 +152,7 @@ class Server:
     def _server(self, gate: CallGuard) -> CoreServer:
         # One connection may have as many streams as there may be calls in total. By default, gRPC
         # ends some calls at random when 1000 wait, and a client that opens thousands at once would
-        # lose some. Each method has its own queue, and so have the calls of unknown names.
+        # lose some. Each method has its own queue, and so have the calls with unknown names.
         most = self.calls.limits.calls
         pending = "grpc.server.max_pending_requests"
         options: list[tuple[str, Any]] = [

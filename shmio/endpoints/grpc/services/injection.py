@@ -114,7 +114,7 @@ class Injection(InjectionFollower):
         self._subjects: dict[Subject, None] = {}
         self._diverted, self._given = _ImageStream(), _ImageStream()
         self._creating = asyncio.get_running_loop().create_task(self._create(name))
-        self._creating.add_done_callback(lambda task: task.cancelled() or task.exception())  # see created()
+        self._creating.add_done_callback(lambda task: task.cancelled() or task.exception())  # created() raises it
         self._lifting: asyncio.Task[None] | None = None
 
     # ---- created, and lifted --------------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ from shmio.segment.commands import End, worst
 TURNS: Final = 3
 """Number of passes through gRPC's queue to wait for.
 
-There are several because one of gRPC's threads may pass on a message late.
+Several passes are necessary because one of gRPC's threads may pass on a message late.
 """
 
 
@@ -57,7 +57,7 @@ SETTLE_S: Final = 5.0
 MAX_VALUES: Final = 256
 """Maximum number of registers in one structure: as many as a source writes in one cycle."""
 LARGE_ELEMENTS: Final = 1024
-"""Arrays with at least this many elements are read in a thread, because that takes noticeable time."""
+"""Arrays with at least this many elements are read in a thread, because reading them takes time."""
 
 
 class _Destination(NamedTuple):
@@ -233,14 +233,15 @@ class Publisher:
     async def write(self, request: Request, peer: str) -> tuple[EventKind, str]:
         """Write one value. Return when its source has accepted it.
 
-        If the device later does not take the accepted value, a log line says so.
+        If the device later does not take the accepted value, a log line says so. After an error
+        nothing was sent.
 
         Returns:
             ``(ACCEPTED, "")``, or the outcome and its reason if the source did not accept the
             value.
 
         Raises:
-            PathError: There is no such topic. Nothing was sent, as with the other errors.
+            PathError: There is no such topic.
             ValueRangeError: The value does not fit.
             CommandError: The topic is not writable, or the source does not answer.
 

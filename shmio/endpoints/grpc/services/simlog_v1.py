@@ -296,7 +296,7 @@ class InjectCalls:
     async def _messages(
         self, injection: Injection, outbox: Outbox, leave: Callable[[], None], context: Context
     ) -> AsyncIterator[bytes]:
-        """Stream an outbox until the injection ends.
+        """Stream an outbox's messages until the injection ends.
 
         Statuses:
             RESOURCE_EXHAUSTED: The client does not read the messages.

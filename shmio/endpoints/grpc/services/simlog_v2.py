@@ -242,7 +242,7 @@ def _numbers(register: Register, kind: np.dtype[Any]) -> Callable[[bytes], bytes
 
     This is a hundred times as fast as encoding each number by itself.
     """
-    one = ListValue(values=[WireValue(number_value=0)]).SerializeToString()  # ends in its double
+    one = ListValue(values=[WireValue(number_value=0)]).SerializeToString()  # ends with its double
     size = register.count * len(one)
     head = b"\x32" + varint(size)
     template = np.zeros(register.count, [("head", f"V{len(one) - 8}"), ("value", "<f8")])
@@ -460,7 +460,7 @@ class Subscribers:
         self._arrived = asyncio.Event()
 
     def enter(self, uuid: str, name: str, outbox: Outbox, holder: object) -> Subscriber:
-        """Add a subscriber whose stream opens.
+        """Add a subscriber for a new stream.
 
         If the same client already has a stream with this uuid, the old stream ends, because a broken
         connection may have left it open.
@@ -593,7 +593,7 @@ class SimlogV2:
         Statuses:
             INVALID_ARGUMENT: The uuid is missing or too long.
             ALREADY_EXISTS: The uuid belongs to another client.
-            RESOURCE_EXHAUSTED: There are too many subscribers, or this one is too slow for the
+            RESOURCE_EXHAUSTED: There are too many subscribers, or this client is too slow for the
                 writes or the steps.
             ABORTED: CreateSubscriber was called again with this uuid.
         """

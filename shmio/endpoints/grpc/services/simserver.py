@@ -22,7 +22,7 @@ _MS: Final = 1_000_000
 
 
 class SimServer:
-    """Serves the control of the instance's time."""
+    """Serves the calls that control the instance's time."""
 
     name = SERVICE
 

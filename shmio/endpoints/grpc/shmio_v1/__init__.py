@@ -1,6 +1,6 @@
 """The service ``shmio.v1``: typed registers with their quality, packed by type.
 
-``service`` has the table of the calls. ``selection`` resolves patterns to tables of registers, once
+``service`` lists the calls. ``selection`` resolves patterns to tables of registers, once
 for all clients with equal patterns. ``tables`` makes updates from frames and writes. ``subscribe``
 follows blocks for one subscriber, and uses the ring in shared memory as the subscriber's queue. So
 a slow client needs no memory in the endpoint, and learns exactly how many frames it missed.

@@ -19,7 +19,7 @@ from shmio.segment import Segment
 from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_ANSWERS: Final = 1024
-"""Maximum number of answers that wait for the client. If there are more, the next step waits."""
+"""Maximum number of answers that wait for the client. While that many wait, no further step is made."""
 
 STEPS: Final = wire.StepsResponse.DESCRIPTOR.fields_by_name["steps"].number
 

@@ -1,4 +1,4 @@
-"""The call Events: streams the events of sources, each explained once for all clients."""
+"""The call Events: streams the events of sources, and converts each event once for all clients."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ MAX_CALLS: Final = 256
 """Maximum number of open Events calls."""
 MAX_SOURCES: Final = 256
 BATCH_EVENTS: Final = 32
-"""Maximum number of events that are explained before the event loop serves the streams again."""
+"""Maximum number of events that are converted before the event loop serves the streams again."""
 BATCH_S: Final = 0.005
-"""Time in s after which a batch ends early; one event may be about thousands of registers."""
+"""Time after which a batch ends early, in s, because one event may be about thousands of registers."""
 LOG_BYTES: Final = 8 << 20
-"""Maximum size of a block's events that wait for clients.
+"""Maximum size of the events in a block's log, in bytes.
 
-At most as many events wait as the event ring has slots.
+The log also has at most as many events as the event ring has slots.
 """
 MESSAGE_BYTES: Final = 1 << 18
 """Size at which a message with the events of all sources is complete."""
@@ -45,7 +45,7 @@ _MISSED: Final = wire.Event.DESCRIPTOR.fields_by_name["missed"].number
 class EventLog:
     """The latest events of one block as messages, for all calls that follow the block.
 
-    When the log is full, it drops the oldest events. A call that has not read these misses
+    When the log is full, it drops the oldest events. A call that has not read them misses
     them. Use it only in the event loop's thread.
     """
 
@@ -225,7 +225,7 @@ class EventsCall:
         self._wake = asyncio.Event()
         self._places: dict[str, _Place] = {}
         self._moved: dict[str, EventLog | None] = {}
-        """The next log of each source that a reload has changed; None if it has removed the source."""
+        """The next log of each source that a reload has changed; None if the reload has removed it."""
         self._failure: EndpointError | None = None
         try:
             for source in dict.fromkeys(sources) or feeds:
@@ -251,7 +251,7 @@ class EventsCall:
             if feed is not None and self._places[source].log.block is feed.block:
                 continue  # the call began with this block
             log = None if feed is None else self._logs.join(feed.block, self._wake.set, after=0)
-            if before is not None and before is not log:  # a second reload before the client has read up to the first
+            if before is not None and before is not log:  # a second reload, before the client has read to the first
                 self._places[source].missed += before.end + before.missed
                 self._logs.leave(before, self._wake.set)
             self._moved[source] = log

@@ -118,7 +118,7 @@ class ByteRanges:
 
     @property
     def bits(self) -> bytes:
-        """Mask of the block with the bits of the ranges set."""
+        """Mask of the block in which the bits of the ranges are set."""
         return self._bits.tobytes()
 
     @property
@@ -211,7 +211,7 @@ class InjectCall(InjectionFollower):
         self._wake = asyncio.Event()
         self._waiting = SendQueue()  # serialised fields of an InjectResponse
         self.failure: ShmioError | None = None
-        """The error in the messages of the client, or None."""
+        """The error in the client's messages that ended the call; None if no error ended it."""
         self._giving: set[asyncio.Task[None]] = set()
         self._room = asyncio.Semaphore(MAX_OPEN)
         self._shown: Frame | None = None
@@ -318,7 +318,7 @@ class InjectCall(InjectionFollower):
         without a sequence number, an error ends the stream.
 
         Raises:
-            ValueRangeError: A message gives no values.
+            ValueRangeError: A message is not one that gives values.
 
         """
         async for request in requests:
@@ -424,10 +424,7 @@ class InjectCall(InjectionFollower):
         self._wake.set()
 
     def _give_up(self, reason: str) -> None:
-        """Lift the injection at once.
-
-        A client that does not read could delay the end of the stream.
-        """
+        """Lift the injection at once: a client that does not read could delay the stream's end."""
         self.over = self.over or reason
         if self._base.number and not (self._options.keep or self._lifted):
             self._lifting = self._lifting or self._lift()

@@ -21,14 +21,14 @@ from shmio.segment import Block
 MAX_PATTERNS: Final = 256
 MAX_REGISTERS: Final = 16_384
 MAX_ELEMENTS: Final = 262_144
-"""Maximum number of elements of one call."""
+"""Maximum number of elements that one call may use."""
 MAX_MATCHES: Final = 1_000_000
 """Maximum number of comparisons of a star pattern with a register in one call.
 
 This many comparisons take a few seconds.
 """
 MAX_ALL_ELEMENTS: Final = 1 << 22
-"""Maximum number of elements of all clients together. Equal patterns count once."""
+"""Maximum number of elements that all clients together may use. Equal patterns count once."""
 KEPT: Final = 16
 """Number of unused views that are cached, for clients that read repeatedly."""
 
@@ -113,13 +113,13 @@ class Selections:
         return views
 
     async def registers(self, wanted: TopicsBySource) -> Selection:
-        """Return the view of a single source. Without topics, the view has no registers."""
+        """Return the table of the only source in ``wanted``. Without topics, the table has no registers."""
         ((place, topics),) = wanted.items()
         if not topics:
             block = self._topics.feed(place.source).block
             return Selection(next(self._numbers), block, (), inward=place.inward)
         view = await self._view(place, topics, _Budget())
-        if not isinstance(view, Selection):  # the view of raw frames, which has no topics
+        if not isinstance(view, Selection):  # a view of raw frames, which has no registers
             raise PathError(f"{place.source}: no register is named")
         return view
 

@@ -221,7 +221,7 @@ class SimulateCalls:
         return block
 
     def _release(self, simulation: SimulateCall, _: object = None) -> None:
-        """Disconnect a model, so that another one can join its source."""
+        """Disconnect a model, so that another model can join its source."""
         if self._open.get(simulation.block.section) is simulation:
             del self._open[simulation.block.section]
             simulation.leave()
@@ -234,7 +234,7 @@ class SimulateCalls:
                 self._segment.clock.slot_bell(slot.index).ring()
 
     def on_sources_replaced(self) -> None:
-        """End the calls whose blocks a reload has ended."""
+        """End the calls whose blocks a reload has retired."""
         for simulation in self._open.values():
             if simulation.block.retired:
                 source = simulation.block.source
@@ -340,7 +340,7 @@ class SimulateCall:
     def _work(self, ask: ModelRequest) -> bytes:
         """Return a serialised ``Do``, which requests a step.
 
-        The first ``Do`` has all inputs, and the later ones have the changed inputs.
+        The first ``Do`` has all inputs; later messages have only the changed inputs.
         """
         before, now = self._given, self._inputs.columns.decode(ask.commanded)
         self._given = now
@@ -369,7 +369,7 @@ class SimulateCall:
         self.end()
 
     def taken(self, task: asyncio.Task[None]) -> None:
-        """Callback for the end of the :meth:`take` task: end the call."""
+        """End the call, because the :meth:`take` task has ended."""
         if not task.cancelled():
             error = task.exception()
             self.end(error if isinstance(error, ShmioError) else None)
@@ -394,7 +394,7 @@ class SimulateCall:
         late_ns = (now_ns := time.monotonic_ns()) - ask.until_ns
         if late_ns < 0:
             self._link.answer(ask, now_ns, image, None if failure is None else printable(failure))
-        else:  # do not pass it on: a source that is late as well might still use it
+        else:  # do not pass on the answer: a source that is late as well might still use it
             self._refused = self._refused or f"step {ask.step}: the answer came {late_ns // 1_000_000} ms too late"
         self._asked = None
         self._wake.set()

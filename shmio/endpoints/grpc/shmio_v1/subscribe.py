@@ -41,7 +41,7 @@ BATCH_BYTES: Final = 1 << 18
 BATCH_UPDATES: Final = 256
 """Maximum number of updates in one message.
 
-That many take some milliseconds to make. Then other tasks can run.
+Making that many takes some milliseconds. Then other tasks can run.
 """
 MAX_RATE_HZ: Final = 1e6
 
@@ -243,7 +243,7 @@ class SubscribeCall:
             raise ValueRangeError("written values have no raw frames: leave out /in, or choose the format VALUES")
         self._blocks: dict[SourceDirection, BlockUpdates] = {}
         self._inward: dict[SourceDirection, WriteFollower] = {}
-        self._rings: dict[SourceDirection, Callback] = {}  # the callbacks of their wake-ups
+        self._rings: dict[SourceDirection, Callback] = {}  # the blocks' wake-up callbacks
         self._moved: dict[SourceDirection, None] = {}
         self._rotation = 0
         self._wake = asyncio.Event()

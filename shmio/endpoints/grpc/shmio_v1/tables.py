@@ -367,7 +367,7 @@ class UpdateMessage(NamedTuple):
 
 
 class StatusChanges(NamedTuple):
-    """Statuses of registers that have changed."""
+    """Changed statuses of registers."""
 
     field: bytes
     """The field of an ``Update``; empty if there are none."""
@@ -681,7 +681,7 @@ def head(table: int, frame: Frame, *, whole: bool = False) -> bytes:
         incarnation=frame.incarnation,
         clock_ns=frame.clock_ns,
         source_ns=frame.source_ns,
-        quality=int(frame.quality),  # type: ignore[arg-type]  # enums of the wire are its own to mypy
+        quality=int(frame.quality),  # type: ignore[arg-type]  # to mypy, Protobuf's enums are types of their own
         reason=frame.reason,
         provenance=int(frame.provenance),  # type: ignore[arg-type]
         whole=whole,

@@ -111,7 +111,7 @@ only if it is delayed itself.
 FEW_FRAMES: Final = 8
 """Maximum number of frames that a client that is far behind gets at once."""
 LOOK_S: Final = 0.02
-"""Longest time between two reads while all clients are busy, in s. A read may find bad quality."""
+"""Longest time between two reads while all clients are busy, in s. These reads notice bad quality."""
 
 
 class Stream(Protocol):
@@ -169,8 +169,8 @@ class BackPressure:
     def passes(self) -> bool:
         """Return whether the feed should read nothing now, because all streams are busy.
 
-        A busy stream calls ``refill`` later. If the last read was more than ``LOOK_S`` ago, return
-        False.
+        Return False if the last read was more than ``LOOK_S`` ago. A busy stream calls ``refill``
+        when it can take more.
         """
         if not self._streams:
             return False
@@ -184,7 +184,7 @@ class BackPressure:
         return time.monotonic() <= self._until_s
 
     def skip(self, follower: FrameFollower) -> None:
-        """Skip the frames that are too many or too old for the streams."""
+        """Skip to the newest frames if there are no streams, or if the feed or all clients are far behind."""
         passing, self._passing = self._passing, False
         self._until_s = time.monotonic() + LOOK_S
         behind = passing and all(stream.behind for stream in self._streams)

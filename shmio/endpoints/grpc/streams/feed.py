@@ -223,7 +223,7 @@ class Feed:
         self._suspended = self.block.attributes.stepped
 
     def resume(self) -> None:
-        """Deliver every frame again.
+        """Deliver every frame from now on, because time is real again.
 
         The newest frame comes first, because it may be newer than the last step.
         """
@@ -412,7 +412,7 @@ class Feeds(Mapping[str, Feed]):
         on_quality: Callable[[str, bool], None],
         virtual_time: VirtualTime | None = None,
     ) -> None:
-        """Prepare without feeds; :meth:`start` creates and starts them.
+        """Prepare the mapping; :meth:`start` creates the feeds.
 
         Args:
             segment: The instance's shared memory.

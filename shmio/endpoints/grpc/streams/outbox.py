@@ -243,7 +243,7 @@ class StateLane(_Lane):
         self.since = 0
 
     def deliver(self, message: Sized, at_s: float | None = None) -> None:
-        """Add a message. It replaces waiting messages that are too many or too old."""
+        """Add a message. Drop waiting messages if they are too many or too old."""
         waits = len(self._numbers)  # 0 if the client keeps up
         outbox, numbers, now_s = self._outbox, self._numbers, time.monotonic()
         at_s = now_s if at_s is None else at_s

@@ -125,16 +125,16 @@ class Player:
 
     @property
     def on(self) -> bool:
-        """True while time is played."""
+        """True while the player plays."""
         return self._task is not None
 
     @property
     def alive(self) -> bool:
-        """False if time is played but the playing task has ended; otherwise True."""
+        """False if the player should play but its task has ended; otherwise True."""
         return self._task is None or not self._task.done()
 
     def begin(self) -> None:
-        """Start playing, unless time is played already."""
+        """Start playing, unless the player plays already."""
         if self._task is None:
             self._task = self._loop.create_task(self._play())
 
@@ -265,7 +265,7 @@ class Stepper:
             peer: The client, as gRPC names it; empty: do not wait for published values.
 
         Raises:
-            TimeError: The step failed, another program controls time, or time is played.
+            TimeError: The step failed, another program controls time, or this process is playing.
             ValueRangeError: ``dt_ns`` is out of range.
 
         """
@@ -322,7 +322,7 @@ class Stepper:
         return status
 
     async def stop(self) -> None:
-        """Stop moving time. If time was played, the next process resumes playing."""
+        """Stop moving time. If this process was playing, the next one resumes playing."""
         if self._rest is not None:
             self._rest.cancel()
         tasks = list(self._tasks)
@@ -361,7 +361,7 @@ class Stepper:
             return step
 
     async def _change(self, call: Callable[[], None], *, end: bool = False) -> None:
-        """Change how time moves, by calling a method of the coordinator."""
+        """Take control of time, and call a method of the coordinator that changes how time moves."""
         async with self._moved():
             call()
             self.timeline.ended = end

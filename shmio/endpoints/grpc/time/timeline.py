@@ -148,7 +148,7 @@ class StepReceiver(Protocol):
 
 
 class _Delivery:
-    """Delivers the steps that any program makes to all streams, in order.
+    """Delivers steps in order to all streams, whichever program makes the steps.
 
     First come the writes before the step. Then come the changed values of all blocks on the
     instance's clock, in the segment's order. When all streams have taken these values, they get the
