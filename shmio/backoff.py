@@ -1,4 +1,4 @@
-"""Back-off: growing waits between attempts."""
+"""Computes back-off, the growing waits between repeated attempts."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Backoff:
     jitter: float = 0.0
 
     def wait_s(self, waits: int = 0) -> float:
-        """Return the next wait in s. ``waits``: number of waits since the last success."""
+        """Return the next wait in s. ``waits`` is the number of waits since the last success."""
         wait_s = min(self.most_s, self.first_s * self.factor ** min(waits, 64))  # the bound prevents an overflow
         if self.jitter:
             wait_s *= random.uniform(1 - self.jitter, 1 + self.jitter)  # noqa: S311  not a secret

@@ -1,4 +1,7 @@
-"""Requests to a running supervisor: one JSON object a line over a UNIX stream socket, one answer.
+"""Requests to a running supervisor, over a UNIX stream socket.
+
+A client sends one request on each connection, and gets one answer. Each is a line with a JSON
+object.
 
 ========================================  =================================================  =======================
 request                                   answer                                             given when
@@ -14,7 +17,7 @@ anything else                             ``{"error": "…"}``                  
 
 The segment's header contains the socket's path. Only the supervisor's own user and root are served.
 
-An emulator with ``faults = true`` has a socket of its own beside it, for ``disturb`` only.
+An emulator with ``faults = true`` has its own socket in the same folder, for ``disturb`` only.
 """
 
 from __future__ import annotations
@@ -59,9 +62,9 @@ _MORE: Final = {
     "done": "… and {} more: shmio-supervisor logs supervisor -n 500 shows them",
     "problems": "… and {} more: shmio-supervisor logs supervisor -n 500 shows them",
 }
-"""By key of an answer, the line that stands for its left-out lines.
+"""For each list in an answer, the line that replaces the lines that do not fit.
 
-Earlier keys are shortened first.
+The lists are shortened in this order.
 
 ``kept`` is missing because it always fits: it has at most 200 names of at most 40 characters.
 """
@@ -268,7 +271,7 @@ class ControlServer:
     def _has_room(self) -> bool:
         """Return whether another client can connect.
 
-        If needed, disconnect the one that was silent longest.
+        If needed, first disconnect the client that has been silent longest.
         """
         silent = (client for client, (_, deadline) in self._clients.items() if deadline is not None)
         if len(self._clients) >= MAX_CLIENTS and (longest := next(silent, None)):
@@ -396,7 +399,7 @@ def _connect(client: socket.socket, path: str, deadline: float, lost: Callable[[
     """Connect as soon as the supervisor accepts another client.
 
     Raises:
-        TimeoutError: It did not accept one by the deadline.
+        TimeoutError: The supervisor did not accept the client by the deadline.
         ControlError: ``lost`` returned a reason.
 
     """
@@ -418,7 +421,7 @@ def _wait(client: socket.socket, deadline: float, lost: Callable[[], str | None]
     """Return the next bytes of the answer.
 
     Raises:
-        TimeoutError: None came by the deadline.
+        TimeoutError: No bytes came by the deadline.
         ControlError: ``lost`` returned a reason.
 
     """
@@ -458,7 +461,7 @@ def _cut(line: str) -> str:
 def _cut_lines(text: str, most_chars: int) -> str:
     """Return a text with long lines shortened.
 
-    Lines beyond ``most_chars`` are replaced by their number.
+    Lines beyond ``most_chars`` characters are replaced by a line with their number.
     """
     lines = text.split("\n")
     kept: list[str] = []
@@ -471,9 +474,9 @@ def _cut_lines(text: str, most_chars: int) -> str:
 
 
 def _shorten(answer: dict[str, object], most_bytes: int) -> dict[str, object]:
-    """Return the answer so shortened that it fits as JSON.
+    """Return the answer with its lists shortened so that its JSON has at most ``most_bytes`` bytes.
 
-    Left-out lines are replaced by their number.
+    In each list, a line with the number of the left-out lines replaces them.
     """
     short = dict(answer)
     shortened = {key: [_cut(line) for line in lines] for key in _MORE if isinstance(lines := answer.get(key), list)}
@@ -488,7 +491,7 @@ def _shorten(answer: dict[str, object], most_bytes: int) -> dict[str, object]:
 
 
 def _first_lines(lines: list[str], excess: int, more: str) -> list[str]:
-    """Return the first lines, so that the result is at least ``excess`` bytes shorter."""
+    """Return the first lines, and a line for the rest, at least ``excess`` bytes shorter in all."""
     excess += len(msgspec.json.encode(more)) + 8  # the number, and a comma
     count = len(lines)
     while count and excess > 0:

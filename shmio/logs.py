@@ -75,7 +75,7 @@ class JsonFormatter(logging.Formatter):
 
 
 def _plain(value: object) -> object:
-    """Return a value that JSON has: a number, a truth value or text."""
+    """Return a number, a bool or a text unchanged; return any other value as text."""
     if isinstance(value, (bool, str)) or type(value) is int or (type(value) is float and math.isfinite(value)):
         return value
     return str(value)
@@ -85,7 +85,7 @@ FORMATTERS: Final[Mapping[str, Callable[[str, str | None], logging.Formatter]]] 
     "text": LineFormatter,
     "json": JsonFormatter,
 }
-"""By ``[instance] log_format``, what makes the lines of a process and its source."""
+"""For each value of ``[instance] log_format``, the formatter of a process and its source."""
 
 
 class RotatingLog(logging.handlers.RotatingFileHandler):
@@ -191,7 +191,7 @@ def fields(**values: object) -> dict[str, dict[str, object]]:
 
 
 def stamp(time_s: float) -> str:
-    """Return a UNIX time as text, in UTC. Such texts have the order of their times."""
+    """Return a UNIX time as text, in UTC. Such texts sort in the order of time."""
     return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
 
 
@@ -232,7 +232,7 @@ class LogRateLimit(logging.Filter):
         """End of the present interval, and number of records in it, for each kind."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether the record is written."""
+        """Return whether to write the record."""
         now_s, text = self._clock_s(), str(record.msg)
         kind = "" if self._one_kind else text
         until_s, count = self._kinds.get(kind, (0.0, 0))

@@ -61,7 +61,7 @@ def value_to_wire(value: object, path: str) -> wire.Value:
 
 
 def value_from_wire(value: wire.Value, path: str) -> object:
-    """Convert a message to a Python value; raise ValueRangeError if the message has none."""
+    """Convert a message to a Python value; raise ValueRangeError if the message has no value."""
     kind = value.WhichOneof("kind")
     if kind is None:
         raise ValueRangeError(f"{path}: no value is given")

@@ -1,4 +1,4 @@
-"""Real-time priority: processes that have it run before all other processes. See sched(7)."""
+"""Real-time priority (sched(7)). A process that has it runs before all processes that do not."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from shmio.errors import ConfigError
 
 
 def prioritise(priority: int) -> None:
-    """Give the calling thread, and threads that it starts later, a priority of SCHED_FIFO.
+    """Give the calling thread, and threads that it starts later, this priority of SCHED_FIFO.
 
     Raises:
         ConfigError: This user may not use the priority. The message contains the remedy.

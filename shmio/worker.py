@@ -115,24 +115,25 @@ class Worker:
             call()
 
     def on_reread(self, call: Callable[[], object]) -> None:
-        """Call ``call`` in another thread whenever SIGHUP requests to read files again.
+        """Call ``call`` in another thread at each SIGHUP, which asks a process to reread its files.
 
-        If a request has come since the process started, also call it now.
+        If a SIGHUP has come since the process started, also call ``call`` now.
         """
         self._on_reread = call
         if self._rereads:
             call()
 
     def revised(self) -> dict[str, Any] | None:
-        """Return the configuration of a new description that the supervisor has written.
+        """Return the configuration in a new process description from the supervisor.
 
-        None if there is none since the start or the last call that returned one. The supervisor
-        writes it into the file that is this process's standard input, and then sends SIGHUP.
+        None if the description has not changed since the start or since the last call that returned
+        a configuration. The supervisor writes a new description to the file that is this process's
+        standard input, and then sends SIGHUP.
         """
         try:
             spec = json.loads(os.pread(STDIN, MAX_SPEC_BYTES, 0))
             revision, config = spec["revision"], spec["config"]
-        except (OSError, ValueError, KeyError, TypeError):  # a pipe, or it is being written
+        except (OSError, ValueError, KeyError, TypeError):  # stdin is a pipe, or the supervisor is writing to it
             return None
         if revision == self._revision or not isinstance(config, dict):
             return None
@@ -197,7 +198,7 @@ def _read_spec() -> dict[str, Any]:
     if sys.stdin.isatty():
         raise ConfigError("this module is a worker process: only shmio-supervisor can start it")
     try:
-        data = sys.stdin.buffer.read(MAX_SPEC_BYTES + 1)  # it stays open for a new description
+        data = sys.stdin.buffer.read(MAX_SPEC_BYTES + 1)  # stdin stays open for a new description
         if len(data) > MAX_SPEC_BYTES:
             raise ConfigError(f"the process description is larger than {MAX_SPEC_BYTES} bytes: the layout is too large")
         spec = json.loads(data)

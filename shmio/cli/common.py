@@ -24,11 +24,11 @@ from shmio.logs import printable
 
 MAX_SECONDS = 86_400
 SHOWN_CHARACTERS = 60
-"""Maximum number of characters of a value on a terminal."""
+"""Largest number of characters of a value on a terminal."""
 
 
 class PartlyDoneError(CommandError):
-    """A command failed after it had done a part.
+    """A command failed after it had done a part of its work.
 
     ``found`` describes that part for the JSON output.
     """
@@ -195,9 +195,9 @@ def add_full(parser: argparse.ArgumentParser) -> None:
 
 
 def room(options: argparse.Namespace) -> int | None:
-    """Return the maximum number of characters of a value; None: no limit.
+    """Return the largest number of characters to print of a value; None if there is no limit.
 
-    There is no limit with ``--full``, and if the output is not a terminal.
+    There is no limit with ``--full``, or if the output is not a terminal.
     """
     return None if options.full or not sys.stdout.isatty() else SHOWN_CHARACTERS
 

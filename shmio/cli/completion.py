@@ -1,4 +1,4 @@
-"""Completes command lines by argcomplete: the shell runs the command, which prints the choices.
+"""Completes command lines with argcomplete. The shell runs the command, which prints the choices.
 
 argcomplete itself completes options, verbs and choices. This module completes other arguments,
 chosen by the ``dest`` of the argument.

@@ -16,7 +16,7 @@ from shmio.version import __version__
 
 PROGRAM = "shmio-dump"
 MODULES = {"info": "examine", "verify": "examine", "cut": "rewrite", "merge": "rewrite", "recover": "rewrite"}
-"""The modules of those verbs whose module does not have the verb's name."""
+"""The module of each verb whose module has another name than the verb."""
 SOME_FILES = "print JSON: one object, or a list for several files"
 IGNORABLE = ("times", "cycle", "reason", "events", "ends")
 """Choices of ``diff --ignore``.

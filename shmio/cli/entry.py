@@ -53,7 +53,7 @@ def shmio_supervisor() -> int:
 def _run(module: str) -> int:
     """Run a module's ``main`` and return its exit status.
 
-    130 if Ctrl-C was pressed during the import.
+    The status is 130 if Ctrl-C interrupts it.
     """
     try:
         main = importlib.import_module(module).main

@@ -123,7 +123,7 @@ def _read(layouts: Mapping[str, Layout], path: str, text: str) -> tuple[Topic, V
 
 
 def _wait(for_s: float | None) -> None:
-    """Wait for Ctrl-C, SIGTERM or SIGHUP, but at most ``for_s`` (in s; None: without limit)."""
+    """Wait for Ctrl-C, SIGTERM or SIGHUP, for at most ``for_s`` seconds; None sets no limit."""
     with stop_on_signals() as over:
         over.wait(for_s)
 
@@ -179,7 +179,7 @@ def _list(cell: Cell, *, as_json: bool) -> None:
 def _targets(one_found: dict[str, Any]) -> list[str]:
     """Return the paths of an injection.
 
-    For a declared injection, the patterns in its declaration.
+    For a declared injection, these are the patterns in its declaration.
     """
     running = one_found.get("running")
     if running is None:
@@ -198,7 +198,7 @@ def _running(running: dict[str, Any] | None) -> str:
 
 
 def run_campaign(cell: Cell, options: argparse.Namespace) -> int:
-    """Run a campaign until all its injections are over, the time is up, or Ctrl-C.
+    """Run a campaign until all its injections have ended, the time is up, or a signal arrives.
 
     With ``keep``, return as soon as the campaign has started.
 
@@ -233,7 +233,7 @@ def _follow(campaign: Campaign, over: threading.Event, options: argparse.Namespa
     deadline_s = None if options.for_s is None else time.monotonic() + options.for_s
     names = {(one.source, one.number): one.name for one in campaign.declared}
     awaited = set(names)
-    while awaited:  # the events begin with the start of each injection
+    while awaited:  # each injection first reports its creation
         event = next(campaign)
         awaited.discard((event.source, event.number))
         _print_event(event, names, as_json=options.json)
@@ -266,10 +266,10 @@ def _queue(campaign: Campaign, waiting: queue.SimpleQueue[InjectionEvent | Shmio
 
 
 def _refuse_past(declarations: Sequence[Declaration], now_s: float) -> None:
-    """Check that no injection would have no effect because its time has passed.
+    """Refuse an injection whose time has passed, because it would have no effect.
 
     Raises:
-        CommandError: An injection would have no effect.
+        CommandError: The time of an injection has passed.
 
     """
     for one in declarations:

@@ -94,9 +94,9 @@ def _complain(lines: Iterable[object]) -> None:
 
 
 def _unread(layout: Layout) -> Iterator[str]:
-    """Yield warnings about initial values that cannot be understood.
+    """Yield a warning for each initial value that shmio cannot read.
 
-    An emulated PLC does not have them.
+    An emulated PLC starts without these values.
     """
     for text in initial_value_warnings(layout):
         yield f"{layout.name}: warning: {text}"

@@ -200,7 +200,7 @@ def _width(readings: Sequence[Reading]) -> int:
 
 
 def _clock(reading: Reading) -> str:
-    """Return the time of a value as text; for a bad value, the present time."""
+    """Return the time of a value as text; the present time if the value is bad."""
     if reading.quality is Quality.BAD:
         when = datetime.now(UTC)
     elif reading.source_time is None:
@@ -225,7 +225,7 @@ def _object(reading: Reading) -> dict[str, Any]:
 def _line(reading: Reading, width: int, limit: int | None) -> str:
     """Return a reading as a line of text.
 
-    It shows the quality unless good, and whether it is injected.
+    The line has the quality if it is not good, and says whether the value is injected.
     """
     quality = "" if reading.quality is Quality.GOOD else f"  {reading.quality}: {printable(reading.reason)}"
     injected = f"  ({reading.provenance})" if reading.provenance == str(Provenance.INJECTED) else ""

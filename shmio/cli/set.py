@@ -92,7 +92,7 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
         if options.json and outcomes:
             raise PartlyDoneError(str(error), _described(outcomes)) from error
         raise
-    finally:  # also print the outcomes from before a later source failed
+    finally:  # print the outcomes of earlier sources even if a later one failed
         if not options.json:
             _print(outcomes, failed[0][1].text if failed else "")
     if options.json:
@@ -131,7 +131,7 @@ def _described(outcomes: dict[str, Outcome]) -> dict[str, object]:
 def _print(outcomes: dict[str, Outcome], complaint: str) -> None:
     """Print the outcomes as text.
 
-    A reason equal to ``complaint`` is left out, as the error line has it.
+    A reason equal to ``complaint`` is left out, because the error message contains it.
     """
     width = max((len(printable(path)) for path in outcomes), default=0)
     for path, end in outcomes.items():

@@ -40,7 +40,7 @@ def _parser() -> argparse.ArgumentParser:
     target.add_argument("--instance", metavar="NAME", help="a running instance (default: the only one)")
 
     def verb(name: str, text: str, *parents: argparse.ArgumentParser, command: str = "") -> argparse.ArgumentParser:
-        """Add a verb; ``command`` is MODULE:FUNCTION in ``shmio.cli.instance``, else the name."""
+        """Add a verb. ``command``: MODULE:FUNCTION in ``shmio.cli.instance``; default: the name."""
         made = verbs.add_parser(name, help=text, description=text, parents=parents)
         made.set_defaults(command=command or f"{name}:{name}")
         return made

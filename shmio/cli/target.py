@@ -79,9 +79,10 @@ def target(arguments: argparse.Namespace) -> Target:
 
 
 def config_option(arguments: argparse.Namespace) -> str | None:
-    """Return the option that selects the same configuration: ``-c FILE``, "" for the default file.
+    """Return the option that selects this command's configuration; "" for the default file.
 
-    Return None if the configuration is not known, because the instance was named or found running.
+    Return None if the configuration is unknown, because ``--instance`` names the instance or the
+    command found it running.
     """
     if getattr(arguments, "instance", None) is not None:
         return None

@@ -99,7 +99,7 @@ def _opened(arguments: argparse.Namespace, *, writable: bool) -> Iterator[Cell]:
         return
     if arguments.config is not None or arguments.instance is not None:
         raise ConfigError("--host already names the instance: remove -c and --instance")
-    os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # its errors say the same
+    os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # shmio's own errors say the same
     with ended_by_interrupt():  # gRPC crashes if an exception interrupts its import
         from shmio.client import connect  # noqa: PLC0415  only for --host
     if not arguments.host.startswith(UNIX):
@@ -122,7 +122,7 @@ def _opened(arguments: argparse.Namespace, *, writable: bool) -> Iterator[Cell]:
 
 
 def _spelled(cell: Cell, arguments: argparse.Namespace) -> argparse.Namespace:
-    """Return the arguments with paths in shmio's spelling, where they have that of TIA Portal."""
+    """Return the arguments, with paths in TIA Portal's spelling converted to shmio's spelling."""
     patterns, pairs = getattr(arguments, "patterns", None) or (), getattr(arguments, "pairs", None) or ()
     if not any(map(may_be_tia_spelling, [*patterns, *(path for path, _ in pairs)])):
         return arguments

@@ -1,4 +1,4 @@
-"""A whole cell that a test starts and stops by shmio's commands, and helpers for such tests."""
+"""A whole cell that a test starts and stops with shmio's commands, and helpers for such tests."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ listen = ["{grpc}"]
 
 
 class Cell:
-    """An instance in a folder, which tests operate by shmio's commands."""
+    """An instance in a folder, which tests control with shmio's commands."""
 
     def __init__(self, folder: Path, instance: str, grpc: Address) -> None:
         self.folder = folder

@@ -59,7 +59,7 @@ class CellUnderTest:
         self.folder = configuration.file.parent
         """The instance's own folder, with its logs and its recording."""
         self.virtual = configuration.virtual
-        """True if time is virtual: it stands still, but for :meth:`run_for`."""
+        """True if time is virtual: only :meth:`run_for` advances it."""
         self._segment, self._title = segment, title
         self.attachment = cleanup.enter_context(Attachment(segment))
         """The instance, as :func:`shmio.attach` returns it."""
@@ -77,7 +77,7 @@ class CellUnderTest:
         self._begin = 0  # index of the first frame of the last run
         self._injections = InjectionTimes()
         self._expected = 0
-        self._unmet: tuple[Expectation, int] | None = None  # the failed expectation, and the begin of its time
+        self._unmet: tuple[Expectation, int] | None = None  # the failed expectation, and its first frame
         self._touched: dict[str, None] = {}
         self._never = threading.Event()
 
@@ -110,7 +110,8 @@ class CellUnderTest:
         Args:
             target: The register, or several.
             operation: The operation of an ``[[injection]]``.
-            keys: Its other keys, such as ``value``, ``for_s`` or ``when``. Times count from now.
+            keys: The other keys of the ``[[injection]]``, such as ``value``, ``for_s`` or ``when``.
+                Times count from now.
 
         Returns:
             The injection; leave its ``with`` block to lift it.
@@ -152,7 +153,7 @@ class CellUnderTest:
         """
         self._take()
         self._begin = len(self._frames)
-        self._frames += self._last.values()  # the values before, so that a change in the first frame is seen
+        self._frames += self._last.values()  # so that a change in the first frame is seen
         if self.virtual:
             blocks = self._segment.blocks.values()
             step_s = step_s or min(block.period_ns for block in blocks) / 1e9
@@ -177,11 +178,11 @@ class CellUnderTest:
         """Fail the test unless the last run met an expectation.
 
         Args:
-            formula: A formula of signal temporal logic. Its times count from the begin of the last
+            formula: A formula of signal temporal logic. Its times count from the start of the last
                 :meth:`run_for`.
-            since_start: Whether to judge from the start of the test on.
-            keys: In place of a formula, the keys of another form of ``[[expect]]``, such as ``never``,
-                or ``when``, ``within_s`` and ``then``.
+            since_start: True to judge all frames since the start of the test.
+            keys: In place of a formula, the keys of another form of ``[[expect]]``, such as
+                ``never``, or ``when``, ``within_s`` and ``then``.
 
         Raises:
             AssertionError: The expectation failed, or the run does not decide it.
@@ -237,7 +238,7 @@ class CellUnderTest:
             for _, some in groupby(frames, lambda pair: pair[0].section):
                 found = list(some)
                 block = found[0][0]
-                # A run begins with the frame before it, which the frames since the start have already.
+                # Each run repeats the last frame before it: remove such duplicates.
                 own = list({frame.number: frame for _, frame in found}.values())
                 judge.follow(source, block.layout, block.stale_ns)
                 judge.add(source, frames_of(own, block.layout.size, raws=judge.needs_raw(source)))
@@ -246,7 +247,7 @@ class CellUnderTest:
         return judge
 
     def _take(self) -> None:
-        """Record what is new, and keep the frames."""
+        """Record the new entries, and store their frames."""
         more = True
         while more:
             entries, more = self._tap.take()
@@ -262,7 +263,7 @@ class CellUnderTest:
                     self._frames.append((block, entry.item))
 
     def _await_good(self) -> None:
-        """Wait until all sources are good, or for some time: a test may be about one that is not."""
+        """Wait until all sources are good, at most ``GOOD_S``: a test may be about a bad source."""
         until_s, never = time.monotonic() + GOOD_S, threading.Event()
         while time.monotonic() < until_s and not never.wait(LOOK_S):
             frames = [(block, block.latest()) for block in self._segment.blocks.values()]
@@ -272,13 +273,13 @@ class CellUnderTest:
 
 @contextmanager
 def running_cell(file: Path, folder: Path, title: str, *, real_time: bool = False) -> Iterator[CellUnderTest]:
-    """Run an instance of its own from a configuration while the ``with`` block runs.
+    """Run a separate instance of a configuration during a ``with`` block.
 
     Args:
         file: The configuration.
         folder: An empty folder for the instance.
-        title: What its report is about.
-        real_time: Whether it must not run in virtual time.
+        title: Title of the report.
+        real_time: True to run in real time even if virtual time is possible.
 
     Raises:
         ConfigError: The configuration is wrong.

@@ -41,9 +41,9 @@ class Rig(Protocol):
         """Return a new connector to the device through the proxy, with a time-out of about 200 ms."""
 
     def changed(self) -> Rig:
-        """Return a rig of the same device and proxy whose layout lacks registers, and has others.
+        """Return a rig of the same device and proxy, in whose layout some registers are replaced.
 
-        It is needed only if the connector has ``register_options``.
+        This method is needed only if the connector has ``register_options``.
         """
 
     def generation(self, raw: bytes) -> int:
@@ -96,7 +96,7 @@ class Run:
         return self.until(lambda frame: frame.quality is Quality.BAD)
 
     def newer(self, generation: int) -> Frame:
-        """Wait for a frame whose image has a higher number."""
+        """Wait for a frame whose image has a higher number than ``generation``."""
         return self.until(lambda frame: self._rig.generation(frame.raw) > generation)
 
     def wait_busy(self) -> None:
@@ -107,7 +107,7 @@ class Run:
             _NEVER.wait(0.001)
 
     def reload(self, rig: Rig) -> None:
-        """Replace the block and the loop as a reload does in which only the registers change."""
+        """Replace the block and the loop, as a reload does if only registers have changed."""
         before = self.loop
         before.keep()
         self.stop()
@@ -166,7 +166,7 @@ class ConnectorConformance:
 
     @pytest.fixture
     def frozen(self, rig: Rig) -> None:
-        """Let the device be silent from before the loop starts."""
+        """Make the device silent before the loop starts."""
         rig.proxy.freeze()
 
     @pytest.fixture
@@ -260,7 +260,10 @@ class ConnectorConformance:
 
     @pytest.fixture
     def others(self, rig: Rig) -> Iterator[Rig]:
-        """Return endless layouts for reloads, in turn; skip the test if the connector cannot change."""
+        """Return an endless iterator over rigs for reloads, which alternates between two layouts.
+
+        Skip the test if a reload cannot change the registers of the connector.
+        """
         if type(rig.connector()).register_options is None:
             pytest.skip("a reload restarts the sources of this connector")
         return cycle((rig.changed(), rig))
@@ -268,7 +271,7 @@ class ConnectorConformance:
     def test_a_reload_that_adds_and_removes_registers_without_reconnecting(
         self, others: Iterator[Rig], run: Run, rig: Rig
     ) -> None:
-        """The connection stays, there and back, also while answers take several periods."""
+        """Such reloads keep the connection, even while answers take several periods."""
         last = rig.generation(run.good().raw)
         rig.proxy.delay(SLOW_S, SLOW_S)
         for _ in range(4):

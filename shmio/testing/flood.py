@@ -108,7 +108,7 @@ def request(name: bytes, stream: int) -> bytes:
 
 @contextmanager
 def connect(target: tuple[str, int] | str, tls: ssl.SSLContext | None = None) -> Iterator[socket.socket]:
-    """Connect to a server, by TLS if a context is given."""
+    """Connect to a server, with TLS if a context is given."""
     if isinstance(target, str):
         plain = socket.socket(socket.AF_UNIX)
         plain.settimeout(PATIENCE_S)

@@ -1,4 +1,4 @@
-"""A copy of a configuration for one test: own folder, instance name and addresses."""
+"""A copy of a configuration for one test, with its own folder, instance name and addresses."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class OwnConfiguration:
     """A copy of a configuration in a folder of its own, for an instance that disturbs no other.
 
     The folder has links to all files beside the original. Each address to listen on is replaced by
-    a free port of this host, also where a source reads from it.
+    a free port of this host. Sources that read from such an address read from the new one.
     """
 
     def __init__(self, file: Path, folder: Path, cleanup: ExitStack, *, real_time: bool = False) -> None:
@@ -39,7 +39,7 @@ class OwnConfiguration:
             file: The original.
             folder: An empty folder.
             cleanup: Frees the ports when it is closed.
-            real_time: Whether the instance must not run in virtual time.
+            real_time: True to run in real time even if virtual time is possible.
 
         Raises:
             ConfigError: The original cannot be read.
@@ -82,7 +82,7 @@ def _link(file: Path, folder: Path) -> None:
 
 
 def _address(text: object) -> Address | None:
-    """Return a TCP address in a normal form; None if it is none."""
+    """Return a TCP address in a normal form; None if ``text`` is not a TCP address."""
     if not isinstance(text, str) or text.startswith("unix:"):
         return None
     try:
@@ -138,7 +138,7 @@ def _key(text: str) -> str:
 
 
 def _toml(value: object) -> str:
-    """Return a value of a TOML file, in one line."""
+    """Return a value as TOML in one line."""
     if isinstance(value, str):
         return _key(value)
     if isinstance(value, bool):

@@ -55,7 +55,7 @@ class TableRig(Protocol):
 
 
 class Source:
-    """A connected connector, and what its images say."""
+    """A connected connector, with the layout that decodes its images."""
 
     def __init__(self, connector: Connector, layout: Layout) -> None:
         self.connector, self.layout = connector, layout
@@ -102,7 +102,7 @@ def connected(rig: TableRig, tags: Tags) -> Iterator[Source]:
 
 
 def value_of(tag: Mapping[str, object], which: int) -> Value:
-    """Return the first or the second value for a tag; arrays have both in turn."""
+    """Return the first or the second value for a tag; arrays alternate between both."""
     kind = str(tag["type"])
     base = kind.rpartition(" OF ")[2].partition("[")[0]
     if not kind.startswith("ARRAY[1.."):
@@ -124,7 +124,7 @@ class TableConformance:
             source.until(values, dict.fromkeys(values, GOOD))
 
     def test_one_bad_address_among_good_ones(self, table: TableRig) -> None:
-        """An address that the device does not have makes no other register bad, and a write to it is no value."""
+        """An address that the device does not have makes only its own register bad."""
         with connected(table, {**table.types, "unknown": table.unknown}) as source:
             values = {path: value_of(tag, 0) for path, tag in table.types.items()}
             assert not any(source.write(values))
@@ -145,7 +145,7 @@ class TableConformance:
             source.until(values, dict.fromkeys(values, GOOD))
 
     def test_a_lost_device_leaves_no_thread_that_writes(self, table: TableRig) -> None:
-        """After a close, a write is refused, and nothing of it is sent later."""
+        """After a close, a write fails, and no part of it is sent later."""
         path, tag = next(iter(table.types.items()))
         with connected(table, table.types) as source:
             source.connector.close()

@@ -91,7 +91,7 @@ class Writer:
     def written(self, *writes: Write) -> Frame:
         """Send a command that must succeed.
 
-        Return the first frame that was requested after its end.
+        Return the first good frame that was requested after the command's end.
         """
         end = self.write(*writes)
         assert end.kind == EventKind.WRITTEN, end

@@ -14,20 +14,20 @@ from shmio.judging.source import Rows, Signal
 from shmio.judging.trace import Traces
 
 MAX_PLOTS: Final = 500
-"""Maximum number of plots in a report; those of further expectations are left out."""
+"""Largest number of plots in a report; further plots are left out."""
 
 
 class Reports:
     """The reports that a command line asks for. They collect signals only if they have plots."""
 
     def __init__(self, arguments: argparse.Namespace) -> None:
-        """Begin. ``arguments`` has ``report`` and ``junit``: files, or None."""
+        """Create the reports; ``arguments.report`` and ``arguments.junit`` are files or None."""
         self._html: Path | None = arguments.report
         self._junit: Path | None = arguments.junit
         self._traces: Traces | None = None
 
     def collector(self, judge: Callable[[], Judge]) -> Callable[[Mapping[str, Rows]], None]:
-        """Return a function that collects signals; ``judge`` returns their judge when it exists."""
+        """Return a function that collects signals. Its first call gets the judge from ``judge``."""
         if self._html is None:
             return lambda _rows: None
 
@@ -70,7 +70,7 @@ class Reports:
 
 
 def _plotted(judge: Judge) -> list[tuple[int, Signal]]:
-    """Return what a report plots: the index of an expectation, and a signal that it reads."""
+    """Return the plots of a report: pairs of an expectation's index and a signal that it reads."""
     return [(index, one) for index in range(len(judge.verdicts)) for one in judge.read_by(index)][:MAX_PLOTS]
 
 

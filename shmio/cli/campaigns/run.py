@@ -97,7 +97,7 @@ def _instance(arguments: argparse.Namespace) -> Iterator[Target]:
     """Yield the instance. With ``-c``, start it if it does not run, and then stop it at the end.
 
     Raises:
-        ControlError: It does not start.
+        ControlError: The instance does not start.
 
     """
     wanted = target(arguments)
@@ -113,7 +113,7 @@ def _instance(arguments: argparse.Namespace) -> Iterator[Target]:
 
 
 def _configuration(segment: Segment) -> Path | None:
-    """Return the configuration file of an instance, if its supervisor says it."""
+    """Return the configuration file of an instance; None if its supervisor does not tell it."""
     try:
         return Path(control.request(segment.header.control, control.Where(), WHERE_S)["config"])
     except (ControlError, KeyError):

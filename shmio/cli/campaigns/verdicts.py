@@ -16,7 +16,7 @@ STATUSES: Final = {Outcome.PASSED: 0, Outcome.FAILED: 1, Outcome.INCONCLUSIVE: 3
 
 
 def exit_status(verdicts: Sequence[Verdict]) -> int:
-    """Return 0 if all passed, 1 if one failed, 3 if otherwise one is inconclusive."""
+    """Return 1 if any expectation failed, else 3 if any is inconclusive, else 0."""
     outcomes = {verdict.outcome for verdict in verdicts}
     worst = (Outcome.FAILED, Outcome.INCONCLUSIVE, Outcome.PASSED)
     return STATUSES[next((outcome for outcome in worst if outcome in outcomes), Outcome.PASSED)]
@@ -66,7 +66,7 @@ def as_table(verdict: Verdict) -> dict[str, Any]:
 
 
 def lines(verdict: Verdict, width: int = 0) -> list[str]:
-    """Return what to print about a verdict; ``width`` is that of the names."""
+    """Return the lines to print about a verdict. ``width`` is the width of the column of names."""
     expectation = verdict.expectation
     of = f" [{expectation.requirement}]" if expectation.requirement else ""
     robustness = "" if verdict.robustness is None else f"  robustness {verdict.robustness:.6g}"

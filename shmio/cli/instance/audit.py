@@ -27,7 +27,7 @@ WHERE_S: Final = 5.0
 
 
 def audit(arguments: argparse.Namespace) -> int:
-    """Print the last entries that are wanted, and with ``-f`` new ones until Ctrl-C."""
+    """Print the last entries that match the options; with ``-f``, also new ones until Ctrl-C."""
     newest = _where(arguments) / AUDIT_FILE
     since_s = arguments.since or 0.0
     wanted = EntryFilter(
@@ -49,7 +49,10 @@ def audit(arguments: argparse.Namespace) -> int:
 
 
 def _last(newest: Path, since_s: float, wanted: EntryFilter, count: int | None) -> Iterable[Entry]:
-    """Return the last ``count`` entries; None: all if a time is given, otherwise a few."""
+    """Return the last ``count`` entries that match.
+
+    If ``count`` is None, return all entries since ``since_s``, or the last 50 if ``since_s`` is 0.
+    """
     most = count if count is not None else None if since_s else 50
     return deque(filter(wanted.chooses, entries(newest, since_s)), maxlen=most)
 

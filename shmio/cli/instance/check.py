@@ -138,7 +138,7 @@ def _line(source: dict[str, Any]) -> str:
 
 
 class _Figures:
-    """How much a source reads and may write, and whether its period can be met."""
+    """Figures about a source: what it reads and may write, and whether its period can be met."""
 
     def __init__(self, source: Source, block: BlockSpec, round_trip_ms: float | None) -> None:
         self._requests = source_requests(source, block.layout)

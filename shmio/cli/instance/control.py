@@ -38,9 +38,9 @@ PREVIEWED: Final[Mapping[str, str]] = {
 
 
 def down(arguments: argparse.Namespace) -> int:
-    """Ask the supervisor to stop, and wait for its end.
+    """Ask the supervisor to stop the instance, and wait until the supervisor has ended.
 
-    If it is dead, remove what it left behind.
+    If the supervisor is dead, remove what it left behind.
     """
     wanted = target(arguments)
     name = wanted.name
@@ -70,10 +70,10 @@ def _forget(path: str, name: str) -> None:
 
 
 def stop(segment: Segment) -> None:
-    """Ask the supervisor to stop the instance, and wait for its end.
+    """Ask the supervisor to stop the instance, and wait until the supervisor has ended.
 
     Raises:
-        ControlError: It does not answer.
+        ControlError: The supervisor does not answer.
 
     """
     pidfd = _pidfd(segment.supervisor[0])

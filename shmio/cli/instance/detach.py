@@ -31,14 +31,14 @@ _FLAGS: Final = ("loop", "paused", "record")
 
 
 class Configured(msgspec.Struct, tag=True):
-    """Message of the detached supervisor: it has read its configuration."""
+    """Message that the detached supervisor has read its configuration."""
 
     log_file: str
     warnings: tuple[str, ...]
 
 
 class Started(msgspec.Struct, tag=True):
-    """Message of the detached supervisor: the instance runs.
+    """Message that the instance of the detached supervisor runs.
 
     ``history`` says what an earlier supervisor left behind; ``processes`` has a line for each
     process.
@@ -50,7 +50,7 @@ class Started(msgspec.Struct, tag=True):
 
 
 class Failed(msgspec.Struct, tag=True):
-    """Message of the detached supervisor: the start has failed."""
+    """Message that the start of the detached supervisor has failed."""
 
     error: str
 
@@ -94,7 +94,7 @@ def start(file: Path, mode: str, words: Sequence[str] = ()) -> tuple[str, Starte
         child = subprocess.Popen(
             [*command, "-c", str(file), "--mode", mode, "--report", str(writer), *words],
             stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,  # it shares our standard error until it has opened its log file
+            stdout=subprocess.DEVNULL,  # the child shares stderr until it has opened its log file
             pass_fds=(writer,),
             env=child_environment(),
             start_new_session=True,
@@ -166,7 +166,7 @@ def _await(fd: int) -> tuple[str, Started]:
 
 
 def _lines(fd: int) -> Iterator[bytes]:
-    """Yield the lines that arrive through the pipe, until it is closed or the time-out has passed."""
+    """Yield the lines that arrive through the pipe. Raise ControlError after the time-out."""
     deadline = time.monotonic() + DETACH_S
     received = b""
     while True:

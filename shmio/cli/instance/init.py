@@ -132,8 +132,8 @@ def new_config(file: Path, files: Sequence[Path], name: str | None = None, *, em
     Args:
         file: Where the configuration will be written.
         files: Source files of data blocks and tags, and at most one properties file.
-        name: The data block to use. None: the block with the number in the properties file, or else
-            all blocks.
+        name: The data block to use; None for the block with the number in the properties file, or
+            else for all blocks.
         emulated: True to add an emulated controller with these blocks.
 
     Raises:
@@ -203,8 +203,8 @@ def new_config(file: Path, files: Sequence[Path], name: str | None = None, *, em
 def _compile(program: Program, name: str | None, number: str) -> tuple[list[Layout], list[str]]:
     """Return the data blocks to use as sources, and warnings.
 
-    If ``name`` is given, use only this block. Otherwise use the block with ``number`` or, if there
-    is not a number, all blocks that can be compiled.
+    If ``name`` is given, use only this block. Otherwise, use the block with ``number``; if
+    ``number`` is empty, use all blocks that can be compiled.
     """
     held = ", ".join(block.name for block in program.blocks)
     if name is not None:
@@ -240,7 +240,7 @@ def _refuse_table(path: Path, file: Path) -> None:
     """Refuse a tag list or the URL of a server.
 
     Raises:
-        ConfigError: It is one; the message says what to do with it.
+        ConfigError: ``path`` is one of these; the message says what to do with it.
 
     """
     text = str(path)
@@ -267,7 +267,7 @@ def _refuse_foreign(path: Path) -> None:
     """Refuse exports of TIA Portal that are not source files.
 
     Raises:
-        ConfigError: The file is one.
+        ConfigError: The file is such an export.
 
     """
     with suppress(OSError), path.open("rb") as stream:  # unreadable files are reported with the others
@@ -276,7 +276,7 @@ def _refuse_foreign(path: Path) -> None:
 
 
 def _source_names(blocks: Sequence[Layout]) -> list[str]:
-    """Return a name for each source: ``cell`` if there is only one, else one like its block's name."""
+    """Return a name for each source: ``cell`` for a single one, else made from the block's name."""
     if len(blocks) == 1:
         return ["cell"]
     names: list[str] = []
@@ -311,7 +311,7 @@ def _emulated(block: Layout, number: str, address: Address) -> list[str]:
 
 
 def _emulators(layout: str, blocks: Sequence[Layout], count: int, number: str) -> tuple[list[Address], list[str]]:
-    """Return each block's emulator address, and the sections.
+    """Return the address of each block's emulator, and the lines of the emulators' sections.
 
     One emulator serves all blocks if possible.
     """
@@ -361,9 +361,9 @@ def _free(ports: range, count: int) -> list[Address]:
 
 
 def _relative(path: Path, file: Path) -> str:
-    """Return a path for the configuration.
+    """Return a path as the configuration contains it.
 
-    It is relative if it is inside the configuration's folder.
+    The path is relative if it is inside the configuration's folder.
     """
     absolute, folder = path.resolve(), file.resolve().parent
     return str(absolute.relative_to(folder)) if absolute.is_relative_to(folder) else str(absolute)

@@ -68,7 +68,7 @@ def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
 def clock_line(clock: ClockStatus, dt_ms: float | None = None) -> str:
     """Return the state of the clock as text.
 
-    ``dt_ms`` is the length of the steps that were just made; None: that of the clock's step size.
+    ``dt_ms`` is the length of the steps that were just made; None for the clock's step size.
     """
     if clock.mode == str(ClockMode.WALL):
         return f"real time {clock.time_s:.3f} s"
@@ -158,9 +158,9 @@ def _listed(name: str) -> Listed | None:
 
 
 def _listening(segment: Segment, note: str) -> tuple[dict[str, list[str]], str]:
-    """Return the addresses to listen on by process, and the note.
+    """Return the addresses on which each process listens, and the note.
 
-    The note says why addresses are missing.
+    If the supervisor does not tell the addresses and ``note`` is empty, the new note says why.
     """
     try:
         answer = control.request(segment.header.control, control.Where(), WHERE_S, lambda: supervisor_silence(segment))

@@ -32,7 +32,7 @@ from shmio.supervisor.start import check_startable, hold_log_folder
 def up(arguments: argparse.Namespace) -> int:
     """Run an instance until it has stopped.
 
-    With ``--report``, be the child process of ``up --detach``.
+    With ``--report``, act as the child process of ``up --detach``.
     """
     file, mode, keys = config_file(arguments), arguments.mode, replay_keys(arguments)
     if arguments.report is not None:

@@ -41,8 +41,8 @@ MAX_PLACES: Final = 4
 def cat(arguments: argparse.Namespace) -> int:
     """Print a line for each frame in which a chosen value or the quality changed.
 
-    Events, gaps and steps have lines of their own. If parts of the recording are damaged, this is
-    reported at their place, everything else is printed, and the exit status is 1.
+    Events, gaps and steps have lines of their own. If parts of the recording are damaged, report
+    each in its place, print the rest, and return 1.
     """
     report = DamageReport()
     with (
@@ -139,10 +139,10 @@ def _views(
 
 
 def _one_file(patterns: Sequence[str]) -> None:
-    """Check that no pattern is a file. This happens if the shell expands ``*.mem``.
+    """Refuse a pattern that is a file. A shell makes such patterns when it expands ``*.mem``.
 
     Raises:
-        PathError: A pattern is one; the message has the remedy.
+        PathError: A pattern is a file; the message has the remedy.
 
     """
     for pattern in patterns:
@@ -179,7 +179,7 @@ def _lines(
 
 
 class View:
-    """The registers of one block that the user has chosen, and their values printed last."""
+    """The chosen registers of one block, and the frame that was printed last."""
 
     def __init__(self, channel: Channel, layout: Layout, registers: Sequence[Register]) -> None:
         self.source = channel.source
@@ -221,7 +221,7 @@ class Printer(Protocol):
 
 
 def _where(event: Event, explained: Explained, room: int | None) -> str:
-    """Return an event's registers as text with direction and values, or its bytes' offset."""
+    """Return an event's registers as text with direction and values, or else its range of bytes."""
     if not explained.places:
         return f"{event.size} bytes at {event.offset}" if event.size and not event.data.startswith(b"{") else ""
     way = f"/{explained.direction}" if explained.direction else ""
@@ -234,7 +234,7 @@ def _where(event: Event, explained: Explained, room: int | None) -> str:
 
 
 def _definition(definition: dict[str, Any]) -> str:
-    """Return the definition of an injection as text, without what the event itself already states."""
+    """Return an injection's definition as text, without keys that the event's line already has."""
     return ", ".join(f"{key} = {dumps(value)}" for key, value in definition.items() if key not in ("name", "direction"))
 
 
@@ -301,13 +301,13 @@ class Table:
     """Formats entries as lines with columns. Headings are printed whenever the block changes."""
 
     def __init__(self, room: int | None) -> None:
-        """Set the maximum number of characters of a value; None: no limit."""
+        """Set the largest number of characters of a value; None for no limit."""
         self._room = room
         self._view: View | None = None
         self._widths: list[int] = []
 
     def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
-        """Format a frame's values, with the quality unless it is good."""
+        """Format a frame's values, and its quality if that is not good."""
         known = frame.source_ns != 0
         cells = [
             shown(decode.decode(frame.image) if known else None, register, self._room)

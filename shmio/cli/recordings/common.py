@@ -53,20 +53,20 @@ class DamageReport:
 
 
 def not_closed(end: str) -> str:
-    """Return a text that says that a file was not closed, and that the reason is ``end``."""
+    """Return a text that says that a file was not closed. ``end`` says how the file ends."""
     return f"not closed ({end}): still being written, or its recorder was killed"
 
 
 class Progress:
-    """A line on standard error that shows progress, if that is a terminal.
+    """Shows progress in a line on standard error, if standard error is a terminal.
 
-    It is removed at the end.
+    The line is removed at the end.
 
     Use it as a context manager.
     """
 
     def __init__(self, what: str, *, silent: bool = False) -> None:
-        """Begin. With ``silent``, nothing is shown, because the terminal shows other output."""
+        """Create the line. With ``silent``, show nothing: the terminal shows other output."""
         self.total = 0
         """Total amount of work, in bytes or in ns of a recording."""
         self._what = what

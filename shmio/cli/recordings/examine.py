@@ -135,5 +135,5 @@ def _each(
 
 
 def _ended(found: dict[str, Any]) -> str:
-    """Return as text how a file ends, from the keys ``closed`` and ``end``."""
+    """Return a text that says how a file ends, from the keys ``closed`` and ``end``."""
     return "closed" if found["closed"] else not_closed(found["end"])

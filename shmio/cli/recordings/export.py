@@ -114,7 +114,7 @@ def _require_one(output: Path, blocks: Sequence[DumpBlock]) -> None:
     """Check that these blocks fit into one table.
 
     Raises:
-        RecordingError: They do not.
+        RecordingError: There are several blocks.
 
     """
     if len(blocks) > 1:

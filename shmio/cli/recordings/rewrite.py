@@ -79,7 +79,7 @@ def recover(arguments: argparse.Namespace) -> int:
 
 
 def _rewrite(dump: Dump, path: Path, made: str, entries: Iterable[Entry[Item]], *, whole: bool = True) -> Rewriter:
-    """Write entries to a new file by :func:`shmio.recording.rewriting.rewrite`.
+    """Write entries to a new file with :func:`shmio.recording.rewriting.rewrite`.
 
     Show the progress.
     """
