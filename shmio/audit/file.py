@@ -1,4 +1,4 @@
-"""Writes an instance's audit files. Several processes may append and rotate without losing a line."""
+"""Writes an instance's audit files. Several processes append and rotate without losing a line."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Final
 import msgspec
 
 LOCK_S: Final = 2.0
-"""How long to wait for another process's lock on the file, in s. Each write holds the lock only briefly."""
+"""How long to wait for another process's lock on the file, in s. Each lock is brief."""
 _LOCK_TURN_S: Final = 0.002
 
 
@@ -76,7 +76,7 @@ class AuditFile:
             self._fd = -1
 
     def _lock(self) -> None:
-        """Lock the newest file. If it was rotated or removed meanwhile, open the file that is newest now."""
+        """Lock the newest file. If it was rotated or removed meanwhile, open the new one."""
         until_s = time.monotonic() + LOCK_S
         while True:
             if self._fd < 0:

@@ -101,14 +101,14 @@ def _words(what: Any) -> Iterator[str]:
 
 
 def last_events(newest: Path, since: str) -> dict[str, int]:
-    """Return the number of each source's last event that the supervisor has entered since a time."""
+    """Return the number of each source's last event that the supervisor has recorded since a time."""
     found: dict[str, int] = {}
     try:
         for entry in entries(newest):
             if entry.event and entry.process == SUPERVISOR and entry.time >= since:
                 source = source_of(entry)
                 found[source] = max(entry.event, found.get(source, 0))
-    except OSError:  # then the commands of this run are entered again
+    except OSError:  # then the commands of this run are recorded again
         return {}
     return found
 

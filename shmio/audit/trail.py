@@ -44,13 +44,13 @@ MAX_REASON: Final = 500
 MAX_BATCH: Final = 500
 """Maximum number of entries that are written at once."""
 MERGED: Final = frozenset({"feed", "read", "sign in", "step"})
-"""Actions that a client can repeat many times a second. Repetitions within a second get one entry, with their count.
+"""Actions that a client can repeat many times a second. Repetitions within a second share one entry.
 
 A ``read`` has an entry only if it is denied.
 """
 MERGE_S: Final = 1.0
 MAX_MERGED: Final = 1000
-"""Maximum number of different actions whose repetitions are merged. Others get an entry for each repetition."""
+"""Maximum number of different actions whose repetitions share an entry at a time."""
 RETRY_S: Final = 1.0
 """Pause before a failed write is repeated, in s."""
 CLOSE_S: Final = 2.0

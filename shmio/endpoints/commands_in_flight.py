@@ -1,4 +1,4 @@
-"""The commands in flight to one source: those whose outcomes are not known yet."""
+"""The commands in flight to one source, whose outcomes are not known yet."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ class InFlightTable:
 
     @property
     def due_ns(self) -> int | None:
-        """The earliest deadline of a command, in ns of the monotonic clock; None if no command is in flight."""
+        """The earliest deadline, in ns of the monotonic clock; None if no command is in flight."""
         return min((pending.until_ns for pending in self._by_number.values()), default=None)
 
     def add(

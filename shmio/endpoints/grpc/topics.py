@@ -44,7 +44,7 @@ class Topics:
         """Parse a path.
 
         Raises:
-            PathError: There is no such source.
+            PathError: There is no such source, or the path names a time topic.
 
         """
         topic = self._parse(path)

@@ -163,7 +163,7 @@ class CommandClient:
             injection: Number of the injection.
             values: Values by register path.
             done: Called once, with the outcome of each write, not of each value.
-            accepted: Called before ``done``, if an injection is over ``/in`` and the source accepts
+            accepted: Called before ``done``, if the injection is over ``/in`` and the source accepts
                 the command.
             raw: Bytes to give in addition to the values.
 

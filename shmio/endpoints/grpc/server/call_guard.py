@@ -375,7 +375,10 @@ class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]
 
     @property
     def alive(self) -> bool:
-        """True while the core serves. A core that has stopped cannot serve again: the process has to end."""
+        """True while the core serves.
+
+        A core that has stopped cannot serve again, so the process has to end.
+        """
         return bool(self.is_running()) and not any(worker.done() for worker in self._workers)
 
     def _make_request_call_future(self, method: bytes | None) -> asyncio.Future[Any]:

@@ -1,4 +1,4 @@
-"""Health (``grpc.health.v1``) of the endpoint, its services and its sources.
+"""Serves the health (``grpc.health.v1``) of the endpoint, its services and its sources.
 
 The servicer of grpcio-health-checking is not suitable. It sends to watchers while it holds a lock
 that changes of a status need. A watcher that does not read would block all changes of that service,

@@ -52,7 +52,7 @@ Leave = Callable[[], None]
 
 
 class _ImageStream:
-    """The listeners to one direction of an injection. A value is encoded once for all of them."""
+    """The listeners to an injection's originals, or to its given values. All share one encoding."""
 
     def __init__(self) -> None:
         self._channels: dict[str, tuple[Encode, set[Listener]]] = {}

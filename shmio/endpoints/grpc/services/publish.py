@@ -73,7 +73,7 @@ class _Destination(NamedTuple):
 class Request(NamedTuple):
     """A value for a topic.
 
-    ``read`` returns the value by register path, or raises ValueRangeError.
+    ``read`` returns the values by register path, or raises ValueRangeError.
     """
 
     path: str

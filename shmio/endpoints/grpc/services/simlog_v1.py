@@ -1,4 +1,4 @@
-"""SimlogAPI version 1, package ``simulation.server``: the calls, and values as ROSMessages.
+"""Serves SimlogAPI version 1, package ``simulation.server``, with values as ROSMessages.
 
 The value of a register is sent as a text. A structure of a known type has its own message type.
 Serialised fields may be concatenated, so constant fields are encoded once, and the time once for

@@ -1,4 +1,4 @@
-"""SimlogAPI version 2, package ``simlog.server``: calls, and values as ``google.protobuf.Value``.
+"""Serves SimlogAPI version 2, package ``simlog.server``, with ``google.protobuf.Value`` as values.
 
 Serialised fields may be concatenated, so the fields that all listeners share are encoded once.
 """

@@ -1,4 +1,4 @@
-"""SimServerAPI, package ``com.ttsnetwork.simulator3``: stepping, playing, and the state of time."""
+"""Serves SimServerAPI, package ``com.ttsnetwork.simulator3``, which controls the instance's time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The call Subscribe: one stream of updates from any number of blocks."""
+"""The call Subscribe, which streams updates from any number of blocks."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class BlockUpdates(Protocol):
 
 
 class EveryFrame:
-    """Makes an update of every frame from the present frame on. Counts overwritten frames."""
+    """Makes an update of every frame from the present one on, and counts overwritten frames."""
 
     due_s = math.inf
 

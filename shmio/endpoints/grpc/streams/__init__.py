@@ -1,1 +1,1 @@
-"""The way from a block's frames to clients' streams: feeds, conflation, and back-pressure."""
+"""Delivers blocks' frames to clients' streams: feeds, conflation, and back-pressure."""

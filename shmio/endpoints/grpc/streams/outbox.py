@@ -225,7 +225,7 @@ class _Lane:
 
 
 class StateLane(_Lane):
-    """A lane for states. A client that keeps up gets every change; a slow one gets the newest value.
+    """A lane for states. A slow client gets only the newest value, any other client every change.
 
     The outbox counts the values that are left out. The lane is a listener of a feed.
     """

@@ -31,7 +31,8 @@ class TimeStatus(NamedTuple):
     """The state of the instance's time.
 
     ``dt_ns`` is the length of the step that the status reports. If it reports no step, ``dt_ns`` is
-    the present step size.
+    the length of the steps that are played, or the step size.
+
     ``alive`` is False after a client has called ``stop`` of SimServerAPI, until the next step.
     """
 
@@ -339,8 +340,7 @@ class Timeline:
     def update(self) -> Clock:
         """Read the clock page, and act on changes.
 
-        This method is also called periodically, because a program that plays time and dies causes no
-        wake-up.
+        This is also called periodically: if a program dies while it plays time, no wake-up comes.
         """
         state = self._clock.read()
         if state.virtual and not self.virtual_time.on:
