@@ -50,7 +50,7 @@ from shmio.segment.processes import Activity, Report
 from shmio.segment.segment import Segment, running_instances
 
 _TURN_S: Final = 1.0
-"""Interval at which a waiting reader checks that the instance still runs, in s."""
+"""Interval in s at which a waiting reader checks whether the instance still runs."""
 
 
 class Attachment:
@@ -159,7 +159,7 @@ class Attachment:
         return [reading(blocks[source], register, frames[source]) for source, register in chosen]
 
     def subscribe(self, *patterns: str, every_frame: bool = False, max_rate_hz: float = 0.0) -> Subscription:
-        """Follow registers, their present values first: see :class:`shmio.Cell`.
+        """Follow registers: get their present values, then each change. See :class:`shmio.Cell`.
 
         Closing the subscription or the attachment ends it.
         """
@@ -170,7 +170,7 @@ class Attachment:
         return subscription
 
     def events(self, *sources: str) -> Events:
-        """Follow the events of these sources, or of all, from now on: see :class:`shmio.Cell`.
+        """Follow the events of these sources (default: all) from now on: see :class:`shmio.Cell`.
 
         Closing the iterator or the attachment ends it.
 
@@ -262,7 +262,7 @@ class Attachment:
         return successor
 
     def _next(self, block: Block, cursor: Cursor[Entry], timeout_s: float | None) -> Entry | None:
-        """Wait for a frame or an event. Meanwhile, check that the instance has not stopped."""
+        """Wait for the next frame or event, and check meanwhile that the instance has not stopped."""
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
             rest_s = _TURN_S if deadline_s is None else deadline_s - time.monotonic()
@@ -283,7 +283,7 @@ class Attachment:
 
         Args:
             source: Name of the source; None if there is only one.
-            after: An earlier frame; None: the newest one at the time of the call.
+            after: The given frame; None: the newest frame at the time of the call.
             timeout_s: Time-out in s; None waits forever.
 
         Returns:
@@ -311,7 +311,7 @@ class Attachment:
         """Write values as :meth:`write` does; each outcome has the path that you gave.
 
         Raises:
-            PathError, ValueRangeError, CommandError: As :meth:`write`; nothing has been sent.
+            PathError, ValueRangeError, CommandError: As for :meth:`write`; nothing has been sent.
             NotRunningError: The instance has stopped.
         """
         self._segment.require_running()
@@ -346,8 +346,9 @@ class Attachment:
 
         Args:
             paths: Registers, elements, structures or patterns of one source. With the suffix
-                ``/in``, the shadow takes what others write. With ``/out``, or without a suffix, it
-                replaces what consumers see. All paths must have the same direction.
+                ``/in``, the shadow takes the values that others write. With ``/out``, or without a
+                suffix, it replaces the values that consumers see. All paths must have the same
+                direction.
             priority: If several shadows cover a register, the shadow with the highest priority is
                 outermost. Among equal priorities, the newest is outermost.
             keep: Whether the shadow stays when this program ends, until a program lifts it.
@@ -377,7 +378,7 @@ class Attachment:
     def written(self, *paths: str, timeout_s: float | None = None) -> Iterator[ObservedWrite]:
         """Iterate over the commands that write to registers of one source, from now on.
 
-        It yields each accepted command when its outcome is known. The commands are in order.
+        The iterator yields accepted commands in order, each when its outcome is known.
 
         Args:
             paths: Registers, structures or patterns of one source.
@@ -392,7 +393,7 @@ class Attachment:
         return written(block, patterns, block.events.cursor(), partial(self._next, block), timeout_s)
 
     def declare(self, declarations: Iterable[Mapping[str, Any] | Declaration], *, keep: bool = False) -> Campaign:
-        """Create declared injections, all or none. Their sources run them without this program.
+        """Create all declared injections, or none of them. Their sources run them on their own.
 
         An injection ends as its declaration says, or when a program lifts it. The attachment must
         be ``writable``. See docs/reference/injections.md.
@@ -418,7 +419,7 @@ class Attachment:
     def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
         """Return the existing injections of these sources (default: all).
 
-        Among the injections of a source, the innermost comes first.
+        The injections of a source begin with the innermost.
 
         Raises:
             PathError: There is no such source.
@@ -493,8 +494,8 @@ class Attachment:
         """Step time, and wait until all sources on the instance clock have done each step.
 
         The first call of this method, :meth:`pause` or :meth:`play` takes control of time: from
-        then on, only steps move it. This program owns time until it detaches or calls
-        :meth:`release`. The attachment must be ``writable``.
+        then on, only steps move it. This program owns time until it calls :meth:`release` or
+        detaches. The attachment must be ``writable``.
 
         Args:
             dt_s: Length of each step in s, from 1 us to 1 h; None: the step size.
@@ -516,7 +517,7 @@ class Attachment:
         return self.clock
 
     def play(self, rate: float = 1.0, dt_s: float | None = None) -> Clock:
-        """Step time in a thread until :meth:`pause`, and return the state of the clock.
+        """Start to step time in a thread, until :meth:`pause`; return the state of the clock.
 
         Args:
             rate: Speed relative to real time; above 0, at most 1000.
@@ -530,7 +531,7 @@ class Attachment:
         return self.clock
 
     def pause(self) -> Clock:
-        """Stop time until it is stepped or played, and return the state of the clock.
+        """Stop time until the next :meth:`step` or :meth:`play`, and return the state of the clock.
 
         Raises:
             TimeError: Another program owns time, or a step failed while time was played.
@@ -556,7 +557,7 @@ class Attachment:
     def _source_writer(self, block: Block) -> SourceWriter:
         """Return the writer for a block.
 
-        The first call takes an external slot, until the program detaches.
+        The first call takes an external slot for this attachment, until it is closed.
         """
         if not self._segment.shared.writable:
             raise CommandError("this attachment only reads: attach with writable=True")
@@ -569,7 +570,7 @@ class Attachment:
             return known
 
     def _end_with_this(self, following: Following[Any]) -> None:
-        """Let :meth:`close` end an iterator, too.
+        """Register an iterator that :meth:`close` must end.
 
         If another thread has just closed this attachment, end the iterator now.
         """
@@ -608,11 +609,11 @@ def attach(instance: str | None = None, *, writable: bool = False) -> Attachment
     Args:
         instance: Name of the instance; None if only one is running.
         writable: Whether to allow writing, injecting and stepping. Only the user who runs the
-            instance can.
+            instance may do this.
 
     Raises:
-        NotRunningError: The instance is not running. Or you named none, and none or several are
-            running.
+        NotRunningError: The instance is not running. Or you gave no name, and no instance or
+            several instances are running.
         FormatError: Another version of shmio made the segment.
         SegmentError: The segment cannot be opened, for example because you have no permission.
     """
@@ -653,10 +654,10 @@ def _of_one_source(
     """Resolve paths that must all belong to one source.
 
     Args:
-        what: What the paths are for, such as "write". Messages use it.
+        what: Purpose of the paths for messages, such as "write".
         paths: The paths.
         blocks: The instance's blocks, by source.
-        written: Whether the caller writes to the paths. Then none may end in ``/out``.
+        written: Whether the caller writes to the paths. If so, no path may end in ``/out``.
 
     Returns:
         The source's block, and a topic for each path.
@@ -680,7 +681,7 @@ def _of_one_source(
 
 
 def _with_source(source: str, one: InjectionEntry) -> Injection[Mapping[str, Any]]:
-    """Convert an injection from the form in the segment to the form that programs get."""
+    """Convert an injection of the segment to the form for programs, which names the source."""
     now, running = one.running, None
     if now is not None:
         declaration = msgspec.to_builtins(now.declaration)
@@ -691,7 +692,7 @@ def _with_source(source: str, one: InjectionEntry) -> Injection[Mapping[str, Any
 
 
 def _ns(dt_s: float | None) -> int | None:
-    """Check the length of a step, and convert it to ns. ValueRangeError: it is out of range."""
+    """Convert the length of a step to ns; raise ValueRangeError if it is out of range."""
     if dt_s is None:
         return None
     check_step(dt_s * 1e9)  # before rounding, which fails for infinity

@@ -14,9 +14,9 @@ from shmio.segment.block import Block
 from shmio.segment.segment import Segment
 
 MAX_PATHS: Final = 2048
-"""Maximum number of paths of an event: the number of bits in the data of an event.
+"""Maximum number of paths in an event: the number of bits in the data of an event.
 
-An injection may cover more registers. Its events then have only the first paths.
+If an injection covers more registers, its events have only the first paths.
 """
 _KINDS: Final = {int(kind): EventKind(str(kind)) for kind in segment_events.EventKind}
 
@@ -54,7 +54,7 @@ class EventReader:
             self._last = event
             explained = self._explainer.explain(event)
             if explained.partial:
-                continue  # of the events that define an injection, only the last is returned
+                continue  # return only the last of the events that define an injection
             missed, self._missed = self._missed, 0
             return Event(
                 self.block.source, _KINDS.get(event.kind, EventKind.OTHER), event.number, event.frame, event.cycle,
@@ -85,7 +85,7 @@ class Events(Following[Event]):
     """Events of a local instance. Implements :class:`shmio.model.cell.Events`."""
 
     def __init__(self, segment: Segment, blocks: Callable[[], Mapping[str, Block]], followed: Iterable[Block]) -> None:
-        """Start to follow.
+        """Start to follow the events of blocks.
 
         Args:
             segment: The instance's segment.

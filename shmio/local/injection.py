@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 _EVENTS: Final = frozenset({EventKind.INJECTED, EventKind.ACTIVATED, EventKind.DEACTIVATED, EventKind.LIFTED})
 
 Next = Callable[[Cursor[Event], float | None], Event | None]
-"""Waits for a cursor's next event, at most for the given time in s.
+"""Function that waits for a cursor's next event, at most for the given time in s.
 
 It returns None if no event came in time, or if no further event can come. It raises NotRunningError
 if the instance has stopped.
@@ -50,14 +50,14 @@ class ObservedWrite:
     """The values that one command wrote to a source, or the part of them that an injection took.
 
     Attributes:
-        values: Values by path within the block. If only part of an array or integer was written,
-            the written elements or bits.
+        values: Values by path within the block. If only a part of an array or integer was written,
+            the paths are those of the written elements or bits.
         writer: Number of the command queue, as in events.
         command: Number that the writer gave the command, as in events.
         clock_ns: Time of the instance's clock.
         utc_ns: UTC time.
-        missed: Number of events lost since the previous item. Some may have been about other
-            writes.
+        missed: Number of events lost since the previous item. Some of them may have been about
+            writes, which are then missing.
     """
 
     values: Mapping[str, Value]
@@ -93,16 +93,16 @@ class Shadow:
             source_writer: The writing side of its source.
             number: Number of the injection.
             direction: Direction that it covers.
-            events: A cursor that is older than the injection.
+            events: A cursor that was created before the injection.
             next_event: Waits for the cursor's next event.
             keep: Whether the injection stays when it is closed.
-            names: The registers over the block by whose names the program chose what it covers.
+            names: The registers of tag tables over the block whose names the program gave.
         """
         self.source = source_writer.block.source
         self.number = number
         """Number of the injection.
 
-        With it, any program may lift the injection or give values to it.
+        Any program may use it to lift the injection or to give values to it.
         """
         self.direction = direction
         self._source_writer = source_writer
@@ -123,8 +123,8 @@ class Shadow:
 
         Returns:
             The outcome of each value, with the path that you gave. SHADOWED: consumers see the
-            value. For ``/in``, it is the outcome of a write to the device. REJECTED: the shadow
-            does not cover the path, or was lifted.
+            value. REJECTED: the shadow does not cover the path, or was lifted. A shadow over
+            ``/in`` returns the outcomes of a write to the device.
 
         Raises:
             PathError: A path names nothing.
@@ -199,7 +199,7 @@ class Shadow:
 def written(
     block: Block, patterns: Iterable[str], events: Cursor[Event], next_event: Next, timeout_s: float | None
 ) -> Iterator[ObservedWrite]:
-    """Iterate over the accepted commands to registers. Yield a command when its outcome is known.
+    """Iterate over the accepted commands that write to registers, each when its outcome is known.
 
     Args:
         block: The source's block.
@@ -255,7 +255,7 @@ class _Created(NamedTuple):
         """Lift the injection.
 
         Raises:
-            CommandError: The injection is over or was lifted, or the source does not answer.
+            CommandError: The injection is over or was lifted already, or the source does not answer.
         """
         self.source_writer.lift(self.number)
 
@@ -268,8 +268,8 @@ def compile_declarations(
     Args:
         declarations: What to compile.
         blocks: The instance's blocks, by source.
-        wanted: Called before each declaration. If it returns False, the compilation is cancelled. A
-            compilation of many declarations over a large layout takes seconds.
+        wanted: Called before each declaration, because compiling many declarations over a large
+            layout takes seconds. If it returns False, the compilation is cancelled.
 
     Raises:
         ConfigError: A declaration is wrong; the message starts as ``injection[0].target: …``.
@@ -321,7 +321,7 @@ def _create(
 
 
 def _read(declarations: Iterable[Mapping[str, Any] | Declaration]) -> list[Declaration]:
-    """Read declarations from tables. Draw a random seed for each declaration that has none.
+    """Read declarations from tables, and give a random seed to each declaration that has none.
 
     Raises:
         DeclarationError: A declaration is wrong.
@@ -363,7 +363,7 @@ class Campaign(Following[InjectionEvent]):
 
         Raises:
             DeclarationError: A declaration is wrong.
-            CommandError: A source refuses one, or does not answer.
+            CommandError: A source refuses an injection, or does not answer.
         """
         super().__init__(segment)
         self._keep = keep
@@ -389,7 +389,7 @@ class Campaign(Following[InjectionEvent]):
             while (event := cursor.poll()) is not None:
                 if event.kind in _EVENTS and event.offset == 0 and (source, event.injection) in self._left:
                     return self._injection_event(source, event)  # the first part, if the event has several
-            if cursor.take_missed():  # a lost event may have been that of a lifted injection
+            if cursor.take_missed():  # a lost event may have said that an injection was lifted
                 present = {one.number for one in block.injections.read() if not one.lifted}
                 self._left = {key: one for key, one in self._left.items() if key[0] != source or key[1] in present}
             if retired:
@@ -412,13 +412,13 @@ class Campaign(Following[InjectionEvent]):
         """Lift the remaining injections, unless they were created with ``keep``."""
         super().close()
         for one in () if self._keep else self._left.values():
-            with suppress(CommandError):  # it is over, or somebody else has lifted it
+            with suppress(CommandError):  # the injection is over, or another program has lifted it
                 one.lift()
         self._left.clear()
 
 
 def lift_all(injections: Iterable[tuple[SourceWriter, int]]) -> None:
-    """Lift injections, given by writer and number. It is no error if one was lifted before.
+    """Lift injections, given by writer and number. Ignore those that were lifted before.
 
     Raises:
         CommandError: Some injections could not be lifted. The message gives the reasons.

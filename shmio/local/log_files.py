@@ -1,4 +1,4 @@
-"""Read the log files of a local instance: their last lines together, and new lines as they come."""
+"""Read the log files of a local instance: the last lines of all files, and new lines as they come."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _LINE = re.compile(
 
 MAX_LINE_BYTES: Final = 65536
 TAIL_BYTES: Final = 65536
-"""Size of the blocks in which the end of a file is read."""
+"""Size in bytes of the pieces in which the end of a file is read, backwards."""
 _STAMP = re.compile(rb'(?:\{"time": ?")?(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{6}Z)[" ]')
-"""The beginning of a record's line, as text or as JSON."""
+"""The start of a record's line, as text or as JSON."""
 _FIRST_STAMP = re.compile(rb"\n(?=" + _STAMP.pattern + rb")")
 
 # inotify(7): events of a folder that concern its log files.
@@ -51,8 +51,8 @@ class _JsonLine(msgspec.Struct):
 def parse_line(line: str) -> dict[str, Any]:
     """Split a line, which is text or JSON, into its fields.
 
-    A continuation, such as a line of a traceback, has only text. The text of a line in JSON has all
-    that a line of text would have.
+    For a continuation, such as a line of a traceback, all fields but the text are None. The text of
+    a line in JSON includes the fields and the traceback of the record.
     """
     if line.startswith("{"):
         with suppress(msgspec.MsgspecError, RecursionError):
@@ -87,9 +87,9 @@ def last_lines(files: Iterable[Path], count: int) -> list[bytes]:
 
 
 def _stamped(file: Path, count: int) -> Iterable[tuple[bytes, bytes]]:
-    """Return the last ``count`` lines of a file.
+    """Return the last ``count`` lines of a file as (time stamp, line).
 
-    Each has its time stamp, or else that of an earlier line.
+    A line without a time stamp gets that of the last line before it that has one.
     """
     try:
         with file.open("rb") as stream:
@@ -100,7 +100,7 @@ def _stamped(file: Path, count: int) -> Iterable[tuple[bytes, bytes]]:
 
 
 def _start(stream: BinaryIO, count: int) -> int:
-    """Return the offset of a line with a time stamp that has at least ``count`` lines from there on; 0 if none has."""
+    """Return an offset after a time stamp from which at least ``count`` lines follow; 0 if there is none."""
     at = stream.seek(0, os.SEEK_END)
     lines = 0
     while at > 0:
@@ -123,9 +123,9 @@ def _lines(stream: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
 
 
 class Follower:
-    """Follows log files from now on. It reads a rotated file to its end, and then the new file.
+    """Returns the new lines of log files. After a rotation, it reads the old file to its end first.
 
-    It waits on inotify, so that idle files cost nothing. Use it as a context manager.
+    It waits with inotify, so that idle files cost nothing. Use it as a context manager.
     """
 
     def __init__(self, files: Iterable[Path]) -> None:
@@ -187,7 +187,7 @@ def _open(file: Path) -> BinaryIO | None:
 
 
 def _replaced(file: Path, stream: BinaryIO | None) -> bool:
-    """Return whether the path now leads to another file than the one that is open."""
+    """Return whether the path now leads to a file other than the open one."""
     try:
         found = file.stat()
     except FileNotFoundError:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class View:
-    """A copy of a frame, with the layout that decodes it. A view never changes.
+    """A copy of a frame, which never changes, with the layout that decodes it.
 
     ``missed`` is the number of frames lost between the previous frame of the stream and this frame.
     """
@@ -106,7 +106,7 @@ class View:
 
     @cached_property
     def array(self) -> np.ndarray[Any, np.dtype[Any]]:
-        """The decoded frame: a numpy structured array of shape (1,), with a field per register.
+        """The decoded frame: a numpy structured array of shape (1,), with a field for each register.
 
         The fields are named by the registers' paths.
         """

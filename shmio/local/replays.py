@@ -31,14 +31,14 @@ from shmio.segment.playhead import (
 from shmio.segment.segment import Segment
 
 ANSWER_S: Final = 5.0
-"""Time-out for an answer that needs no search."""
+"""Time-out in s for an answer that needs no search."""
 _SEARCH_S: Final = 600.0
 _TURN_NS: Final = 500_000_000
-"""Interval at which a wait for an answer checks whether the caller has given up."""
+"""Interval in ns at which a wait for an answer checks whether the caller has given up."""
 
 
 class ReplayRequest(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A request to change replays. A field that is None or empty changes nothing.
+    """A request to change replays. A field that is None or empty requests no change.
 
     Attributes:
         paused: Whether to pause.
@@ -49,7 +49,7 @@ class ReplayRequest(msgspec.Struct, frozen=True, omit_defaults=True):
         loop: Whether to start again at the end.
         change: Path of a register: play until its next change, and pause there.
         event: Kind of event: play until the next event of this kind, and pause there.
-        jump: With ``change`` or ``event``: go to that position at once instead of playing.
+        jump: With ``change`` or ``event``: go to its position at once instead of playing.
         sources: Names of sources. All sources that replay the same recordings are included. Empty:
             all replays.
     """
@@ -77,7 +77,7 @@ class Replays:
     """
 
     def __init__(self, segment: Segment) -> None:
-        """Create the object. ``segment`` must be writable for any method but :meth:`status`."""
+        """Create the object. Every method but :meth:`status` needs a writable ``segment``."""
         self._segment = segment
 
     def __call__(self, **changes: Unpack[ReplayChanges]) -> list[ReplayStatus]:
@@ -93,8 +93,8 @@ class Replays:
         """Return the status of each replay.
 
         Args:
-            sources: Names of sources. All sources that replay the same recordings are included. Empty:
-            all replays.
+            sources: Names of sources. All sources that replay the same recordings are included.
+                Empty: all replays.
 
         Raises:
             CommandError: The instance replays no recording.
@@ -143,7 +143,7 @@ class Replays:
         return self.change(ReplayRequest(loop=on))
 
     def play_until(self, to: float | str) -> list[ReplayStatus]:
-        """Play until a position, in the same form as for :meth:`seek`, and pause there."""
+        """Play up to a position, in the same form as for :meth:`seek`, and pause there."""
         return self.change(ReplayRequest(paused=False, until=str(to)))
 
     def to_change(self, path: str, *, jump: bool = False) -> list[ReplayStatus]:
@@ -213,7 +213,7 @@ class Replays:
         return found
 
     def _chosen(self, wanted: ReplayRequest) -> dict[str, PlayState]:
-        """Return the states of the requested sources and of all that replay the same recordings."""
+        """Return the states of the requested sources, and of all others that replay their recordings."""
         plays = self._plays()
         for source in wanted.sources:
             if source not in plays:
@@ -243,7 +243,7 @@ class Replays:
 
     @contextmanager
     def _held(self, sources: Collection[str]) -> Iterator[dict[str, Playhead]]:
-        """Lock the playheads of sources, so that no other program can move them."""
+        """Lock the playheads of sources within a ``with`` block, so that no other program moves them."""
         blocks = self._blocks()
         heads = {source: head for source in blocks if source in sources and (head := blocks[source].playhead)}
         with ExitStack() as stack:
@@ -254,7 +254,7 @@ class Replays:
     # ---- moves -----------------------------------------------------------------------------------------------------
 
     def _go_to(self, wanted: ReplayRequest, heads: Mapping[str, Playhead], given_up: Callable[[], bool]) -> None:
-        """Pause, search for the next change or event, and play until it or jump to it."""
+        """Pause, find the next change or event, and play up to its position or go there at once."""
         self._move(heads, lambda _, clock_ns: MoveRequest(clock_ns, paused=True))
         searched = dict(heads)
         path = ""
@@ -279,9 +279,9 @@ class Replays:
             self._move(heads, lambda _, now: MoveRequest(now, paused=False, until_ns=at_ns, speed=wanted.speed))
 
     def _move(self, heads: Mapping[str, Playhead], move: Callable[[PlayState, int], MoveRequest]) -> None:
-        """Send a request to each playhead.
+        """Send a request to each playhead, so that all take effect at the same time of the clock.
 
-        All of them take effect at the same time of the clock.
+        ``move`` returns the request for a state, given that time in ns.
         """
         clock_ns = self._segment.clock.read().time_ns  # a step in progress counts: no source answers before its end
         asks: dict[str, PlayheadRequest] = {}
@@ -300,7 +300,7 @@ class Replays:
         patience_s: float,
         given_up: Callable[[], bool] = lambda: False,
     ) -> dict[str, PlayheadAnswer]:
-        """Send a request to each playhead, and wait for the answers."""
+        """Send to each playhead its request from ``asks``, and return the answers by source."""
         numbers = {source: heads[source].ask(ask) for source, ask in asks.items()}
         for slot in self._segment.processes:
             if slot.name in asks:
@@ -339,7 +339,7 @@ def _recording(play: PlayState) -> tuple[int, int, int]:
 
 
 def _move_request(play: PlayState, wanted: ReplayRequest, clock_ns: int) -> MoveRequest:
-    """Convert a request of a program to the request to one playhead.
+    """Convert a program's request to the request for one playhead, whose state is ``play``.
 
     Raises:
         ValueRangeError: A position is not in the recording.

@@ -1,4 +1,4 @@
-"""Read the status of an instance from its shared memory. No other process has to answer."""
+"""Read the status of an instance from its shared memory, without asking any process."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from shmio.segment.processes import Phase, ProcessSlot
 from shmio.segment.segment import Segment, running_instances
 
 SILENT_S = 5.0
-"""Time in s. A supervisor without a heartbeat for this time is reported as not responding."""
+"""After this time in s without a heartbeat, a supervisor is reported as not responding."""
 
 
 class ProcessStatus(msgspec.Struct, kw_only=True):
@@ -97,8 +97,8 @@ def read_status(instance: str, config: str | None = None, file: Path | None = No
 
     Args:
         instance: Name of the instance.
-        config: Option that the commands in the note need to name the configuration, such as ``-c
-            plc.toml``. Empty: they need none. None: unknown.
+        config: Option with which the commands that the note recommends name the configuration, such
+            as ``-c plc.toml``. Empty: they need no option. None: unknown.
         file: Configuration file from which the instance must have been started; None: any.
 
     Raises:
@@ -122,8 +122,8 @@ def status_of(segment: Segment, remedy: str, asking: str = "") -> InstanceStatus
     Args:
         segment: The segment.
         remedy: Advice for the note if the supervisor is dead.
-        asking: Kind of the calling process, if it belongs to the instance; else empty. That process
-            is reported as alive, because it cannot see its own lock.
+        asking: Kind of the calling process, if it belongs to the instance; else empty. The result
+            reports that process as alive, because a process cannot see its own lock.
     """
     supervised = segment.supervised
     pid, state = segment.supervisor
@@ -163,7 +163,7 @@ def clock_status(state: Clock) -> ClockStatus:
 
 
 def supervisor_silence(segment: Segment) -> str | None:
-    """Return a message if the supervisor does not respond, with the remedy; None if it responds."""
+    """Return a message with the remedy if the supervisor does not respond; None if it responds."""
     silent_s = (time.monotonic_ns() - segment.supervisor_heartbeat_ns) / 1e9
     if silent_s < SILENT_S:
         return None
@@ -184,7 +184,7 @@ def _state(state: InstanceState, processes: list[SourceStatus | ProcessStatus], 
 
 
 def complaint(kind: str, note: str) -> str:
-    """Return the note of a running process if the note reports a problem, else an empty text.
+    """Return the note of a running process if it reports a problem, else an empty text.
 
     The note ``to FILE`` of a recorder is no problem, nor is ``active: …`` of the alerts.
     """
@@ -218,7 +218,7 @@ def _process(
     elif phase is Phase.RUNNING and not alive:  # the supervisor has not noticed the death yet
         phase, note = Phase.STOPPED, "dead"
     counters = slot.counters
-    current = alive and report.pid != 0 and report.started_ns >= state.spawned_ns  # else that of the previous process
+    current = alive and report.pid != 0 and report.started_ns >= state.spawned_ns  # else of the previous process
     values = ProcessStatus(
         name=slot.name,
         kind=slot.kind,

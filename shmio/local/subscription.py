@@ -27,7 +27,7 @@ from shmio.segment.doorbell import Relay
 from shmio.segment.segment import Segment
 
 TURN_S: Final = 0.2
-"""Interval at which a waiting iterator checks whether it was closed or the instance has stopped."""
+"""Interval in s at which a waiting iterator checks whether it was closed or the instance has stopped."""
 
 Item = TypeVar("Item")
 
@@ -80,7 +80,7 @@ class Following(Generic[Item]):
         raise NotImplementedError
 
     def _follow(self, block: Block) -> None:
-        """Let the frames and events of a block wake this iterator."""
+        """Make the frames and events of a block wake this iterator."""
         self._relays[block.section] = Relay(block.ring, f"following-{block.source}", round(TURN_S * 1e9))
 
     def _leave(self, block: Block) -> None:
@@ -148,7 +148,7 @@ class Subscription(Following[Update]):
         every_frame: bool,
         max_rate_hz: float,
     ) -> None:
-        """Prepare to follow.
+        """Prepare the subscription; the first update starts it.
 
         Args:
             segment: The instance's segment.
@@ -186,7 +186,7 @@ class Subscription(Following[Update]):
         return None
 
     def _begin(self) -> None:
-        """Follow the blocks that the patterns name. PathError: a pattern names nothing."""
+        """Start to follow the blocks that the patterns name; raise PathError if a pattern names nothing."""
         blocks = self._blocks()
         layouts = Layouts(blocks)
         wanted: dict[str, list[str]] = {}
@@ -199,7 +199,7 @@ class Subscription(Following[Update]):
         self._wanted = wanted
 
     def _add(self, block: Block, patterns: Sequence[str]) -> None:
-        """Follow a block. PathError: a pattern names nothing in it."""
+        """Start to follow a block; raise PathError if a pattern names nothing in it."""
         registers = [register for _, register in choose(patterns, {block.source: block.layout})]
         self._followers.append(_Follower(block, registers, every_frame=self._every_frame, interval_s=self._interval_s))
         self._follow(block)
@@ -235,9 +235,9 @@ def _check(patterns: Sequence[str], max_rate_hz: float, *, every_frame: bool) ->
 
 
 class _Follower:
-    """Follows the registers of one block.
+    """Returns updates of the registers of one block.
 
-    It compares each frame with the frame of the last update.
+    For this, it compares each frame with the frame of the last update.
     """
 
     def __init__(self, block: Block, registers: Sequence[Register], *, every_frame: bool, interval_s: float) -> None:
@@ -284,7 +284,7 @@ class _Follower:
         )  # fmt: skip
 
     def _next(self) -> Frame | None:
-        """Return the next frame. None: there is none yet, or ``max_rate_hz`` delays it."""
+        """Return the next frame; None if there is none yet, or if ``max_rate_hz`` delays it."""
         frames = self._frames
         if self._every_frame:
             return frames.poll()

@@ -11,7 +11,7 @@ from shmio.segment import Segment
 
 
 def ask_supervisor(segment: Segment, request: control.Request, timeout_s: float) -> dict[str, Any]:
-    """Return the supervisor's answer to a request.
+    """Send a request to the supervisor, and return its answer.
 
     Raises:
         ControlError: The supervisor refuses, does not answer, or seems to be dead.

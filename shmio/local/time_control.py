@@ -1,4 +1,4 @@
-"""Control an instance's time: take it over, step it, play it and release it."""
+"""Control an instance's time: take it over, step it, play it, and release it."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from shmio.segment.segment import Segment
 MIN_STEP_NS: Final = 1_000
 MAX_STEP_NS: Final = 3_600_000_000_000
 _TURN_NS: Final = 100_000_000
-"""Interval at which a wait for the owner of time checks whether that process has died."""
+"""Interval in ns at which a wait for the owner of time checks whether that process has died."""
 MAX_RATE: Final = 1000.0
 _DISPATCHERS: Final = frozenset({"alerts", "emulator", "grpc", "mqtt", "recorder"})
-"""Kinds of processes that act when a step is done: for clients, a recording or alerts. Steps may wait for them."""
+"""Kinds of processes that act when a step is done. Steps may wait until these have delivered the step."""
 _PATIENCE_S: Final = 2.0
-"""Time to wait until the owner of time gives up its ownership.
+"""Time in s to wait until the owner of time gives up its ownership.
 
 The gRPC endpoint gives it up when its clients are idle.
 """
 _LATE_NS: Final = 500_000_000
-"""If playing is late by more than this time, it does not catch up."""
+"""If playing is late by more than this time in ns, it does not catch up."""
 
 _NOBODY: Final = (
     "no source uses the instance clock, so stepping has no effect; sources with a device continue in real time"
@@ -60,10 +60,10 @@ class Step:
 
 
 class StepWait(NamedTuple):
-    """Wait of a step: until a doorbell's value differs from ``seen``, at most ``rest_ns``.
+    """What a step waits for: that a doorbell's value differs from ``seen``, at most ``rest_ns``.
 
-    It is the doorbell of ``block``, whose source has not answered yet. If ``block`` is None, it is
-    the doorbell that processes ring when they have delivered a step.
+    The doorbell is that of ``block``, whose source has not answered yet. If ``block`` is None, it
+    is the doorbell that processes ring when they have delivered a step.
     """
 
     block: Block | None
@@ -72,7 +72,7 @@ class StepWait(NamedTuple):
 
 
 class Coordinator:
-    """Moves the time of one instance. Several threads may use it; one program at a time owns time.
+    """Moves the time of one instance, which one program at a time owns. Several threads may use it.
 
     A step begins when the coordinator writes the step's number to the clock page. Each source that
     uses the instance clock then publishes a frame for the step, and the step is ``done``. Finally,
@@ -114,7 +114,7 @@ class Coordinator:
 
         Args:
             patience_s: Time to wait, in s, until an owner that does not play gives up time.
-            steps: Whether a step follows at once. Then the clock gets no note about stopped time.
+            steps: Whether a step follows at once. If so, the clock gets no note about stopped time.
 
         Raises:
             TimeError: Another living process owns time, and is playing or does not give it up.
@@ -228,7 +228,7 @@ class Coordinator:
                     block.ring.wait(seen, rest_ns)
 
     def stepping(self, dt_ns: int | None = None) -> Generator[StepWait, None, Step]:
-        """Do a step without blocking: yield what to wait for, and check again when resumed.
+        """Do a step without blocking: yield what to wait for, and continue when resumed.
 
         Close the generator if you do not run it to its end. Call no other method of this
         coordinator meanwhile.
@@ -243,7 +243,7 @@ class Coordinator:
         asked = before._replace(step=step.number, time_ns=step.time_ns, dt_ns=dt_ns, stepping=True, note="")
         problem = "it was cancelled"
         try:
-            self._segment.clock.write(asked, ring=False)  # delivering processes need not act before it is done
+            self._segment.clock.write(asked, ring=False)  # processes need not deliver a step before it is done
             self._ring([block.source for block in participants])
             problem = yield from self._await_frames(step.number, participants, asked)
         finally:
@@ -296,7 +296,7 @@ class Coordinator:
             bell.wait(seen, min(rest_ns, _TURN_NS))
 
     def _frozen(self, state: Clock) -> Clock:
-        """Return the state for a change from wall time to virtual time at the present moment."""
+        """Return the state of virtual time that begins at the present moment of wall time."""
         now_ns = self._segment.clock_ns(time.monotonic_ns()) + state.offset_ns
         step = max([state.step, *(self._cycle(block, state, now_ns) for block in self._participants())])
         return state._replace(mode=ClockMode.VIRTUAL, step=step, done=step, time_ns=now_ns, resumed_ns=0, offset_ns=0)
@@ -328,7 +328,7 @@ class Coordinator:
     def _await_frames(self, number: int, participants: Sequence[Block], asked: Clock) -> Generator[StepWait, None, str]:
         """Wait until each source has done a step.
 
-        Return a text about failures; empty: none failed.
+        Return a text about the sources that failed; empty: none failed.
         """
         begun_ns = time.monotonic_ns()
         waiting = list(participants)
@@ -359,7 +359,7 @@ class Coordinator:
     def _await_delivery(self, number: int) -> Generator[StepWait, None, str]:
         """Wait until other processes have delivered a step.
 
-        Return a text about the processes that have not; empty: all have.
+        Return a text about the processes that have not delivered it; empty: all have.
         """
         clock, begun_ns = self._segment.clock, time.monotonic_ns()
         rung = warned = False
@@ -386,7 +386,7 @@ class Coordinator:
         if slot.kind not in _DISPATCHERS:
             return False
         last = self._segment.clock.delivered(slot.index)
-        return last is not None and last < number and slot.alive()  # alive() ignores the lock of this process
+        return last is not None and last < number and slot.alive()  # alive() is False for this process's own slot
 
     def _owner(self, pid: int) -> str:
         """Return name and pid of the owner of time, for a message."""
@@ -397,8 +397,8 @@ class Coordinator:
 class Timekeeper:
     """Steps or plays an instance's time.
 
-    It owns time from the first step until :meth:`close`. Use it from one thread. It plays in
-    another thread.
+    It owns time from the first step until :meth:`close`. Use it from one thread; it plays in another
+    thread of its own.
     """
 
     def __init__(self, segment: Segment, coordinator: Coordinator | None = None) -> None:
@@ -406,7 +406,7 @@ class Timekeeper:
 
         Args:
             segment: The instance's segment, writable.
-            coordinator: Moves the time; None: a new one of this segment.
+            coordinator: Moves the time; None: create a coordinator for this segment.
         """
         self._segment = segment
         self._coordinator = coordinator or Coordinator(segment)
@@ -427,7 +427,7 @@ class Timekeeper:
         return self._coordinator.step(dt_ns)
 
     def play(self, rate: float = 1.0, dt_ns: int | None = None) -> None:
-        """Step in a thread, ``rate`` times as fast as real time.
+        """Start to step in a thread, ``rate`` times as fast as real time.
 
         Raises:
             TimeError: Another program owns time.
@@ -503,7 +503,7 @@ def check_step(dt_ns: float) -> None:
 
 
 def _step_answer(block: Block, number: int) -> str | None:
-    """Return a source's answer to a step: empty if done, the reason if failed, None if missing."""
+    """Return a source's answer to a step: "" if it is done, the reason if it failed, None if none came yet."""
     if block.retired:
         return ""  # a reload has retired the block
     try:
@@ -531,14 +531,14 @@ def _describe_silence(segment: Segment, block: Block, hard_ns: int) -> str:
 
 
 def _moves(segment: Segment, participants: Sequence[Block]) -> bool:
-    """Return whether a step moves anything: a source, or the program of an emulated controller."""
+    """Return whether a step has any effect: on a source, or on the program of an emulated controller."""
     return bool(participants) or any(
         slot.kind == "emulator" and segment.clock.delivered(slot.index) is not None for slot in segment.processes
     )
 
 
 def _take_over_note(segment: Segment, participants: Sequence[Block]) -> str:
-    """Return the clock's note for the time between the take-over and the first step."""
+    """Return the note that the clock has between the take-over and the first step."""
     return _PAUSED if _moves(segment, participants) else f"{_NOBODY}{_REAL}"
 
 

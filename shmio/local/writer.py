@@ -37,13 +37,10 @@ if TYPE_CHECKING:
 
 TIMEOUT_S: Final = 2.0
 MIN_PERIODS: Final = 3
-"""Minimum number of cycles that a command may wait by default.
-
-If TIMEOUT_S is longer than these cycles, the command may wait for that time.
-"""
-_MODELS: Final = frozenset({"simulation", "remote"})  # connectors of sources with registers that only a model writes
+"""A command may wait for this number of cycles by default, or for TIMEOUT_S if that is longer."""
+_MODELS: Final = frozenset({"simulation", "remote"})  # connectors with registers that only a model writes
 PATIENCE_S: Final = 1.0
-"""Additional time, after a command's deadline, in which the device's answer may arrive."""
+"""Time in s after a command's deadline in which the device's answer may still arrive."""
 RETIRED: Final = "the source was changed or removed by a reload"
 _UNKNOWN: Final = "; it is not known whether the value was written"
 RESTARTED: Final = f"the source was restarted meanwhile{_UNKNOWN}"
@@ -76,7 +73,7 @@ class CommandSender:
 
         Args:
             writes: The items.
-            deadline_ns: CLOCK_MONOTONIC after which the command must not be started.
+            deadline_ns: Time after which the source must not start the command, CLOCK_MONOTONIC.
             kind: Kind of command.
             injection: Number of the injection to lift, or to give values to.
             options: Options of the injection to create.
@@ -146,7 +143,7 @@ class SourceWriter:
         self._sender = CommandSender(block, writer)
 
     def prepare(self) -> None:
-        """Determine now which bits are writable, so that the first :meth:`submit` does not have to.
+        """Determine now which bits are writable, so that the first :meth:`submit` is fast.
 
         For a large layout, this takes seconds.
         """
@@ -183,7 +180,7 @@ class SourceWriter:
         return self._send_values({path: (self._register(path), value) for path, value in values.items()}, timeout_s)
 
     def shadow(self, injection: int, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
-        """Give values to an injection. They go to consumers (``/out``) or the device (``/in``).
+        """Give values to an injection, for consumers (``/out``) or for the device (``/in``).
 
         Raises:
             PathError: There is no such register.
@@ -358,7 +355,7 @@ class SourceWriter:
         return PendingCommand(number, paths, incarnation, deadline_ns + round(PATIENCE_S * 1e9), events)
 
     def outcomes(self, ticket: PendingCommand) -> list[Outcome]:
-        """Wait until a command has ended, and return the outcomes of its values, in their order."""
+        """Wait until a command has ended, and return the outcomes of its values in their order."""
         return [Outcome(path, OutcomeKind[kind.name], text) for path, (kind, text) in self._ends(ticket)]
 
     def _ends(self, ticket: PendingCommand) -> list[tuple[str, End]]:
@@ -397,7 +394,8 @@ class SourceWriter:
             if event.command == ticket.number and event.writer == self._sender.writer:
                 return event
             if event.kind == EventKind.STARTED and event.incarnation != ticket.incarnation:
-                # The new process reports those commands that the old one left in the queue; others stay unknown.
+                # The new process reports the commands that the old process left in the queue. The outcomes of
+                # others remain unknown.
                 ticket.until_ns = min(ticket.until_ns, time.monotonic_ns() + round(PATIENCE_S * 1e9))
         return None
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Closable(Protocol):
-    """A resource that stays open until the program closes it or leaves its ``with`` block."""
+    """A resource that a program closes, by :meth:`close` or by leaving its ``with`` block."""
 
     def close(self) -> None:
         """Release the resource."""
@@ -47,7 +47,7 @@ class Update(Protocol):
 
     @property
     def incarnation(self) -> int:
-        """Number of starts of the source's process, including the present one."""
+        """Number of times that the source's process has been started, including the present start."""
 
     @property
     def clock_ns(self) -> int:
@@ -55,7 +55,7 @@ class Update(Protocol):
 
     @property
     def source_ns(self) -> int:
-        """The source's time stamp, UTC in ns; 0 if there never were any values."""
+        """The source's time stamp, UTC in ns; 0 if the source has never delivered values."""
 
     @property
     def quality(self) -> Quality:
@@ -63,7 +63,7 @@ class Update(Protocol):
 
     @property
     def reason(self) -> str:
-        """Reason why the quality is not good. With ``ended``: what a reload has removed."""
+        """Reason why the quality is not good; empty if it is. With ``ended``: what a reload has removed."""
 
     @property
     def provenance(self) -> Provenance:
@@ -91,7 +91,7 @@ class Update(Protocol):
 
 
 class Subscription(Closable, Protocol):
-    """Iterator over updates, for one thread. Any thread may close it, which ends the iteration."""
+    """Iterator over updates. Use it in one thread; any thread may close it, which ends the iteration."""
 
     def __iter__(self) -> Iterator[Update]:
         """Return the object itself."""
@@ -100,15 +100,15 @@ class Subscription(Closable, Protocol):
         """Wait for the next update.
 
         Raises:
-            PathError: A pattern names nothing; only the first call raises it.
+            PathError: A pattern names nothing; only the first call raises this.
             ValueRangeError: There is no pattern, or an option is wrong; only the first call raises
-                it.
+                this.
             NotRunningError: The instance has ended.
         """
 
 
 class Events(Closable, Protocol):
-    """Iterator over events, for one thread. Any thread may close it, which ends the iteration.
+    """Iterator over events. Use it in one thread; any thread may close it, which ends the iteration.
 
     Events of one source come in order. When a reload has removed all sources, the iteration waits
     until it is closed or the instance ends.
@@ -175,9 +175,9 @@ class Cell(Closable, Protocol):
     """A running cell.
 
     :func:`shmio.attach` returns a cell on this host, :func:`shmio.connect` a remote one, by gRPC.
-    The methods raise the errors of :mod:`shmio.errors`. Every method raises NotRunningError if the
-    instance has ended or cannot be reached. Exceptions are ``sources`` and ``clock`` of a cell on
-    this host, which then return the last state.
+    The methods raise the errors of :mod:`shmio.errors`. If the instance has ended or cannot be
+    reached, every method raises NotRunningError; only ``sources`` and ``clock`` of a cell on this
+    host then return the last state instead.
     """
 
     @property
@@ -198,8 +198,8 @@ class Cell(Closable, Protocol):
             patterns: Paths, array elements, slices, structures, globs, or names of sources.
 
         Returns:
-            A reading of each register that the patterns name, each once, in the order of the
-            patterns. Readings of one source come from one frame.
+            One reading of each register that the patterns name, in the order of the patterns. All
+            readings of one source come from the same frame.
 
         Raises:
             PathError: A pattern names nothing.
@@ -210,7 +210,7 @@ class Cell(Closable, Protocol):
 
         Args:
             patterns: As for :meth:`get`.
-            every_frame: Whether to return an update for each frame, in order, and count lost
+            every_frame: Whether to return an update for each frame, in order, and to count lost
                 frames. Otherwise, a slow reader gets only the newest values.
             max_rate_hz: Maximum number of updates per second of each source; 0: no limit. Only
                 without ``every_frame``.
@@ -248,12 +248,12 @@ class Cell(Closable, Protocol):
         """
 
     def inject(self, *patterns: str, priority: int = 0, keep: bool = False, name: str = "") -> Shadow:
-        """Create an injection over registers of one source, all ``/out`` (default) or all ``/in``.
+        """Create an injection over registers of one source, either ``/out`` (default) or ``/in``.
 
         Args:
             patterns: As for :meth:`get`.
             priority: An injection with a higher priority covers those with a lower one.
-            keep: Whether the injection stays when this program ends, until somebody lifts it.
+            keep: Whether the injection stays when this program ends, until a program lifts it.
             name: Name of the injection in events and lists.
 
         Raises:
@@ -262,7 +262,7 @@ class Cell(Closable, Protocol):
         """
 
     def declare(self, declarations: Iterable[Any], *, keep: bool = False) -> Campaign:
-        """Create declared injections, all or none. Their sources run them without this program.
+        """Create all declared injections, or none of them. Their sources run them on their own.
 
         Args:
             declarations: Mappings with the keys of an ``[[injection]]`` table, or
@@ -291,7 +291,8 @@ class Cell(Closable, Protocol):
     def lift_all(self, *sources: str) -> list[Lifted]:
         """Lift all injections of these sources, or of all sources, whichever program created them.
 
-        Return the result for each injection.
+        Returns:
+            The result for each injection.
 
         Raises:
             CommandError: Some injections were not lifted; the message gives the reasons.
@@ -320,7 +321,7 @@ class Cell(Closable, Protocol):
         """
 
     def play(self, rate: float = 1.0, dt_s: float | None = None) -> Clock:
-        """Take control of time, and step it until :meth:`pause`; return the state of the clock.
+        """Take control of time, and start to step it until :meth:`pause`. Return the clock's state.
 
         Args:
             rate: Speed relative to real time; above 0, at most 1000.
@@ -332,7 +333,9 @@ class Cell(Closable, Protocol):
         """
 
     def pause(self) -> Clock:
-        """Take control of time, and stop it until the next step or play. Return the clock's state.
+        """Take control of time, and stop it until the next :meth:`step` or :meth:`play`.
+
+        Return the clock's state.
 
         Raises:
             TimeError: Another program owns time, or a step failed while time was played.

@@ -10,7 +10,7 @@ STEP_SIZE_NS: Final = 50_000_000
 
 
 class ClockMode(IntEnum):
-    """Mode of the clock: real time, or time that is moved by steps."""
+    """Mode of the clock: real time (wall time), or time that only steps move."""
 
     WALL = 0
     VIRTUAL = 1
@@ -29,12 +29,12 @@ class Clock(NamedTuple):
         time_ns: Time of the instance's clock after that step, in ns; in wall time, the present time.
         dt_ns: Length of that step, in ns.
         done: Number of the last step that all sources have finished.
-        step_size_ns: Length of a step whose request names no length, in ns.
+        step_size_ns: Default length of a step, in ns.
         playing: True while the program that owns time steps it continuously.
         rate: Speed of playing, relative to real time.
         stepping: True while the last requested step is in progress.
         owner: Pid of the program that owns time; 0: no program owns it.
-        note: The processes that a step waits for, or the problem of the last step, as text.
+        note: Text that names the processes that a step waits for, or the problem of the last step.
         resumed_ns: In wall time: the time of the clock at the last release of time, in ns.
         offset_ns: In wall time: the clock minus the real time since the instance's start, in ns.
     """
@@ -69,7 +69,7 @@ class Clock(NamedTuple):
 
     @property
     def basis(self) -> tuple[ClockMode, int, int, int]:
-        """Values that determine clock and cycles in wall time; take-over and release change them."""
+        """The values that determine clock and cycles in wall time; taking and releasing time changes them."""
         return self.mode, self.step, self.resumed_ns, self.offset_ns
 
     def lead(self, period_ns: int) -> int:

@@ -20,7 +20,7 @@ class EventKind(StrEnum):
     QUALITY = "quality"
     """The quality of the source's values has changed."""
     ACCEPTED = "accepted"
-    """The source accepted an item of a command; one of the outcomes follows."""
+    """The source accepted an item of a command; an event with the outcome follows."""
     REJECTED = "rejected"
     """The source rejected the whole command before it did anything."""
     WRITTEN = "written"
@@ -48,7 +48,7 @@ class EventKind(StrEnum):
     NOTED = "noted"
     """A program added a note."""
     REMOVED = "removed"
-    """A reload has removed the source: it has no more events."""
+    """A reload has removed the source; no more events follow."""
     OTHER = "other"
     """A kind that only a later version of shmio knows."""
 
@@ -66,20 +66,21 @@ class Event:
             reload replaces the source.
         frame: Number of the last frame before the event.
         cycle: Cycle of the source's schedule.
-        incarnation: Number of starts of the source's process, including the present one.
+        incarnation: Number of times that the source's process has been started, including the
+            present start.
         clock_ns: The instance's clock, in ns.
         utc_ns: UTC time, in ns.
         quality: Quality after the event.
-        text: The reason, the note, or the name of the injection.
+        text: A reason, the note, or the name of the injection, depending on the kind.
         injection: Number of the injection that the event is about; 0: none.
         command: Number of the command that the event is about, chosen by its writer; 0: none.
-        by: The event's cause: ``grpc``, ``mqtt``, or a program such as ``program 1``. Empty if
-            there is none or it is unknown.
-        direction: ``in`` if the event is about data for the device, ``out`` if about data for
-            consumers. Empty if it is about no registers, or the direction is unknown.
+        by: The client that caused the event: ``grpc``, ``mqtt``, or a program such as ``program
+            1``. Empty if no client caused the event, or if the client is unknown.
+        direction: ``in`` if the event is about data for the device, ``out`` if it is about data for
+            consumers. Empty if it is about no registers, or if the direction is unknown.
         paths: The registers, elements, slices or bits that the event is about, at most 2048. If a
-            command has several items, ``rejected`` and ``taken`` name only the paths of the first
-            item. Other outcomes do the same if the event ``accepted`` was missed.
+            command has several items, ``rejected`` and ``taken`` have only the paths of the first
+            item. So do other outcomes if the event ``accepted`` was missed.
         values: Values by path; only with ``accepted``, ``diverted`` and ``shadowed``. None stands
             for bytes that are not valid for their type.
         missed: Number of the source's events lost since the previous event.

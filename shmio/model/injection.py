@@ -17,8 +17,8 @@ class Running(msgspec.Struct, Generic[DeclarationT], frozen=True):
         declaration: The declaration: in a segment a ``Declaration``, for programs a mapping with
             the keys of an ``[[injection]]`` table.
         state: ``waiting``, ``active``, ``over``, or ``lifted`` before its end.
-        seed: Seed of all random numbers of the run. If the declaration has no seed, the source draws
-            one.
+        seed: Seed of all random numbers of the run: that of the declaration, or else a random seed
+            that the source chose.
         runs: Number of activations.
         cycle: Cycle of the last activation.
         time_ns: The instance's clock at the last activation, in ns.
@@ -41,12 +41,12 @@ class Injection(msgspec.Struct, Generic[DeclarationT], frozen=True, omit_default
         priority: An injection with a higher priority covers those with a lower one.
         keep: True if the injection stays when the program that created it ends.
         name: Name of the injection.
-        writer: Number of the command queue that the injection came from; 4294967295: the injection
-            comes from the configuration.
-        pid: Process that created the injection; 0: the injection comes from the configuration.
+        writer: Number of the command queue that the injection came from; 4294967295: the
+            configuration declares the injection.
+        pid: Process that created the injection; 0: the configuration declares the injection.
         ranges: The covered bits, as (offset in bytes, size in bytes, mask).
         running: State of a declared injection; None: a program gives the values.
-        source: Name of the source; empty in the segment, where the block has the name.
+        source: Name of the source; empty in the segment, where the name of the block tells it.
     """
 
     number: int = msgspec.field(name="id")

@@ -1,4 +1,4 @@
-"""Status of a source that replays a recording, and what a program may change in it."""
+"""Status of a source that replays a recording, and changes that a program may request."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TypedDict
 class ReplayStatus:
     """Status of one source that replays a recording.
 
-    Unless paused, the position moves ``speed`` times as fast as the instance's clock.
+    Unless the replay is paused, its position moves ``speed`` times as fast as the instance's clock.
 
     Attributes:
         source: Name of the source.
@@ -49,7 +49,7 @@ class ReplayChanges(TypedDict, total=False):
     loop: bool
     """True to start again at the end."""
     seek: float | str
-    """Time to go to."""
+    """Time to which to move the position."""
     until: float | str
     """Time at which to pause once."""
     change: str

@@ -44,7 +44,7 @@ BAD_NOT_CONNECTED: Final = 0x808A0000
 BAD_DEVICE_FAILURE: Final = 0x808B0000
 BAD_NO_DATA: Final = 0x809B0000
 
-_NAMES: Final = {  # OPC 10000-6, annex A.2: those that data sources give
+_NAMES: Final = {  # those codes of OPC 10000-6, annex A.2, that data sources use
     0x00000000: "Good",
     0x002D0000: "GoodSubscriptionTransferred",
     0x002E0000: "GoodCompletesAsynchronously",
@@ -190,8 +190,8 @@ class RegisterStatus(NamedTuple):
 
     Attributes:
         code: OPC UA status code.
-        source_ns: UTC time of the value at its origin, in ns since 1970; 0: the time of the frame
-            applies.
+        source_ns: Time at which the value's origin had the value, UTC in ns since 1970; 0: unknown,
+            so that the time of the frame applies.
     """
 
     code: int
@@ -199,7 +199,7 @@ class RegisterStatus(NamedTuple):
 
     @property
     def quality(self) -> Quality:
-        """Quality according to the severity of the code. The reserved severity counts as bad."""
+        """Quality that the severity of the code means. The reserved severity means bad."""
         return quality_of(self.code)
 
     @property
@@ -215,12 +215,12 @@ def describe(code: int) -> str:
 
 
 def worse(quality: Quality, reason: str, status: RegisterStatus) -> tuple[Quality, str]:
-    """Return the worse quality, of a frame or of a register's status, and the reason for it."""
+    """Return the worse of a frame's quality and that of a register's status, with its reason."""
     return (quality, reason) if quality <= status.quality else (status.quality, status.reason)
 
 
 def quality_of(code: int) -> Quality:
-    """Return the quality according to a status code's severity. The reserved severity is bad."""
+    """Return the quality that the severity of a status code means. The reserved severity means bad."""
     return _QUALITIES[code >> 30]
 
 
@@ -236,7 +236,7 @@ class StatusArea:
         """Offset of the source times in an image, in bytes."""
         order = ">" if layout.byte_order == "big" else "<"
         self._code, self._time = struct.Struct(f"{order}I"), struct.Struct(f"{order}q")
-        self._severity_at = 0 if layout.byte_order == "big" else 3  # the byte of a code that has its severity
+        self._severity_at = 0 if layout.byte_order == "big" else 3  # index of the byte with a code's severity
         self._first_bits = [8 * register.offset + (register.bit or 0) for register in layout.own]
 
     def index(self, register: Register) -> int:
@@ -266,7 +266,7 @@ class StatusArea:
         return _QUALITIES[image[self.codes_offset + _CODE_BYTES * index + self._severity_at] >> 6]
 
     def worst(self, image: Buffer, indices: Iterable[int]) -> tuple[int, RegisterStatus]:
-        """Return the first of the indices whose status has the worst quality, and this status."""
+        """Return the worst of the statuses at these indices, as (index, status); the first if several are equal."""
         found = min(indices, key=lambda index: self.quality(image, index))
         return found, self.get(image, found)
 
@@ -277,7 +277,7 @@ class StatusArea:
 
 
 def status_registers(layout: Layout, registers: Iterable[Register], *, times: bool = True) -> list[Register]:
-    """Return registers that hold the statuses of other registers, for tables and comparisons.
+    """Return registers whose values are the statuses of other registers, for tables and comparisons.
 
     Args:
         layout: The layout of the registers.
@@ -304,7 +304,7 @@ def status_registers(layout: Layout, registers: Iterable[Register], *, times: bo
 
 
 class _StatusCodec:
-    """Codec of a register that decodes to None while the register's status is bad."""
+    """Codec of a register that decodes the value as None while the register's status is bad."""
 
     def __init__(self, register: Register, layout: Layout, area: StatusArea) -> None:
         self._codec = codec(register, layout.byte_order)
@@ -317,7 +317,7 @@ class _StatusCodec:
 
 
 def trusted_codec(register: Register, layout: Layout) -> RegisterCodec:
-    """Return a codec for a register that decodes to None while the register's status is bad."""
+    """Return a codec of a register that decodes the value as None while the register's status is bad."""
     area = status_area(layout)
     return codec(register, layout.byte_order) if area is None else _StatusCodec(register, layout, area)
 

@@ -35,7 +35,7 @@ class Provenance(IntEnum):
 
 
 class Column(IntEnum):
-    """Array in which a client stores the values of a type.
+    """The array in which a client stores values of a type.
 
     Each number is that of the array's field in the message ``Values`` of shmio.v1.
     """
@@ -63,7 +63,8 @@ class Reading:
         provenance: Where the value comes from: live, simulated, replayed or injected.
         source_time: The source's time stamp, UTC in s; None if there never was a value.
         age_s: Age of the value by the source's clock, in s; None if there never was a frame. In
-            updates of a remote cell the age is unknown: 0, or None while the quality is bad.
+            updates of a remote cell, the age is unknown, and ``age_s`` is 0, or None while the
+            quality is bad.
     """
 
     source: str
@@ -89,7 +90,7 @@ class OutcomeKind(StrEnum):
     TAKEN = "taken"
     """An injection over ``/in`` took the value in the device's place."""
     SHADOWED = "shadowed"
-    """Consumers see the value of an injection over ``/out``."""
+    """An injection over ``/out`` got the value, and consumers see it."""
     ACCEPTED = "accepted"
     """The source accepted the value; the caller did not wait for the device."""
     REJECTED = "rejected"
@@ -107,7 +108,7 @@ _DONE = frozenset({OutcomeKind.WRITTEN, OutcomeKind.TAKEN, OutcomeKind.SHADOWED,
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """The outcome of one value.
+    """The outcome of one written value.
 
     Attributes:
         path: Path of the register.
