@@ -1,5 +1,5 @@
 """Emulated controllers: processes that act as a PLC with its plant, for demonstrations and tests.
 
-``s7`` is the server; ``programs`` has the programs that an emulated controller can run;
-``emulator`` combines a server and a program.
+``emulator`` has the S7 controller, and ``s7`` its server. ``modbus`` and ``opcua`` have the devices of
+the other kinds. ``programs`` has the programs that a device can run, and ``cycle`` runs them.
 """

@@ -62,7 +62,7 @@ def run(worker: Worker) -> None:
 
 
 def _follow_clock(worker: Worker, device: Device, selector: selectors.BaseSelector, cleanup: ExitStack) -> None:
-    """Let the program follow the instance's clock."""
+    """Let the device's program follow the instance's clock."""
     page, slot = worker.segment.clock, worker.slot.index
     relay = Relay(page.slot_bell(slot), "emulator-steps")
     cleanup.callback(relay.join)
@@ -77,7 +77,7 @@ def _follow_clock(worker: Worker, device: Device, selector: selectors.BaseSelect
 
 
 def _started(worker: Worker, listen: Address, cleanup: ExitStack) -> Device:
-    """Start the device, which ``cleanup`` stops."""
+    """Create and start the device. ``cleanup`` will stop it."""
     config: dict[str, Any] = worker.config
     layouts = [load_layout(layout.encode()) for layout in config["layouts"]]
     served = [Served(layout, options) for layout, options in zip(layouts, config["options"], strict=True)]

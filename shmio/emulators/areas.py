@@ -1,4 +1,4 @@
-"""The memory of an emulated controller that the addresses of a tag table need."""
+"""The memory areas of an emulated S7 controller that hold the registers of a tag table."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ AREAS: Final[Mapping[Area, SrvArea]] = {
 """The areas that are not data blocks, with python-snap7's names."""
 _LETTERS: Final = {Area.INPUT: "%I", Area.OUTPUT: "%Q", Area.MARKER: "%M", Area.TIMER: "%T", Area.COUNTER: "%C"}
 _LEAST: Final = dict.fromkeys(AREAS, 1024) | {Area.TIMER: 512, Area.COUNTER: 512}
-"""Minimum size of these areas in bytes, about that of an S7-300."""
+"""Minimum sizes of these areas in bytes, about those of an S7-300."""
 
 
 def is_table(layout: Layout) -> bool:
@@ -62,7 +62,7 @@ class TableMemory:
 
     @property
     def needs(self) -> dict[Place, int]:
-        """The areas that the registers need, with the size of each in bytes; an even number."""
+        """The areas that the registers need, each with its size in bytes, rounded up to an even number."""
         sizes: dict[Place, int] = {}
         for one in self._conversions:
             place = _place(one)
@@ -74,7 +74,7 @@ class TableMemory:
 
         Args:
             memory: The areas.
-            present: Areas that already have values: only the values of the tag table are stored there.
+            present: Areas that already have values. Defaults do not overwrite these.
 
         """
         frame, _ = initial_frame(self.layout)

@@ -1,4 +1,4 @@
-"""The cycle of an emulated device's program: an absolute schedule in a thread."""
+"""Runs the cycles of an emulated device's program in a thread, on an absolute schedule."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Cycle:
         self._free = threading.Event()  # cleared while the cycle is frozen
         self._free.set()
         self._turn = threading.Lock()  # held during a cycle
-        self._number = 0  # of the last cycle, with those that were skipped
+        self._number = 0  # of the last cycle; skipped cycles are counted as well
         self._owed_ns = 0  # time since the last cycle of a frozen program
         self.failure: Exception | None = None
         """Error that ended the program, or None; the emulator's process checks it regularly."""
@@ -46,23 +46,23 @@ class Cycle:
         """Number of cycles skipped because the previous one took too long."""
 
     def first(self) -> None:
-        """Run the first cycle, before anybody can see the device."""
+        """Run the first cycle. Call this before clients can connect to the device."""
         self._step(0)
         self.cycles += 1
 
     def start(self) -> None:
-        """Continue in a thread."""
+        """Start the thread that runs all further cycles."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Return when the thread has ended."""
+        """End the thread; return when it has ended."""
         self._stopping.set()
         self._free.set()
         if self._thread.ident is not None:
             self._thread.join()
 
     def freeze(self) -> None:
-        """Stop the schedule. The present cycle has ended when this returns."""
+        """Stop the schedule; return when the present cycle has ended."""
         self._free.clear()
         with self._turn:
             self._owed_ns = 0
@@ -72,9 +72,9 @@ class Cycle:
         self._free.set()
 
     def advance(self, dt_ns: int) -> None:
-        """Run the cycles of the next ``dt_ns`` of a frozen program. An error is in ``failure``.
+        """Run the cycles of a frozen program that are due in the next ``dt_ns``; store an error in ``failure``.
 
-        What remains of a period counts for the next call.
+        A remaining part of a period counts for the next call.
         """
         period_ns = round(self._period_s * 1e9)
         with self._turn:

@@ -1,4 +1,4 @@
-"""The interface of an emulator that its process uses, and the layouts that it serves."""
+"""The interface of an emulated device to its process, and the layouts that it serves."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Served(NamedTuple):
 
     layout: Layout
     options: Mapping[str, Any] = MappingProxyType({})
-    """The keys of the source that reads it, such as ``unit`` or ``nodes``."""
+    """The keys of the source that reads this layout, such as ``unit`` or ``nodes``."""
 
 
 class Device(Protocol):
@@ -26,7 +26,7 @@ class Device(Protocol):
         """The cycle of the device's program."""
 
     def start(self) -> None:
-        """Listen, and run the program; raise EndpointError if the address is not available."""
+        """Listen, and run the program. Raise EndpointError if the address is not available."""
 
     def stop(self) -> None:
-        """Stop both; return when all threads have ended."""
+        """Stop listening, and stop the program; return when all threads have ended."""

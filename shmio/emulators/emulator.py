@@ -20,9 +20,9 @@ from shmio.layout.s7.address import Area
 
 
 class Emulator:
-    """Runs a program on one data block or tag table, and serves it over S7 with further blocks.
+    """Runs a program on one data block or tag table, and serves this and further ones over S7.
 
-    The further blocks have no program. You can start an emulator only once.
+    The further blocks and tables have no program. You can start an emulator only once.
 
     Clients read and write between cycles, never within one. A client that stops the emulated CPU
     stops the program and its time, but not the server, as with a real controller.
@@ -76,7 +76,7 @@ class Emulator:
 
     @property
     def address(self) -> Address:
-        """Address on which the server listens; raises ShmioError before the start."""
+        """Address on which the server listens. Raises ShmioError before the start."""
         return self._server.address
 
     def start(self) -> None:
@@ -115,7 +115,7 @@ class Emulator:
         return frame
 
     def _serve_tables(self, tables: Sequence[TableMemory]) -> None:
-        """Serve the areas that tables need, besides the blocks, with their initial values."""
+        """Serve the memory areas that tables need and that are not served yet; store the tables' initial values."""
         present = frozenset(self._memory)
         sizes: dict[Place, int] = {}
         for table in tables:

@@ -1,4 +1,4 @@
-"""Faults of an emulated device on command, to rehearse how its clients react."""
+"""Makes an emulated device misbehave on command, so that you can rehearse how its clients react."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _LENGTHS: Final[Mapping[str, tuple[int, Callable[[bytes | bytearray], int]]]] = 
     "s7": (4, tpkt),
     "modbus": (6, lambda data: 6 + int.from_bytes(data[4:6], "big") if len(data) >= 6 else 0),
 }
-"""For each kind: the bytes of an answer up to its length, and a function that returns the length."""
+"""For each kind, how many bytes an answer has up to the end of its length field, and what measures an answer."""
 
 
 class FaultControl:
-    """A proxy before an emulator's server, and the control socket that commands its faults.
+    """A proxy in front of an emulator's server, and the control socket that receives commands for its faults.
 
     Use it from one thread.
     """
@@ -91,7 +91,7 @@ class FaultControl:
             proxy.refuse()
 
     def _corrupted(self, frame: bytes) -> bytes:
-        """Invert an answer except its length, so that it arrives as a whole."""
+        """Invert an answer after its length field, so that the client still receives the whole answer."""
         return frame[: self._head] + bytes(byte ^ 0xFF for byte in frame[self._head :])
 
     def _deny(self, peer: Peer) -> None:

@@ -1,4 +1,4 @@
-"""The kinds of emulators: how each is made, and what it needs."""
+"""The kinds of emulators, and how each of them is created."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from shmio.errors import ConfigError
 
 S7: Final = "s7"
 KINDS: Final = (S7, "modbus", "opcua")
-"""The kinds; the name of each is that of the connector that reads it."""
+"""The kinds. Each has the name of the connector that can read it."""
 FAULTY: Final = (S7, "modbus")
-"""The kinds that can have faults on command."""
+"""The kinds that can misbehave on command."""
 _LIBRARIES: Final = {"modbus": "pymodbus", "opcua": "asyncua"}
 _EXTRA: Final = "kind: the emulator {kind} needs another library: pip install 'shmio[{kind}]'"
 
@@ -29,11 +29,11 @@ def create(
     db_number: int | None = None,
     code: UserCode = BUILT_IN,
 ) -> Device:
-    """Make an emulator; it does nothing until it is started.
+    """Create an emulator without starting it.
 
     Args:
         kind: One of ``KINDS``.
-        served: What it serves, at least one; the program runs on the first.
+        served: The layouts to serve, at least one; the program runs on the first.
         program: The program to run.
         listen: The address to listen on.
         db_number: Number of the first block, for S7; default: the layout's own.

@@ -1,4 +1,4 @@
-"""A thread with an event loop, in which an emulator runs a server of an asynchronous library."""
+"""Runs an event loop in a thread, for an emulator whose server is of an asynchronous library."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _Result = TypeVar("_Result")
 
 
 class LoopThread:
-    """An event loop in a thread of its own. Start it once."""
+    """An event loop in its own thread. Start it once."""
 
     def __init__(self, name: str) -> None:
         self._loop = asyncio.new_event_loop()
@@ -22,7 +22,7 @@ class LoopThread:
         self._thread.start()
 
     def stop(self) -> None:
-        """Cancel what still runs in the loop; return when the thread has ended."""
+        """Cancel all tasks in the loop; return when the thread has ended."""
         if self._thread.is_alive():
             self.run(_cancel_others)
             self._loop.call_soon_threadsafe(self._loop.stop)

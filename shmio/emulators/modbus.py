@@ -1,7 +1,7 @@
-"""An emulated Modbus device, with pymodbus's server.
+"""An emulated Modbus device, based on pymodbus's server.
 
-pymodbus decodes requests and encodes the answers. The tables are shmio's own, because those of the
-library do not allow that the program also changes values.
+pymodbus decodes the requests and encodes the answers. shmio has its own tables, because the program
+must change values, too, which the library's tables do not allow.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class _Place:
         return nest(flat, self.register.shape) if self.register.dims else flat[0]
 
     def write(self, entries: list[int], value: Any) -> None:
-        """Store a value of the register. ValueError: the device's type cannot hold it."""
+        """Store a value of the register. Raise ValueError if the device's type cannot hold it."""
         register = self.register
         flat = flatten(value, register.shape, register.path) if register.dims else (value,)
         for at, one in zip(self._starts, flat, strict=True):
@@ -80,7 +80,7 @@ class _Place:
 
 
 class _TableImage:
-    """The registers of a tag table in the device's tables."""
+    """Copies the registers of a tag table between an image and the device's tables."""
 
     def __init__(self, served: Served) -> None:
         """Find the place of each register.
@@ -102,7 +102,7 @@ class _TableImage:
         self._codecs = [codec(register, layout.byte_order) for register in layout.registers]
 
     def fill(self, words: Words) -> None:
-        """Store the initial values. Those of the tag table override the others."""
+        """Store the initial values. Those of the tag table override the defaults of the types."""
         frame, _ = initial_frame(self.layout)
         for given in (False, True):
             self._store(words, frame, [place.register.initial is not None for place in self.places], given)
@@ -125,7 +125,7 @@ class _TableImage:
 
 
 class ModbusEmulator:
-    """Runs a program on one tag table, and serves the addresses of this and further tables.
+    """Runs a program on one tag table, and serves the registers of this and further tables.
 
     You can start an emulator only once.
     """
@@ -217,7 +217,7 @@ class ModbusEmulator:
 
 
 class _Store:
-    """The tables, in the form that pymodbus's server needs. Numbers begin at 0."""
+    """The device's tables, with the methods that pymodbus's server calls. The first entry is number 0."""
 
     def __init__(self, words: Mapping[tuple[int, Table], list[int]], lock: threading.Lock) -> None:
         self._words, self._lock = words, lock

@@ -39,10 +39,10 @@ _DIGITS: Final = {"DATE_AND_TIME": 3, "LDT": 9, "DTL": 9}
 
 
 class _Variable:
-    """A register, and the values of its node."""
+    """A register and its node. Converts values between the two."""
 
     def __init__(self, register: Register, address: NodeAddress | BrowsePath, byte_order: Any) -> None:
-        """Choose the type of the node. ValueError: no type fits the register."""
+        """Choose the type of the node. Raise ValueError if no type fits the register."""
         base = register.element.base
         if base not in _TYPES:
             raise ValueError(f"the emulator has no nodes for a {register.type}")
@@ -54,14 +54,14 @@ class _Variable:
         self.node: Any = None
 
     def there(self, frame: bytearray) -> Any:
-        """Return the register's value in an image, in the node's type."""
+        """Return the register's value in an image, converted to the node's type."""
         register, value = self.register, self.codec.decode(frame)
         if not register.dims:
             return self._element(value)
         return nest([self._element(one) for one in flatten(value, register.shape, register.path)], register.shape)
 
     def here(self, value: Any, frame: bytearray) -> None:
-        """Store a value of the node in an image. ValueRangeError: the register cannot hold it."""
+        """Store a value of the node in an image. Raise ValueRangeError if the register cannot hold it."""
         register = self.register
         if not register.dims:
             self.codec.encode_into(self._back(value), frame)
@@ -121,7 +121,7 @@ class OpcUaEmulator:
         self.cycle = Cycle(self._program.period_ms / 1000, self._step, f"program-{program_name}")
 
     def start(self) -> None:
-        """Run the first cycle, listen, and continue in threads. It takes some seconds.
+        """Run the first cycle, listen, and continue in threads. This takes some seconds.
 
         Raises:
             EndpointError: The address is not available.
@@ -167,7 +167,7 @@ class OpcUaEmulator:
             self._loop.run(self._in_loop, time_s)
 
     async def _in_loop(self, time_s: float) -> None:
-        """Read the nodes, run a cycle, and write the changed nodes. Clients have to wait meanwhile."""
+        """Read the nodes, run a cycle, and write the changed nodes. Clients must wait in the meantime."""
         from asyncua import ua  # noqa: PLC0415  it needs the extra
 
         frame, variables = self._frames[0], self._tables[0]

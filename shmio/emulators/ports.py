@@ -11,11 +11,11 @@ from shmio.config.address import Address
 
 @contextmanager
 def reserved_port(host: str = "127.0.0.1", port: int = 0) -> Iterator[Address]:
-    """Reserve a port for the length of a ``with`` block; 0: a free port.
+    """Reserve a port for the duration of a ``with`` block. Port 0 selects a free port.
 
-    The port is bound, but nothing listens. So the kernel refuses connections to it, and does not
-    choose it for other programs. A server that binds it with SO_REUSEADDR, as all servers here do,
-    gets it.
+    The port is bound, but nothing listens on it. So the kernel refuses connections, and gives the
+    port to no other program. A server can still listen on it if it sets SO_REUSEADDR, as all servers
+    here do.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as keeper:

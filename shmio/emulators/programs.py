@@ -20,13 +20,13 @@ from shmio.simulation.loading import load
 
 
 class A50:
-    """The program of the A50 cell's controller, with the plant."""
+    """The program of the A50 cell's controller, with a model of the plant."""
 
     period_ms = 10
 
     def __init__(self, layout: Layout) -> None:
-        """Find the registers. ConfigError: a register is missing or has another type."""
-        # A DB201 from print has spaces in place of some underscores.
+        """Find the registers. Raise ConfigError if one is missing or has another type."""
+        # A DB201 that was copied from a printout has spaces instead of some underscores.
         named = tuple(
             msgspec.structs.replace(register, path=register.path.replace(" ", "_")) for register in layout.registers
         )
@@ -41,13 +41,13 @@ class A50:
         frame[:] = self._runner.step(round(time_s * 1e9), self.period_ms * 1_000_000)
 
 
-# Odd, so that word i of generation g, g + i * STRIDE modulo 2**64, is unique in the block and, as
-# long as any test runs, at its place.
+# Word i of generation g is g + i * STRIDE modulo 2**64. STRIDE is odd, so that all words of a block
+# differ; and for longer than any test runs, no word occurs at its place again.
 _STRIDE = 0x9E37_79B9_7F4A_7C15
 
 
 class Counter:
-    """Fills the block with big-endian 64-bit words: the cycle number mixed with the place.
+    """Fills the block with big-endian 64-bit words, computed from the cycle number and the word's place.
 
     If fewer than eight bytes remain at the end, they contain the first bytes of a word.
     """
@@ -99,7 +99,7 @@ class Wave:
     swing_s = 10.0
 
     def __init__(self, layout: Layout) -> None:
-        """Find the registers. ConfigError: there are none."""
+        """Find the registers to move. Raise ConfigError if there are none."""
         moved = [one for one in layout.registers if not one.writable and (one.type in NUMBERS or one.type == "BOOL")]
         if not moved:
             raise ConfigError("program wave: the layout has no number or BOOL that commands cannot write")
@@ -130,10 +130,10 @@ class Idle:
 
 @dataclass(frozen=True)
 class UserCode:
-    """What a program needs that is a class of the user."""
+    """How to load and parametrize a program that is a class of the user."""
 
     folder: str | None = None
-    """Where modules that are not installed are searched for."""
+    """Folder of modules that are not installed; None if there is none."""
     parameters: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -159,7 +159,7 @@ class UserProgram:
         self._time_ns = 0
 
     def step(self, time_s: float, frame: bytearray) -> None:
-        """Run a scan on the frame. ModelError: the user's code failed."""
+        """Run a scan on the frame. Raise ModelError if the user's code fails."""
         time_ns = round(time_s * 1e9)
         self._runner.resume(bytes(frame))  # clients may have written any register, also outputs
         frame[:] = self._runner.step(time_ns, time_ns - self._time_ns)
@@ -193,7 +193,7 @@ def is_user_code(name: str) -> bool:
 
 
 def program(name: str, layout: Layout, code: UserCode = BUILT_IN) -> Program:
-    """Create the program of this name for a block of this layout.
+    """Create the program called ``name`` for a block with this layout.
 
     Raises:
         ConfigError: There is no such program, or the layout lacks a register.

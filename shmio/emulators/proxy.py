@@ -1,11 +1,11 @@
 """TCP proxy with faults on demand between a program and its peer.
 
-An emulator with ``faults = true`` puts it before its server; tests and benchmarks put it before any
-peer.
+An emulator with ``faults = true`` puts the proxy in front of its server; tests and benchmarks put it
+in front of any peer.
 
-It has one thread and uses ``select``, because its time-outs have a resolution of microseconds, and
-``epoll`` has only milliseconds. A method that changes the behaviour returns when the change is in
-effect, so that tests need not wait.
+The proxy has one thread. It uses ``select``, whose time-outs have a resolution of microseconds, instead
+of ``epoll``, which has only milliseconds. A method that changes the behaviour returns when the change
+is in effect, so that tests need not wait.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _RESET = struct.pack("ii", 1, 0)  # SO_LINGER: close with RST
 
 
 class Link:
-    """A client's connection to the proxy, and the proxy's connection to the server for it."""
+    """A client's connection to the proxy, and the connection to the server that the proxy opens for this client."""
 
     def __init__(self, client: socket.socket, server: socket.socket) -> None:
         self._sockets = (client, server)
@@ -68,7 +68,7 @@ class Pipe:
     def __init__(self, link: Link, source: socket.socket, sink: socket.socket) -> None:
         self.link = link
         self.source, self.sink = source, sink
-        self.partial = bytearray()  # an incomplete frame that is to be edited
+        self.partial = bytearray()  # the start of a frame that will be edited once it is complete
         self.due = bytearray()
         self.ended = False
         self.finished = False
@@ -100,7 +100,7 @@ class Pipe:
             self.due += self._later.popleft()[1]
 
     def end_when_drained(self) -> None:
-        """Pass on the end of the stream when its last byte has been sent."""
+        """If the sender has ended its stream and all of its bytes are sent, end the stream to the receiver."""
         if self.ended and not self.due and not self._later and not self.finished:
             self.finished = True
             with contextlib.suppress(OSError):
@@ -121,7 +121,7 @@ def _listener(address: Address) -> socket.socket:
 
 
 def tpkt(data: bytes | bytearray) -> int:
-    """Return the length of the ISO-on-TCP frame (RFC 1006) in ``data``; 0: not known yet."""
+    """Return the length of the ISO-on-TCP frame (RFC 1006) in ``data``; 0 if ``data`` is too short to tell."""
     return data[2] << 8 | data[3] if len(data) >= 4 else 0
 
 
@@ -142,7 +142,7 @@ class Tampering:
     """
 
     def __init__(self, framing: Framing | None) -> None:
-        """Set the function that measures a frame. None: the result of each ``recv`` is a frame."""
+        """Start without an edit. ``framing`` measures a frame; if None, the result of each ``recv`` is a frame."""
         self._framing = framing
         self._edit: Edit | None = None
         self._held: list[bytes] = []
@@ -150,10 +150,7 @@ class Tampering:
         """Set while a frame is on hold."""
 
     def begin(self, edit: Edit, frames: int | None) -> None:
-        """Pass the next ``frames`` frames through a function.
-
-        None: all frames until :meth:`end`.
-        """
+        """Pass the next ``frames`` frames through a function; if None, all frames until :meth:`end`."""
         left = frames
 
         def counted(frame: bytes) -> bytes | None:
@@ -167,7 +164,7 @@ class Tampering:
         self._edit = counted
 
     def keep(self, frame: bytes) -> None:
-        """Put a frame on hold. This method can be used as an edit."""
+        """Put a frame on hold. You can pass this method to :meth:`begin` as an edit."""
         self._held.append(frame)
         self.frame_held.set()
 
@@ -336,7 +333,7 @@ class FaultProxy:
     def edit(self, change_frame: Edit, *, frames: int | None = None) -> None:
         """Pass frames through a function, which returns None to drop a frame.
 
-        The edit ends after ``frames`` frames. None: it ends when it is changed.
+        The edit ends after ``frames`` frames; if None, it lasts until another method ends it.
         """
         self._do(lambda: self._tampering.begin(change_frame, frames))
 

@@ -1,11 +1,11 @@
 """An S7 server for emulated controllers, based on python-snap7's server.
 
-From python-snap7 3.3 come the memory areas, the ISO-on-TCP handshake, system status lists, block
+python-snap7 3.3 provides the memory areas, the ISO-on-TCP handshake, system status lists, block
 lists, the clock, and the start and stop of the emulated CPU. This module adds the status list with
 the operating mode, cuts answers that do not fit a PDU into parts, and replaces:
 
-- the status lists with what the CPU is: those of python-snap7 have no heads of records; and the
-  information about blocks, which has no checksum there;
+- the status lists that describe the CPU, which lack the head of the records in python-snap7, and the
+  information about blocks, which lacks the checksum there;
 - jobs (set-up, read, write), which ``Jobs`` answers: python-snap7 grants one job and 480 bytes,
   writes a bit as a whole byte, stores only the first item of a write, stores part of a write past
   the end of a block, and reads several times slower;
@@ -67,7 +67,7 @@ _TYPES = {
 }
 _LENGTH_IN_BITS = {0x04, 0x05}
 _PERIPHERAL = 0x80
-_AREAS = {int(area): area for area in S7Area} | {_PERIPHERAL: S7Area.PE}  # of peripheral access, inputs only
+_AREAS = {int(area): area for area in S7Area} | {_PERIPHERAL: S7Area.PE}  # peripheral access reaches only inputs
 _NUMBERED = {S7Area.CT: S7WordLen.COUNTER, S7Area.TM: S7WordLen.TIMER}
 """Areas that are addressed by number, with the type that they need."""
 
@@ -76,11 +76,11 @@ _DT = b"\x02\xf0\x80"  # COTP data, and the end of the message: PDUs fit a TPDU,
 _FRAME_OVERHEAD = 7
 _LONGEST_FRAME = MAX_PDU_SIZE + _FRAME_OVERHEAD
 _INBOX_SIZE = 8 * _LONGEST_FRAME
-_ANSWERS_AT_ONCE = 8  # so many are sent at once, even if more requests are waiting
+_ANSWERS_AT_ONCE = 8  # maximum number of answers sent together, even if more requests are waiting
 _SEND_TIMEOUT_S = 5
 _KEEPALIVE = {socket.TCP_KEEPIDLE: 30, socket.TCP_KEEPINTVL: 10, socket.TCP_KEEPCNT: 3}
 """Socket options, in s: a client whose host is down is disconnected within a minute."""
-_SERVICES = (b"P_PROGRAM", b"_MODU", b"_GARB")  # start; the others need no action
+_SERVICES = (b"P_PROGRAM", b"_MODU", b"_GARB")  # the first starts the CPU; the others need no action
 _SERVICE_ARGUMENT = 8  # offset, in the parameters, of the length of the service's argument
 _MODE_LIST, _MODULE_LIST, _COMPONENT_LIST = 0x0424, 0x0011, 0x001C
 _RUN, _STOP = 0x08, 0x04  # operating modes in that list
@@ -95,7 +95,7 @@ _COMPONENTS = {
     0x0005: b"0",
     0x0007: b"Emulated S7",
 }
-"""Names of: the system, the module, the plant; copyright; serial number; type of the module."""
+"""The names of the system, the module and the plant; the copyright, the serial number, the module's type."""
 _BLOCK_HEAD = 36
 """Bytes of a block in load memory besides its data."""
 _USERDATA_DATA = 22
@@ -129,12 +129,12 @@ class ServerOptions:
     """Differences between an emulated controller and a permissive S7-1500."""
 
     max_pdu_size: int = MAX_PDU_SIZE
-    """Size of the largest PDU that it grants, in bytes."""
+    """Size of the largest PDU that the server grants, in bytes."""
     max_jobs: int = 8
-    """Maximum number of jobs in flight that it grants."""
+    """Maximum number of jobs in flight that the server grants."""
     fault: Fault | None = None
     block_size: int | None = None
-    """Apparent maximum size of data blocks in bytes, as of an older version; None: no maximum."""
+    """Size in bytes beyond which data blocks are hidden, as if the controller had older ones; None: no limit."""
 
     def __post_init__(self) -> None:
         if not (100 <= self.max_pdu_size <= MAX_PDU_SIZE and 1 <= self.max_jobs <= MAX_JOBS):
@@ -368,9 +368,9 @@ class _Parts:
 
 
 class S7Server(Server):
-    """Serves data blocks to S7 clients on one address. Start and stop it once; or use ``with``.
+    """Serves data blocks to S7 clients on one address. Start and stop it once, or use ``with``.
 
-    Each job takes ``lock``. Take it to change a block between two jobs.
+    Each job holds ``lock``. Hold this lock to change a block between two jobs.
     """
 
     def __init__(self, address: Address, *, max_clients: int = 16, options: ServerOptions | None = None) -> None:
@@ -407,7 +407,7 @@ class S7Server(Server):
 
     @property
     def address(self) -> Address:
-        """Address on which it listens, with the actual port if port 0 was requested.
+        """Address on which the server listens, with the actual port if port 0 was requested.
 
         Raises:
             ShmioError: The server is not started.
@@ -534,7 +534,7 @@ class S7Server(Server):
                 client_socket.close()
 
     def _serve(self, client: socket.socket, address: tuple[str, int]) -> None:
-        """Answer one client until it leaves or breaks the protocol, with a fixed buffer."""
+        """Answer one client, with a buffer of fixed size, until the client leaves or breaks the protocol."""
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         client.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         for option, value in _KEEPALIVE.items():
@@ -583,14 +583,14 @@ class S7Server(Server):
         if answer is None:
             return None
         if min(len(request) - 16, len(answer) - _USERDATA_DATA) > 0 and answer[1] == S7PDUType.USERDATA:
-            # python-snap7 refuses everything as if "read SZL" had been asked
+            # python-snap7 refuses each request as if it were "read SZL"
             answer = answer[:15] + bytes((0x80 | request[15] & 0x0F, request[16])) + answer[17:]
         return parts.cut(request, answer, size)
 
     def _process_request(self, request_data: bytes, client_address: tuple[str, int]) -> bytes | None:
-        """Answer a job other than read, write and set-up: by python-snap7, if that is safe.
+        """Answer a request other than a job to read, to write or to set up.
 
-        All other jobs are refused.
+        python-snap7 answers the requests that are safe; all others are refused.
         """
         protocol, kind, function = request_data[0], request_data[1], request_data[10] if len(request_data) > 10 else 0
         if protocol != _PROTOCOL:  # such as S7comm-plus
@@ -608,7 +608,7 @@ class S7Server(Server):
         return None
 
     def load_block(self, number: int, data: bytearray) -> None:
-        """Serve other data under a number, as after loading a changed block from the programming tool."""
+        """Replace the data block ``number``, as when the programming tool loads a changed block."""
         with self.lock:
             self.memory_areas[(S7Area.DB, number)] = data
             self._checksums[number] = zlib.crc32(data) & 0xFFFF
@@ -619,7 +619,7 @@ class S7Server(Server):
         userdata_params: dict[str, Any],
         client_address: tuple[str, int],  # noqa: ARG002
     ) -> bytes:
-        """Tell a block's length as the options say, and a checksum of the data as they were loaded."""
+        """Answer with a block's length, as limited by the options, and the checksum of its data when loaded."""
         asked = request.get("data", {}).get("data", b"")
         digits = bytes(asked[2:7])
         number = int(digits) if digits.isdigit() else 0
@@ -635,11 +635,11 @@ class S7Server(Server):
         return answer
 
     def _get_szl_data(self, szl_id: int, szl_index: int) -> bytes | None:
-        """Return the records of a list as in the manual of S7-300/400, with their head.
+        """Return a system status list with its head, as in the manual of S7-300/400.
 
-        Of the operating mode, the previous mode, which shares the byte, is left out: with it,
-        Snap7's ``Cli_GetPlcStatus`` would report STOP for RUN after STOP. Any index gives the whole
-        list.
+        For the lists of this module, ``szl_index`` has no effect: the list is always whole. The list
+        with the operating mode lacks the previous mode, which shares its byte: with it, Snap7's
+        ``Cli_GetPlcStatus`` would report STOP for a CPU in RUN that was in STOP before.
         """
         if szl_id == _MODE_LIST:
             mode = _RUN if self.cpu_state == CPUState.RUN else _STOP

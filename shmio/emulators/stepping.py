@@ -1,4 +1,4 @@
-"""An emulated device on the instance's clock: a step runs the scans that are due in it."""
+"""Lets an emulated device follow the instance's clock: each step runs the scans that are due in it."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ class InstanceTime:
     """Lets the program of an emulated device follow the instance's clock. Use it from one thread.
 
     In wall time the program keeps its own schedule. In virtual time it stands still, and each step
-    runs the scans that are due. They run when all sources have done the step, and the step waits
-    for them.
+    runs the scans that are due. The scans run once all sources have done the step, and the step ends
+    only after the scans.
     """
 
     def __init__(self, page: ClockPage, slot: int, cycle: Cycle, beat: Callable[[], object]) -> None:
-        """Follow the clock. From now on, each step waits for the scans.
+        """Start to follow the clock. From now on, each step waits for the scans.
 
         Args:
             page: The clock page.
@@ -40,7 +40,7 @@ class InstanceTime:
         page.deliver(slot, self._step)
 
     def follow(self) -> None:
-        """Run the scans that are due, and report the step as delivered."""
+        """Run the scans that are due, and report the step as delivered. Call this when the clock changes."""
         state = self._page.read()
         if not state.virtual:
             if self._time_ns is not None:
@@ -60,7 +60,7 @@ class InstanceTime:
                 self._page.deliver(self._slot, state.step)
 
     def close(self) -> None:
-        """Let no step wait for this process any more."""
+        """Stop following the clock, so that later steps do not wait for this process."""
         self._page.abstain(self._slot)
 
     def _advance(self, dt_ns: int) -> None:

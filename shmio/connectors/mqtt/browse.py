@@ -1,7 +1,7 @@
 """Lists the topics of a broker, with the types and addresses that a tag table needs.
 
-It listens to all messages for a time, and publishes nothing. It therefore finds the metrics of a
-Sparkplug node only if the node sends its birth in that time.
+:class:`Listener` listens to all messages for a limited time, and publishes nothing. It therefore
+finds the metrics of a Sparkplug node only if the node sends its birth in that time.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from shmio.connectors.mqtt.values import decode_json, is_number
 from shmio.wire import sparkplug_b_pb2 as wire
 
 MAX_BYTES: Final = 1 << 26
-"""Largest total size of the payloads kept, in bytes."""
+"""Maximum total size of the stored payloads, in bytes."""
 MAX_TEXT: Final = 254
 _WORDS: Final = frozenset({b"true", b"false", b"on", b"off"})
 _KINDS: Final = {
@@ -46,7 +46,7 @@ class Listener:
         self._size = 0
         self.incomplete = ""
 
-    def take(self, topic: str, payload: bytes, *, retained: bool) -> None:  # noqa: ARG002  both show what there is
+    def take(self, topic: str, payload: bytes, *, retained: bool) -> None:  # noqa: ARG002  both kinds count
         """Store a message. The thread of the connection calls this."""
         sparkplug = topic.startswith(f"{NAMESPACE}/")
         if not sparkplug and not self._wanted.enters(_levels(topic)):
@@ -144,7 +144,7 @@ def _kind(found: Any) -> str:
     if isinstance(found, bool):
         return "BOOL"
     if isinstance(found, int | float):
-        return "LREAL"  # what is whole now need not be so next time
+        return "LREAL"  # the next value may not be a whole number
     if isinstance(found, str):
         return _text(found)
     if isinstance(found, list) and found and not isinstance(found[0], list):
@@ -159,9 +159,10 @@ def _text(found: str) -> str:
 
 
 def _metrics(topic: str, payload: bytes | None, all_topics: Mapping[str, object], quiet: set[str]) -> Iterator[Offer]:
-    """Yield the metrics in a birth.
+    """Yield the metrics in a Sparkplug message, if it is a birth.
 
-    Add to ``quiet`` each node or device that has sent only data.
+    If it has data, and no birth of its node or device has arrived, add this node or device to
+    ``quiet``.
     """
     levels = topic.split("/")
     if not 4 <= len(levels) <= 5 or levels[2] not in ("NBIRTH", "DBIRTH", "NDATA", "DDATA"):
@@ -201,7 +202,7 @@ def _array(one: wire.Metric, kind: str) -> str:
 
 
 def _offer(names: tuple[str, ...], kind: str, source: Place | Metric) -> Offer:
-    """Return an offer with the address of a value; refused if an address cannot express it."""
+    """Return the offer of a value with its address. The offer is refused if no address can name the value."""
     text = _address(source)
     try:
         readable = addresses.parse(text).source == source

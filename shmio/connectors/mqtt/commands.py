@@ -24,10 +24,7 @@ class Command:
         self.publication, self.writes = publication, writes
         self.number: int | None = None
         self.outcome: str | None = None
-        """Empty if the broker has accepted the message, or why it refused it.
-
-        None if that is not known.
-        """
+        """Empty if the broker has accepted the message, else why it was refused; None if that is not known."""
 
 
 class _Draft:
@@ -135,7 +132,7 @@ def _message(store: Store, options: MqttOptions, draft: _Draft) -> Publication:
         document = msgspec.json.decode(options.templates[target.topic])
     for index, value in draft.values.items():
         place = _target(store, index)
-        assert isinstance(place, Place)  # noqa: S101 - as all of a draft
+        assert isinstance(place, Place)  # noqa: S101 - all targets of a draft are of one kind
         try:
             if place.steps is None:
                 payload = store.converters[index].to_text(value)

@@ -1,4 +1,4 @@
-"""The connector ``mqtt``: a connection to a broker, the newest messages in an image, and writes."""
+"""The connector ``mqtt``: connects to a broker, makes images of the newest messages, and publishes writes."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ class _Sending:
     left: deque[Command]
     sent: list[Command] = field(default_factory=list)
     ping: int = 0
-    """Number of the PINGREQ behind the messages with QoS 0; 0: none was sent."""
+    """Number of the PINGREQ that was sent after the messages with QoS 0; 0 if none was sent."""
     echo_until_s: float = 0.0
-    """When to stop waiting for the messages to come back; 0: the broker has not acknowledged all."""
+    """When to stop waiting for the messages to come back, s of CLOCK_MONOTONIC; 0 before all are acknowledged."""
 
 
 class MqttConnector(Connector):
@@ -67,7 +67,7 @@ class MqttConnector(Connector):
         self._link: Link | None = None
         self._last_number = 0
         self._sending = _Sending([], [], 0.0, deque())
-        _secrets(options)  # a wrong file is an error of the configuration now, and of the connection later
+        _secrets(options)  # here, a wrong file is a ConfigError; when connecting, it is a ConnectorError
 
     @classmethod
     def browse(cls, options: MqttOptions, wanted: Wanted) -> Browsed:
@@ -106,9 +106,7 @@ class MqttConnector(Connector):
         return CycleRequests(counted(len(self._store.filters), "subscription"), note="the broker sends their messages")
 
     def connect(self) -> None:
-        """Connect to the broker and subscribe.
-
-        Wait for a short time for the messages that it retains.
+        """Connect to the broker, subscribe, and wait a short time for retained messages.
 
         Raises:
             ConnectorError: The broker cannot be reached, or refuses the client.
@@ -131,7 +129,7 @@ class MqttConnector(Connector):
         link = self._link
         assert link is not None  # noqa: S101 - for the type checker
         self._ask(link)
-        number = link.ping()  # what the broker has kept comes before the answer
+        number = link.ping()  # the broker sends retained messages before the answer
         self._store.wait(
             lambda: self._store.complete or (not self._store.host and link.answered(number)),
             min(time.monotonic() + FIRST_S, until_s),
@@ -185,7 +183,7 @@ class MqttConnector(Connector):
     # -- writing -------------------------------------------------------------------------------------------------------
 
     def send(self, writes: Sequence[Write]) -> None:
-        """Publish the written values, as many messages as may be unacknowledged.
+        """Publish the written values, with as many messages as may be unacknowledged at a time.
 
         Raises:
             WriteLostError: The connection is lost.
@@ -205,7 +203,7 @@ class MqttConnector(Connector):
             raise self._lost(error) from None
 
     def confirm(self, until_ns: int) -> list[str] | None:
-        """Wait until the broker has acknowledged all messages, and those that are also read came back.
+        """Wait until the broker has acknowledged all messages, and has sent back those that this source reads.
 
         Raises:
             WriteLostError: The connection is lost, or the broker did not acknowledge all messages
@@ -239,7 +237,7 @@ class MqttConnector(Connector):
         return [str(outcome) for outcome in sending.outcomes]
 
     def _publish(self, link: Link, sending: _Sending) -> None:
-        """Publish messages as long as another one may be unacknowledged."""
+        """Publish messages until the maximum number is unacknowledged."""
         while sending.left and link.await_room(0.0):
             command = sending.left[0]
             if link.fits(command.publication):
@@ -251,7 +249,7 @@ class MqttConnector(Connector):
             sending.left.popleft()
 
     def _acknowledged(self, link: Link, sending: _Sending, until_s: float) -> bool:
-        """Wait until the broker has all messages."""
+        """Wait until the broker has received all messages; return whether it has by ``until_s``."""
         numbers = [one.number for one in sending.sent if one.number is not None]
         if not link.wait_acknowledged(numbers, until_s):
             return False
@@ -264,7 +262,7 @@ class MqttConnector(Connector):
         return True
 
     def _take_outcomes(self, link: Link, sending: _Sending) -> None:
-        """Store what the broker has said about each message."""
+        """Store the broker's answer to each message with QoS 1."""
         for one in sending.sent:
             if one.number is not None:
                 one.outcome = link.outcome(one.number, one.publication.topic, retain=one.publication.retain)
@@ -293,7 +291,7 @@ def _secrets(options: MqttOptions) -> tuple[str | None, ssl.SSLContext | None]:
 
 
 def _mark(outcomes: list[str | Lost], commands: Sequence[Command], sent: Sequence[Command]) -> None:
-    """Store in ``outcomes`` what is known of each write. A write may need several messages."""
+    """Store in ``outcomes`` what is known of each write, from all the messages that it needs."""
     begun = {id(command) for command in sent}
     needed: dict[int, list[Command]] = {}
     for command in commands:

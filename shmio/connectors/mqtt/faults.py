@@ -1,10 +1,10 @@
-"""The error for a single value, which turns only its own register bad."""
+"""The error about a single value. It makes only the value's own register bad."""
 
 from __future__ import annotations
 
 
 class ValueFaultError(Exception):
-    """A message does not contain the value of a register, or a value that does not fit.
+    """A message contains no value for a register, or a value that does not fit the register.
 
     ``code`` is the status of the register. ``source_ns`` is the time of the message in ns since
     1970; 0 if unknown.

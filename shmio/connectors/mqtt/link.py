@@ -1,8 +1,8 @@
 """One connection to a broker. Its own thread receives the packets.
 
-The connection has no session at the broker, so that messages for an old connection are never
-delivered on a new one. A PINGREQ is sent at least every half time-out. The answer shows that the
-broker is alive, and that messages which it sends are not delayed.
+The broker keeps no session for the client, so that it never delivers messages of an old connection on
+a new one. The client sends a PINGREQ at least every half time-out. The answer shows that the broker is
+alive, and that its messages are not delayed.
 """
 
 from __future__ import annotations
@@ -79,17 +79,14 @@ class _Client(Client):
         self._opened = opened
         self.tls_error: ssl.SSLError | None = None
         self.violation = ""
-        """The broker's protocol error that ends the connection.
-
-        Empty if it did nothing.
-        """
+        """How the broker broke the protocol, which ends the connection; empty if it did not."""
         self.on_pong: Callable[[], None] = lambda: None
         self.pings = self.pongs = 0
         """Numbers of PINGREQs that were sent and answered. Paho also sends some by itself."""
         self.pinged_ns = 0
-        """When the oldest unanswered PINGREQ was sent, in ns of CLOCK_MONOTONIC.
+        """When the client began to wait for the next answer to a PINGREQ, in ns of CLOCK_MONOTONIC.
 
-        If all were answered, the time of the last one.
+        If all were answered, when it began to wait for the last answer.
         """
         self._pinging = threading.Lock()
         self._last_mid = after
@@ -223,7 +220,7 @@ class Link:
         client.on_subscribe, client.on_publish = self._on_subscribe, self._on_publish
         client.on_message, client.on_pong = self._on_message, self._on_pong
         client.on_socket_register_write = lambda *_: None  # the thread alone writes, so that packets never mix
-        client.max_inflight_messages_set(0)  # this object counts them
+        client.max_inflight_messages_set(0)  # this object counts the messages in flight
         if self._options.username is not None:
             client.username_pw_set(self._options.username, self._password)
         given: dict[str, Any] = {"clean_start": True} if version == MQTTv5 else {}
@@ -305,7 +302,7 @@ class Link:
         _close_socket(client)
         if thread is not None:
             thread.join(CLOSE_S)
-        # The client refers to this object, and frees its sockets when it is freed.
+        # Break the reference cycle with the client, which closes its sockets when it is freed.
         client.on_connect = client.on_disconnect = client.on_subscribe = client.on_publish = client.on_message = None
         client.on_pong = lambda: None
         self._client = None
@@ -345,9 +342,10 @@ class Link:
         return bool(size <= self._limits.get("MaximumPacketSize", size))
 
     def await_room(self, until_s: float) -> bool:
-        """Wait until another message may be sent; return whether it may be by ``until_s``.
+        """Wait until few enough messages are unacknowledged to send another one.
 
-        It may if few enough are unacknowledged.
+        Returns:
+            Whether another message may be sent by ``until_s``, a time of CLOCK_MONOTONIC.
 
         Raises:
             ConnectorError: The connection is lost.
@@ -373,7 +371,7 @@ class Link:
         qos = min(publication.qos, self._limits.get("MaximumQoS", 1))
         if self.version == MQTTv5 and not publication.retain:
             properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
-            properties.MessageExpiryInterval = max(1, self._options.timeout // 1000)  # no command comes late
+            properties.MessageExpiryInterval = max(1, self._options.timeout // 1000)  # the broker drops late commands
         info = client.publish(publication.topic, publication.payload, qos, publication.retain, properties)
         if info.rc == MQTTErrorCode.MQTT_ERR_NO_CONN:
             raise ConnectorError(self._failure or f"the connection to {self.peer} was lost")
@@ -393,10 +391,7 @@ class Link:
         return self._seen(lambda: wanted <= self._acks.keys(), until_s)
 
     def outcome(self, number: int, topic: str, *, retain: bool) -> str | None:
-        """Return "" if the broker has accepted a message, or why it refused it.
-
-        None if it has not answered.
-        """
+        """Return "" if the broker has accepted a message, else why it was refused; None if there is no answer."""
         code = self._acks.get(number)
         if code is None:
             return None
@@ -425,7 +420,12 @@ class Link:
         return self._seen(lambda: self._client is not None and self._client.pongs >= number, until_s)
 
     def _seen(self, condition: Callable[[], bool], until_s: float) -> bool:
-        """Wait until ``condition`` holds, at most until ``until_s``; return whether it holds."""
+        """Wait until ``condition`` holds, at most until ``until_s``; return whether it holds.
+
+        Raises:
+            ConnectorError: The connection was lost while waiting.
+
+        """
         with self._condition:
             self._condition.wait_for(lambda: condition() or self._failure, max(0.0, until_s - time.monotonic()))
             if condition():
@@ -501,7 +501,7 @@ class Link:
     def _on_message(self, _client: Client, _data: Any, message: MQTTMessage) -> None:
         try:
             topic = message.topic
-        except UnicodeDecodeError:  # it is none of ours
+        except UnicodeDecodeError:  # no register has such a topic
             return
         if self._closing:
             return

@@ -36,7 +36,7 @@ def decode(metric: wire.Metric, datatype: int) -> Any:
         datatype: The metric's data type, as its birth states it.
 
     Raises:
-        ValueFaultError: The metric has no value, or a wrong one.
+        ValueFaultError: The metric has no value, or its value does not fit the data type.
 
     """
     field = metric.WhichOneof("value")
@@ -66,10 +66,10 @@ def decode(metric: wire.Metric, datatype: int) -> Any:
 
 
 def _signed(found: int, bits: int, field: str) -> int:
-    """Return a signed number.
+    """Return the signed number that an unsigned field contains.
 
-    Implementations of Sparkplug send a negative number either with the bits of its type or with all
-    bits of the field.
+    Some implementations of Sparkplug extend a negative number only to the bits of its type, others
+    to all bits of the field.
     """
     wide = 32 if field == "int_value" else 64
     if found >> (wide - 1):

@@ -19,7 +19,7 @@ _Texts = Annotated[list[_Text], msgspec.Meta(min_length=1, max_length=100)]
 class Will(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
     """A topic that says whether a device is online.
 
-    Usually, the device's last will is published on it.
+    Usually, this is the topic of the device's last will.
     """
 
     topic: _Text
@@ -58,7 +58,7 @@ class MqttOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_on
     max_age_ms: _Age | dict[_Text, _Age] | None = None
     """Age in ms above which a topic's last message is too old; 0: never.
 
-    One number is for all registers, and a table has numbers by pattern.
+    A single number applies to all registers; a table has a number for each pattern of registers.
     """
     will: _Text | Annotated[list[Will], msgspec.Meta(max_length=1000)] = msgspec.field(default_factory=list)
     time: _Text | None = None

@@ -1,9 +1,9 @@
 """Sparkplug B as a host application sees it: births, data and deaths of edge nodes. No I/O.
 
-The messages of a node may name metrics by aliases, which its birth defines. A node's data are
-therefore used only after its birth, and only while its sequence numbers have no gap: in a gap,
-another birth may have been lost. After a gap, all registers of the node are bad, and the node is
-asked for a new birth (Eclipse Sparkplug Specification 3.0.0, 5 and 6).
+The messages of a node may name metrics by aliases, which its birth defines. shmio therefore uses a
+node's data only after its birth, and only while its sequence numbers have no gap: in a gap, another
+birth may have been lost. After a gap, all registers of the node are bad, and shmio asks the node for
+a new birth (Eclipse Sparkplug Specification 3.0.0, 5 and 6).
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ MAX_METRICS: Final = 100_000
 MAX_ALIASES: Final = 1_000_000
 """Largest number of aliases of a node and all its devices."""
 ASK: Final = Backoff(1.0, 60.0)
-"""The waiting times before a node is asked again for its birth."""
+"""The waiting times before shmio asks a node again for its birth."""
 CALM_NS: Final = 120_000_000_000
-"""If a node was not asked for this time in ns, the waiting times begin again with the shortest."""
+"""Time in ns without a request to a node after which the waiting times start again with the shortest."""
 KINDS: Final = ("NBIRTH", "NDATA", "NDEATH", "DBIRTH", "DDATA", "DDEATH")
 _SEQUENCE: Final = 256
 _BAD: Final = 0x80000000
@@ -63,9 +63,9 @@ class Device(Origin):
     def __init__(self, node: Node, name: str) -> None:
         self.node, self.name = node, name
         self.wanted: dict[str, list[int]] = {}
-        """The indices of the registers that have each metric, by the metric's name."""
+        """By the name of a metric, the indices of the registers that have its value."""
         self.metrics: dict[str, _Known] = {}
-        """The metrics in the device's birth that registers have, by name."""
+        """The definitions in the device's birth, by name, of the metrics that registers have."""
         self.born = False
         self.died = False
         self._birth_order = 0
@@ -76,10 +76,7 @@ class Device(Origin):
 
     @property
     def fault(self) -> int:
-        """Why none of the device's registers has a good value: a status.
-
-        GOOD if there is no reason.
-        """
+        """The status that makes all of the device's registers bad; GOOD if there is none."""
         if self.born:
             return GOOD
         return BAD_NO_COMMUNICATION if self.died else BAD_WAITING_FOR_INITIAL_DATA
@@ -116,13 +113,13 @@ class Device(Origin):
         self.end(died=False)
 
     def end(self, *, died: bool) -> None:
-        """Use no values of the device until its next birth."""
+        """Discard the values and metrics of the device, which has none until its next birth."""
         self.born, self.died = False, died
         self.metrics.clear()
         self._found.clear()
 
     def begin(self, order: int) -> None:
-        """Discard all values and metrics, because a birth of the device has arrived."""
+        """Prepare for the metrics of a birth of the device: discard all earlier values and metrics."""
         self.end(died=False)
         self.born, self._birth_order = True, order
 
@@ -140,7 +137,7 @@ class Device(Origin):
             self._found[index] = found, message.order
 
     def command(self, values: Mapping[str, Any], now_ms: int) -> tuple[str, bytes]:
-        """Return topic and payload of a command with these values by metric.
+        """Return the topic and the payload of a command that sets metrics, given by name, to values.
 
         Raises:
             ValueError: The device is offline, or a value does not fit its metric.
@@ -311,7 +308,7 @@ class Node:
                 found[0].take(found[1], one, message, payload.timestamp)
 
     def _lose(self, why: str) -> None:
-        """Use no values of the node until its next birth, and note that it must be asked for that."""
+        """Discard all values of the node until its next birth, and note that shmio must ask for this birth."""
         log.warning("%s: %s; shmio asks the node for a new birth", self, why)
         self._born, self._ask = False, True
         for one in self.devices.values():
@@ -337,7 +334,7 @@ class Host:
     """All Sparkplug nodes of a layout."""
 
     def __init__(self, *, max_bytes: int) -> None:
-        """Create it. A message of more than ``max_bytes`` counts as unreadable."""
+        """Start without nodes. A message of more than ``max_bytes`` counts as unreadable."""
         self._max_bytes = max_bytes
         self._nodes: dict[tuple[str, str], Node] = {}
 
@@ -377,7 +374,7 @@ class Host:
         node.take(levels[2], levels[4] if len(levels) == 5 else "", message)
 
     def requests(self, now_ns: int) -> Iterator[tuple[str, bytes]]:
-        """Yield topics and payloads of the commands that are due to ask nodes for their births."""
+        """Yield the topics and payloads of the requests for births that are due."""
         for node in self._nodes.values():
             if (found := node.request(now_ns)) is not None:
                 yield found

@@ -54,11 +54,9 @@ class Group:
         """The message whose values the image shows; None if there is none."""
 
     def state(self, now_ns: int) -> int:
-        """Return the status of all registers at ``now_ns``.
+        """Return the status of all registers at ``now_ns``, a time of CLOCK_MONOTONIC.
 
-        GOOD if each register has its own status.
-
-        ``now_ns`` is a time of CLOCK_MONOTONIC.
+        GOOD means that each register has its own status.
         """
         message = self.origin.message
         for watch in self.watches:
@@ -71,7 +69,7 @@ class Group:
         if self.max_age_ns:
             if now_ns - message.monotonic_ns > self.max_age_ns:
                 return BAD_TIMEOUT
-            if message.retained:  # nobody knows how old it is
+            if message.retained:  # its age is unknown
                 return UNCERTAIN_LAST_USABLE_VALUE
         return GOOD
 
@@ -92,7 +90,7 @@ class Store:
         self.layout, self._options = layout, options
         log.filters[:] = [LogRateLimit()]  # a process has one source
         self._changed = threading.Condition()
-        """Locks all attributes below, and is notified of each message."""
+        """Guards all attributes below; waiting threads are notified at each message."""
         self.addresses: list[Address] = []
         self.converters: list[ValueConverter] = []
         self.host = Host(max_bytes=options.max_payload_bytes)
@@ -174,7 +172,7 @@ class Store:
     # -- the thread that receives --------------------------------------------------------------------------------------
 
     def take(self, topic: str, payload: bytes, *, retained: bool) -> None:
-        """Store a message."""
+        """Store a message, and wake the threads that wait for it."""
         with self._changed:
             self._order += 1
             message = Message(payload, retained, self._order, time.monotonic_ns(), time.time_ns())
@@ -280,10 +278,7 @@ class Store:
     # -- for writes ----------------------------------------------------------------------------------------------------
 
     def offline(self, index: int) -> str:
-        """Return why a command to a register would not reach its device.
-
-        "" if that is not known.
-        """
+        """Return why a command to a register would not reach its device; "" if there is no known reason."""
         with self._changed:
             group = self._group_of[index]
             return next((watch.problem for watch in group.watches if watch.problem), group.origin.offline)
@@ -329,7 +324,7 @@ class Store:
             return list(self.host.requests(now_ns))
 
     def expect(self, topic: str, payload: bytes) -> None:
-        """Note that a payload is about to be published, if its topic is also read."""
+        """Note that a payload is about to be published, and will come back, if its topic is also read."""
         with self._changed:
             if topic in self._topics and not self._topics[topic].refused:
                 self._expected[topic] = payload
@@ -342,13 +337,13 @@ class Store:
         return self.wait(lambda: not self._expected, until_s)
 
     def expect_nothing(self) -> None:
-        """Wait no more for published payloads."""
+        """Forget the published payloads that have not come back."""
         with self._changed:
             self._expected.clear()
 
     @property
     def complete(self) -> bool:
-        """True if all topics, wills and Sparkplug devices have sent a first message."""
+        """True if no topic, will or Sparkplug device is still without a first message."""
         return (
             all(one.message is not None or one.refused for one in self._topics.values())
             and all(watch.there is not None for watch in self._watches)

@@ -15,10 +15,7 @@ from shmio.model.statuses import BAD_OUT_OF_RANGE, BAD_USER_ACCESS_DENIED, GOOD
 
 _MAX_NS: Final = (1 << 63) - 1
 _UNITS: Final = ((1e11, 10**9), (1e14, 10**6), (1e17, 10**3))
-"""Pairs (number, unit in ns): a time below the number is in this unit.
-
-These are s, ms and µs. A larger time is in ns.
-"""
+"""Pairs (limit, unit in ns): a time below the limit is in this unit (s, ms or µs). A larger time is in ns."""
 
 
 class Message(NamedTuple):
@@ -33,7 +30,7 @@ class Message(NamedTuple):
 
 
 class Found(NamedTuple):
-    """The content of a message for a register: text as bytes, or a JSON value."""
+    """What a message contains for a register: text as bytes, or a JSON value."""
 
     value: Any
     source_ns: int
@@ -51,11 +48,11 @@ class Origin(ABC):
     @property
     @abstractmethod
     def fault(self) -> int:
-        """Why none of the registers has a good value: a status; GOOD if there is no reason."""
+        """The status that makes all registers bad; GOOD if there is none."""
 
     @property
     def offline(self) -> str:
-        """Why a command would not reach the device; "" if that is not known."""
+        """Why a command would not reach the device; "" if there is no known reason."""
         return ""
 
     @abstractmethod
@@ -99,10 +96,10 @@ class Topic(Origin):
 
     @property
     def fault(self) -> int:
-        """Why none of the registers has a good value: a status; GOOD if there is no reason."""
+        """The status that makes all registers bad; GOOD if there is none."""
         return BAD_USER_ACCESS_DENIED if self.refused else GOOD
 
-    def order_of(self, index: int) -> int:  # noqa: ARG002  a message has all of them
+    def order_of(self, index: int) -> int:  # noqa: ARG002  each message is for all registers
         """Return the order of the newest message."""
         return self.message.order if self.message is not None else 0
 

@@ -42,7 +42,7 @@ class ValueConverter:
 
         Args:
             register: The register.
-            texts: The texts for false and for true.
+            texts: Further texts that mean false and true in a BOOL register; these are published.
 
         Raises:
             ValueError: MQTT messages cannot carry values of the register's type.
@@ -74,7 +74,7 @@ class ValueConverter:
     def from_json(self, found: Any) -> Value:
         """Return the value of the register for a JSON value.
 
-        It raises the errors of :meth:`from_text`.
+        It raises the same errors as :meth:`from_text`.
         """
         register = self._register
         if not register.dims:

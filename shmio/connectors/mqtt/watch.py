@@ -22,7 +22,7 @@ class Watch:
     """Follows the topic that says whether a device is online."""
 
     def __init__(self, will: Will) -> None:
-        """Create it for a will of the configuration.
+        """Create the watch for a will of the configuration.
 
         Raises:
             ConfigError: The topic or a pattern of the will is wrong.
@@ -76,14 +76,11 @@ class Watch:
         return str(found).lower() if isinstance(found, bool) else str(found)
 
     def fault(self, message: Message | None) -> int:
-        """Return the status to show in place of a message of the device.
-
-        GOOD if the message is valid.
-        """
+        """Return the status to show instead of the values in a message of the device; GOOD if they are valid."""
         if self.there is None:
             return BAD_WAITING_FOR_INITIAL_DATA
         if not self.there:
             return BAD_NO_COMMUNICATION
         if self._gone_order and message is not None and (message.retained or message.order < self._gone_order):
-            return BAD_WAITING_FOR_INITIAL_DATA  # it is of the time before the device was gone
+            return BAD_WAITING_FOR_INITIAL_DATA  # the message is from before the device went offline
         return GOOD

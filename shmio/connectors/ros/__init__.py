@@ -1,8 +1,8 @@
 """The connectors ``rosbridge`` and ``ros2``: read the topics of robots, and publish commands.
 
-``messages.py`` has the message types, ``addresses.py`` finds the fields that addresses name,
-``values.py`` fits them to registers, ``topics.py`` turns messages into images, and ``commands.py``
-turns writes into messages. Both connectors share these. ``rosbridge.py`` and ``websocket.py`` speak
-the rosbridge protocol; ``dds.py``, ``participant.py`` and ``dds_types.py`` speak DDS as ROS 2
-does.
+Both connectors share these modules: ``messages.py`` has the message types, ``addresses.py`` finds the
+fields that addresses name, ``values.py`` converts their values to those of registers, ``topics.py``
+turns messages into images, and ``commands.py`` turns writes into messages. ``rosbridge.py`` and
+``websocket.py`` speak the rosbridge protocol; ``dds.py``, ``participant.py`` and ``dds_types.py``
+speak DDS as ROS 2 does.
 """

@@ -2,9 +2,9 @@
 
 An example is ``/joint_states sensor_msgs/JointState position[name=j1]``. FIELD consists of names
 joined by dots. After the name of a sequence, ``[2]`` selects its third element. ``[name=j1]``
-selects the element with the index that ``j1`` has in the sequence ``name``. That sequence is in the
-same message as the first one, or in a message that contains this message. A sequence without
-brackets at the end of FIELD is a whole array.
+selects the element with the index that ``j1`` has in the sequence ``name``. The sequence ``name`` is
+in the same message as the selected sequence, or in a message that contains this message. A sequence
+without brackets at the end of FIELD is a whole array.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _STEP: Final = re.compile(
 
 
 class FieldError(Exception):
-    """A message does not contain a field, or not at present.
+    """A message does not contain a field, or its value does not fit the register.
 
     ``code`` is the status of the register.
     """
@@ -40,7 +40,7 @@ class Step(NamedTuple):
     """The name of a field and, if the field is a sequence, the element that is selected.
 
     ``place`` is the element's index. ``key`` is a pair: the name of a sequence of names, and the
-    name whose index in it is meant. A step has at most one of the two.
+    name whose index in that sequence selects the element. At least one of the two is None.
     """
 
     name: str

@@ -1,9 +1,8 @@
 """Turns writes of registers into ROS messages.
 
-A message contains all its fields, not only written ones.
-
-The fields that a command does not write are copied from the last message of the topic. If there was
-none, the command must write all registers of the topic, so that no value is invented.
+A ROS message always has all its fields. shmio copies the fields that a command does not write from the
+last message of the topic. If there was none, the command must write all registers of the topic, so that
+shmio need not invent a value.
 """
 
 from __future__ import annotations
@@ -64,7 +63,7 @@ def plan(topics: Topics, writes: Sequence[Write]) -> tuple[list[Publication], li
             draft.values[index] = value
             draft.writes.add(number)
     failed = True
-    while failed:  # a message may build on one that is not sent after all
+    while failed:  # a message may copy fields from one that is refused now
         failed = False
         bases = {draft.topic.name: draft.topic.message for draft in drafts}
         for draft in drafts:
@@ -82,7 +81,7 @@ class Sending:
     """The messages of a cycle's writes, which are published one after the other."""
 
     def __init__(self, publications: Sequence[Publication], outcomes: list[str | Lost], until_s: float) -> None:
-        """Begin with the first message.
+        """Start with the first message.
 
         Args:
             publications: The messages.
@@ -99,13 +98,13 @@ class Sending:
         return self._publications[self._place] if self._place < len(self._publications) else None
 
     def end(self, refusal: str) -> None:
-        """Note that the message is confirmed, or why it is refused."""
+        """Store the outcome of :attr:`publication` ("" if confirmed, else why refused); go to the next message."""
         for number in self._publications[self._place].writes:
             self.outcomes[number] = self.outcomes[number] or refusal
         self._place += 1
 
     def lost(self, reason: str) -> WriteLostError:
-        """Return the error with what is known of each write, if no confirmation can come any more."""
+        """Return the error for a lost connection, with what is known of the outcome of each write."""
         done = {number for one in self._publications[: self._place] for number in one.writes}
         for one in self._publications[self._place :]:
             for number in one.writes:
@@ -137,7 +136,7 @@ def _touched(topics: Topics, write: Write, open_drafts: Mapping[str, Publication
 
 
 def _present(topics: Topics, index: int, open_drafts: Mapping[str, Publication]) -> Value:
-    """Return the present value of an array register, to which a write of some elements is added.
+    """Return the present value of an array register, in which a write replaces some elements.
 
     Raises:
         ValueRangeError: The last message does not contain the array.
@@ -156,7 +155,7 @@ def _present(topics: Topics, index: int, open_drafts: Mapping[str, Publication])
 def _message(topics: Topics, draft: Publication, base: Any) -> Any:
     """Return the message of a publication.
 
-    ``base`` is the message from which other fields are copied.
+    ``base`` is the message from which the other fields are copied; None if there is none.
 
     Raises:
         ValueError: The message would be incomplete, or a value does not fit its field.

@@ -46,7 +46,7 @@ class Ros2Options(TopicOptions, frozen=True, kw_only=True):
     ] = msgspec.field(default_factory=list)
     """Hosts to contact directly, without multicast."""
     reliability: Literal["best_effort", "reliable"] = "best_effort"
-    """The reliability that readers request of publishers."""
+    """The reliability that readers request from publishers."""
     max_message_bytes: Annotated[int, msgspec.Meta(ge=1000, le=1 << 26)] = 1 << 20
     """The largest message that is received, in bytes; larger ones are dropped."""
 
@@ -201,7 +201,7 @@ class Ros2Connector(Connector):
         return [str(outcome) for outcome in sending.outcomes]
 
     def _publish(self, joined: Participant, publication: Publication, until_s: float) -> str | None:
-        """Publish a message, unless it is published, and wait until all subscribers have received it.
+        """Publish a message, if this was not done yet, and wait until all subscribers have received it.
 
         Returns:
             "" if they have, or why the message is refused; None if they have not by ``until_s``.

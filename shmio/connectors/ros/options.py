@@ -19,7 +19,4 @@ class TopicOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_o
     latched: Annotated[list[_Topic], msgspec.Meta(max_length=10_000)] = msgspec.field(default_factory=list)
     """Topics whose last message stays valid for ever."""
     time: Literal["stamp", "receipt"] = "stamp"
-    """The source time: ``stamp`` is that in the message's header, if it has one.
-
-    ``receipt`` is when it came.
-    """
+    """Which source time values get: the time stamp in a message's header, if it has one, or the time of receipt."""

@@ -30,7 +30,7 @@ MAX_PARTICIPANTS: Final = 60
 """Largest number of participants on a host that are found without multicast."""
 WRITER_DEPTH: Final = 10
 _HEARTBEAT: Final = '<HeartbeatInterval min="2 ms" minsched="2 ms" max="1 s">5 ms</HeartbeatInterval>'
-"""Makes the writer ask for acknowledgements at short intervals, because the poll loop waits."""
+"""Makes writers ask for acknowledgements at short intervals, because the poll loop waits for them."""
 
 log = logging.getLogger("shmio.source")
 
@@ -61,7 +61,7 @@ def _sockets() -> Iterator[int]:
 def _keep_to_loopback(before: set[int]) -> None:
     """Let the sockets that are not in ``before`` receive from this host only.
 
-    Cyclone DDS sends by the configured interface, but receives from all interfaces.
+    Cyclone DDS sends only through the configured interface, but receives from all interfaces.
 
     Raises:
         ConnectorError: The kernel does not allow this.

@@ -180,7 +180,7 @@ class RosbridgeConnector(Connector):
         return [str(outcome) for outcome in sending.outcomes]
 
     def _publish(self, link: Link, publication: Publication, until_s: float) -> str | None:
-        """Publish a message, unless it is published; return its outcome, or None if it has none by ``until_s``."""
+        """Publish a message, if this was not done yet; return its outcome, or None if it has none by ``until_s``."""
         message, topic = publication.message, publication.topic
         if not publication.begun:
             if not finite(message):

@@ -29,7 +29,7 @@ log = logging.getLogger("shmio.source")
 
 
 class Topic:
-    """A topic, the registers that have its fields, and its last message."""
+    """A topic, the indices of the registers that have values of its fields, and its last message."""
 
     def __init__(self, name: str, kind: str) -> None:
         self.name, self.type = name, kind
@@ -42,10 +42,7 @@ class Topic:
         """When the last message was received, ns of CLOCK_MONOTONIC; 0: never."""
         self.utc_ns = 0
         self.fault = GOOD
-        """Why none of the topic's registers has a good value: a status.
-
-        GOOD if there is no reason.
-        """
+        """The status that makes all of the topic's registers bad; GOOD if there is none."""
         self.changed = False
         self.shown = GOOD
         """The fault that the image shows at present."""
@@ -176,10 +173,7 @@ class Topics:
         return (stamp_ns(topic.message) if self._stamps else 0) or topic.utc_ns
 
     def report(self, index: int, what: str) -> None:
-        """Log a fault of a register once in each connection.
-
-        After ``MAX_REPORTED``, log no more names.
-        """
+        """Log a fault of a register, once per connection. After ``MAX_REPORTED`` faults, log no more of them."""
         if len(self._reported) > MAX_REPORTED or (index, what) in self._reported:
             return
         self._reported.add((index, what))
@@ -189,7 +183,7 @@ class Topics:
             log.warning("more registers are bad: use shmio get to see all of them")
 
     def waiting(self) -> Iterable[str]:
-        """Yield the names of topics that have not had a message."""
+        """Yield the names of the topics on which no message has arrived."""
         return (topic.name for topic in self.by_name.values() if not topic.received_ns)
 
 

@@ -23,9 +23,7 @@ class ValueConverter:
     """Converts between the values of a field and those of its register."""
 
     def __init__(self, register: Register, kind: str | None) -> None:
-        """Create the converter for a register and the type of its field.
-
-        None if the type is unknown.
+        """Create the converter for a register and ``kind``, the type of its field; None if this is unknown.
 
         Raises:
             ValueError: No value of the field can fit the register.

@@ -95,7 +95,7 @@ class Link:
         except OSError as error:
             raise ConnectorError(f"cannot connect to {peer}: {error.strerror or error}") from None
         try:
-            channel.settimeout(None)  # the thread waits for ever, and a send as long as the option below says
+            channel.settimeout(None)  # the thread waits for ever; the option below limits the time of a send
             whole, part = divmod(timeout_s, 1)
             channel.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _SEND_TIMEOUT.pack(int(whole), int(part * 1e6)))
             self._socket: Connection = self._stack.enter_context(connect(
@@ -167,7 +167,7 @@ class Link:
     # -- confirmation --------------------------------------------------------------------------------------------------
 
     def publish(self, topic: str, message: Any, number: str) -> None:
-        """Publish a message. The server sends it back to this subscriber.
+        """Publish a message. The server sends it back, since this client also subscribes to the topic.
 
         Args:
             topic: The topic.
@@ -202,7 +202,7 @@ class Link:
             return self._outcome
 
     def _receive(self) -> None:
-        """Receive until the connection ends; runs in the thread."""
+        """Receive messages until the connection ends. This runs in the connection's own thread."""
         failure = f"{self._peer} closed the connection"
         try:
             for text in self._texts():
