@@ -28,20 +28,20 @@ def of_file(file: Path) -> str:
 
 
 def of_campaign(file: Path, expectations: Iterable[Expectation]) -> Iterator[tuple[str, str]]:
-    """Yield a name and the digest of a campaign file, and of the recordings that it names."""
+    """Yield a label and the digest of a campaign file, and of each recording that it names."""
     yield "campaign", f"{file}, sha256 {of_file(file)}"
     for name in dict.fromkeys(one.like for one in expectations if one.like is not None):
         yield "like", f"{name}, sha256 {of_file(file.parent / name)}"
 
 
 def of_layouts(layouts: Mapping[str, Layout]) -> Iterator[tuple[str, str]]:
-    """Yield a name and the digest of each layout."""
+    """Yield a label and the digest of each layout."""
     for source, layout in layouts.items():
         yield f"layout of {source}", layout.hash.hex()
 
 
 def of_configuration(file: Path) -> Iterator[tuple[str, str]]:
-    """Yield a name and the digest of a ``supervisor.toml`` and of the files of its models."""
+    """Yield a label and the digest of a ``supervisor.toml``, and of the file of each of its models."""
     yield "configuration", f"{file}, sha256 {of_file(file)}"
     try:
         sources = load(file).source
@@ -55,12 +55,12 @@ def of_configuration(file: Path) -> Iterator[tuple[str, str]]:
 
 
 def _file_of(model: str, folder: Path) -> Path | None:
-    """Return the file of a model: that of an FMU, or that of its Python module."""
+    """Return the file of a model, an FMU or a Python module; None if no module is found."""
     return folder / model if is_fmu(model) else _module(model.partition(":")[0], folder)
 
 
 def _module(name: str, folder: Path) -> Path | None:
-    """Return the file of a Python module, without importing it."""
+    """Return the file of a Python module, without importing the module; None if there is none."""
     parts = name.split(".")
     if not all(part.isidentifier() for part in parts):
         return None

@@ -31,7 +31,7 @@ from shmio.segment.block import Layouts
 MAX_STEPS: Final = 256
 """Maximum number of steps of virtual time between two turns of the judge."""
 STOP_STEPS: Final = 64
-"""The same, if the run stops at the first failure: after it there may be so many steps."""
+"""The same, if the run stops at the first failure: at most so many steps may follow the failure."""
 GOOD_S: Final = 10.0
 """Time in s to wait at the start until the sources that the expectations read are good."""
 LOOK_S: Final = 0.02
@@ -45,14 +45,14 @@ class Plan:
     """What a run does.
 
     Attributes:
-        injections: The declared injections, with their seeds; their times count from the start.
+        injections: The declared injections, with their seeds; their times count from the run's start.
         expectations: The expectations.
         duration_s: Duration on the instance's clock.
         folder: Folder of the campaign; the files that it names are relative to it.
         step_s: Length of a step; None: the shortest period of the sources.
         real_time: Whether to run in real time, even if all sources could be stepped.
         stop: Whether to stop at the first failure.
-        record: A file for the recording; None: none.
+        record: The file to create for a recording; None: do not record.
     """
 
     injections: Sequence[Declaration]
@@ -82,7 +82,7 @@ class LiveRun:
             segment: The instance's segment, writable.
             plan: What to do.
             attachments: Returns the files to attach to the recording.
-            seen: Called with the values of the signals, by source, in order.
+            seen: Called with the new values of the signals, by source, in order of time.
             attach: Attaches to the instance by its segment.
 
         Raises:
@@ -114,8 +114,8 @@ class LiveRun:
             begun: Called when the run has begun.
 
         Raises:
-            ConfigError: An injection is invalid, or a length of steps was given, but a source
-                cannot be stepped.
+            ConfigError: An injection is invalid, or the instance does not allow the plan's
+                ``step_s`` or ``real_time``.
             CommandError: A source refuses an injection.
             RecordingError: The file of the recording cannot be created.
         """
@@ -153,7 +153,7 @@ class LiveRun:
             self._seen(self.judge.finish())
 
     def _await_good(self, over: threading.Event) -> None:
-        """Wait until the judged sources are good. If they are not in time, the verdicts will say so."""
+        """Wait up to ``GOOD_S`` until the judged sources are good. If they are not, the verdicts will show it."""
         until_s = time.monotonic() + GOOD_S
         while True:
             frames = [(block, block.latest()) for block in self._blocks.values()]
@@ -184,7 +184,7 @@ class LiveRun:
             raise RecordingError(f"{file}: {output.problem or 'it is not complete yet'}")
 
     def _steps(self, cell: Attachment, over: threading.Event) -> Iterator[None]:
-        """Step time, several steps at once."""
+        """Step virtual time to the end of the run, and yield after each batch of steps."""
         left = ceil(self._plan.duration_s / self.step_s - 1e-9)
         room = min(block.ring.slot_count for block in self._segment.blocks.values()) // 2
         most = STOP_STEPS if self._plan.stop else MAX_STEPS
@@ -195,7 +195,7 @@ class LiveRun:
             yield
 
     def _waits(self, tap: InstanceFollower, over: threading.Event) -> Iterator[None]:
-        """Wait, again and again."""
+        """Wait in real time until the end of the run, and yield after each pause."""
         until_s = time.monotonic() + self._plan.duration_s
         while (rest_s := until_s - time.monotonic()) > 0 and not over.wait(min(tap.pause_s, rest_s)):
             if not self._segment.shared.current():
@@ -203,7 +203,7 @@ class LiveRun:
             yield
 
     def _turns(self, tap: InstanceFollower, recorder: Recorder | None) -> Iterator[None]:
-        """Each time, record and judge what is new."""
+        """In each iteration, record and judge what is new."""
         while True:
             more = True
             while more:
@@ -238,7 +238,7 @@ def frames_of(frames: Sequence[Frame], size: int, *, raws: bool) -> Frames:
     Args:
         frames: Frames of one block.
         size: Size of an image in bytes.
-        raws: Whether the judge needs what the source delivered.
+        raws: Whether the judge also needs the images that the source delivered, without injections.
     """
 
     def images(some: Iterator[bytes]) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:

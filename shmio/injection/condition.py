@@ -107,7 +107,7 @@ def parse(text: str) -> Expression:
 
 
 def _step(node: Tree, place: int, references: dict[str, int]) -> _Step:
-    """Return the step for a node, whose operands are on the stack; ``place`` is that of the step."""
+    """Return the step for a node, whose operands are on the stack; ``place`` is the index of the step."""
     match node:
         case Constant(value):
             return _push(value)

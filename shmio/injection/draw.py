@@ -19,9 +19,9 @@ Words = npt.NDArray[np.uint64]
 Floats = npt.NDArray[np.float64]
 
 FEW: Final = 16
-"""Plain Python computes up to this count of numbers faster than numpy.
+"""Up to this count, plain Python computes numbers faster than numpy.
 
-Both compute the same numbers, except for the last bit of a Gaussian number.
+Both give the same numbers, except for the last bit of a Gaussian number.
 """
 
 _MASK: Final = (1 << 64) - 1
@@ -65,7 +65,7 @@ class SeededRandom:
     def gaussian(self, run: int, place: int, count: int) -> Floats:
         """Return ``count`` normally distributed numbers of mean 0 and standard deviation 1.
 
-        It uses the method of Box and Muller, 1958.
+        The method is that of Box and Muller, 1958.
         """
         if count <= FEW:
             radii = (1 - (word >> 11) * 2.0**-53 for word in self._few(run, place, Purpose.VALUE, count))

@@ -79,7 +79,7 @@ class Reference:
 
     path: str
     at: int = field(default=1, compare=False)
-    """Position of its first character in the text, from 1."""
+    """Position of the path's first character in the text, counted from 1."""
 
 
 @dataclass(frozen=True, slots=True)

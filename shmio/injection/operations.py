@@ -85,10 +85,7 @@ class ValueGroup:
         return np.ascontiguousarray(image[self.index]).view(self.dtype)[:, 0].astype(exact)
 
     def put_numbers(self, image: Bytes, values: Values) -> None:
-        """Write numbers into an image.
-
-        Clamp them to the type's range, and round them for integers.
-        """
+        """Write numbers into an image, clamped to the type's range and, for integers, rounded."""
         least, most = self.limits
         if self.dtype.kind != "f":
             values = np.rint(values)
@@ -102,7 +99,7 @@ class ValueGroup:
 
     @cached_property
     def single(self) -> struct.Struct | None:
-        """The packing of the value if there is only one number and a double can represent it, else None.
+        """How the group's value is packed, if it is a single number that a double can represent; else None.
 
         Plain Python is faster than numpy for one number, and gives the same bytes.
         """
@@ -257,7 +254,7 @@ class Arithmetic(Operation):
         Args:
             places: The values.
             change: Computes new numbers of a group.
-            single: Computes the same for one number; None: only ``change`` does.
+            single: Computes the same for a single number, but faster; None: use ``change`` for it, too.
 
         """
         self._places = places
@@ -379,7 +376,7 @@ class Drop(Operation):
     def begin(self) -> None:
         """Forget all values.
 
-        Readers see the next values in any case, because there are no earlier values.
+        Even if the next cycle is dropped, readers see its values, because there are no earlier ones.
         """
         self._held = self._passing = None
 
@@ -439,7 +436,7 @@ class Delay(Operation):
         image[:] = self._line[0][2]
 
     def due(self, cycle: int, time_ns: int, at: OperationContext) -> bool:
-        """Return whether readers may see an image of this cycle and time at ``at``."""
+        """Return whether an image of this cycle and time is old enough to be seen at ``at``."""
         return at.cycle - cycle >= self.cycles if self.cycles else at.time_ns - time_ns >= self.delay_ns
 
 

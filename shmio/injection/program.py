@@ -143,11 +143,11 @@ def _read(path: str, layouts: Mapping[str, Layout]) -> tuple[str, RegisterCodec]
 
 
 def number_register(path: str, layouts: Mapping[str, Layout]) -> tuple[str, Register]:
-    """Return the source and the register that a condition names, which has a number or a BOOL.
+    """Return the source and the register that a condition names; its value must be a number or a BOOL.
 
     Raises:
         PathError: There is no such register, or the path names an input.
-        ConfigError: The register has several values, or others.
+        ConfigError: The register is an array, or its value is neither a number nor a BOOL.
 
     """
     source, register = single(path, layouts)

@@ -27,7 +27,8 @@ class Formula:
         expectation: The expectation.
         tree: Its formula, whose truth at the start of the judged time is the verdict. None: its
             signals must be like those of a recording.
-        trigger: What must become true once, so that the expectation says anything; None: nothing.
+        trigger: A condition that must become true at least once; otherwise the verdict is
+            inconclusive. None: there is no such condition.
         signals: What the formula reads.
         failure: What a failure means, as text.
     """
@@ -40,7 +41,7 @@ class Formula:
 
     @property
     def horizon_ns(self) -> int:
-        """How far the formula looks ahead or back within what it demands at each moment, in ns."""
+        """How far, in ns, the formula looks ahead or back from each moment that it judges."""
         return 0 if self.tree is None else _reach_ns(self.tree)
 
 
@@ -74,7 +75,7 @@ def read_expectations(
 
 
 def check_texts(expectations: Sequence[Expectation]) -> None:
-    """Parse all texts of expectations, without their registers.
+    """Parse all texts of expectations, without looking up their registers.
 
     Raises:
         ConfigError: A text is invalid; the message starts as ``expect[0].formula: …``.
@@ -90,7 +91,7 @@ def check_texts(expectations: Sequence[Expectation]) -> None:
 
 
 def _parsed(expectation: Expectation, key: str, *, momentary: bool = False) -> Tree:
-    """Parse the text of a key. ``momentary``: it must have no temporal operator."""
+    """Parse the text of a key. With ``momentary``, refuse temporal operators."""
     try:
         tree = parse_formula(getattr(expectation, key))
         check(tree)

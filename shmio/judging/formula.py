@@ -40,9 +40,9 @@ from shmio.layout.glob import choose
 from shmio.layout.model import Layout, Register
 
 MAX_HORIZON_S: Final = 1_000_000
-"""The longest time for which a formula may look ahead or back, with all its parts."""
+"""The longest time in s by which a formula, with all its parts, may look ahead or back."""
 MAX_CHANGES: Final = 64
-"""By how much nested temporal operators may multiply the number of changes of a signal."""
+"""Maximum factor by which nested temporal operators may multiply the number of changes of a signal."""
 ASPECTS: Final = ("quality", "age", "raw")
 _LOGIC: Final = frozenset({"and", "or", "not", "implies"})
 _EDGES: Final = frozenset({"rise", "fall", "rising", "falling", "changed"})
@@ -80,7 +80,7 @@ class Registers:
         """Return the signals of all numbers and BOOLs that a path, a structure or a pattern names.
 
         Raises:
-            ConfigError: It names none.
+            ConfigError: The text names no such register.
 
         """
         try:
@@ -98,7 +98,7 @@ class Registers:
 
 
 def check(tree: Tree) -> None:
-    """Check what the grammar does not.
+    """Check the rules for formulas that the grammar cannot express.
 
     Raises:
         ConfigError: A part of the formula has no meaning, or needs bounds.
@@ -126,7 +126,7 @@ def check(tree: Tree) -> None:
 
 
 def _check_bounds(tree: Tree, *, outer: bool) -> None:
-    """Refuse an operator without bounds within a temporal one, which would wait until the end each time."""
+    """Refuse a temporal operator without bounds inside another one: its values would be known only at the end."""
     if not isinstance(tree, Operation):
         return
     if not outer and tree.name in ("always", "eventually", "until") and tree.bounds_ns is None:
@@ -138,7 +138,7 @@ def _check_bounds(tree: Tree, *, outer: bool) -> None:
 
 
 def _changes(tree: Tree) -> int:
-    """Return how often one change of a register can change the truth of a tree, at most."""
+    """Return the maximum number of changes of a tree's truth that one change of a register can cause."""
     if not isinstance(tree, Operation):
         return 1
     own = 1
@@ -148,7 +148,7 @@ def _changes(tree: Tree) -> int:
 
 
 def temporal(tree: Tree, operators: Collection[str] = TEMPORAL) -> bool:
-    """Return whether a tree has a temporal operator, or one of these."""
+    """Return whether a tree has one of ``operators``; by default, any temporal operator."""
     return any(isinstance(node, Operation) and node.name in operators for node in nodes(tree))
 
 
@@ -180,7 +180,7 @@ class Network:
         self._nodes: dict[tuple[object, ...], Node] = {}
 
     def turn(self) -> None:
-        """Let each node take what has become known of its operands."""
+        """Let each node read what has become known of its operands."""
         for node in self._nodes.values():
             node.turn()
 
@@ -206,7 +206,7 @@ class Network:
         return TopLevelExtremum(_extremum(tree.name), self.truth(tree.operands[0]), tree.bounds_ns)
 
     def like(self, signal: Signal, golden: Piece, tolerance: float, tolerance_ns: int) -> tuple[TopLevel, Tube]:
-        """Return the part that compares a signal with another one, up to the end of that one.
+        """Return the part that compares a signal with a golden signal, up to the end of the golden signal.
 
         The times of ``golden`` count from the start; its last value is unknown.
         """
@@ -215,7 +215,7 @@ class Network:
         return TopLevelExtremum(np.minimum, node, (0, max(int(golden.time[-1]) - 1, 0))), node
 
     def truth(self, tree: Tree) -> Node:
-        """Return the node of a truth; a number is true if it is not 0."""
+        """Return the node for the truth of a tree; a number is true if it is not 0."""
         if isinstance(tree, Operation) and tree.name in _TRUTH:
             return self._operation(tree)
         number = self.number(tree)
@@ -224,7 +224,7 @@ class Network:
         return self._shared(("truth", number), lambda: Truth(function, (number,)))
 
     def number(self, tree: Tree) -> Node | float:
-        """Return the node of a number, or a constant; truth is 1 or 0."""
+        """Return the node for the number of a tree, or its constant value; a truth counts as 1 or 0."""
         match tree:
             case Constant(value):
                 return float(value)
@@ -258,7 +258,7 @@ class Network:
                 return False
 
     def _operation(self, tree: Operation) -> Node:
-        """Return the node of an operation that gives a truth."""
+        """Return the node of an operation whose result is a truth."""
         name = tree.name
         if name in COMPARISONS:
             operands = [self.number(operand) for operand in tree.operands]
@@ -292,7 +292,7 @@ class Network:
         return self._shared((function, operand, begin_ns, end_ns), lambda: Window(function, operand, begin_ns, end_ns))
 
     def _truths(self, tree: Operation) -> list[Node]:
-        """Return the nodes of truths. A constant gets the times of another one."""
+        """Return the nodes for the truths of the operands. A constant gets the times of another operand."""
         truths = {at: self.truth(operand) for at, operand in enumerate(tree.operands) if not constant(operand)}
         other = next(iter(truths.values()))
         for at, operand in enumerate(tree.operands):

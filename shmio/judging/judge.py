@@ -1,4 +1,4 @@
-"""Judges: gives verdicts on expectations from the frames of the sources that they read."""
+"""Gives verdicts on expectations from the frames of the sources that they read."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from shmio.judging.verdict import All, Outcome, TopLevel, TopLevelExtremum, Verd
 from shmio.layout.model import Layout, Register
 
 AROUND: Final = 3
-"""Number of values before and after a moment that a verdict has."""
+"""Number of values that a verdict has before the moment of a failure, and after it."""
 
 
 Golden = Callable[[str, Sequence[Signal]], Sequence[Piece]]
 """Reads signals of a recording.
 
-Its arguments are the file, as the campaign names it, and the signals. It returns them from 0 on,
-with a last value that is unknown (NaN), at the end of the recording. It raises ConfigError if the
-recording cannot be read, or does not have a signal.
+The arguments are the file, as the campaign names it, and the signals. The function returns the
+signals from time 0 on; the last value of each is unknown (NaN), at the end of the recording. It
+raises ConfigError if the recording cannot be read, or lacks a signal.
 """
 
 
@@ -90,7 +90,7 @@ class Judge:
 
     @property
     def begin_ns(self) -> int | None:
-        """Begin of the judged time on the instance's clock; None while a source has no frame."""
+        """Start of the judged time on the instance's clock; None while a source has no frame."""
         return self._origin_ns
 
     def needs_raw(self, source: str) -> bool:
@@ -111,13 +111,13 @@ class Judge:
         return case.tubes[case.formula.signals.index(signal)].limits if case.tubes else None
 
     def troubles(self, source: str) -> Sequence[Trouble]:
-        """Return the times in which values of a source were unknown, and why."""
+        """Return the spans of time in which values of a source were unknown, and why."""
         return self._sources[source].troubles
 
     def follow(self, name: str, layout: Layout, stale_ns: int) -> None:
         """Set the block from which the next frames of a source come, such as after a reload.
 
-        Values of registers that it does not have are unknown.
+        Values of registers that the block does not have are unknown.
         """
         source = self._sources[name]
         found = {}
@@ -127,15 +127,15 @@ class Judge:
         source.follow(layout, found, stale_ns)
 
     def add(self, source: str, frames: Frames) -> None:
-        """Add the frames of a source that follow."""
+        """Add the next frames of a source."""
         self._sources[source].add(frames)
 
     def turn(self) -> dict[str, Rows]:
-        """Judge what the added frames make known, and return the values of the signals by source."""
+        """Judge the added frames as far as possible, and return the new values of the signals by source."""
         return self._turn(None)
 
     def finish(self) -> dict[str, Rows]:
-        """Judge what is left: no more frames follow. Return as :meth:`turn`."""
+        """Judge the rest, because no more frames follow. Return the same as :meth:`turn`."""
         self.end_ns = max((source.newest_ns for source in self._sources.values()), default=0) + 1
         for case in self._cases:
             case.finish(self.end_ns)
@@ -164,7 +164,7 @@ class Judge:
         return rows
 
     def _around(self, case: _Case, *, final: bool) -> dict[str, list[tuple[int, float | None]]] | None:
-        """Return the values around the moment of a failure; None if some will follow."""
+        """Return the values around the moment of a failure; None if some of them have not come yet."""
         moment_ns = case.top_level.decided_ns()
         found: dict[str, list[tuple[int, float | None]]] = {}
         for signal in case.formula.signals if moment_ns is not None else ():
@@ -182,7 +182,7 @@ class Judge:
 
     @property
     def verdicts(self) -> list[Verdict]:
-        """The verdicts: before :meth:`finish`, with what is known up to now."""
+        """The verdicts; before :meth:`finish`, from what is known up to now."""
         return [self._verdict(case) for case in self._cases]
 
     def _verdict(self, case: _Case) -> Verdict:
@@ -201,7 +201,7 @@ class Judge:
         )
 
     def _unknown(self, case: _Case) -> str:
-        """Return why the truth of a formula is not known."""
+        """Return why the truth of a formula is unknown."""
         names = dict.fromkeys(signal.source for signal in case.formula.signals)
         for name in names:
             if self._sources[name].origin_ns is None:
@@ -272,7 +272,7 @@ class _Case:
 
     @property
     def idle(self) -> bool:
-        """True if its condition has never become true."""
+        """True if the expectation has a condition that has never become true."""
         return self._trigger is not None and self._trigger.high < 0
 
     @property
@@ -282,7 +282,7 @@ class _Case:
         return expectation.when or expectation.stays or "the condition before 'implies'"
 
     def turn(self) -> None:
-        """Take what has become known."""
+        """Read what has become known of the formula and of the condition."""
         self.top_level.turn()
         if self._trigger is not None:
             self._trigger.turn()
@@ -309,7 +309,10 @@ class _History:
             self._rows.popleft()
 
     def around(self, moment_ns: int, index: int, *, final: bool) -> list[tuple[int, float | None]] | None:
-        """Return times and values of a signal around a moment; None if some will follow, unless it is final."""
+        """Return times and values of a signal around a moment.
+
+        None if some have not come yet; with ``final``, none will come, so return those that there are.
+        """
         time = np.concatenate([rows.time for rows in self._rows]) if self._rows else np.empty(0, np.int64)
         at = int(time.searchsorted(moment_ns, "right"))
         if at + AROUND > len(time) and not final:

@@ -1,6 +1,7 @@
 """The operators of formulas, as nodes of a network through which the pieces of signals pass.
 
-Each node takes what has become known of its operands, and gives what is therefore known of itself.
+In each turn, a node reads what has become known of its operands, and computes what that makes known
+of its own signal.
 The result does not depend on how a signal is divided into pieces. So the same nodes serve a
 live cell, which brings a few frames at a time, and a recording, which brings thousands.
 """
@@ -19,12 +20,12 @@ Numeric = Callable[..., Values]
 
 
 class Node:
-    """A signal. ``out`` is what has become known of it in the present turn."""
+    """A signal. ``out`` is the part of the signal that has become known in the present turn."""
 
     out: Piece = NOTHING
 
     def turn(self) -> None:
-        """Take what has become known of the operands, and set ``out``."""
+        """Read what has become known of the operands, and set ``out``."""
         raise NotImplementedError
 
 
@@ -66,7 +67,7 @@ class Arithmetic(_Pointwise):
         self._constants = [None if isinstance(operand, Node) else operand for operand in operands]
 
     def combine(self, pieces: list[Piece]) -> Piece:
-        """Return the result; see the class."""
+        """Return the number at each time."""
         values = iter(pieces)
         arguments = [next(values).low if constant is None else constant for constant in self._constants]
         with np.errstate(all="ignore"):
@@ -78,7 +79,7 @@ class Truth(Arithmetic):
     """Turns numbers into truth: the function gives the distance, with the sign of the truth."""
 
     def combine(self, pieces: list[Piece]) -> Piece:
-        """Return the result; see the class."""
+        """Return the truth at each time."""
         time, distance, _, end = super().combine(pieces)
         unknown = np.isnan(distance)
         if not unknown.any():
@@ -103,7 +104,7 @@ class Digit(_Pointwise):
     """Turns truth into a number: 1 is true, 0 is false, NaN is unknown."""
 
     def combine(self, pieces: list[Piece]) -> Piece:
-        """Return the result; see the class."""
+        """Return 1, 0 or NaN at each time."""
         time, low, high, end = pieces[0]
         found = np.where(low > 0, 1.0, np.where(high < 0, 0.0, np.nan))
         return Piece(time, found, found, end)
@@ -113,7 +114,7 @@ class Not(_Pointwise):
     """The opposite of a signal."""
 
     def combine(self, pieces: list[Piece]) -> Piece:
-        """Return the result; see the class."""
+        """Return the opposite at each time."""
         time, low, high, end = pieces[0]
         opposite = -low
         return Piece(time, opposite if high is low else -high, opposite, end)
@@ -127,7 +128,7 @@ class Extremum(_Pointwise):
         self._function = function
 
     def combine(self, pieces: list[Piece]) -> Piece:
-        """Return the result; see the class."""
+        """Return the extremum at each time."""
         found = pieces[0]
         for piece in pieces[1:]:
             low = self._function(found.low, piece.low)
@@ -177,7 +178,7 @@ class Moment(Node):
         self._operand = operand
 
     def turn(self) -> None:
-        """Put a false value behind each moment."""
+        """Put a false value directly after each moment."""
         time, low, high, end = self._edge.out
         if not len(time):
             self.out = NOTHING
@@ -245,9 +246,9 @@ class Window(Node):
     the past (both up to 0: once, historically). In a window that ends before the judged time
     begins, ``once`` is false, and ``historically`` is true.
 
-    It keeps only what can still decide a future result. For the greatest value that is, of the
-    values up to now, at each moment the greatest from then on, because each further window reaches
-    at least up to now.
+    The node keeps only what can still decide a future result. Each future window reaches at least up
+    to now. For the greatest value, it is therefore enough to keep, at each moment, the greatest of
+    the values from this moment up to now.
 
     Args:
         function: ``np.maximum`` or ``np.minimum``.
@@ -360,7 +361,7 @@ class History(Node):
 
 
 UNTIL_SHARE: Final = 8
-"""See :class:`Until`."""
+"""The :class:`Until` node waits until one in so many of its values is new."""
 
 
 class Until(Node):
@@ -413,11 +414,21 @@ class Until(Node):
 
 
 def _until(left: Values, right: Values, here: Times, before: Times, first: Times, last: Times) -> Values:
-    """Return ``until`` for places of the present, and of the first and the last value of the window.
+    """Return the value of ``until`` at several moments.
 
-    A value continues what follows it as x → max(p, min(q, x)); two such functions make one. So do
-    2**level of them, of which each window takes those that make up its length. ``before`` values
-    of ``left`` come before the window: there, p is minus infinity.
+    Each value of the signals turns the result x of the values after it into max(p, min(q, x)), where
+    p is ``right`` and q is ``left``. Two such functions in sequence are again one such function. So
+    :func:`_continue` combines them in blocks of 2**level, and each window uses the blocks that make
+    up its length.
+
+    Args:
+        left: The values of the left operand.
+        right: The values of the right operand.
+        here: The index of the value at each moment.
+        before: The number of values from there to the start of the window; for these, p is minus
+            infinity.
+        first: The index of the first value of each window.
+        last: The index of the last value of each window.
     """
     false = np.full(len(left), -np.inf)
     found = np.full(len(here), -np.inf), np.full(len(here), np.inf)
@@ -511,12 +522,12 @@ def tube(golden: Piece, tolerance: float, tolerance_ns: int) -> tuple[Piece, Pie
 
 
 def _strict(distance: Values) -> Values:
-    """Return distances of which 0 counts as false."""
+    """Return the distances, with each 0 replaced by the smallest value that counts as false."""
     return np.where(distance == 0, -TINY, distance)
 
 
 def _loose(distance: Values) -> Values:
-    """Return distances of which 0 counts as true."""
+    """Return the distances, with each 0 replaced by the smallest value that counts as true."""
     return np.where(distance == 0, TINY, distance)
 
 

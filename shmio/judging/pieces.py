@@ -18,9 +18,9 @@ Times = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
 FAR_NS: Final = 1 << 61
-"""A time after any judged time, in ns. Everything is unknown between the end of the run and it."""
+"""A time in ns after any judged time. From the end of the run to this time, everything is unknown."""
 TINY: Final = 5e-324
-"""The smallest positive number. Truth at the distance 0 has it as value, with the sign of the truth."""
+"""The smallest positive number. A truth at the distance 0 has this value, with the sign of the truth."""
 
 
 class Piece(NamedTuple):
@@ -57,7 +57,7 @@ def join(first: Piece, second: Piece) -> Piece:
 
 
 def cut(piece: Piece, at_ns: int) -> Piece:
-    """Return the part of a piece from a moment on, which is not before its start."""
+    """Return the part of a piece from a moment on. The moment must not be before the piece's start."""
     if at_ns >= piece.end:
         return NOTHING
     first = int(piece.time.searchsorted(at_ns, "right")) - 1
@@ -82,7 +82,7 @@ def head(piece: Piece, until_ns: int) -> Piece:
 class Alignment:
     """Brings the pieces of several signals to the same times.
 
-    It keeps what is not known of all of them yet.
+    The object stores the parts that are not known of all signals yet.
     """
 
     def __init__(self, count: int) -> None:
@@ -110,7 +110,7 @@ class Alignment:
 
 
 def _at(piece: Piece, time: Times) -> Piece:
-    """Return a piece with its values at more moments."""
+    """Return a piece with its values at the moments in ``time``, which include its own."""
     if len(piece.time) == len(time):
         return piece._replace(time=time)
     index = piece.time.searchsorted(time, "right") - 1

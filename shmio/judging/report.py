@@ -38,7 +38,7 @@ svg { display: block; margin: .4em 0 } svg text { font: 11px system-ui, sans-ser
 
 
 class Span(NamedTuple):
-    """A time in which an injection was active, on the instance's clock; ``end_ns`` None: to the end."""
+    """A span of the instance's time in which an injection was active; ``end_ns`` is None if that was to the end."""
 
     name: str
     source: str
@@ -59,13 +59,13 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Report:
-    """What a report says.
+    """The contents of a report.
 
     Attributes:
-        title: Its heading.
+        title: The heading.
         facts: Names and values, such as the seed and digests.
         command: The command that repeats the run.
-        begin_ns: Begin of the judged time; None if it never began.
+        begin_ns: Start of the judged time; None if it never began.
         end_ns: End of the judged time.
         verdicts: The verdicts.
         signals: The signals of each verdict's expectation.

@@ -16,7 +16,7 @@ from shmio.layout.values.frame_codec import FrameCodec
 from shmio.model.statuses import status_registers
 
 MAX_TROUBLES: Final = 1000
-"""Maximum number of times of unknown values whose reasons are stored for each source."""
+"""Maximum number of spans of unknown values that are stored for each source, with their reasons."""
 _BAD: Final = 2 << 30  # the least status code that is bad
 _UNCERTAIN: Final = 1 << 30
 
@@ -44,13 +44,13 @@ class Frames(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Signal:
-    """What an input of a formula is: a register, seen in one of several ways.
+    """An input of a formula: a register, seen in one of several ways.
 
     Attributes:
         source: Name of the source.
         path: Path of the register within the source.
         aspect: ``value``: as consumers see it; ``raw``: as the source delivered it; ``quality``: 0
-            bad, 1 uncertain, 2 good; ``age``: in s, before the next frame came.
+            bad, 1 uncertain, 2 good; ``age``: its age in s, directly before the next frame came.
     """
 
     source: str
@@ -65,7 +65,7 @@ class Signal:
 
 
 class Trouble(NamedTuple):
-    """A time in which values of a source are unknown, and why."""
+    """A span of time in which values of a source are unknown, and why."""
 
     begin_ns: int
     end_ns: int
@@ -76,7 +76,7 @@ class Rows(NamedTuple):
     """Values of all signals of a source.
 
     Attributes:
-        time: The moments from which they hold, in ns, int64, shape (n,).
+        time: The moments from which the values hold, in ns, int64, shape (n,).
         values: The values, NaN where unknown, float64, shape (signals, n).
         end: The moment up to which the last values hold.
     """
@@ -87,7 +87,7 @@ class Rows(NamedTuple):
 
 
 class _Decoder:
-    """Decodes the registers of a block that formulas read."""
+    """Decodes those registers of a block that formulas read."""
 
     def __init__(self, layout: Layout, registers: Mapping[str, Register], signals: Sequence[Signal]) -> None:
         self.layout = layout
@@ -133,7 +133,7 @@ class _Decoder:
 
 
 class _Waiting(NamedTuple):
-    """Frames whose values are decoded, in order, with strictly ascending times."""
+    """Decoded frames, in order; :func:`_ordered` makes their times strictly ascending."""
 
     time: Times
     values: Values
@@ -162,7 +162,7 @@ class Source:
         self.inputs = tuple(Input() for _ in signals)
         """The node of each signal."""
         self.troubles: list[Trouble] = []
-        """The first times in which values are unknown, and why."""
+        """The first spans of time in which values are unknown, and why."""
         self._noted: dict[str, int] = {}  # the index of the last trouble for each reason
         self.origin_ns: int | None = None
         """The clock of the first frame; None before it."""
@@ -191,16 +191,16 @@ class Source:
         """Set the block from which the next frames come.
 
         Args:
-            layout: Its layout.
-            registers: The registers of the signals, by path. One that is missing has no values.
-            stale_ns: Age from which a frame is stale.
+            layout: The layout of the block.
+            registers: The registers of the signals, by path. If one is missing, its values are unknown.
+            stale_ns: Age in ns from which a frame is stale.
         """
         self._decoder = _Decoder(layout, registers, self.signals)
         self._stale_ns = stale_ns
         self._number = None
 
     def add(self, frames: Frames) -> None:
-        """Add the frames that follow. Of frames with the same time, the last one counts."""
+        """Add the next frames. Of frames with the same time, the last one counts."""
         if not len(frames.number) or self._decoder is None:
             return
         time, number = frames.clock_ns, frames.number
@@ -219,8 +219,8 @@ class Source:
         """Set the output of each input, and ``rows``, to what the added frames make known.
 
         Args:
-            origin_ns: Begin of the judged time.
-            end_ns: None; or the end of the judged time, if no more frames follow.
+            origin_ns: Start of the judged time.
+            end_ns: The end of the judged time, if no more frames follow; else None.
         """
         rows = self._known(end_ns)
         if len(rows.time) and not self._begun:
@@ -231,7 +231,7 @@ class Source:
             node.out = Piece(rows.time, values, values, rows.end) if len(rows.time) else NOTHING
 
     def _known(self, end_ns: int | None) -> Rows:
-        """Return the values up to the last frame, or up to the end and then unknown."""
+        """Return the values up to the last frame; with ``end_ns``, up to the end, and unknown after it."""
         if self._waiting:
             self._waiting[0].missed[0] |= self._left_out
             whole = _joined(self._waiting if self._held is None else [self._held, *self._waiting])
@@ -273,7 +273,7 @@ class Source:
         after_ns: npt.NDArray[np.int64],
         chosen: npt.NDArray[np.bool_],
     ) -> tuple[Times, Values]:
-        """Return the values with a time in which they are unknown, ``after_ns`` after each chosen frame."""
+        """Return the values, which become unknown ``after_ns`` after each chosen frame, until the next frame."""
         begin = time[chosen] + after_ns[chosen]
         for why, some in ((f"frames of {self.name} were missed", missed), (f"{self.name} is stale", chosen & ~missed)):
             self._note((time + after_ns)[some], following[some], why)

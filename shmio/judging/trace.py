@@ -29,11 +29,11 @@ class Traces:
     """Collects the signals of a run. It joins neighbouring values when there are too many."""
 
     def __init__(self, signals: Mapping[str, Sequence[Signal]], chosen: Collection[Signal]) -> None:
-        """Begin to collect.
+        """Prepare to collect signals.
 
         Args:
             signals: The signals of each source, in the order of its rows.
-            chosen: Those to collect.
+            chosen: The signals to collect.
         """
         self._traces: dict[str, _Trace] = {}
         self._places: dict[str, list[int]] = {}
@@ -65,7 +65,7 @@ class _Trace:
         self._waiting = 0
 
     def add(self, rows: Rows) -> None:
-        """Add values. They wait until there are many."""
+        """Add values. When there are many, they become points."""
         self._rows.append(rows)
         self._waiting += len(rows.time)
         if self._waiting >= MAX_POINTS // 2 * self._each:
@@ -104,7 +104,7 @@ def _joined(points: _Points, count: int) -> _Points:
 
 
 def compressed(time_ns: Times, least: Values, greatest: Values) -> Plot:
-    """Return a plot of a whole signal."""
+    """Return a plot of a whole signal, with at most :data:`MAX_POINTS` points."""
     count = -(-len(time_ns) // MAX_POINTS)
     time, low, high = _joined((time_ns, least[None, :], greatest[None, :]), count)
     return Plot(time, low[0], high[0])

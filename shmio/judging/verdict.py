@@ -1,4 +1,4 @@
-"""Verdicts: what the truth of a formula at the start of the judged time says about an expectation."""
+"""Evaluates formulas at the start of the judged time, and describes the verdicts on expectations."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Outcome(StrEnum):
 class TopLevel:
     """An outermost part of a formula, which is evaluated only at the start of the judged time.
 
-    ``low`` and ``high`` bound its truth, with what is known up to now.
+    ``low`` and ``high`` are the bounds of its truth, from what is known up to now.
     """
 
     low: float = -np.inf
@@ -34,30 +34,30 @@ class TopLevel:
     """The moment of the value that is closest to deciding otherwise; None: unknown."""
 
     def turn(self) -> None:
-        """Take what has become known of the operands."""
+        """Read what has become known of the operands."""
         raise NotImplementedError
 
     def finish(self, end_ns: int) -> None:
-        """Set the end of the judged time. One turn follows, with all that is left."""
+        """Set the end of the judged time. One last turn follows, with the rest of the signals."""
 
     def decided_ns(self) -> int | None:
         """Return the moment at which the truth was decided, on the instance's clock; None if unknown."""
         raise NotImplementedError
 
     def unknown_ns(self) -> int | None:
-        """Return the first moment that keeps the truth from being known."""
+        """Return the first moment whose unknown value leaves the truth undecided; None if there is none."""
         raise NotImplementedError
 
 
 class TopLevelInitial(TopLevel):
-    """The truth of a signal at the start."""
+    """The truth of a signal at the start of the judged time."""
 
     def __init__(self, operand: Node) -> None:
         self._operand = operand
         self._at_ns: int | None = None
 
     def turn(self) -> None:
-        """Take the first value."""
+        """Read the first value."""
         piece = self._operand.out
         if self._at_ns is None and len(piece.time):
             self._at_ns = int(piece.time[0])
@@ -73,12 +73,12 @@ class TopLevelInitial(TopLevel):
 
 
 class TopLevelExtremum(TopLevel):
-    """The least or the greatest value of a signal over a time: always, or eventually.
+    """The least or the greatest value of a signal in a span of time: always, or eventually.
 
     Args:
         function: ``np.minimum`` for always, ``np.maximum`` for eventually.
         operand: The signal.
-        bounds_ns: The time, relative to the start; None: up to the end.
+        bounds_ns: The span, relative to the start; None: the whole judged time.
     """
 
     def __init__(self, function: np.ufunc, operand: Node, bounds_ns: tuple[int, int] | None) -> None:
@@ -93,7 +93,7 @@ class TopLevelExtremum(TopLevel):
         self._unknown_ns: int | None = None
 
     def turn(self) -> None:
-        """Add the values that belong to the time."""
+        """Add the values in the span."""
         piece = self._operand.out
         if self._over or not len(piece.time):
             return
@@ -133,11 +133,11 @@ class TopLevelExtremum(TopLevel):
                 self._unknown_ns = int(time[unknown.argmax()])
 
     def finish(self, end_ns: int) -> None:
-        """Set the end of the time, if it has no bounds."""
+        """Set the end of the judged time, which ends the span if it has no bounds."""
         self._end_ns = end_ns
 
     def decided_ns(self) -> int | None:
-        """Return the first moment that decides the truth, or the end of the time."""
+        """Return the first moment that decides the truth, or the end of the span."""
         if self._decided_ns is not None:
             return self._decided_ns
         if self._range is None:
@@ -151,7 +151,7 @@ class TopLevelExtremum(TopLevel):
 
 
 class UntilEnd(TopLevel):
-    """Whether ``left`` is true until ``right`` is, within the judged time."""
+    """Whether ``right`` becomes true within the judged time, and ``left`` is true until then."""
 
     def __init__(self, left: Node, right: Node) -> None:
         self._operands = (left, right)
@@ -207,7 +207,7 @@ class Opposite(TopLevel):
         self._operand = operand
 
     def turn(self) -> None:
-        """Take the opposite bounds."""
+        """Compute the bounds from those of the operand."""
         self._operand.turn()
         self.low, self.high = -self._operand.high, -self._operand.low
 
@@ -231,7 +231,7 @@ class All(TopLevel):
         self._operands = operands
 
     def turn(self) -> None:
-        """Take the least bounds."""
+        """Compute the bounds: the least ones of the parts."""
         for operand in self._operands:
             operand.turn()
         self.low = min(operand.low for operand in self._operands)
@@ -251,7 +251,7 @@ class All(TopLevel):
         return min(moments) if false else max(moments)
 
     def unknown_ns(self) -> int | None:
-        """Return the first moment that keeps a part from being known."""
+        """Return the first moment whose unknown value leaves a part undecided; None if there is none."""
         moments = [one.unknown_ns() for one in self._operands if one.low < 0 < one.high]
         return min((moment for moment in moments if moment is not None), default=None)
 
@@ -263,13 +263,14 @@ class Verdict:
     Attributes:
         expectation: The expectation.
         outcome: Passed, failed or inconclusive.
-        reason: Why it is not passed; empty if it is.
+        reason: Why the outcome is not passed; else empty.
         low: Lower bound of the robustness.
-        high: Upper bound of the robustness. It is the same if all that matters was known.
+        high: Upper bound of the robustness. Both bounds are the same if all that matters was known.
         moment_ns: First moment at which the expectation was not met; None if there is none.
-        extreme_ns: Moment at which it was closest to failing, or furthest from being met; None: unknown.
-        around: Values before and after the moment, by signal: pairs of time and value, None if it
-            was unknown.
+        extreme_ns: Moment at which the expectation was closest to failing, or furthest from being
+            met; None: unknown.
+        around: Values before and after ``moment_ns``, by signal: pairs of a time and a value, which is
+            None if it was unknown.
     """
 
     expectation: Expectation
@@ -285,7 +286,7 @@ class Verdict:
     def robustness(self) -> float | None:
         """The distance to failing: negative if failed, None if inconclusive or without a limit.
 
-        If it is not known exactly, it is the bound that is closer to 0.
+        If the distance is not known exactly, this is the bound that is closer to 0.
         """
         if self.outcome is Outcome.INCONCLUSIVE:
             return None
@@ -294,7 +295,7 @@ class Verdict:
 
 
 def distance(bound: float) -> float | None:
-    """Return a bound of the robustness for people: 0 for the least distance, None if it has no limit."""
+    """Return a bound of the robustness as reports show it: 0 for the least distance, None if it is infinite."""
     if not isfinite(bound):
         return None
     return 0.0 if abs(bound) == TINY else bound

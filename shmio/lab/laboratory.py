@@ -31,11 +31,11 @@ from shmio.recorder.recorder import AttachedFiles, ConfigFiles
 from shmio.segment import Segment
 
 COMMANDS_S: Final = 2.0
-"""Maximum time in s that the end of a laboratory waits for each of its threads."""
+"""Maximum time in s that :meth:`Laboratory.close` waits for each thread."""
 
 
 def prepare_laboratory(file: Path) -> Plan:
-    """Read a configuration for laboratories. One plan serves any number of them.
+    """Read a configuration for laboratories. You can create any number of laboratories from one plan.
 
     Args:
         file: The ``supervisor.toml``. Only its sources and injections are used: emulators, endpoints
@@ -89,7 +89,7 @@ class Laboratory:
         """True while a step is computed."""
         self._segment = Segment.private(plan.instance, plan.blocks, plan.processes, mode=plan.mode)
         self.page = self._segment.clock
-        """The clock page, as the loops read it."""
+        """The clock page, which the loops read."""
         self._others: list[Segment] = []
         self._threads: list[threading.Thread] = []
         self._sources: list[Computed] = []
@@ -166,7 +166,7 @@ class Laboratory:
         Args:
             plan: What to do.
             over: Ends the run when it is set.
-            seen: Called with the values of the signals, by source, in order.
+            seen: Called with the new values of the signals, by source, in order of time.
 
         Returns:
             The run, with its verdicts.
@@ -202,7 +202,7 @@ class Laboratory:
 
 
 class _LabClock:
-    """The clock of a loop that nobody runs: the laboratory calls what is due."""
+    """The clock of a loop that does not run by itself: the laboratory calls its methods."""
 
     loop: SteppedLoop
 
@@ -214,11 +214,11 @@ class _LabClock:
         return time.monotonic_ns()
 
     def wait_ns(self, duration_ns: int | None) -> bool:  # noqa: ARG002
-        """Return True, because nothing follows by itself."""
+        """Return True without waiting: the loop must not go on by itself."""
         return True
 
     def nudge(self) -> None:
-        """Carry out accepted commands; if a step is in progress, after it."""
+        """Carry out accepted commands; if a step is in progress, wait for its end first."""
         with self._lab.moving:
             if not self._lab.stepping:
                 self.loop.write_now()

@@ -22,7 +22,7 @@ from typing import Protocol, Self, overload
 
 
 class Clock(Protocol):
-    """What a block needs of its program."""
+    """What a block needs from its program."""
 
     _now_ns: int
 
@@ -81,7 +81,7 @@ class _Timer(FunctionBlock):
 
     @property
     def pt_s(self) -> float:
-        """The preset time PT, in s. If you change it while the timer runs, the new time counts."""
+        """The preset time PT, in s. If you change it while the timer runs, the new time applies at once."""
         return self._pt_ns / 1e9
 
     @pt_s.setter
@@ -103,7 +103,7 @@ class _Timer(FunctionBlock):
 
 
 class TON(_Timer):
-    """On-delay timer: Q becomes true when IN has been true for PT, and false with IN."""
+    """On-delay timer: Q becomes true when IN has been true for PT, and becomes false with IN."""
 
     def __call__(self, in_: object) -> bool:
         """Set IN, and return Q."""
@@ -118,7 +118,7 @@ class TON(_Timer):
 
 
 class TOF(_Timer):
-    """Off-delay timer: Q becomes true with IN, and false when IN has been false for PT."""
+    """Off-delay timer: Q becomes true with IN, and becomes false when IN has been false for PT."""
 
     def __call__(self, in_: object) -> bool:
         """Set IN, and return Q."""
@@ -151,7 +151,7 @@ class TP(_Timer):
 class R_TRIG(FunctionBlock):  # noqa: N801  the standard's name
     """Rising edge: Q is true in the call in which CLK has become true.
 
-    As the standard says, the first call counts CLK as false before it.
+    As in the standard, CLK counts as false before the first call.
     """
 
     def __init__(self) -> None:
@@ -167,7 +167,7 @@ class R_TRIG(FunctionBlock):  # noqa: N801  the standard's name
 class F_TRIG(FunctionBlock):  # noqa: N801  the standard's name
     """Falling edge: Q is true in the call in which CLK has become false.
 
-    As the standard says, the first call counts CLK as true before it: Q is true if CLK is false.
+    As in the standard, CLK counts as true before the first call, so Q is true there if CLK is false.
     """
 
     def __init__(self) -> None:

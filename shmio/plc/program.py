@@ -34,7 +34,7 @@ class Program(Model):
         """Check the declarations and the period when a subclass is created.
 
         Raises:
-            ModelError: One of them is invalid. The message names the class.
+            ModelError: A declaration or the period is invalid. The message names the class.
 
         """
         super().__init_subclass__(**keywords)
