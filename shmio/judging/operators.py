@@ -522,12 +522,12 @@ def tube(golden: Piece, tolerance: float, tolerance_ns: int) -> tuple[Piece, Pie
 
 
 def _strict(distance: Values) -> Values:
-    """Return the distances, with each 0 replaced by the smallest value that counts as false."""
+    """Return distances that count as false where they were 0."""
     return np.where(distance == 0, -TINY, distance)
 
 
 def _loose(distance: Values) -> Values:
-    """Return the distances, with each 0 replaced by the smallest value that counts as true."""
+    """Return distances that count as true where they were 0."""
     return np.where(distance == 0, TINY, distance)
 
 

@@ -24,11 +24,11 @@ _BYTES: Final = (bytes, bytearray)
 
 
 class Images:
-    """The two images of a block. They begin with the initial values of the layout.
+    """The two images of a block. At first, both have the initial values of the layout.
 
     ``commanded`` has the values that clients and connections have written: to inputs, to the
     ``/in`` of in-outs, and to registers that the model does not declare. ``shown`` has the values
-    that readers see. The model computes the outputs and the ``/out`` of in-outs in it.
+    that readers see; into it, the model writes the outputs and the ``/out`` of in-outs.
     """
 
     def __init__(self, layout: Layout, outputs: Sequence[Register], inouts: Sequence[Register] = ()) -> None:
@@ -170,7 +170,7 @@ class RegisterPort:
     def read(self) -> Any:
         """Return the value.
 
-        An array is returned as tuples, which nobody can change: changes would not reach the image.
+        An array is returned as tuples, not as lists, because changes of a list would not reach the image.
         """
         if self._is_row:
             return bytes(self._image[self._start : self._stop])
@@ -198,7 +198,7 @@ class RegisterPort:
 
     @property
     def native(self) -> memoryview | None:
-        """The register's bytes in the image, if they are as C has them on this machine; else None."""
+        """The register's bytes in the image, if C can read them as numbers on this machine; else None."""
         return memoryview(self._image)[self._start : self._stop] if self._is_native else None
 
     def overlaps(self, start: int, stop: int) -> bool:
@@ -206,7 +206,7 @@ class RegisterPort:
         return self._start < stop and start < self._stop
 
     def fault(self, value: object) -> str:
-        """Return how a value is outside the limits; "" if it is not, or if it is no number."""
+        """Return how a value is outside the limits; "" if it is within them, or is not of a numeric type."""
         if self._limits is None:
             return ""
         low, high = self._limits
@@ -224,7 +224,7 @@ class _StructurePort:
     ) -> None:
         """Create the port.
 
-        ``bulk`` is a faster codec for all members together; None: there is none.
+        ``bulk`` is a faster codec for all members together; None if there is none.
         """
         self._path = path
         self._ports = ports

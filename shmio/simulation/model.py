@@ -190,7 +190,7 @@ class InOut(Declaration):
 
 
 def place_declarations(model: str, declarations: Iterable[Declaration]) -> Layout:
-    """Return a layout of the declarations. They are placed as the entries of a tag table.
+    """Return a layout of the declarations, which are placed like the entries of a tag table.
 
     Raises:
         ModelError: A declaration is invalid. The message names the model and all errors.
@@ -288,7 +288,7 @@ class Model(ABC):
         self.random = np.random.default_rng(seed)
 
     def start(self) -> None:  # noqa: B027  not every model needs it
-        """Prepare the model. It is called once before the first step.
+        """Prepare the model. ``ModelRunner`` calls this method once, before the first step.
 
         All declared values are available. In a restarted process, the registers have the values
         that the previous process published last.
@@ -326,7 +326,7 @@ def declared(model: type[Model], *kinds: type[Declaration]) -> list[Declaration]
 
 @lru_cache(maxsize=256)
 def layout_of(model: type[Model]) -> Layout:
-    """Return a layout of a model's registers. They are placed as the entries of a tag table.
+    """Return a layout of a model's registers, which are placed like the entries of a tag table.
 
     Args:
         model: The model's class.

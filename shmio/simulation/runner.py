@@ -190,7 +190,7 @@ class ModelRunner:
         before = self.image if instead is None else instead
         try:
             call(*arguments)
-        except ModelError as error:  # it says by itself what has failed, and where
+        except ModelError as error:  # its message already says what has failed, and where
             self._images.shown[:] = before
             raise ModelError(f"model {self.name}: {error}") from error
         except (Exception, SystemExit) as error:
@@ -252,7 +252,7 @@ def _kind(register: Register) -> str:
 
 
 class Inputs(Protocol):
-    """The values of a model's inputs, by path. None: the value is not known."""
+    """The values of a model's inputs, by path; None if a value is unknown."""
 
     @property
     def changed(self) -> Collection[str]:
@@ -280,7 +280,7 @@ class Source(Protocol):
 
     @property
     def computed(self) -> bool:
-        """True if a model has computed these outputs before: this one or an earlier one."""
+        """True if this model or an earlier one has already computed these outputs."""
 
 
 class ServedModel:

@@ -33,7 +33,7 @@ class Memory(Computed):
         self._image[:] = image
 
     def begin(self) -> bytes:
-        """Return all registers."""
+        """Return the image of all registers."""
         return bytes(self._image)
 
     def write(self, writes: Sequence[Write]) -> list[str]:
@@ -43,5 +43,5 @@ class Memory(Computed):
         return [""] * len(writes)
 
     def step(self, time_ns: int, dt_ns: int) -> bytes:  # noqa: ARG002  time changes nothing
-        """Return all registers."""
+        """Return the image of all registers, which time does not change."""
         return bytes(self._image)

@@ -84,7 +84,7 @@ class Remote(Computed):
         return self._inputs
 
     def attach(self, writer: BlockWriter) -> None:
-        """Find the communication area of the model in the source's block."""
+        """Find the model channel in the source's block, which carries requests and answers."""
         link = writer.block.model_channel
         if link is None:
             raise SegmentError(f"source {writer.block.source}: its block has no link to a model")

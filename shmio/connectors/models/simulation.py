@@ -121,10 +121,7 @@ class Request(msgspec.Struct):
 
 
 class Answer(msgspec.Struct):
-    """The layout of the model's block as JSON, and the inputs that can be connected.
-
-    Or an error.
-    """
+    """The layout of the model's block as JSON and the inputs that can be connected, or an error."""
 
     layout: str = ""
     inputs: tuple[str, ...] = ()

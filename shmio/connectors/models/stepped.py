@@ -262,7 +262,7 @@ class SteppedLoop:
         self._writer.at_ns = self._page.monotonic_ns(state.time_ns)
         self._time_ns = state.time_ns
         if state.stepping and last is None:
-            self._handled -= 1  # it takes part in the present step
+            self._handled -= 1  # a source without a frame takes part in the present step
         elif state.stepping and last is not None and last.cycle < state.step:
             self._fail(state.step, f"{RESTARTED} ({crash})" if crash else RESTARTED)
         else:
@@ -283,7 +283,7 @@ class SteppedLoop:
         self._writer.at_ns = None
         due = self._schedule.next(self._clock.now_ns())
         self.counters.overruns += due.skipped
-        if self._crash:  # if this process also crashes, readers then know more than that the frame is old
+        if self._crash:  # readers then know the reason, even if this process crashes too
             self._writer.cycle = max(0, due.cycle - 1)
             self._fail(self._writer.cycle, f"the source's process was restarted: {self._crash}")
             self._crash = ""
@@ -319,11 +319,9 @@ class SteppedLoop:
     # ---- virtual time --------------------------------------------------------------------------------------------
 
     def _live(self) -> bool:
-        """Compute a step that was requested.
+        """Compute the requested step; between steps, carry out commands and publish new results.
 
-        Between steps, carry out commands and publish new results.
-
-        Return whether the loop must stop.
+        Then wait, and return whether the loop must stop.
         """
         state = self._page.read()
         if not state.virtual:
@@ -349,7 +347,7 @@ class SteppedLoop:
         return self._compute(state.step, state.time_ns, state.dt_ns)
 
     def write_now(self) -> None:
-        """Carry out the commands that wait, between two steps."""
+        """Carry out the waiting commands. Call this between two steps."""
         if self.commands.waiting:
             self._carry_out()
 

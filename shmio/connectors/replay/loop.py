@@ -41,7 +41,7 @@ NOTHING: Final = f"{OWN_WORDS}nothing of this source was recorded up to here"
 GOES_ON: Final = f"{OWN_WORDS}the recording continues"
 
 PIECE: Final = 64
-"""Largest number of frames and events to play before the loop handles requests and commands again."""
+"""Maximum number of frames and events to play before the loop handles requests and commands again."""
 LATE_NS: Final = 10_000_000_000
 """In wall time, frames that are more than this late (instance time, ns) are skipped."""
 ASK_TURN_NS: Final = 1_000_000
@@ -50,7 +50,7 @@ ASK_TURN_NS: Final = 1_000_000
 The end of a step does not wake the loop.
 """
 BEHIND_NS: Final = 3_000_000_000
-"""A request of this age in ns or less waits until everything due before it has been played."""
+"""A request younger than this, in ns, waits until everything due before it has been played."""
 AHEAD_NS: Final = 60_000_000_000
 """The longest time in ns by which a request may lie in the future.
 
@@ -136,7 +136,7 @@ class Player:
         self.go(None if entry is None else position_ns)
 
     def again(self, position_ns: int, stale_ns: int, stamp: StampOf) -> None:
-        """Continue at the beginning of a loop.
+        """Start the next round of a looped replay at a position.
 
         If no frame is due within ``stale_ns`` from there, publish a bad frame.
         """
@@ -177,7 +177,7 @@ class Player:
         return self._next is not None and self._next.position_ns <= until_ns
 
     def end(self, reason: str, stamp: Stamp) -> None:
-        """Publish a bad frame, unless the last one was bad."""
+        """Publish a bad frame, unless the last published frame was bad."""
         if not self._bad:
             self.fail(reason, stamp)
 
@@ -224,7 +224,7 @@ class Player:
         self.published += 1
 
     def _happen(self, event: Event, at: Stamp) -> None:
-        """Publish a recorded event without its owner, so that no client takes it for an answer."""
+        """Publish a recorded event without its owner, so that no client takes it for an answer to itself."""
         if not is_replayed(event, keep=self._keep):
             return
         record = Record(
@@ -431,14 +431,11 @@ class ReplayLoop:
             self._writer.event(Record(EventKind.STOPPED))
 
     def _begin(self) -> None:
-        """Continue where the source's previous process stopped.
-
-        If there was none, begin to play.
-        """
+        """Continue where the source's previous process stopped; without such a process, start to play."""
         play, clock_ns = self._play, self._page.read().time_ns
         if self._done_ns is not None:
             reach_ns = play.reach_ns(clock_ns) if play.wraps else play.at_ns(clock_ns)
-            # If that is ahead of the present position, it was published before a seek or in an earlier round.
+            # A position ahead of the present one was published before a seek or in an earlier round.
             self._player.resume(self._done_ns if self._done_ns <= reach_ns else play.position_ns - 1)
         else:  # `play` may be that of other sources, which play already
             since_ns = clock_ns if clock_ns - play.anchor_ns > LATE_NS else play.anchor_ns
@@ -475,10 +472,7 @@ class ReplayLoop:
         return self._clock.wait_ns(0 if more else ASK_TURN_NS if waits else self._patience_ns(virtual=state.virtual))
 
     def _patience_ns(self, *, virtual: bool) -> int | None:
-        """Return the time in ns until the next entry is due.
-
-        None if the loop can wait for a wake-up.
-        """
+        """Return the time in ns until the next entry is due; None if the loop need only wait for a wake-up."""
         play, next_ns = self._play, self._player.next_ns
         if virtual or play.paused:
             return None
@@ -562,7 +556,7 @@ class ReplayLoop:
         return (next_ns is not None and next_ns <= due_ns) or play.settled(clock_ns) is not play
 
     def _before_ns(self, asked: Asked, clock_ns: int) -> int | None:
-        """Return the position in ns to which to play before a waiting request is answered.
+        """Return the instance time in ns up to which to play before answering a request.
 
         None if the request can be answered now.
         """
@@ -629,7 +623,7 @@ class ReplayLoop:
         return PlayheadAnswer()
 
     def _catch_up(self, clock_ns: int) -> None:
-        """Adopt the playing state of the recording's other sources, after missing requests."""
+        """After missed requests, adopt the playing state of the other sources that replay the recording."""
         other = as_others(self._source, [head for block in self._blocks().values() if (head := block.playhead)])
         if other is None or other.anchor_ns <= self._play.anchor_ns:
             return

@@ -161,10 +161,7 @@ def _is_of(source: Replay, play: PlayState) -> bool:
 
 
 def as_others(source: Replay, heads: Iterable[Playhead]) -> PlayState | None:
-    """Return the newest playing state among sources that replay the same recording.
-
-    None if none does.
-    """
+    """Return the newest playing state of the sources that replay the same recording; None if there are none."""
     plays = [play for head in heads if (play := head.read()) is not None and _is_of(source, play)]
     return max(plays, key=lambda play: play.anchor_ns, default=None)
 

@@ -1,6 +1,6 @@
-"""The archive of an FMU: checks it, reads its description, and extracts it.
+"""Checks the archive of an FMU, reads its description, and extracts it.
 
-An FMU comes from somebody else, so that nothing in the archive is trusted.
+FMUs come from others, so nothing in the archive is trusted.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from shmio.logs import printable
 
 MAX_FILES: Final = 10_000
 MAX_BYTES: Final = 1 << 30
-"""Limit of all files together, extracted."""
+"""Maximum size in bytes of all extracted files together."""
 MAX_DESCRIPTION_BYTES: Final = 32 << 20
 DESCRIPTION: Final = "modelDescription.xml"
 _PREFIX: Final = "shmio-fmu-"
@@ -39,8 +39,8 @@ class Archive:
         """Check the archive, and read its description.
 
         Raises:
-            ModelError: The file cannot be read, is not an archive, or the archive is too large or
-                has a file outside of it.
+            ModelError: The file cannot be read, is not an archive, or is too large; or a file in it
+                has a path that leads out of the archive.
 
         """
         self.path = path
@@ -91,8 +91,8 @@ def _check(files: list[zipfile.ZipInfo]) -> None:
     ``zipfile`` reads no more of a file than its size says.
 
     Raises:
-        ModelError: There are too many or too large files, or a file is encrypted, a link, or
-            outside of the archive.
+        ModelError: The files are too many or too large, or a file is encrypted, is a link, or has a
+            path that leads out of the archive.
 
     """
     if len(files) > MAX_FILES:
@@ -112,15 +112,15 @@ def _check(files: list[zipfile.ZipInfo]) -> None:
 class Extracted:
     """A folder with the files of an FMU, in the folder for temporary files.
 
-    The process holds a lock on it. If it was killed, the next process that extracts an FMU removes
-    the folder.
+    The process holds a lock on the folder. If the process is killed, the next process that extracts
+    an FMU removes the folder.
     """
 
     def __init__(self) -> None:
         """Create the folder, and remove those of killed processes.
 
         Raises:
-            OSError: It cannot be created.
+            OSError: The folder cannot be created.
 
         """
         _remove_orphans()
@@ -146,7 +146,7 @@ def _remove(path: Path, descriptor: int) -> None:
 def _remove_orphans() -> None:
     """Remove the folders of processes that have been killed."""
     for path in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
-        with suppress(OSError):  # it belongs to another user, or to a process that runs
+        with suppress(OSError):  # the folder belongs to another user, or to a running process
             descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
             try:
                 if os.fstat(descriptor).st_uid == os.geteuid():

@@ -1,4 +1,4 @@
-"""The description of an FMU: its variables as declarations of a model."""
+"""Reads the description of an FMU, and turns its variables into declarations of a model."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Variable(NamedTuple):
     """An input, output or parameter of an FMU.
 
     ``fmi_type`` is the type of its value. A single value has the shape ``()``. ``initial`` is the
-    value with which the FMU begins; None: it is not known.
+    value with which the FMU begins; None if it is unknown.
     """
 
     name: str
@@ -62,7 +62,7 @@ class Variable(NamedTuple):
 
     @property
     def size(self) -> int:
-        """The number of its values."""
+        """Number of values: the elements of an array, else 1."""
         return math.prod(self.shape)
 
 
@@ -82,7 +82,7 @@ class Description(NamedTuple):
 
 
 def describe(archive: Archive) -> Description:
-    """Read the description of an FMU. This runs nothing of the FMU.
+    """Read the description of an FMU, without running any of its code.
 
     Raises:
         ModelError: The description is invalid, or shmio cannot run this FMU on this machine.
@@ -133,7 +133,7 @@ def _parse(xml: bytes) -> Any:
     if version != "2.0" and not version.startswith("3.0"):
         raise ModelError(f"it has the FMI version {shorten(printable(version))!r}; expected 2.0 or 3.0")
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / DESCRIPTION  # from a file alone FMPy does not also read the description of the sources
+        file = Path(folder) / DESCRIPTION  # given only this file, FMPy reads no description of the sources
         file.write_bytes(xml)
         try:
             return read_model_description(str(file))
@@ -149,7 +149,7 @@ def _check_platform(names: frozenset[str], version: int, identifier: str) -> Non
     """Check that the archive has a library for this machine.
 
     Raises:
-        ModelError: It has none.
+        ModelError: The archive has no such library.
 
     """
     import fmpy  # noqa: PLC0415  only FMUs need it
@@ -193,11 +193,11 @@ def _variables(parsed: Any, version: int) -> Iterator[tuple[Variable, Declaratio
 def _start(text: str | None, type_: str, count: int | None) -> object:
     """Return the start value; a list for an array of ``count`` elements.
 
-    None: there is none that a register can have. The FMU then begins with its own.
+    None if there is no start value that a register can have. The FMU then begins with its own value.
     """
     if text is None:
         return None
-    if type_ == "String":  # of an array, FMPy gives only the first
+    if type_ == "String":  # FMPy gives only the first one of an array
         fits = count is None and len(text) <= MAX_STRING and all(ord(character) < 256 for character in text)
         return text if fits else None
     values = [_value(one, type_) for one in ([text] if count is None else text.split())]
@@ -222,7 +222,7 @@ def _limits(variable: Any, type_: str) -> tuple[float, float] | None:
 
 
 def _inherited(variable: Any, attribute: str) -> Any:
-    """Return an attribute of the variable, or else of its declared type."""
+    """Return an attribute of the variable; if the variable has none, that of its declared type."""
     own = getattr(variable, attribute)
     return getattr(variable.declaredType, attribute) if own is None and variable.declaredType is not None else own
 

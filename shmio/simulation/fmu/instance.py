@@ -67,7 +67,7 @@ class Instance:
         self._start_s = description.start_s
         self.words = ""
         """The FMU's last message about a problem in the present call."""
-        self._status = 0  # the worst of all calls
+        self._status = 0  # the worst status of all calls
         try:
             self._fmu: Any = instantiate_fmu(
                 str(folder),
@@ -101,13 +101,13 @@ class Instance:
             self._fmu.exitInitializationMode()
 
     def set(self, groups: list[Group]) -> None:
-        """Give the FMU the values that have changed."""
+        """Give the FMU the values of those groups in which a value has changed."""
         with self._calling():
             for group in groups:
                 group.set_changed(self._fmu.component)
 
     def get(self, groups: list[Group]) -> None:
-        """Show the values of the FMU.
+        """Read the values of the FMU, and write them to their ports.
 
         Raises:
             ValueRangeError: A value does not fit its register.
@@ -177,7 +177,7 @@ class Instance:
         return _Call(self)
 
     def failed(self, error: Exception) -> FmuError:
-        """Return the failure that FMPy's error about a call means."""
+        """Return an FmuError for FMPy's error about a call, and remember the call's status."""
         self._status = max(self._status, _status(error))
         function = getattr(error, "function", "a call")
         status = _status(error)
@@ -190,7 +190,7 @@ class Instance:
         return self._error
 
     def _with_words(self, text: str) -> str:
-        """Return a message with the last one of the FMU."""
+        """Return a message, followed by the FMU's last message."""
         return f"{text}: {self.words}" if self.words else text
 
     def _log(self, *arguments: Any) -> None:
@@ -209,7 +209,7 @@ def _status(error: Exception) -> int:
 
 
 class _Call:
-    """Turns FMPy's errors about calls into failures."""
+    """Turns FMPy's errors about calls into FmuErrors, as a context manager."""
 
     __slots__ = ("_instance",)
 
@@ -225,7 +225,7 @@ class _Call:
 
 
 class Group:
-    """Variables of one type. Their values are together in one array, which the FMU reads or writes."""
+    """Variables of one type, whose values are in one array that the FMU reads or writes in one call."""
 
     def __init__(
         self, version: int, fmu: Any, type_: str, variables: list[Variable], ports: Mapping[str, Port]
@@ -290,12 +290,12 @@ class Group:
             place += count
 
     def set_other(self, component: object) -> None:
-        """Give the FMU the values of the ports, if one is not that with which the FMU begins."""
+        """Give the FMU the values of the ports, unless it begins with all of them anyway."""
         self._given = self._starts
         self.set_changed(component)
 
     def set_changed(self, component: object) -> None:
-        """Give the FMU the values of the ports, if one has changed since the last call."""
+        """Give the FMU the values of the ports, if any of them has changed since the last call."""
         if self._is_native:
             given_bytes = [bytes(view) for view in self._views]
             if given_bytes == self._given_bytes:
@@ -311,7 +311,7 @@ class Group:
 
 
 def _start(variable: Variable) -> object:
-    """Return the value with which the FMU begins, as a port reads it; None if it is not known."""
+    """Return the value with which the FMU begins, as a port reads it; if it is unknown, zero or empty text."""
     initial = variable.initial
     if initial is None:
         zero = "" if variable.fmi_type == "String" else 0

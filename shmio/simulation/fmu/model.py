@@ -1,4 +1,4 @@
-"""An FMU as a model."""
+"""Runs an FMU as a model."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from shmio.simulation.model import Model
 SUFFIX: Final = ".fmu"
 REMEDY: Final = "; the FMU starts again when its source is restarted"
 MAX_CALLS: Final = 10_000
-"""Limit of the calls of ``doStep`` in one step."""
+"""Maximum number of calls of ``doStep`` in one step."""
 MAX_TRIES: Final = 4
-"""How often a step of one size is tried before a smaller one is."""
+"""How often to try a step of one size before a smaller step is tried."""
 MAX_HALVINGS: Final = 30
 MAX_REPEATS: Final = 1000
-"""How often a discarded step is tried if the FMU does not allow a smaller one."""
+"""How often to try a discarded step if the FMU does not allow a smaller step."""
 
 
 def is_fmu(text: str) -> bool:
-    """Return whether the name of a model is that of the file of an FMU."""
+    """Return whether a model's name is the path of an FMU, which ends in ``.fmu``."""
     return text.lower().endswith(SUFFIX)
 
 
 def load_fmu(file: Path) -> type[FmuModel]:
-    """Read an FMU, and return a model of it. This runs nothing of the FMU.
+    """Read an FMU, and return a model's class for it, without running any of the FMU's code.
 
     Raises:
         ModelError: The file is not an FMU that shmio can run on this machine.
@@ -46,8 +46,8 @@ def load_fmu(file: Path) -> type[FmuModel]:
 class FmuModel(Model):
     """Steps an FMU. :func:`load_fmu` makes a subclass for each FMU.
 
-    The FMU's own time begins with the first step. A call that fails ends the FMU: all further steps
-    fail with the same reason.
+    The FMU's own time begins with the first step. If a call to the FMU fails, all further steps fail
+    for the same reason.
     """
 
     archive: ClassVar[Archive]
@@ -102,7 +102,7 @@ class FmuModel(Model):
             raise ModelError(str(error)) from None
 
     def _advance_evenly(self, instance: Instance, passed_ns: int, dt_ns: int) -> None:
-        """Make steps of one length until a time.
+        """Make steps of equal length up to a time since the FMU's start.
 
         Raises:
             ModelError: The time is not a multiple of the steps' length.
@@ -119,7 +119,7 @@ class FmuModel(Model):
             self._done_ns += self._fixed_ns
 
     def _advance(self, instance: Instance, passed_s: float) -> None:
-        """Make a step until a time since the FMU's start, in parts if the FMU does not make it at once."""
+        """Make a step up to a time since the FMU's start, in parts if the FMU does not complete it at once."""
         target_s = self.description.start_s + passed_s
         size_s = target_s - self._now_s
         tries = halvings = 0
@@ -158,7 +158,7 @@ class FmuModel(Model):
 def _point_s(passed_ns: int, dt_ns: int) -> float:
     """Return a time in s.
 
-    For steps of one length this is the product that FMPy computes, so that the FMU gets the same
+    For steps of equal length, this is the product that FMPy computes, so that the FMU gets the same
     numbers to the last bit.
     """
     count, rest = divmod(passed_ns, dt_ns) if dt_ns else (0, 1)
