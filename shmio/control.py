@@ -73,7 +73,7 @@ The lists are shortened in this order.
 def socket_path(instance: str) -> str:
     """Return the path of an instance's control socket; create its folder with mode 0700.
 
-    It is in the first of these folders that can be used: ``$XDG_RUNTIME_DIR/shmio``,
+    The socket is in the first of these folders that can be used: ``$XDG_RUNTIME_DIR/shmio``,
     ``/run/user/<uid>/shmio`` and ``/tmp/shmio-<uid>``.
 
     Raises:
@@ -100,7 +100,7 @@ def socket_path(instance: str) -> str:
 def emulator_socket_path(control: str, name: str) -> str:
     """Return the path of an emulator's control socket, beside that of its supervisor.
 
-    Names of instances contain no ``+``.
+    Its file name contains a ``+``, which no instance's name contains.
     """
     path = Path(control)
     return str(path.with_name(f"{path.stem}+{name}{path.suffix}"))
@@ -127,7 +127,7 @@ def _prepare(folder: Path, uid: int) -> str | None:
 
 
 def remove_socket(path: str) -> None:
-    """Remove a socket. Another kind of file with this name stays, so that bind fails."""
+    """Remove a socket. A file of another kind stays, so that bind fails."""
     with suppress(FileNotFoundError):
         if stat.S_ISSOCK(os.lstat(path).st_mode):
             Path(path).unlink()
@@ -170,7 +170,7 @@ class Disturb(_Request, tag="disturb", omit_defaults=True):
 
     answers: Answers
     delay_ms: Annotated[float, msgspec.Meta(ge=0, le=600_000)] = 0.0
-    """Delay of each answer, with ``answers = "delay"``."""
+    """Delay of each answer in ms, with ``answers = "delay"``."""
 
 
 class Peer(NamedTuple):
@@ -187,7 +187,7 @@ class Answer:
         self._server = server
         self._client = client
         self.peer = peer
-        """Who sent the request."""
+        """The process that sent the request."""
         self.ended: Callable[[str], object] = lambda _: None
         """Called with each answer: why the request failed, or "" if it succeeded."""
 
@@ -307,7 +307,7 @@ class ControlServer:
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             self.answer(client, {"error": f"this is not a request: {error}"})
         else:
-            if _hung_up(client):  # it gave up while the supervisor was delayed
+            if _hung_up(client):  # the client gave up while the supervisor was delayed
                 self._drop(client)
                 return
             self._handle(request, Answer(self, client, _peer(client)))
@@ -342,7 +342,7 @@ class ControlServer:
             return
         self._selector.unregister(self._listener)
         with suppress(OSError):
-            if os.lstat(self._path).st_ino == self._inode:  # not a successor's
+            if os.lstat(self._path).st_ino == self._inode:  # not the socket of a successor
                 remove_socket(self._path)
         self._listener.close()  # closed last: until then no other file can get its inode number
 

@@ -30,7 +30,7 @@ KEPT_FILES = 3
 
 
 class LineFormatter(logging.Formatter):
-    """Formats a record as one line, followed by its traceback, indented.
+    """Formats a record as one line, followed by its indented traceback.
 
     Control characters in the line are escaped.
     """
@@ -85,7 +85,7 @@ FORMATTERS: Final[Mapping[str, Callable[[str, str | None], logging.Formatter]]] 
     "text": LineFormatter,
     "json": JsonFormatter,
 }
-"""For each value of ``[instance] log_format``, the formatter of a process and its source."""
+"""For each value of ``[instance] log_format``, the class of the formatter."""
 
 
 class RotatingLog(logging.handlers.RotatingFileHandler):
@@ -99,7 +99,7 @@ class RotatingLog(logging.handlers.RotatingFileHandler):
 
         If that fails, raise OSError, or with ``patient`` try again at each record.
         """
-        self._streams = False  # they already go to this file, if it can be opened
+        self._streams = False  # the caller redirects the streams to the first file
         super().__init__(file, maxBytes=MAX_FILE_BYTES, backupCount=KEPT_FILES - 1, delay=True)
         try:
             self.stream = self._open()
@@ -127,7 +127,7 @@ class RotatingLog(logging.handlers.RotatingFileHandler):
     def _open(self) -> TextIOWrapper:
         """Open a new file and redirect standard output and error to it.
 
-        Without that, the traceback of a crash would go to a removed file.
+        Otherwise, the traceback of a crash would go to a removed file.
         """
         stream = super()._open()
         if self._streams:

@@ -34,7 +34,7 @@ def check(priority: int) -> None:
         except ConfigError as error:
             refused.append(error)
 
-    thread = threading.Thread(target=attempt, name="priority")  # in a thread: the caller keeps its priority
+    thread = threading.Thread(target=attempt, name="priority")  # in a thread, so that the caller keeps its priority
     thread.start()
     thread.join()
     if refused:

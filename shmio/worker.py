@@ -1,8 +1,8 @@
 """Base of all child processes: role, log, heartbeat, report, and stop on request.
 
 A worker's ``__main__`` is one line: ``raise SystemExit(worker.main(run))``, where ``run(worker)``
-does the work of the process. Exit status: 0: the worker stopped as requested; 1: it failed, and a
-restart may help; 2: it failed, and the configuration must be changed first.
+does the work of the process. The exit status is 0 if the worker stopped as requested, 1 if it
+failed and a restart may help, and 2 if it failed and the configuration must be changed first.
 
 A worker outlives its supervisor. The next supervisor takes it over: see
 :mod:`shmio.supervisor.takeover`.

@@ -123,7 +123,7 @@ def _give_up_output() -> None:
 
 
 def at_least(least: int) -> Callable[[str], int]:
-    """Return a type for arguments that are whole numbers of at least ``least``."""
+    """Return an argparse type for whole numbers from ``least`` on."""
 
     def convert(text: str) -> int:
         if not text.isascii() or not text.isdecimal() or len(text) > 7 or int(text) < least:
@@ -212,7 +212,7 @@ def dumps(value: Any, indent: int | None = None) -> str:
 def stop_on_signals() -> Iterator[threading.Event]:
     """Yield an event that is set by SIGINT, SIGTERM or SIGHUP; restore the handlers at the end.
 
-    SIGHUP is left out if it is ignored, as under nohup.
+    If SIGHUP is ignored, as under nohup, it stays ignored.
     """
     stopping = threading.Event()
 

@@ -83,7 +83,7 @@ def _compile(names: Sequence[str], block: str | None, sizes: Mapping[str, int], 
 
 
 def _read(name: str) -> Source:
-    """Read a file. Of a file that is too large, read just enough that the compiler refuses it."""
+    """Read a file. If it is too large, read just enough that the compiler refuses it."""
     with Path(name).open("rb") as file:
         return Source(name, file.read(MAX_SOURCE_BYTES + 4))
 

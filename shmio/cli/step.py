@@ -41,7 +41,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(cell: Cell, options: argparse.Namespace) -> int:
-    """Step, play, pause or release the clock, and print it.
+    """Step, play, pause or release the clock, and print its new state.
 
     Raises:
         CommandError: The options contradict each other, or the user declined.

@@ -41,7 +41,7 @@ def inject_request(
     for_s: float | None,
     originals: bool,
 ) -> bytes:
-    """Return the first message of a call of Inject, which creates the injection.
+    """Return the first message of an Inject call, which creates the injection.
 
     Raises:
         ValueRangeError: An argument is invalid.
@@ -96,7 +96,7 @@ class ShadowState:
         data = bytes(request.SerializeToString())
         if values:
             more = wire.InjectRequest(shadow=wire.Shadow(assignments=calls.assignments(values)))
-            data += more.SerializeToString()  # parts of one message are merged
+            data += more.SerializeToString()  # protobuf merges the two parts into one message
         return shadow.sequence, data
 
     def _fill(self, part: Any, column: Column, given: Given | tuple[Given, Given]) -> None:

@@ -40,7 +40,7 @@ class Values(Mapping[str, Any]):
         """Paths of the values that came with the present step. The first step brings all values."""
 
     def __getitem__(self, path: str) -> Any:
-        """Return a register's value; PathError if there is no such register."""
+        """Return a register's value; raise PathError if there is no such register."""
         return self._table.value(self._table.place(path))
 
     def __contains__(self, path: object) -> bool:
@@ -223,7 +223,7 @@ class Rejoining:
         return answer
 
     def failed(self, part: Part, work: Work, error: Exception) -> bytes:
-        """Return the answer that the step has failed. Log the reason if it is a new one."""
+        """Return the answer that the step has failed. Log the reason if it has changed."""
         text = explain(error)
         if text != self._failure:
             self._failure = text

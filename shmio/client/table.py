@@ -120,7 +120,7 @@ class Register(model.Register, frozen=True, gc=False, kw_only=True):
 
     @classmethod
     def of(cls, found: Any) -> Register:
-        """Convert a message. Raise RemoteError if it is invalid."""
+        """Convert a message to a register. Raise RemoteError if it is invalid."""
         try:
             return cls(
                 found.path,
@@ -241,7 +241,7 @@ class Table:
         return None if self.invalid[place] else array[register.slot]
 
     def changed(self, changes: tuple[Change, ...]) -> list[int]:
-        """Return the ascending indices of the changed registers."""
+        """Return the indices of the changed registers, in ascending order."""
         found: set[int] = set()
         for change in changes:
             slots, places = self._starts[change.column]

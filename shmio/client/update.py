@@ -90,7 +90,7 @@ class Update:
         return [f"{self.source}/{registers[place].path}" for place in self._changed()]
 
     def _changed(self) -> Sequence[int]:
-        """Return the ascending indices of the registers with new values or statuses."""
+        """Return the indices of registers with new values or statuses, in ascending order."""
         changed = self.table.changed(self.changes)
         return sorted({*changed, *self._statuses}) if self._statuses else changed
 

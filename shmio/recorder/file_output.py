@@ -15,11 +15,11 @@ from typing import Final
 from shmio.errors import RecordingError
 
 RETRY_S: Final = 0.5
-"""Time between attempts after a failed write."""
+"""Time in s between attempts after a failed write."""
 WAIT_S: Final = 0.02
-"""Interval at which to check whether the previous file is complete."""
+"""Interval in s at which to check whether the previous file is complete."""
 SLOW_S: Final = 2.0
-"""A write that takes longer than this is reported as a problem."""
+"""A write that takes longer than this time in s is reported as a problem."""
 SUFFIX: Final = ".mem"
 _NAMES: Final = 1000
 

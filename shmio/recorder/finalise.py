@@ -1,4 +1,4 @@
-"""Closes a recording that a dead recorder has left open: repairs its end, and adds index and footer."""
+"""Closes a recording that a dead recorder left open: repairs its end, adds an index and footer."""
 
 from __future__ import annotations
 

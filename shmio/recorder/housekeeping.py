@@ -62,7 +62,7 @@ class Housekeeper:
     def stop(self, patience_s: float = 0.5) -> None:
         """Stop the thread before it handles the next file.
 
-        Wait for its end, at most ``patience_s``.
+        Wait until it has ended, for at most ``patience_s`` seconds.
         """
         self._stop.set()
         self._thread.join(patience_s)
@@ -143,7 +143,7 @@ class Housekeeper:
 def _is_held(path: Path) -> bool:
     """Return whether a replay uses the file.
 
-    The file must stay: a restarted replay reads it again.
+    Such a file must not be deleted, because a restarted replay reads it again.
     """
     fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:

@@ -213,8 +213,8 @@ class Recorder:
             tap: Follows the instance.
             output: The file.
             by: Kind of recorder.
-            places: Positions at which the previous file ended, by section of the block. None: the
-                positions at which ``tap`` started.
+            places: Positions at which the previous file ended, by section of the block; None for
+                the positions at which ``tap`` started.
             about: More metadata about the recording.
             counters: Counters to continue; None for new ones.
             attachments: Returns the files to attach.

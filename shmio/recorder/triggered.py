@@ -87,7 +87,7 @@ class PreTriggerBuffer:
     """Stores the entries of the last seconds before a trigger, within a limit of memory."""
 
     def __init__(self, before_s: float, limit_bytes: int, places: Mapping[int, BlockPosition]) -> None:
-        """Create the buffer. ``places`` are the positions after which it starts, by section."""
+        """Create the buffer. ``places`` are the positions after which to start, by section."""
         self._before_ns = round(before_s * 1e9)
         self._limit = limit_bytes
         self._entries: deque[BlockEntry | InstanceEntry] = deque()
@@ -213,7 +213,7 @@ class TriggeredRecorder:
             self._series.put(batch)
             silent_s = time.monotonic() - self._came_s
             if not self.tap.segment.clock.read().virtual and silent_s > self._times.after_s + TURN_S:
-                self._end([])  # no later entry will end the file; not in virtual time, whose times are not the host's
+                self._end([])  # nothing else may end the file; in virtual time, the host's clock does not count
         return more
 
     def _begin(self, log_ns: int) -> None:

@@ -27,7 +27,7 @@ class Findings:
     """Number of intact chunks."""
     messages: int = 0
     damage: list[Damage] = field(default_factory=list)
-    """The first damaged places, which cannot be read."""
+    """The first damaged places, which are parts of the file that cannot be read."""
     problems: list[str] = field(default_factory=list)
     """Messages about the first places that can be read, but are inconsistent."""
     count: int = 0
@@ -67,7 +67,7 @@ def check(reader: Reader, at: Callable[[int], object] = lambda _: None) -> Findi
 
 
 def check_by_record(reader: Reader) -> Generator[int, None, Findings]:
-    """Do what :func:`check` does, and yield the byte offset of each record before it is checked.
+    """Check a file like :func:`check`, and yield the byte offset of each record before its check.
 
     Between two records, the caller may do other work, or give up.
     """

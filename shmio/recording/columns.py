@@ -41,8 +41,8 @@ class Columns(Mapping[str, Array]):
 
     The keys are the paths without the source. The values are arrays of shape (n, …). If the source
     gave its registers statuses, the key ``PATH#status`` has the OPC UA status codes of a register,
-    and ``PATH#source_ns`` has the register's times (UTC, ns since 1970; 0: the source time of the
-    frame).
+    and ``PATH#source_ns`` has the register's times (UTC, ns since 1970; 0 if the source time of the
+    frame applies).
 
     Attributes:
         source: Name of the source.

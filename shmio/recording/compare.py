@@ -28,7 +28,7 @@ MAX_EVENTS: Final = 4096
 While time is paused, one cycle may have any number of events.
 """
 MAX_SHIFT: Final = 64
-"""Number of frames at the start of the first common cycle in which the recordings are aligned."""
+"""Number of frames of the first common group to compare in order to align two recordings."""
 
 T = TypeVar("T", Frame, Event)
 _Pair = tuple[Entry[T] | None, Entry[T] | None]
@@ -406,8 +406,8 @@ class _Registers:
     def differing(self, one: Frame, other: Frame) -> Iterator[tuple[str, tuple[Value, Value]]]:
         """Yield the path and both values of each register or array element that differs.
 
-        The values are those that readers saw. For registers in which these are equal, compare the
-        values that the source delivered, without injections.
+        The values are those that readers saw. If these are equal, compare the values that the
+        source delivered, without injections.
         """
         seen = set()
         for path, values in self._images(one.image, other.image):

@@ -1,4 +1,4 @@
-"""Lets programs read recordings: :func:`shmio.open_dump`."""
+"""Reads recordings; programs start with :func:`shmio.open_dump`."""
 
 from __future__ import annotations
 
@@ -473,7 +473,7 @@ class _Names:
         return chosen
 
     def _named(self, path: str, topic: Topic) -> Chosen:
-        """Return the registers that a topic names, by block: blocks may have different layouts."""
+        """Return the registers that a topic names, by block. Blocks may have different layouts."""
         found: Chosen = {}
         problem = PathError(f"{path}: no register of this recording has such a path")
         for block in self._blocks:

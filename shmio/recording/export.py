@@ -238,7 +238,7 @@ class BlockTables:
             path = self._path(block)
             stream = self._stack.enter_context(new_file(path))
             table = TABLES[self._form](stream, self._chosen[block])
-            self._stack.callback(table.close)  # before its file is closed, even if the file is removed after that
+            self._stack.callback(table.close)  # closes the table before its file, even if the file is then removed
             self._tables[block] = path, table
         self._tables[block][1].write(columns)
 

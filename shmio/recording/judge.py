@@ -71,7 +71,7 @@ class GoldenRecordings:
         self._folder = folder
 
     def __call__(self, name: str, signals: Sequence[Signal]) -> list[Piece]:
-        """Return signals of a recording, with times from 0 on: :data:`shmio.judging.judge.Golden`.
+        """Return signals of a recording; times start at 0. See :data:`shmio.judging.judge.Golden`.
 
         Raises:
             ConfigError: The recording cannot be read, is too long, or does not have a signal.

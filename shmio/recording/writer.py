@@ -61,7 +61,7 @@ def layout_files(layout: Layout) -> Iterator[tuple[str, bytes]]:
 
 
 class Output(Protocol):
-    """Where a recording is written to, such as a binary file."""
+    """What a recording is written to, such as a binary file."""
 
     def write(self, data: bytes, /) -> object:
         """Append data."""
@@ -100,7 +100,7 @@ class Writer:
             self._mcap.add_metadata(PLACES, {str(section): encode_position(place) for section, place in places.items()})
 
     def attach(self, name: str, media_type: str, data: bytes, now_ns: int, changed_ns: int = 0) -> None:
-        """Attach a file. ``changed_ns`` is the time of the file's last change, UTC; 0: unknown."""
+        """Attach a file. ``changed_ns`` is the UTC time of the file's last change; 0 if unknown."""
         self._mcap.add_attachment(changed_ns, now_ns, name, media_type, data)
 
     def attach_layout(self, layout: Layout, now_ns: int) -> None:

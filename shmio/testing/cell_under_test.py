@@ -105,7 +105,7 @@ class CellUnderTest:
         return self.attachment.write(values)
 
     def inject(self, target: str | Sequence[str], operation: str = "set", **keys: Any) -> Campaign:
-        """Inject values until the end of the test, or as the keys say.
+        """Inject values until the end of the test, or as long as the keys say.
 
         Args:
             target: The register, or several.

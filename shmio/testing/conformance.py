@@ -25,7 +25,7 @@ from shmio.testing.proxy import FaultProxy
 PATIENCE_S = 20.0
 PERIOD_NS = 5_000_000
 SLOW_S = 0.01
-"""Delay of a slow connection in each direction: two periods, and far below the time-out."""
+"""Delay in s of a slow connection in each direction: two periods, far below the time-out."""
 
 
 _NEVER = threading.Event()
@@ -47,7 +47,7 @@ class Rig(Protocol):
         """
 
     def generation(self, raw: bytes) -> int:
-        """Return a number for an image of the device that never decreases over time.
+        """Return a number for an image of the device. Later images never have a lower number.
 
         Raises:
             AssertionError: The device never had this image.

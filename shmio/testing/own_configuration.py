@@ -21,7 +21,7 @@ from shmio.errors import ConfigError
 FILE: Final = "supervisor.toml"
 LOGS: Final = "logs"
 LEFT_OUT: Final = ("alert", "recorder")
-"""Sections that a test leaves out: nobody is alerted, and the test records by itself."""
+"""Sections that the copy leaves out: a test must alert nobody, and makes its own recording."""
 _NAME_CHARS: Final = 31
 
 

@@ -40,7 +40,7 @@ class TableRig(Protocol):
 
     @property
     def types(self) -> Tags:
-        """A writable tag of each type that the connector supports; also arrays."""
+        """Writable tags: one of each type that the connector supports, and arrays."""
 
     @property
     def unknown(self) -> Mapping[str, object]:

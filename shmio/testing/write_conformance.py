@@ -30,7 +30,7 @@ class WriteRig(Rig, Protocol):
     spare: int
     """Offset of ``SPARE`` bytes that are zero at first. The device itself never changes them."""
     flags: int
-    """Offset of a byte. The device counts in all its bits but the lowest, which it never changes.
+    """Offset of a byte in whose upper bits the device counts. It never changes the lowest bit.
 
     ``generation`` checks that no count is lost.
     """
@@ -39,7 +39,7 @@ class WriteRig(Rig, Protocol):
 
 
 def write(connector: Connector, writes: Sequence[Write]) -> list[str]:
-    """Write as the loop does, and return the outcomes."""
+    """Write as a source's loop does, and return the outcomes."""
     connector.send(writes)
     while (found := connector.confirm(time.monotonic_ns() + 1_000_000_000)) is None:
         pass

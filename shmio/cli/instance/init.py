@@ -370,7 +370,7 @@ def _relative(path: Path, file: Path) -> str:
 
 
 def _toml(value: str | list[str]) -> str:
-    """Return a text as TOML string, or texts as an array. JSON's escapes are also valid in TOML."""
+    """Return a text, or a list of texts, as TOML. JSON's escapes are also valid in TOML."""
     return json.dumps(value, ensure_ascii=False)
 
 

@@ -175,7 +175,7 @@ class Campaign(AsyncIterator[InjectionEvent]):
 
     @classmethod
     async def create(cls, stream: Stream, lift: Lift, *, keep: bool) -> Self:
-        """Read the first answers to the call Declare, and return the campaign."""
+        """Read the first answer to Declare, and return the campaign."""
         try:
             return cls(stream, await stream.first(), lift, keep=keep)
         except BaseException:

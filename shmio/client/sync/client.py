@@ -148,7 +148,8 @@ class Client:
             deadband: A number's change up to this size is not reported.
 
         Returns:
-            An iterator over updates. Its first step raises PathError if a pattern names nothing.
+            An iterator over updates. The first iteration raises PathError if a pattern names
+            nothing.
         """
         request = calls.subscribe_request(
             patterns, every_frame=every_frame, frames=frames, max_rate_hz=max_rate_hz, deadband=deadband
@@ -179,8 +180,8 @@ class Client:
 
         Args:
             values: Values by path.
-            timeout_s: Time in s that the values may wait for a cycle of the source; None: 2 s, or
-                three cycles if that is longer.
+            timeout_s: Time in s that the values may wait for a cycle of the source; None for 2 s,
+                or three cycles if that is longer.
             until_accepted: Whether to return when the source has accepted the values, without
                 waiting for the device.
 
@@ -219,7 +220,7 @@ class Client:
             priority: Injections with a higher priority cover those with a lower one.
             keep: Whether the injection stays when this program ends, until somebody lifts it.
             name: Name in the list of injections.
-            for_s: Time in s after which the injection is lifted; None: no limit.
+            for_s: Time in s after which the injection is lifted; None for no limit.
             originals: Whether to receive the covered values. To read them, iterate over the
                 injection.
 
@@ -312,7 +313,7 @@ class Client:
 
         Args:
             source: Name of the source.
-            step: Called as ``step(time_s, dt_s, inputs)``; returns outputs by path, all or some. If
+            step: Called as ``step(time_s, dt_s, inputs)``; returns all or some outputs by path. If
                 it raises an error, the step fails, and the logger ``shmio.client`` logs the reason.
             name: Name of the model in messages.
             start: Called with the :class:`Simulation` each time the model has joined.

@@ -176,7 +176,7 @@ class Campaign(Iterator[InjectionEvent]):
 
     @classmethod
     def create(cls, stream: Stream, lift: Lift, *, keep: bool) -> Self:
-        """Read the first answers to the call Declare, and return the campaign."""
+        """Read the first answer to Declare, and return the campaign."""
         try:
             return cls(stream, stream.first(), lift, keep=keep)
         except BaseException:

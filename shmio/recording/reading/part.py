@@ -56,10 +56,10 @@ class DumpBlock:
     """Number of the last frame (key ``frames``) and event (key ``events``) before the recording."""
     begin_ns: int = 0
     end_ns: int = 0
-    """``begin_ns`` and ``end_ns``: log times of the first and the last frame or event."""
+    """Log times of the first (``begin_ns``) and the last (``end_ns``) frame or event."""
     first_ns: int = 0
     last_ns: int = 0
-    """``first_ns`` and ``last_ns``: log times of the first and the last frame."""
+    """Log times of the first (``first_ns``) and the last (``last_ns``) frame."""
 
     def add(self, kind: str, track: Track) -> None:
         """Add the counts and times of the frames or events in a file."""
@@ -206,7 +206,10 @@ class Part:
             yield list(self.reader.messages(wanted, 0, time_ns, damaged, [record]))
 
     def batches(self, number: int, size: int, from_ns: int, to_ns: int, *, raw: bool) -> Iterator[Batch]:
-        """Yield the frames of a channel as arrays, chunk by chunk. ``size``: bytes of an image."""
+        """Yield the frames of a channel as arrays, chunk by chunk.
+
+        ``size`` is the number of bytes of an image.
+        """
         channel = self.reader.channels[number]
         for found in self._each(
             number, from_ns, to_ns, lambda data: batch(data, channel, size, from_ns, to_ns, raw=raw)

@@ -197,7 +197,7 @@ class Reader:
     def raw(self, record: Record) -> Iterator[tuple[Channel, int, memoryview]]:
         """Yield channel, log time and data of each message in a chunk.
 
-        Add the channels that it describes.
+        Add the channels that the chunk describes to ``channels``.
 
         This skips messages of other programs, and converts frames of both versions to FRAME.
 
@@ -231,8 +231,8 @@ class Reader:
     def channel(self, number: int) -> Channel | None:
         """Return a channel by its number; None if it is unknown.
 
-        If the chunk that describes the channel is damaged, the description in the summary of a
-        closed file is used. If that is damaged, too, :attr:`summary_damage` says so; other channels
+        If the chunk that describes the channel is damaged, this uses the description in the summary
+        of a closed file. If that is also damaged, :attr:`summary_damage` says so; other channels
         are not affected.
         """
         if number not in self.channels and not self._summarized:

@@ -173,7 +173,7 @@ class Track:
     def _in(self, reader: Reader, chunk: Record) -> list[int]:
         """Return the numbers of the channel's frames or events in a chunk.
 
-        There is at least one.
+        The result has at least one number.
         """
         found: list[int] = []
         try:
@@ -429,9 +429,9 @@ def _records(data: bytes) -> Iterator[tuple[int, memoryview]]:
 
 
 def _places(content: memoryview, at: int) -> Iterator[tuple[int, int]]:
-    """Yield the items of a map from channels to numbers at ``at``.
+    """Yield the items of the map from channels to numbers that begins at ``at``.
 
-    Its length in bytes precedes it.
+    The length of the map in bytes precedes the map.
     """
     (size,) = struct.unpack_from("<I", content, at - 4)
     if size > len(content) - at or size % _PLACE.size:
