@@ -159,7 +159,7 @@ class Reload(_Request, tag="reload", omit_defaults=True):
 
 
 class Where(_Request, tag="where"):
-    """Ask for the configuration in force, when it was read, the log folder and the addresses."""
+    """Ask for the configuration file, when it was read, the log folder, and the addresses."""
 
 
 Request = Stop | Restart | Reload | Where

@@ -256,7 +256,7 @@ def _follow(campaign: Campaign, over: threading.Event, options: argparse.Namespa
 
 
 def _queue(campaign: Campaign, waiting: queue.SimpleQueue[InjectionEvent | ShmioError | None]) -> None:
-    """Put the events of a campaign into a queue, then None, or the error that ended the campaign."""
+    """Put a campaign's events into a queue, then the error that ended it, if any, and then None."""
     try:
         for event in campaign:
             waiting.put(event)

@@ -103,7 +103,7 @@ class BlockFollower:
         self._events = _Stream("events", block.events.cursor(after=place.event), place.log_ns, reason)
 
     def take(self, limit: int) -> Iterator[BlockEntry]:
-        """Yield the entries that were published so far, at most about ``limit``."""
+        """Yield the entries that were published so far, at most about ``limit`` entries."""
         retired = self.block.retired  # before the read, so that the last entries are read, too
         for _ in range(limit):
             side = self._next()

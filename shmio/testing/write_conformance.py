@@ -30,7 +30,7 @@ class WriteRig(Rig, Protocol):
     spare: int
     """Offset of ``SPARE`` bytes that are zero at first. The device itself never changes them."""
     flags: int
-    """Offset of a byte in whose upper bits the device counts. It never changes the lowest bit.
+    """Offset of a byte in whose upper bits the device counts. The lowest bit is left to writers.
 
     ``generation`` checks that no count is lost.
     """
