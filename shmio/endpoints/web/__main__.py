@@ -1,4 +1,4 @@
-"""The process of the HTTP endpoint: the web page, or figures for Prometheus alone."""
+"""The process of the HTTP endpoint: serves the web page, or only metrics for Prometheus."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from shmio.logs import LogRateLimit
 from shmio.worker import BEAT_S, Worker
 
 LOGGERS: Final = ("shmio.web", "uvicorn", "asyncio", "websockets")
-"""Loggers of lines that clients can cause. The rate of these lines is limited."""
+"""Loggers that clients can flood. The rate of their lines is limited."""
 FOLDERS: Final = "folders"
 
 
@@ -38,7 +38,7 @@ def run(worker: Worker) -> None:
 
 
 async def _serve(worker: Worker) -> None:
-    from shmio.endpoints.web.app import PageApp, metrics_app  # noqa: PLC0415  it needs the extra
+    from shmio.endpoints.web.app import PageApp, metrics_app  # noqa: PLC0415  this import needs the extra
     from shmio.endpoints.web.measurements import Measurements  # noqa: PLC0415
     from shmio.endpoints.web.served import Served  # noqa: PLC0415
     from shmio.endpoints.web.server import HttpServer  # noqa: PLC0415

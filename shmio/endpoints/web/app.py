@@ -1,4 +1,4 @@
-"""The paths that the server answers."""
+"""The HTTP routes: the page's files, session, WebSocket and uploads, and ``/metrics``."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ MAX_SILENT: Final = 256
 """Maximum number of WebSockets without a call. If there are more, the oldest is closed."""
 MAX_LOGIN_BYTES: Final = 4096
 MAX_DROPPED: Final = 2
-"""Maximum number of requests with dropped files at a time."""
+"""Maximum number of simultaneous requests with files that users have dropped on a page."""
 _TYPES: Final = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
 _POLICY: Final = {
     "content-security-policy": (
@@ -52,8 +52,8 @@ def metrics_app(
 
     Args:
         segment: The instance's segment.
-        measurements: The histograms.
-        folders: Folders whose free space is reported, by purpose.
+        measurements: Histograms of the sources' timing.
+        folders: Directories whose free space is reported, by purpose.
         registers: Patterns of the registers whose values are reported.
 
     """
@@ -93,7 +93,7 @@ class PageApp:
 
         Args:
             served: What the pages show.
-            sessions: The users.
+            sessions: The sessions of all users.
             tabs: The tabs of a page.
             secure: Whether the server uses TLS. Then browsers send the session's cookie over TLS only.
 
@@ -114,11 +114,11 @@ class PageApp:
 
     @property
     def counters(self) -> tuple[int, int, int]:
-        """Number of open pages, and of messages and bytes that were sent to pages."""
+        """Numbers of open pages, and of messages and bytes that were sent to pages."""
         return len(self._pages), self._served.messages, self._served.bytes
 
     def app(self, measurements: Measurements, registers: Sequence[str]) -> Starlette:
-        """Return the routes of the application.
+        """Return the application with its routes.
 
         Args:
             measurements: The histograms for ``/metrics``.
@@ -144,7 +144,7 @@ class PageApp:
         return self._sessions.user(request.cookies.get(self._cookie), _host(request))
 
     def _refuse_metrics(self, request: Request) -> Response | None:
-        """Return an answer to those who may not read the figures: they have neither a session nor a token."""
+        """Return the refusal of a client that may not read the metrics; None: its session or token allows it."""
         user, host = self._user(request), _host(request)
         kind, _, token = request.headers.get("authorization", "").partition(" ")
         if kind.lower() == "bearer":
@@ -161,7 +161,7 @@ class PageApp:
         return PlainTextResponse(text, 401, {"www-authenticate": "Bearer"})
 
     async def _session(self, request: Request) -> Response:
-        """Tell who the user is; with POST, open a session for a token; with DELETE, close it."""
+        """Describe the user. POST first opens a session for a token, and DELETE first closes the session."""
         host = _host(request)
         if request.method == "GET":
             return JSONResponse(self._describe(self._user(request)))
@@ -194,7 +194,7 @@ class PageApp:
         return answer
 
     async def _layout(self, request: Request) -> Response:
-        """Answer with the registers of files that the user has dropped on the page. They are not stored."""
+        """Return the registers in files that the user has dropped on the page. The files are not stored."""
         if "read" not in self._user(request).roles:
             return JSONResponse({"error": "this needs the role read: sign in"}, 403)
         if self._dropping >= MAX_DROPPED:
@@ -223,7 +223,7 @@ class PageApp:
         user = self._user(socket)
         if "read" not in user.roles:
             trail.record("read", {}, "denied", "it needs the role read", who=trail.Acting(user.actor, "web"))
-            await socket.close(1008)  # before it is accepted: an answer 403
+            await socket.close(1008)  # before accept(): the client gets the status 403
             return
         page = Page(self._served, socket, user, self._tabs)
         cookie, host = socket.cookies.get(self._cookie), _host(socket)
@@ -241,7 +241,7 @@ class PageApp:
             self._pages.discard(page)
 
     def _admit(self, page: Page) -> str:
-        """Count a page that makes its first call. Return why it is to be closed; empty: it is not."""
+        """Count a page that makes its first call. Return the reason to close it; empty: it stays open."""
         self._silent.pop(page, None)
         if len(self._pages) >= MAX_PAGES:
             return f"{MAX_PAGES} pages are open: close one of them"
@@ -254,7 +254,7 @@ def _record_sign_in(host: str, reason: str) -> None:
 
 
 async def _body(request: Request, most_bytes: int) -> bytes | None:
-    """Return the body of a request; None if it is larger, or if the client disconnects before its end."""
+    """Return the body of a request; None if the body is too large, or the client disconnects too early."""
     body = bytearray()
     with suppress(ClientDisconnect):
         async for part in request.stream():

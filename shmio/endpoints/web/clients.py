@@ -1,6 +1,6 @@
-"""Who is connected to the endpoints: the connections of the sockets on which they listen, proc_net(5).
+"""Finds out who is connected to the endpoints, from the connections of their sockets in proc_net(5).
 
-The endpoints need not count their clients for this, and those of mosquitto are found as well.
+So the endpoints need not count their clients, and the clients of mosquitto are found, too.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple
 ENDPOINTS: Final = ("grpc", "mqtt", "opcua", "web")
 """Kinds of processes that have clients."""
 MAX_CLIENTS: Final = 50
-"""Maximum number of clients that are listed for an endpoint: those with the most connections."""
+"""Maximum number of clients that are listed for an endpoint. Those with the most connections come first."""
 _ESTABLISHED: Final = "01"
 _LISTEN: Final = "0A"
 _ACCEPTS: Final = 0x10000  # __SO_ACCEPTCON of a UNIX socket
@@ -44,8 +44,9 @@ def clients(pids: Mapping[str, tuple[str, int]]) -> list[dict[str, Any]]:
         pids: Kind and pid of each process of the instance, by name.
 
     Returns:
-        For each endpoint that listens: its name, the number of connections, and the clients with theirs.
-        A client is an address, ``UNIX socket``, or the name of a process of the instance.
+        For each endpoint that listens: its name, its number of connections, and its clients, each with
+        a number of connections. A client is an address, ``UNIX socket``, or the name of a process of
+        the instance.
 
     """
     owners = {inode: name for name, (_, pid) in pids.items() for inode in _sockets(pid)}
@@ -102,7 +103,7 @@ def _tcp() -> Iterator[_Connection]:
 
 
 def _unix() -> Iterator[tuple[str, str, bool]]:
-    """Yield path, inode, and whether it listens, of each UNIX socket that listens or was accepted."""
+    """Yield path and inode of each UNIX socket that listens or was accepted, and whether it listens."""
     for fields in _lines("unix"):
         if len(fields) > 7 and (listens := bool(int(fields[3], 16) & _ACCEPTS)) | (fields[5] == _CONNECTED):
             yield fields[7], fields[6], listens

@@ -1,7 +1,7 @@
-"""The configuration file as all pages show it: its text, the faults, and what a reload would do.
+"""The configuration file as all pages show it: its text, its faults, and what a reload would do.
 
-The supervisor checks the file, as for ``shmio-supervisor reload --dry-run``. Pages share the result, so
-that many of them cause no more work than one.
+The supervisor checks the file, as for ``shmio-supervisor reload --dry-run``. All pages share the
+result, so that many pages cause no more work than one page.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from shmio.endpoints.web.supervisor import Supervisor
 from shmio.errors import ConfigError, ControlError
 
 CHECK_S: Final = 90.0
-"""Longest time in s that the supervisor takes for a dry run."""
+"""Time limit in s for the supervisor's answer to a dry run."""
 WHERE_S: Final = 5.0
 FRESH_S: Final = 1.0
-"""Time in s for which a result is used again."""
+"""Time in s for which a result is reused."""
 _KINDS: Final = ("stop", "start", "restart", "change", "injections", "reread", "keep")
 
 
@@ -45,7 +45,7 @@ class ConfigurationFile:
         self._state_s = -FRESH_S
 
     async def state(self) -> tuple[str, int | None]:
-        """Return the version of the file, and when the instance read it in ns since 1970; None if unknown."""
+        """Return the file's version, and when the instance read the file, in ns since 1970; None: unknown."""
         asked_s = time.monotonic()
         async with self._asking:
             if self._state_s < asked_s - FRESH_S:
@@ -58,7 +58,7 @@ class ConfigurationFile:
             return self._state
 
     async def checked(self) -> dict[str, Any]:
-        """Return the file and its state. The check began at most a second before this call, and after a reload."""
+        """Return the file with the result of a check that started at most a second ago, and after the last reload."""
         asked_s = time.monotonic()
         async with self._checking:
             if self._checked_s < max(asked_s - FRESH_S, self._outdated_s) or self._checked["problem"]:
@@ -68,7 +68,7 @@ class ConfigurationFile:
             return self._checked
 
     def outdate(self) -> None:
-        """Use no result again that was begun before now, because a reload has changed the instance."""
+        """Reuse no result of a check that started before now, because a reload has changed the instance."""
         self._outdated_s = time.monotonic()
 
     async def _check(self) -> dict[str, Any]:
@@ -89,7 +89,7 @@ class ConfigurationFile:
 
 
 def version(file: str) -> str:
-    """Return a text that changes with the file; "" if there is none. It reveals nothing of the content."""
+    """Return a text that changes when the file changes, and reveals no content; empty: there is no file."""
     try:
         found = Path(file).stat()
     except OSError:

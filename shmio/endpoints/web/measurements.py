@@ -23,7 +23,7 @@ BOUNDS_S: Final = (
     0.0001, 0.0002, 0.0005, 0.001, 0.002, 0.003, 0.005, 0.0075, 0.01, 0.015, 0.02, 0.025, 0.03, 0.05, 0.075,
     0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0,
 )  # fmt: skip
-"""Upper bounds of the buckets of all histograms."""
+"""Upper bounds of the buckets of all histograms, in s."""
 MAX_CHANGES: Final = 4096
 """Maximum number of a source's changes of quality that are kept."""
 MAX_COMMANDS: Final = 4096
@@ -55,7 +55,7 @@ class SourceTiming:
     """The histograms of one source. Use it in one thread; others may read the histograms."""
 
     def __init__(self, block: Block, started_ns: int) -> None:
-        """Begin with the next frame and event.
+        """Start with the next frame and event.
 
         Args:
             block: The source's block.
@@ -70,7 +70,7 @@ class SourceTiming:
         self.round_trip = Histogram()
         """Times that the device took to answer."""
         self.wake_up = Histogram()
-        """Times from the publication of a frame until this process ran, which waited for the frame."""
+        """Times from the publication of a frame until this process, which waited for it, ran."""
         self.command = Histogram()
         """Times from the acceptance of a command by the source until its outcome was known."""
         self.connections: deque[tuple[float, bool]] = deque(maxlen=MAX_CHANGES)

@@ -1,7 +1,8 @@
-"""The figures of an instance in the text format of Prometheus.
+"""The metrics of an instance in the text format of Prometheus.
 
-Names, units and types follow https://prometheus.io/docs/practices/naming. All figures come from the segment, from
-``/proc``, and from :mod:`shmio.endpoints.web.measurements`. No other process does anything for them.
+Names, units and types follow https://prometheus.io/docs/practices/naming. All values come from the
+segment, from ``/proc``, and from :mod:`shmio.endpoints.web.measurements`. No other process does any
+work for them.
 """
 
 from __future__ import annotations
@@ -106,7 +107,7 @@ _COUNTERS: Final[Mapping[str, Mapping[str, _Named]]] = {
     },
 }
 _LABELS: Final[Mapping[str, str]] = {"source": "source", "emulator": "emulator", "web": "process"}
-"""Label for the name of the process, for each kind of process that an instance can have several times."""
+"""The label that holds a process's name, for each kind of which an instance can have several processes."""
 BROKER: Final = "broker"
 """Name of the process of shmio's own MQTT broker. It has the same kind as the bridge, but no counters."""
 _TICKS: Final = os.sysconf("SC_CLK_TCK")
@@ -125,7 +126,7 @@ class Usage:
 
 
 def usage(pid: int) -> Usage | None:
-    """Return what a process uses, by proc(5); None if the process has ended."""
+    """Return the resources that a process uses, from proc(5); None if the process has ended."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(errors="replace")
     except OSError:
@@ -140,7 +141,7 @@ def usage(pid: int) -> Usage | None:
 
 
 class InstanceCollector(Collector):
-    """Collects the figures of an instance."""
+    """Collects the metrics of an instance."""
 
     def __init__(
         self,
@@ -153,8 +154,8 @@ class InstanceCollector(Collector):
 
         Args:
             segment: The instance's segment.
-            measurements: The histograms.
-            folders: Folders whose free space is reported, by purpose.
+            measurements: Histograms of the sources' timing.
+            folders: Directories whose free space is reported, by purpose.
             registers: Patterns of the registers whose values are reported.
 
         """
@@ -166,7 +167,7 @@ class InstanceCollector(Collector):
         """The reported registers of each block, by its section."""
 
     def collect(self) -> Iterator[Metric]:
-        """Yield all figures."""
+        """Yield all metrics."""
         self._segment.refresh()
         status = status_of(self._segment, "", "web")
         yield _info(self._segment.instance, status.mode or "", __version__)
@@ -311,7 +312,7 @@ class InstanceCollector(Collector):
                     yield path, register.unit, value
 
     def _choose(self, block: Block) -> list[Register]:
-        """Return the registers that are to be reported and have numbers."""
+        """Return the block's numeric and BOOL registers that match the patterns."""
         return [
             register
             for register in block.layout.registers
@@ -321,7 +322,7 @@ class InstanceCollector(Collector):
 
 
 class Exposition:
-    """Makes the answers to requests for the figures. Several threads may use it."""
+    """Answers requests for the metrics. Several threads may use it."""
 
     def __init__(self, collector: Collector) -> None:
         self._registry = CollectorRegistry(auto_describe=False)
@@ -331,7 +332,7 @@ class Exposition:
         self._fresh_until_s = 0.0
 
     def answer(self) -> bytes:
-        """Return all figures in the text format. They are at most ``FRESH_S`` old."""
+        """Return all metrics in the text format. They are at most ``FRESH_S`` old."""
         with self._lock:
             if time.monotonic() >= self._fresh_until_s:
                 self._answer = generate_latest(self._registry)

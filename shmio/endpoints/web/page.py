@@ -1,11 +1,11 @@
 """One open page: its WebSocket, the calls that it makes, and the data that it follows.
 
 A page sends calls as JSON text, ``{"id": 7, "call": "registers.rows", "with": {…}}``. The answer is
-``{"id": 7, "result": …}`` or ``{"id": 7, "error": "…"}``. Data that a page follows comes unasked, as
+``{"id": 7, "result": …}`` or ``{"id": 7, "error": "…"}``. The server sends data that a page follows as
 ``{"topic": "overview", "data": …}``, or as binary messages for plots (``signals.py``). The classes in
-``tabs/`` have the calls.
+``tabs/`` implement the calls.
 
-Nothing waits for a page. Of data that is not sent yet, newer data replaces older data.
+Nothing waits for a slow page: newer data replaces data of the same topic that is not sent yet.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from shmio.model.cell import Closable
 MAX_CALLS: Final = 16
 """Maximum number of a page's calls that may be in progress. The page's next call waits."""
 MAX_BATCHES: Final = 32
-"""Maximum number of binary messages that may wait for a page. The oldest ones are dropped."""
+"""Maximum number of binary messages that may wait for a page. If there are more, the oldest are dropped."""
 FIRST_CALL_S: Final = 10.0
-"""Time in s in which a page must make its first call. If there are many pages, it has less."""
+"""Time limit in s for a page's first call. If too many pages make none, the oldest is closed earlier."""
 
 _log = logging.getLogger("shmio.web")
 
 
 class Nothing(msgspec.Struct, forbid_unknown_fields=True):
-    """The arguments of a call that takes none."""
+    """The arguments of a call that takes no arguments."""
 
 
 class _Message(msgspec.Struct, forbid_unknown_fields=True):
@@ -63,7 +63,7 @@ _Tab = TypeVar("_Tab", bound="Tab")
 def call(
     role: str, arguments: type[_Arguments]
 ) -> Callable[[Callable[[_Tab, _Arguments], Awaitable[Any]]], Callable[[_Tab, _Arguments], Awaitable[Any]]]:
-    """Make a method of a tab a call. Its name is the tab's name, a point, and the method's name.
+    """Decorate a method of a tab, so that pages can call it as ``<tab>.<method>``.
 
     Args:
         role: The role that a user needs.
@@ -81,7 +81,7 @@ def call(
 
 
 def release(resources: Mapping[str, Closable], user: User) -> None:
-    """Close resources of a user's page, by name. Skip those that another program or a source has ended."""
+    """Close the resources of a closed page, given by name. Another program or a source may have ended some."""
     for name, one in resources.items():
         with acting(user.actor, "web"), suppress(ShmioError), Attempt("lift", {name: None}) as attempt:
             one.close()
@@ -95,7 +95,7 @@ class Tab:
     calls: ClassVar[Mapping[str, Call]]
 
     def __init_subclass__(cls) -> None:
-        """Collect the calls."""
+        """Collect the calls of the class."""
         cls.calls = {
             f"{cls.name}.{name}": Call(method.page_call[0], method.page_call[1], method)
             for name, method in vars(cls).items()
@@ -106,12 +106,12 @@ class Tab:
         self.page = page
 
     @classmethod
-    def offered(cls, served: Served) -> bool:  # noqa: ARG003  a tab may need something
+    def offered(cls, served: Served) -> bool:  # noqa: ARG003  subclasses use it
         """Return whether pages of this instance have this tab."""
         return True
 
     def close(self) -> None:
-        """Release what the tab holds, because the page has been closed."""
+        """Release the tab's resources, because the page has been closed."""
 
 
 _ACTIONS: Final = {
@@ -120,7 +120,7 @@ _ACTIONS: Final = {
     "injections.start": "declare",
     "injections.lift_all": "lift",
 }
-"""The actions of calls in the audit log, if these are not the calls' own names."""
+"""The audit log's names of calls, where they differ from the methods' names."""
 
 
 def _outcome(result: Any) -> tuple[str, str]:
@@ -141,7 +141,7 @@ class Page:
         self._calls = {name: (call, tab) for tab in self._tabs.values() for name, call in tab.calls.items()}
         self._tasks: set[asyncio.Task[Any]] = set()
         self._room = asyncio.Semaphore(MAX_CALLS)
-        self._answers: deque[bytes] = deque()  # bounded, because a call in progress keeps its place until it is sent
+        self._answers: deque[bytes] = deque()  # bounded: a call counts as in progress until its answer is sent
         self._newest: dict[str, bytes] = {}
         self._batches: deque[bytes] = deque(maxlen=MAX_BATCHES)
         self._waiting = asyncio.Event()
@@ -154,7 +154,8 @@ class Page:
         """Serve the page until it is closed.
 
         Args:
-            admit: Called at the page's first call. Returns why the page is to be closed; empty: it is not.
+            admit: Called at the page's first call. It returns the reason to close the page; empty: the page
+                stays open.
             lasts_s: Time in s after which the user's session ends; None: it does not end.
 
         """
@@ -185,9 +186,9 @@ class Page:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     def end(self, why: str) -> None:
-        """Close the page."""
+        """Close the page, with ``why`` as the reason."""
         self.silent, self._why = False, why
-        with suppress(RuntimeError):  # it has ended, or has not begun
+        with suppress(RuntimeError):  # run() has ended, or has not started
             self._limit.reschedule(asyncio.get_running_loop().time())
 
     async def _serve(self, message: str | None) -> None:
@@ -204,12 +205,12 @@ class Page:
         return task
 
     def push(self, topic: str, data: object) -> None:
-        """Send data of a topic. Data of this topic that is not sent yet is replaced."""
+        """Send data of a topic soon, in place of the topic's data that is not sent yet."""
         self._newest[topic] = msgspec.json.encode({"topic": topic, "data": data})
         self._waiting.set()
 
     def push_batch(self, batch: bytes) -> None:
-        """Send a binary message."""
+        """Send a binary message soon. If too many wait, drop the oldest."""
         self._batches.append(batch)
         self._waiting.set()
 
@@ -220,13 +221,13 @@ class Page:
             _log.error("a page's work failed", exc_info=error)
 
     async def _receive(self) -> str | None:
-        """Return the next message; None if the page is closed or sends something else than text."""
+        """Return the next message; None if the page is closed or sends anything but text."""
         message = await self._socket.receive()
         text: str | None = message.get("text") if message["type"] == "websocket.receive" else None
         return text
 
     def _attempt(self, message: _Message) -> Attempt:
-        """Begin an entry of the audit log for a call."""
+        """Create a call's entry in the audit log."""
         tab, _, name = message.call.partition(".")
         with acting(self.user.actor, "web"):
             attempt = Attempt(_ACTIONS.get(message.call, name.replace("_", " ")), {"tab": tab})
@@ -237,7 +238,7 @@ class Page:
         return attempt
 
     async def _answer(self, text: str) -> None:
-        """Make the call of a message, and send its result."""
+        """Carry out the call in a message, and send the answer."""
         number = 0
         answer: dict[str, object]
         try:

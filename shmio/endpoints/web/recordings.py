@@ -29,12 +29,12 @@ from shmio.recording.times import lost
 THREADS: Final = 2
 """Maximum number of threads that read recordings at a time."""
 MAX_LISTED: Final = 500
-"""Maximum number of files that are listed: the newest ones."""
+"""Maximum number of files that are listed. The newest are chosen."""
 MAX_NAME: Final = 255
 LOOKS: Final = 16
-"""Maximum number of files whose details are read after one request for the list."""
+"""Maximum number of files whose details one request for the list reads."""
 MAX_OF_RUN: Final = 256
-"""Maximum number of files among which those of the present run are searched."""
+"""Maximum number of files to search for those of the present run."""
 MAX_OPEN: Final = 64
 """Maximum number of files that are open at a time."""
 MAX_DAMAGE: Final = 20
@@ -42,11 +42,11 @@ MAX_DAMAGE: Final = 20
 OPENING_S: Final = 60.0
 """Time limit in s for opening a file."""
 PART_S: Final = 30.0
-"""Time limit in s for one part of the work with a file."""
+"""Time limit in s for one part of the work on a file."""
 IDLE_S: Final = 15.0
-"""Time in s for which a file stays open after its last use. The disk space of a deleted file is in use meanwhile."""
+"""Time in s for which a file stays open after its last use. If it is deleted, it takes disk space meanwhile."""
 FRESH_S: Final = 2.0
-"""Time in s for which a file that grows is not opened again; longer if opening takes long."""
+"""Minimum time in s before a growing file is opened again. It is longer if opening takes long."""
 SUFFIX: Final = ".mem"
 
 _NAME: Final = re.compile(rf"[^/\0.][^/\0]*{re.escape(SUFFIX)}")
@@ -55,11 +55,11 @@ T = TypeVar("T")
 
 
 class _StoppedError(Exception):
-    """The work was stopped. It is no ShmioError, so that readers do not take it for damage."""
+    """The work was stopped. This is not a ShmioError, which readers would take for damage."""
 
 
 class _Watch:
-    """Ends reading that takes too long, or that was stopped. Readers call it at intervals."""
+    """Ends work that takes too long or was stopped, with an exception. Readers call it at intervals."""
 
     def __init__(self) -> None:
         self.until_s = time.monotonic() + OPENING_S
@@ -85,7 +85,7 @@ class _State:
 
 @dataclass(eq=False)
 class Opened:
-    """An open recording. Whoever holds its lock may use it."""
+    """An open recording. Use it only while you hold its lock."""
 
     name: str
     state: _State
@@ -100,28 +100,28 @@ class Opened:
 
     @property
     def fresh(self) -> bool:
-        """True if the file was opened a short time ago, compared with the time that this takes."""
+        """True if the file was opened so recently that it is not worth opening it again."""
         return time.monotonic() - self.opened_s < max(FRESH_S, 20 * self.took_s)
 
     def close(self) -> None:
-        """Close the file, once nobody uses it."""
+        """Wait until nobody uses the file, and close it."""
         with self.lock:
             self.dump.close()
 
 
 class Work(Generic[T]):
-    """Work with a recording, part by part. Use it in the event loop's thread only."""
+    """Work on a recording, part by part. Use it in the event loop's thread only."""
 
     def __init__(
         self, recordings: Recordings, work: Callable[[Callable[[], None]], Iterator[T]], opened: Opened | None = None
     ) -> None:
-        """Begin.
+        """Prepare the work. :meth:`next` does its parts.
 
         Args:
             recordings: The recordings.
             work: Returns an iterator that does the work and yields its results. It runs in other threads. Its
                 argument is the ``beat`` for readers that it opens.
-            opened: The recording that it uses; it is released when the work is stopped.
+            opened: The recording that the work uses; it is released when the work is stopped.
 
         """
         self._recordings, self._opened = recordings, opened
@@ -132,7 +132,7 @@ class Work(Generic[T]):
         self.stopped = False
 
     async def next(self) -> T | None:
-        """Return the next result; None if there is none any more.
+        """Do the next part of the work, and return its result; None: there are no more parts.
 
         Raises:
             RecordingError: The file cannot be read.
@@ -166,7 +166,7 @@ class Recordings:
     """Lists and opens recordings. Use it in the event loop's thread only."""
 
     def __init__(self, folder: str | None) -> None:
-        """Create the object.
+        """Prepare to list and open recordings.
 
         Args:
             folder: The recorder's directory; None if the instance has no recorder.
@@ -199,15 +199,15 @@ class Recordings:
         return self.folder / name
 
     async def open(self, name: str, since_s: float | None = None) -> Opened:
-        """Open a recording, or return it if it is open. :meth:`release` it after use.
+        """Open a recording, or return it if it is open already. :meth:`release` it after use.
 
         Args:
             name: Name of the file.
-            since_s: If the file has grown, an open recording may be returned that was opened after this monotonic
-                time in s; None: that was opened a short time ago.
+            since_s: If the file has grown, an already open recording is only returned if it was opened
+                after this monotonic time in s; None: if it was opened a short time ago.
 
         Raises:
-            RecordingError: It cannot be opened.
+            RecordingError: The recording cannot be opened.
 
         """
         path = self.path(name)
@@ -232,11 +232,11 @@ class Recordings:
                 self._opening.pop(name, None)
 
     async def of_run(self, instance: str, epoch: str, since_s: float) -> AsyncIterator[Opened]:
-        """Open the files of the present run of an instance, the newest first. Release each of them.
+        """Open and yield the recordings of an instance's present run, the newest first. Release each after use.
 
         Args:
             instance: Name of the instance.
-            epoch: Its epoch in hexadecimal digits.
+            epoch: The instance's epoch in hexadecimal digits.
             since_s: As for :meth:`open`.
 
         """
@@ -248,7 +248,7 @@ class Recordings:
             try:
                 opened = await self.open(name, since_s)
             except RecordingError:
-                continue  # its recorder has just begun it, or it is no recording
+                continue  # the recorder has just created it, or it is not a recording
             about = opened.dump.about
             if about.get("instance") == instance and about.get("epoch") == epoch:
                 if about.get("recorder") == SUPERVISED and "made_by" not in about:
@@ -256,11 +256,11 @@ class Recordings:
                     continue
             elif about.get("recorder") == SUPERVISED and about.get("instance") == instance:
                 self.release(opened)
-                return  # of an earlier run
+                return  # this recording, and so each older one, is of an earlier run
             self.release(opened)
 
     def release(self, opened: Opened, *, at_once: bool = False) -> None:
-        """End a use of a recording. It is closed after a while, or at once."""
+        """Release a recording after use. If nobody uses it any more, it is closed after ``IDLE_S``, or at once."""
         opened.users -= 1
         loop = asyncio.get_running_loop()
         if at_once:
@@ -297,7 +297,7 @@ class Recordings:
         return rows
 
     async def _examine(self, files: list[tuple[str, _State]]) -> None:
-        """Find the details of some files, one after the other. The next list asks for more."""
+        """Find the details of some files, one after the other. The next request for the list continues."""
         for name, state in files[:LOOKS]:
             opened: Opened | None = None
             started_s = time.monotonic()
@@ -314,13 +314,13 @@ class Recordings:
 
 
 def _order(name: str) -> tuple[str, int]:
-    """Return a key for the order in which a recorder began files: ``a_2.mem`` follows ``a.mem``."""
+    """Return a key that sorts files in the order in which a recorder created them: ``a_2.mem`` follows ``a.mem``."""
     begin, _, number = name.removesuffix(SUFFIX).rpartition("_")
     return (begin, int(number)) if begin and number.isdecimal() else (name.removesuffix(SUFFIX), 1)
 
 
 def _serves(opened: Opened, state: _State, since_s: float | None) -> bool:
-    """Return whether an open recording is the present file, or has what is wanted of it."""
+    """Return whether an open recording can be reused: its file is unchanged, or it was opened recently enough."""
     if opened.state == state:
         return True
     enough = opened.fresh if since_s is None else opened.opened_s >= since_s
@@ -369,7 +369,7 @@ def _details(opened: Opened) -> dict[str, Any]:
 
 
 def _listed(folder: Path) -> list[tuple[str, _State, bool]]:
-    """Return name, state, and whether it is being written, of the newest files."""
+    """Return the newest files: the name and state of each, and whether a recorder is writing it."""
     found = []
     with suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
@@ -384,7 +384,7 @@ def _listed(folder: Path) -> list[tuple[str, _State, bool]]:
 def _locked() -> set[int]:
     """Return the inodes of files that are locked for writing: a recorder locks the file that it writes.
 
-    It reads proc(5). To try the lock could take it from a recorder.
+    The locks are read from proc(5). An attempt to lock a file could take the lock from a recorder.
     """
     found = set()
     with suppress(OSError, ValueError, IndexError):

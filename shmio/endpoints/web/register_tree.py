@@ -24,7 +24,7 @@ class Row(NamedTuple):
 
 
 class Node:
-    """A source, a structure or a register, and what is below it in the order of the layout."""
+    """A source, a structure or a register, and the nodes below it in the order of the layout."""
 
     __slots__ = ("children", "name", "path", "register")
 
@@ -48,7 +48,7 @@ def tree(source: str, layout: Layout) -> Node:
 
 
 def rows(root: Node, layout: Layout, expanded: Collection[str]) -> Iterator[Row]:
-    """Yield the visible rows of a source, of which nodes with an expanded path show what is below them."""
+    """Yield the visible rows of a source: its root, and the rows below each node whose path is in ``expanded``."""
     pending = [(root, 0)]
     while pending:
         node, depth = pending.pop()
@@ -68,10 +68,10 @@ class Trees:
         self._trees: dict[int, Node] = {}
         self._making = threading.Lock()
         self.looking = asyncio.Lock()
-        """Held while rows are searched. Searches at the same time would delay all that pages get."""
+        """Held during a search for rows. Simultaneous searches would delay the data of all pages."""
 
     def of(self, block: Block, blocks: Iterable[Block]) -> Node:
-        """Return the tree of a block. Trees of blocks that are none of ``blocks`` are forgotten."""
+        """Return the tree of a block. To create it also drops the trees of blocks that are not in ``blocks``."""
         with self._making:
             node = self._trees.get(block.section)
             if node is None:
@@ -82,7 +82,7 @@ class Trees:
 
 
 def matching(root: Node, layout: Layout, text: str) -> Iterator[Row]:
-    """Yield a row for each register whose path or comment contains a text, in any case."""
+    """Yield a row for each register with ``text`` in its path, comment or source's name. Case is ignored."""
     wanted = text.lower()
     for register in layout.registers:
         if wanted in register.path.lower() or wanted in register.comment.lower() or wanted in root.name.lower():

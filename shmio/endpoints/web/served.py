@@ -26,7 +26,7 @@ from shmio.local.status import SourceStatus, status_of
 from shmio.segment import Segment
 
 OVERVIEW_S: Final = 0.9
-"""Time in s for which an overview is used again."""
+"""Time in s for which an overview is reused."""
 MINUTES: Final = (1, 10, 30)
 """Periods, in minutes, for which losses and recoveries of a source's data are counted."""
 _TICKS: Final = os.sysconf("SC_CLK_TCK")
@@ -35,7 +35,7 @@ _PAGE_BYTES: Final = os.sysconf("SC_PAGE_SIZE")
 
 @dataclass(frozen=True, slots=True)
 class _Usage:
-    """CPU time of a process in s, when it was read, and the process's memory in bytes."""
+    """CPU time of a process in s, the time at which it was read, and the process's memory in bytes."""
 
     cpu_s: float
     at_s: float
@@ -55,13 +55,13 @@ class Served:
         recordings: str | None = None,
         scene: Mapping[str, Any] | None = None,
     ) -> None:
-        """Begin without an overview.
+        """Create the shared state.
 
         Args:
             segment: The instance's segment.
             cell: The instance as programs see it. It must be writable.
             measurements: The timing of the sources.
-            folders: Folders in which the instance writes files, by purpose.
+            folders: Directories in which the instance writes files, by purpose.
             config_file: Path of the configuration.
             recordings: The recorder's directory; None if no recorder is configured.
             scene: The cell in 3D, as shmio/plan/scene.py makes it; None if the configuration has none.
@@ -79,7 +79,7 @@ class Served:
         """The newest events."""
         self.recordings = Recordings(recordings)
         self.messages = self.bytes = 0
-        """Messages that were sent to pages, and their bytes."""
+        """Numbers of messages and bytes that were sent to pages."""
         self._overview: dict[str, Any] = {}
         self._overview_s = -OVERVIEW_S
         self._usages: dict[int, _Usage] = {}

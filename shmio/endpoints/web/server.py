@@ -1,4 +1,4 @@
-"""The HTTP server: bounded connections and requests, and the rules for all answers."""
+"""The HTTP server: limits connections and requests, and adds security headers to all answers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from shmio.config import Address
 from shmio.errors import EndpointError
 
 MAX_CONNECTIONS: Final = 512
-"""Maximum number of connections. If there are more, the one is closed that has waited longest for a request."""
+"""Maximum number of connections. If there are more, the server closes the one longest without a request."""
 MAX_MESSAGE_BYTES: Final = 64 << 10
 """Maximum size of a message that a page sends over its WebSocket."""
 SEND_BUFFER_BYTES: Final = 64 << 10
@@ -48,7 +48,7 @@ _HEADERS: Final = (
 
 @dataclass
 class Counters:
-    """Counts of what clients have done."""
+    """Counts the requests and refusals so far, and the open connections."""
 
     requests: int = 0
     refused: int = 0
@@ -61,10 +61,10 @@ class _Protocol(H11Protocol):
     counters: Counters
     _deadline: asyncio.TimerHandle | None = None
     _quiet_s: float | None = None
-    """Since when no request is processed, as a time of the event loop in s; None while one is."""
+    """The event loop's time in s since which no request is in progress; None: a request is in progress."""
 
     def connection_made(self, transport: Any) -> None:
-        """Accept the connection, if there are not too many."""
+        """Accept the connection. If there are now too many connections, close one of them."""
         super().connection_made(transport)
         self.counters.connections = len(self.connections)
         self._quiet_s = self.loop.time()
@@ -74,7 +74,7 @@ class _Protocol(H11Protocol):
             self._longest_quiet().abort()
 
     def _longest_quiet(self) -> asyncio.Transport:
-        """Return the connection that others miss least: a WebSocket that is being closed, or without a request."""
+        """Return the connection to close: a WebSocket that is closing, or else the one longest without a request."""
         for other in self.connections:
             if getattr(other, "close_sent", False):
                 return other.transport
@@ -82,7 +82,7 @@ class _Protocol(H11Protocol):
         return min(quiet, key=lambda one: one._quiet_s or 0.0).transport
 
     def handle_websocket_upgrade(self, event: Any) -> None:
-        """Leave the connection to a page's WebSocket."""
+        """Hand the connection over to a page's WebSocket, without a deadline."""
         self._clear_deadline()
         super().handle_websocket_upgrade(event)
 
@@ -122,7 +122,7 @@ class _Protocol(H11Protocol):
 
 
 class _Guarded:
-    """Refuses requests for other hosts' names, and gives every answer its headers.
+    """Refuses requests for other hosts' names or from other servers' pages, and adds headers to every answer.
 
     A foreign web page can make a browser send requests to this server under a name of the page's own (DNS
     rebinding). Then the Host header has that name, so only names of this server are accepted.
@@ -132,7 +132,7 @@ class _Guarded:
         self._app, self._names, self._counters = app, names, counters
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request."""
+        """Pass a request on to the application, or refuse it."""
         if scope["type"] not in ("http", "websocket"):
             return
         self._counters.requests += 1
@@ -144,7 +144,7 @@ class _Guarded:
                 await self._app(scope, receive, send)
             else:
                 self._counters.refused += 1
-                await send({"type": "websocket.close", "code": 1008})  # before it is accepted: an answer 403
+                await send({"type": "websocket.close", "code": 1008})  # before accept(): the client gets the status 403
             return
 
         async def with_headers(message: Message) -> None:
@@ -183,7 +183,7 @@ class _Guarded:
 
 
 def _same_origin(origins: list[bytes], host: bytes, *, secure: bool) -> bool:
-    """Return whether a request comes from a page of this server, or from a program that is no browser.
+    """Return whether a request comes from a page of this server, or from a program other than a browser.
 
     Browsers name the page that sends a request in the Origin header (RFC 6454, section 7).
     """
@@ -199,7 +199,7 @@ class _Server(Uvicorn):
         """Set once connections are accepted."""
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Begin to accept connections."""
+        """Start to accept connections."""
         await super().startup(sockets)
         self.ready.set()
 
@@ -222,7 +222,7 @@ class HttpServer:
         certificate: str | None = None,
         key: str | None = None,
     ) -> None:
-        """Create the server; :meth:`start` begins to listen.
+        """Create the server; :meth:`start` starts to listen.
 
         Args:
             app: The application.
@@ -264,7 +264,7 @@ class HttpServer:
         self._serving: asyncio.Task[None] | None = None
 
     async def start(self) -> None:
-        """Begin to listen. Raise EndpointError if the address cannot be used."""
+        """Start to listen. Raise EndpointError if the address cannot be used."""
         family = socket.AF_INET6 if ":" in self.address.host else socket.AF_INET
         listening = socket.socket(family, socket.SOCK_STREAM)
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -279,7 +279,7 @@ class HttpServer:
         self._serving = asyncio.get_running_loop().create_task(self._server.serve([listening]))
         ready = asyncio.get_running_loop().create_task(self._server.ready.wait())
         await asyncio.wait({ready, self._serving}, return_when=asyncio.FIRST_COMPLETED)
-        if self._serving.done():  # uvicorn could not begin
+        if self._serving.done():  # uvicorn could not start
             ready.cancel()
             listening.close()
             await self._serving  # raises the reason

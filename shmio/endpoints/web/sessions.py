@@ -20,7 +20,7 @@ from shmio.config.credentials import Secret, digest
 from shmio.config.model import ROLES
 
 COOKIE: Final = "shmio_session_{}"
-"""Name of the cookie; it has the instance's name. Browsers share cookies among all ports of a host."""
+"""Name of the cookie. It includes the instance's name, because browsers share cookies among a host's ports."""
 MAX_SESSIONS: Final = 256
 MAX_AGE_S: Final = 12 * 3600
 """Time in s after which a user must show the token again."""
@@ -32,7 +32,7 @@ _MAX_HOSTS: Final = 1024
 
 @dataclass(frozen=True, slots=True)
 class User:
-    """A user of the page: the name of the token, or an empty name, and the roles."""
+    """A user of the page. ``name`` is the token's name; empty: the user has shown no token."""
 
     name: str
     roles: frozenset[str]
@@ -40,7 +40,7 @@ class User:
 
     @property
     def actor(self) -> Actor:
-        """The user in the audit log."""
+        """The user's identity for the audit log."""
         return Actor("token" if self.name else "anonymous", self.name, self.host)
 
     @property
@@ -54,7 +54,7 @@ class _Session:
     user: User
     opened_s: float
     ends: set[Callable[[], None]] = field(default_factory=set)
-    """Called when the session is closed."""
+    """Functions that are called when the session is closed."""
 
 
 class Sessions:
@@ -67,8 +67,8 @@ class Sessions:
 
         Args:
             tokens: The tokens that users may show.
-            anonymous: Roles of users who show none.
-            now: Clock in s.
+            anonymous: Roles of users who show no token.
+            now: Returns the time in s.
 
         """
         self._tokens = tokens
@@ -83,17 +83,17 @@ class Sessions:
         return bool(self._tokens)
 
     def user(self, cookie: str | None, host: str) -> User:
-        """Return the user who sent a cookie, or who sent none, from a host."""
+        """Return the user of the session with this cookie and host; an anonymous user if there is none."""
         found = self._found(cookie, host)
         return User("", self._anonymous, host) if found is None else found.user
 
     def left_s(self, cookie: str | None, host: str) -> float | None:
-        """Return the time in s until a session ends; None if the user has none."""
+        """Return the time in s until a session ends; None if there is no such session."""
         found = self._found(cookie, host)
         return None if found is None else found.opened_s + MAX_AGE_S - self._now()
 
     def on_end(self, cookie: str | None, host: str, end: Callable[[], None]) -> Callable[[], None]:
-        """Call ``end`` when a session is closed. Return what takes this back."""
+        """Call ``end`` when a session is closed. Return a function that cancels this."""
         found = self._found(cookie, host)
         if found is None:
             return lambda: None

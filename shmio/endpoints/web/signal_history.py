@@ -35,13 +35,13 @@ PART_BYTES: Final = 16 << 20
 PART_FRAMES: Final = 20_000
 """Number of frames after which a part ends."""
 MAX_PATHS: Final = 3
-"""Maximum number of paths that are named for an event."""
+"""Maximum number of paths that an event lists."""
 MAX_EXPLAINED: Final = 64
-"""Maximum number of registers that are searched for an event."""
+"""Maximum number of registers to search for those that an event concerns."""
 NEAR_NS: Final = 50_000_000
-"""Precision with which the log time of a frame is found."""
+"""Precision, in ns, with which the log time of a frame is found."""
 GAP_NS: Final = 1_000
-"""Time from the last frame before a gap to the gap's mark."""
+"""Time from the last frame before a gap to the gap's mark, in ns."""
 
 
 class Signal(NamedTuple):
@@ -80,15 +80,15 @@ class MarkedEvent(msgspec.Struct, omit_defaults=True):
 
 
 class Part(msgspec.Struct):
-    """A part of the course: its batches and events, and the share of the work that is done."""
+    """A part of the history: its batches and events, and the share of the work that is done."""
 
     batches: list[bytes]
     events: list[MarkedEvent]
     share: float
     reduced: bool = False
-    """True if frames were left out so far that a plot does not need."""
+    """True if frames were left out so far, because the plot does not need them."""
     damage: list[str] = []
-    """The last part: messages about places that could not be read."""
+    """Only in the last part: messages about places that could not be read."""
 
 
 def signals_of(dump: Dump, paths: Sequence[str]) -> list[Signal]:
@@ -116,7 +116,7 @@ def signal_history(dump: Dump, signals: Sequence[Signal], window: Window, damage
         dump: The recording.
         signals: The registers.
         window: The window.
-        damage: Messages about places of the recording that could not be read; they may become more.
+        damage: Messages about places of the recording that could not be read. The work may add some.
 
     """
     sources = list(dict.fromkeys(signal.source for signal in signals))
@@ -133,12 +133,12 @@ def signal_history(dump: Dump, signals: Sequence[Signal], window: Window, damage
 
 
 def past(dump: Dump, signals: Sequence[Signal], window: Window, utc_ns: int) -> Iterator[Part]:
-    """Yield the history of registers of one source, with the times that the plots of a running instance have.
+    """Yield the history of registers of one source, on the time scale of live plots.
 
     Args:
         dump: A recording of this run.
         signals: The registers, all of one source.
-        window: The window, in these times.
+        window: The window, on this time scale.
         utc_ns: UTC minus the time of CLOCK_MONOTONIC in ns, as for a feed in ``signals.py``.
 
     """
@@ -161,9 +161,10 @@ def first_time(dump: Dump, source: str) -> int | None:
 
 
 def _log_times(dump: Dump, source: str, publish_ns: int) -> tuple[int, int]:
-    """Return log times before and after a time of CLOCK_MONOTONIC, at most ``NEAR_NS`` from each other.
+    """Return log times before and after a time of CLOCK_MONOTONIC, at most ``NEAR_NS`` apart.
 
-    Log time follows the instance's clock, which may have been stepped. Both times ascend.
+    Log time follows the instance's clock, which may have been stepped. From frame to frame, neither
+    log time nor CLOCK_MONOTONIC goes back.
     """
     low, high = dump.begin_ns - 1, dump.end_ns
     while high - low > NEAR_NS:
@@ -177,7 +178,7 @@ def _log_times(dump: Dump, source: str, publish_ns: int) -> tuple[int, int]:
 
 
 class _History:
-    """Reads the frames of one source."""
+    """Reads the frames of one source, and reduces them for a plot."""
 
     def __init__(
         self,
@@ -192,10 +193,10 @@ class _History:
         self._waiting: list[tuple[Batch, Batch | None]] = []
         self._block: DumpBlock | None = None
         self._number = self._time_ns = 0
-        """Number and time of the last frame; 0 at the start, and in a new block."""
+        """Number and time of the last frame; 0 at the start. In a new block, the number starts at 0 again."""
 
     def parts(self, source: str, from_ns: int | None = None, to_ns: int | None = None) -> Iterator[Part]:
-        """Yield the parts. The frame before the window and the first one after it are included."""
+        """Yield the parts. They include the last frame before the window and the first frame after it."""
         begin_ns = self._window.from_ns if from_ns is None else from_ns
         end_ns = self._window.to_ns if to_ns is None else to_ns
         before = self._dump.latest(source, begin_ns)
@@ -222,7 +223,7 @@ class _History:
             return
 
     def _raw(self, source: str, batch: Batch) -> Batch | None:
-        """Return the frames as the source delivered them, if readers saw other values."""
+        """Return a batch's frames as the source delivered them; None if readers saw these same values."""
         if not (batch.head["flags"] & 1).any():
             return None
         for _, raw in self._dump.batches(source, int(batch.time_ns[0]), int(batch.time_ns[-1]), raw=True):
@@ -306,7 +307,7 @@ class _History:
 
 
 def events(dump: Dump, sources: Collection[str], window: Window) -> Iterator[Part]:
-    """Yield the first event of each column, part by part."""
+    """Yield the progress, and finally the first event of each column."""
     width_ns = max(1, (window.to_ns - window.from_ns) // max(1, window.columns))
     explainers: dict[DumpBlock, Explainer] = {}
     found: dict[int, MarkedEvent] = {}

@@ -1,4 +1,4 @@
-"""The history of registers over time, for plots. What several pages plot is packed once.
+"""The values of registers over time, for plots. Registers that several pages plot are packed once.
 
 A batch is a binary message with the frames of one feed, little-endian: the feed's number (uint32),
 the number of frames (uint32), and the time of the frame before them (float64), NaN after a gap.
@@ -32,9 +32,9 @@ from shmio.segment.block import Frame
 INTERVAL_S: Final = 0.04
 """Interval at which new frames are packed and sent, in s. A page redraws as often."""
 HISTORY_S: Final = 8.0
-"""Time in s before a feed's start, from which the feed sends the frames that the ring still has."""
+"""A new follower first gets the frames of this time in s, as far as the ring still has them."""
 MAX_HISTORY: Final = 2_000
-"""Maximum number of these frames. If there are more, they are taken at equal distances."""
+"""Maximum number of frames that a new follower first gets. If there are more, every n-th is chosen."""
 MAX_BEHIND: Final = 500
 """Maximum number of unread frames. If there are more, this process was too slow: the older ones become a gap."""
 MAX_BATCH_BYTES: Final = 256 << 10
@@ -42,7 +42,7 @@ MAX_BATCH_BYTES: Final = 256 << 10
 MAX_IMAGE_BYTES: Final = 32 << 20
 """Maximum size of the images from which a batch is made."""
 LEAST_GAP_NS: Final = 100_000_000
-"""Time without frames that is a gap, unless the source's period or its stale time is longer."""
+"""Minimum time without frames that counts as a gap, in ns. It is longer for sources with a long period."""
 HEAD: Final = struct.Struct("<IId")
 """The head of a batch."""
 _MILLISECOND: Final = np.timedelta64(1, "ms")
@@ -51,17 +51,17 @@ _log = logging.getLogger("shmio.web")
 
 
 class Follower(Protocol):
-    """A follower of a feed."""
+    """Receives the batches of a feed."""
 
     def take(self, batch: bytes) -> None:
-        """Take a batch. It may be dropped."""
+        """Receive a batch. The follower may drop it."""
 
     def end(self, number: int) -> None:
-        """Learn that a feed has ended, because a reload has replaced its source."""
+        """Handle the end of a feed: a reload has replaced its source, or the feed has failed."""
 
 
 class Feed:
-    """Some registers of one source, frame by frame. Use it in the event loop's thread only."""
+    """Sends the values of some registers of one source to followers. Use it in the event loop's thread only."""
 
     def __init__(self, number: int, block: Block, registers: Sequence[Register], utc_ns: int) -> None:
         """Start with the next frame.
@@ -84,7 +84,7 @@ class Feed:
     def history(self, last: int) -> tuple[list[bytes], Frame | None]:
         """Return the batches of the frames before the feed's start, and the last of these frames.
 
-        It may run in another thread.
+        You may call this from another thread.
 
         Args:
             last: Number of the last frame before the start.
@@ -156,7 +156,7 @@ class Feed:
         return (frame.publish_ns + self._utc_ns) / 1e9
 
     def _bad(self, register: Register, frames: Sequence[Frame]) -> npt.NDArray[np.bool_] | bool:
-        """Return in which frames the source calls a register bad."""
+        """Return for each frame whether the source reports the register as bad."""
         if self.block.statuses is None:
             return False
         statuses = (status_of(self.block, register, frame) for frame in frames)
@@ -167,12 +167,12 @@ class _Packer:
     """Splits a feed's frames into batches: at gaps, and where a batch has become large."""
 
     def __init__(self, feed: Feed, before: Frame | None = None, step: int = 1) -> None:
-        """Start.
+        """Create the packer.
 
         Args:
             feed: The feed.
             before: The frame before the first; None after a gap.
-            step: Distance between the numbers of two frames.
+            step: Difference between the numbers of consecutive frames.
 
         """
         self.before = before
@@ -211,7 +211,7 @@ class Feeds:
         self._feeds: dict[tuple[int, tuple[str, ...]], Feed] = {}
         self._number = 0
         self.utc_ns = time.time_ns() - time.monotonic_ns()
-        """UTC minus the time of CLOCK_MONOTONIC, in ns. All feeds have one: a frame has the same time in each."""
+        """UTC minus the time of CLOCK_MONOTONIC, in ns. All feeds use it, so that a frame has the same time in each."""
         self._task: asyncio.Task[None] | None = None
 
     async def follow(self, block: Block, registers: Sequence[Register], follower: Follower) -> Feed:
@@ -220,7 +220,7 @@ class Feeds:
         Args:
             block: The source's block.
             registers: The registers.
-            follower: Who follows.
+            follower: Receives the batches.
 
         """
         key = (block.section, tuple(register.path for register in registers))
@@ -240,7 +240,7 @@ class Feeds:
         return feed
 
     def leave(self, feed: Feed, follower: Follower) -> None:
-        """End that a follower follows a feed."""
+        """Remove a follower from a feed."""
         feed.followers.discard(follower)
         if self._task is not None and not any(feed.followers for feed in self._feeds.values()):
             self._task.cancel()
@@ -266,14 +266,14 @@ def _sent(feed: Feed) -> bool:
     try:
         retired = feed.block.retired  # before the frames are read: nothing is published after the end
         feed.send()
-    except Exception:  # noqa: BLE001  the feeds of other sources go on
+    except Exception:  # noqa: BLE001  the feeds of other sources continue
         _log.exception("a plot of %s ends", feed.block.source)
         return False
     return not retired
 
 
 def check_plottable(register: Register) -> None:
-    """Raise PathError unless a register is one number, BOOL or duration."""
+    """Raise PathError unless a register is a single number, BOOL or duration."""
     kind = np.dtype(_kind(register)).kind
     if register.dims:
         raise PathError(f"{register.path}: this is an array; plot one element, such as {_first(register)}")

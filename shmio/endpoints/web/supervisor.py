@@ -1,4 +1,4 @@
-"""Requests of pages to the supervisor."""
+"""Sends requests of pages to the supervisor."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ MAX_REQUESTS: Final = 4
 
 
 class Supervisor:
-    """The supervisor of the instance. Use it in the event loop's thread only."""
+    """Sends requests to the instance's supervisor. Use it in the event loop's thread only."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._room = asyncio.Semaphore(MAX_REQUESTS)
 
     async def ask(self, request: Request, timeout_s: float) -> dict[str, Any]:
-        """Return the answer to a request.
+        """Send a request, and return the answer.
 
-        The thread that waits does not keep this process alive: the request may be to restart it.
+        A daemon thread waits for the answer. It does not keep this process alive, which the request may
+        be about to restart.
 
         Raises:
             ControlError: The supervisor refuses, does not answer, or seems to be dead.
@@ -52,6 +53,6 @@ class Supervisor:
             with suppress(RuntimeError):  # the event loop has ended
                 loop.call_soon_threadsafe(settle, answer, failure)
 
-        await self._room.acquire()  # released when the thread ends, also if the page is closed before
+        await self._room.acquire()  # released when the thread ends, even if the page is closed earlier
         threading.Thread(target=run, name="ask", daemon=True).start()
         return await answered

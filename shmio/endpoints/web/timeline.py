@@ -11,20 +11,20 @@ from shmio.model.event import Event
 from shmio.segment import Segment
 
 MAX_EVENTS: Final = 200
-"""Number of events that are kept."""
+"""Maximum number of events that are kept."""
 MAX_READ: Final = 500
 """Maximum number of a source's events that are read at a time. The ring keeps more for the next time."""
 MAX_PATHS: Final = 8
-"""Maximum number of paths that are kept of an event."""
+"""Maximum number of paths that are kept for an event."""
 INTERVAL_S: Final = 0.4
-"""Time in s for which the list is used again."""
+"""Time in s for which the list is reused."""
 
 
 class Timeline:
     """Keeps the newest events. Use it in the event loop's thread only."""
 
     def __init__(self, segment: Segment) -> None:
-        """Begin without events."""
+        """Create an empty timeline."""
         self._segment = segment
         self._readers: dict[int, EventReader] = {}
         self._events: deque[dict[str, Any]] = deque(maxlen=MAX_EVENTS)

@@ -1,7 +1,7 @@
 """Compiles files that a user drops on a page: sources of data blocks, tag tables, other tools' tag lists.
 
-Nobody has checked these files. A process of its own reads them, from its standard input, with limits of
-time and memory. No file is written.
+These files may be hostile. A separate process reads them from its standard input, with limits of time
+and memory. No file is written.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from shmio.layout.tags import SUFFIXES, place_tags
 from shmio.logs import printable
 
 MAX_BYTES: Final = 8 << 20
-"""Maximum size of all files together."""
+"""Maximum size of all files together, in bytes."""
 MAX_HEAD_BYTES: Final = 64 << 10
-"""Maximum size of the line with the names."""
+"""Maximum size of the line with the names, in bytes."""
 MAX_FILES: Final = 100
 MAX_ROWS: Final = 100_000
 """Maximum number of registers that are shown."""
 MAX_ANSWER_BYTES: Final = 16 << 20
-"""Maximum size of the shown registers as JSON."""
+"""Maximum size of the shown registers as JSON, in bytes."""
 MAX_MESSAGES: Final = 200
 MAX_TEXT: Final = 500
-"""Number of characters of a text that are shown."""
+"""Maximum number of characters of a text that are shown."""
 LIMIT_S: Final = 30
-"""Longest time in s to compile files."""
+"""Time limit in s to compile files."""
 MEMORY_BYTES: Final = 1 << 30
-"""Largest address space of the process that compiles."""
+"""Maximum address space of the process that compiles, in bytes."""
 _SOURCES: Final = (".db", ".udt", ".awl", ".scl")
 
 _Name = Annotated[str, Meta(min_length=1, max_length=255)]
@@ -56,13 +56,13 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 
 
 async def compile_uploads(body: bytes) -> bytes:
-    """Compile files in a process of its own; return its answer, which is JSON.
+    """Compile files in a separate process, and return its answer, which is JSON.
 
     Args:
         body: A line with a JSON list of names and sizes, and then the contents of the files.
 
     Raises:
-        CommandError: It took too much time or memory.
+        CommandError: The process took too much time or memory.
 
     """
     process = await asyncio.create_subprocess_exec(
@@ -120,7 +120,7 @@ def _compile(files: Sequence[Source]) -> tuple[Sequence[Layout], list[str]]:
     """Compile files as ``shmio-layout`` does; import a single file that is a tag list of another tool.
 
     Raises:
-        LayoutError: Neither can be done.
+        LayoutError: The files can neither be compiled nor imported.
 
     """
     single = files[0] if len(files) == 1 and not files[0].file.lower().endswith(_SOURCES) else None
@@ -136,7 +136,7 @@ def _compile(files: Sequence[Source]) -> tuple[Sequence[Layout], list[str]]:
 
 
 def _import(file: Source) -> tuple[Sequence[Layout], list[str]] | None:
-    """Import a tag list of another tool; return None if it is none."""
+    """Import a tag list of another tool; return None if the file is not such a list."""
     try:
         found: Found = import_tags(file.text)
     except ImportingError:
@@ -186,7 +186,7 @@ def _short(text: str) -> str:
 
 def main() -> None:
     """Read a request from standard input, and write the answer to standard output."""
-    signal.alarm(2 * LIMIT_S)  # if the process that waits for it has died
+    signal.alarm(2 * LIMIT_S)  # ends this process even if its parent has died
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     resource.setrlimit(resource.RLIMIT_CPU, (LIMIT_S, LIMIT_S))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

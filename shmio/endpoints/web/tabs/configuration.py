@@ -17,13 +17,13 @@ from shmio.errors import CommandError
 INTERVAL_S: Final = 1.0
 """Interval in s at which to check that the file is still the same."""
 RELOAD_S: Final = 90.0
-"""Longest time in s of a reload."""
+"""Time limit in s for a reload."""
 
 _log = logging.getLogger("shmio.web")
 
 
 class Seen(msgspec.Struct, forbid_unknown_fields=True):
-    """The version of the file that the user has seen."""
+    """The arguments of ``reload``: the version of the file that the user has seen."""
 
     version: Annotated[str, Meta(max_length=200)]
 
@@ -46,7 +46,7 @@ class Configuration(Tab):
 
     @call("read", Nothing)
     async def leave(self, _: Nothing) -> None:
-        """End what ``follow`` began."""
+        """Stop sending what ``follow`` started to send."""
         if self._following is not None:
             self._following.cancel()
             self._following = None
@@ -75,7 +75,7 @@ class Configuration(Tab):
             if present != seen:
                 described = await self._described()
                 self.page.push("configuration", described)
-                seen = None if described["problem"] else present  # the supervisor may have been busy
+                seen = None if described["problem"] else present  # try again: the supervisor may have been busy
             await asyncio.sleep(INTERVAL_S)
 
     async def _described(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The injections tab: what is injected, campaigns, and the events of all sources."""
+"""The injections tab: the present injections, campaigns, and the events of all sources."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ MAX_INJECTIONS: Final = 500
 MAX_PATHS: Final = 20
 """Maximum number of paths that are shown for an injection or an event."""
 MAX_COUNTED: Final = 4_096
-"""Number of registers above which they are no longer counted."""
+"""Maximum number of an injection's registers that are counted."""
 MAX_CAMPAIGNS: Final = 16
 """Maximum number of campaigns that one page may run at a time."""
 MAX_CONDITION: Final = 1_000
@@ -45,25 +45,25 @@ MAX_CAMPAIGN: Final = 60_000
 
 
 class Given(msgspec.Struct, forbid_unknown_fields=True):
-    """A campaign as TOML text."""
+    """The arguments of a call about a campaign: its TOML text."""
 
     text: Annotated[str, Meta(max_length=MAX_CAMPAIGN)]
     keep: bool = False
-    """True if the injections continue when the page is closed."""
+    """True if the injections continue after the page is closed."""
 
 
 class Typed(msgspec.Struct, forbid_unknown_fields=True):
-    """A condition that the user types."""
+    """The arguments of ``condition``: a condition that the user types."""
 
     when: Annotated[str, Meta(max_length=MAX_CONDITION)]
 
 
 class Chosen(msgspec.Struct, forbid_unknown_fields=True):
-    """An injection."""
+    """The arguments of ``lift``: the source and the number of an injection."""
 
     source: Annotated[str, Meta(max_length=200)]
     number: Annotated[str, Meta(pattern="^[0-9]{1,20}$")]
-    """Its number as text: JavaScript has no exact numbers above 2**53."""
+    """The number as text, because JavaScript has no exact numbers above 2**53."""
 
 
 class Injections(Tab):
@@ -77,7 +77,7 @@ class Injections(Tab):
         self._following: asyncio.Task[None] | None = None
 
     def close(self) -> None:
-        """Lift the campaigns of this page that are not to be kept."""
+        """Lift the campaigns of this page, except those with ``keep``."""
         campaigns, self._campaigns = self._campaigns, []
         if campaigns:
             named = {", ".join(f"{one.source}: {one.name}" for one in held.declared): held for held in campaigns}
@@ -91,7 +91,7 @@ class Injections(Tab):
 
     @call("read", Nothing)
     async def leave(self, _: Nothing) -> None:
-        """End what ``follow`` began."""
+        """Stop sending what ``follow`` started to send."""
         if self._following is not None:
             self._following.cancel()
             self._following = None
@@ -197,7 +197,7 @@ class Injections(Tab):
 
 
 def _present(block: Block, codec: RegisterCodec) -> Number | None:
-    """Return the present value of a register; None if it is unknown, as for the conditions of injections."""
+    """Return the present value of a register, by the rules for conditions of injections; None: unknown."""
     frame = block.latest()
     if frame is None or not frame.source_ns or block.assess(frame)[0] is Quality.BAD:
         return None
@@ -209,7 +209,7 @@ def _parse(text: str) -> list[Declaration]:
     """Return the declarations in a campaign.
 
     Raises:
-        ConfigError: The text is no TOML, or a declaration is wrong.
+        ConfigError: The text is not TOML, or a declaration is wrong.
 
     """
     try:
@@ -224,7 +224,7 @@ def _described_declaration(declaration: Declaration) -> dict[str, Any]:
 
 
 def _covered(block: Block, cover: Any) -> Iterator[str]:
-    """Yield the paths of the registers of which a declared injection covers a bit."""
+    """Yield the paths of the registers of which ``cover`` includes at least one bit."""
     mask = bytes(cover)
     for register in block.layout.own:
         share = mask[register.offset : register.offset + register.size]

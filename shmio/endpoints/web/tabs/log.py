@@ -17,16 +17,16 @@ MAX_LINES: Final = 500
 SEARCHED_LINES: Final = 5_000
 """Number of the newest lines in which a filter searches."""
 MAX_TEXT: Final = 2_000
-"""Number of characters of a line that are sent."""
+"""Maximum number of characters of a line that are sent."""
 
 
 class Wanted(msgspec.Struct, forbid_unknown_fields=True):
-    """Which lines the page shows."""
+    """The arguments of ``lines``: which lines the page shows."""
 
     filter: Annotated[str, Meta(max_length=200)] = ""
-    """Text that the lines contain; case is ignored."""
+    """Text that each line must contain; case is ignored."""
     process: Annotated[str, Meta(max_length=200)] = ""
-    """Name of the process; empty: all."""
+    """Name of the process; empty: all processes."""
     count: Annotated[int, Meta(ge=1, le=MAX_LINES)] = 200
 
 
@@ -37,7 +37,7 @@ class Log(Tab):
 
     @call("read", Wanted)
     async def lines(self, given: Wanted) -> list[dict[str, Any]]:
-        """Return the newest lines that fit, the oldest first."""
+        """Return the newest lines that match, the oldest first."""
         served = self.page.served
         names = ["supervisor", *(slot.name for slot in served.segment.processes)]
         chosen = [name for name in names if given.process in ("", name)]

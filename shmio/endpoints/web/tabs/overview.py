@@ -17,19 +17,19 @@ INTERVAL_S: Final = 1.0
 
 
 RESTART_S: Final = 40.0
-"""Longest time in s until a process runs again."""
+"""Time limit in s for the restart of a process."""
 
 _log = logging.getLogger("shmio.web")
 
 
 class Named(msgspec.Struct, forbid_unknown_fields=True):
-    """A process."""
+    """The arguments of ``restart``: the name of a process."""
 
     name: Annotated[str, Meta(min_length=1, max_length=200)]
 
 
 class Overview(Tab):
-    """Sends the overview of the instance. All tabs show its head line, so each page follows it."""
+    """Sends the overview of the instance. Every page follows it, because all tabs show its head line."""
 
     name: ClassVar[str] = "overview"
 

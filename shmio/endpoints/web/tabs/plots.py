@@ -1,4 +1,4 @@
-"""The plots tab: the history of registers, live, and their past from the recording of this run."""
+"""The plots tab: live values of registers, and their past from the recordings of this run."""
 
 from __future__ import annotations
 
@@ -22,19 +22,22 @@ MAX_SIGNALS: Final = 200
 """Maximum number of registers that one page plots."""
 MAX_COLUMNS: Final = 4000
 RECORDED_S: Final = 2.0
-"""Time in s after which a frame is in the recorder's file."""
+"""Time in s after which a published frame is in the recorder's file."""
 
 
 class Plotted(msgspec.Struct, forbid_unknown_fields=True):
-    """The registers of one source that the page plots from now on."""
+    """The arguments of ``follow``: the registers of one source that the page plots from now on."""
 
     source: Annotated[str, Meta(min_length=1, max_length=MAX_PATH)]
     paths: Annotated[list[Annotated[str, Meta(min_length=1, max_length=MAX_PATH)]], Meta(max_length=MAX_SIGNALS)]
-    """Paths with the source, of registers or elements."""
+    """Paths of registers or elements, which start with the source's name."""
 
 
 class Wanted(msgspec.Struct, forbid_unknown_fields=True):
-    """A window of the past (s, UTC, as in batches), the registers of one source, and the width in pixels."""
+    """The arguments of ``past``: registers of one source, a window of time, and the plot's width in pixels.
+
+    Times are in s, UTC, as in batches.
+    """
 
     source: Annotated[str, Meta(min_length=1, max_length=MAX_PATH)]
     paths: Annotated[list[Annotated[str, Meta(min_length=1, max_length=MAX_PATH)]], Meta(min_length=1, max_length=32)]
@@ -44,13 +47,13 @@ class Wanted(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Numbered(msgspec.Struct, forbid_unknown_fields=True):
-    """A part of the past that the page has requested."""
+    """The arguments of ``more``: a number that ``past`` has returned."""
 
     number: int
 
 
 class Plots(Tab):
-    """Sends the history of registers. A page that stalls gets a gap, and then the newest data."""
+    """Sends the values of registers over time. A page that stalls gets a gap, and then the newest data."""
 
     name: ClassVar[str] = "plots"
 
@@ -70,11 +73,11 @@ class Plots(Tab):
 
     @call("read", Wanted)
     async def past(self, given: Wanted) -> list[int]:
-        """Begin to read the past of registers, in place of what was requested before for this source.
+        """Start to read the past of registers. This replaces an earlier request for the same source.
 
         Returns:
-            A number for each file that has a part of it, in the order of time; ``more`` returns the
-            parts. Empty: the recorder has nothing of it.
+            A number for each recording that has some of this past, in the order of time; ``more``
+            returns its parts. Empty: no recording has any.
 
         """
         async with self._changing:
@@ -106,7 +109,7 @@ class Plots(Tab):
 
     @call("read", Numbered)
     async def more(self, given: Numbered) -> Part | None:
-        """Return the next part of the past; None if there is none, or other registers were requested since."""
+        """Return the next part of the past; None: there are no more, or a newer request has replaced it."""
         work = next((works[given.number] for works in self._past.values() if given.number in works), None)
         return None if work is None else await work.next()
 
@@ -116,10 +119,10 @@ class Plots(Tab):
 
     @call("read", Plotted)
     async def follow(self, given: Plotted) -> dict[str, Any] | None:
-        """Send the history of these registers of a source, in place of those sent so far.
+        """Send the values of these registers of a source from now on, in place of those sent so far.
 
-        The answer comes before the first batch. It names the feed's number, and the registers in
-        the order of the batch.
+        The answer comes before the first batch. It has the feed's number, and the registers in the
+        order of the batches.
         """
         async with self._changing:
             paths = list(dict.fromkeys(given.paths))
@@ -151,7 +154,7 @@ class Plots(Tab):
         self.page.push_batch(batch)
 
     def end(self, number: int) -> None:
-        """Tell the page which feeds are left. It follows the others again."""
+        """Tell the page which feeds are left, so that it follows the registers of the ended feed again."""
         self._feeds = {source: feed for source, feed in self._feeds.items() if feed.number != number}
         self.page.push("plots", [feed.number for feed in self._feeds.values()])
 
@@ -162,7 +165,9 @@ class Plots(Tab):
 
 
 def _work(served: Served, opened: Opened, given: Wanted, window: Window) -> tuple[Work[Part] | None, int]:
-    """Return the work with one file, and the monotonic time of its first frame; None if it has nothing to read.
+    """Return the work that reads the past from a recording, and the monotonic time of the first frame in ns.
+
+    The work is None if the recording has nothing of this past.
 
     Raises:
         PathError: The file has no such register.

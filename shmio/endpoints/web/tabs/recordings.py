@@ -38,7 +38,7 @@ MAX_SHOWN: Final = 100
 MAX_INSTANCE: Final = 40
 """Maximum length of an instance's name."""
 BESIDE: Final = "-replay"
-"""End of the name of an instance that replays a recording beside the one that made it."""
+"""Suffix of the name of an instance that replays a recording beside this instance."""
 CHECKED_BYTES: Final = 1 << 20
 """Number of bytes after which a check reports its progress."""
 
@@ -49,20 +49,23 @@ _Text = Annotated[str, Meta(max_length=MAX_PATH)]
 
 
 class Named(msgspec.Struct, forbid_unknown_fields=True):
-    """A recording."""
+    """The arguments of a call about one recording: its name."""
 
     name: _Name
 
 
 class Search(msgspec.Struct, forbid_unknown_fields=True):
-    """A recording, and a text that paths of its registers contain."""
+    """The arguments of ``registers``: a recording, and a text that the paths of registers must contain."""
 
     name: _Name
     filter: Annotated[str, Meta(max_length=200)] = ""
 
 
 class Plotted(msgspec.Struct, forbid_unknown_fields=True):
-    """Registers of a recording, the window of the plot (s, UTC; None: all of it), and its width in pixels."""
+    """The arguments of ``plot``: registers of a recording, a window of time, and the plot's width in pixels.
+
+    Times are in s, UTC; None: the start or the end of the recording.
+    """
 
     name: _Name
     paths: Annotated[list[_Path], Meta(max_length=MAX_SIGNALS)]
@@ -72,13 +75,13 @@ class Plotted(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Numbered(msgspec.Struct, forbid_unknown_fields=True):
-    """Work that the page has started."""
+    """The arguments of a call about work that the page has started: its number."""
 
     number: int
 
 
 class Request(msgspec.Struct, forbid_unknown_fields=True):
-    """A change of replays: see :class:`shmio.local.replays.ReplayRequest`."""
+    """The arguments of ``replay``: a change as in :class:`shmio.local.replays.ReplayRequest`."""
 
     paused: bool | None = None
     speed: float | None = None
@@ -136,7 +139,7 @@ class RecordingsTab(Tab):
 
     @call("read", Plotted)
     async def plot(self, given: Plotted) -> dict[str, Any]:
-        """Begin to read the history of registers, reduced to the width of the plot; ``more`` returns it."""
+        """Start to read the history of registers, reduced to the width of the plot; ``more`` returns its parts."""
         opened = await self._recordings.open(given.name)
         try:
             dump = opened.dump
@@ -163,7 +166,7 @@ class RecordingsTab(Tab):
 
     @call("read", Named)
     async def verify(self, given: Named) -> int:
-        """Begin to read all of a recording, as ``shmio-dump verify`` does; ``more`` returns progress and result."""
+        """Start to read a whole recording, as ``shmio-dump verify`` does; ``more`` returns progress and result."""
         path = self._recordings.path(given.name)
 
         def work(beat: Callable[[], None]) -> Iterator[dict[str, Any]]:
@@ -200,14 +203,14 @@ class RecordingsTab(Tab):
 
     @call("read", Numbered)
     async def stop(self, given: Numbered) -> None:
-        """Stop work."""
+        """Stop work that the page has started."""
         work = self._works.pop(given.number, None)
         if work is not None:
             work.stop()
 
     @call("read", Nothing)
     async def replays(self, _: Nothing) -> dict[str, Any]:
-        """Return the status of each replay, and the kinds of events that a replay can search."""
+        """Return the status of each replay, and the kinds of events for which a replay can search."""
         try:
             found = await run_in_threadpool(self.page.served.cell.replay.status)
         except CommandError:  # the instance plays no recording
@@ -216,7 +219,7 @@ class RecordingsTab(Tab):
 
     @call("control", Request)
     async def replay(self, given: Request) -> list[dict[str, Any]]:
-        """Change replays; return their status. The page's next change waits."""
+        """Change replays, and return their status. The page's next change waits until this one is done."""
         wanted = ReplayRequest(**msgspec.structs.asdict(given) | {"sources": tuple(given.sources)})
         async with self._moving:
             replay = self.page.served.cell.replay
@@ -224,10 +227,10 @@ class RecordingsTab(Tab):
         return [asdict(one) for one in found]
 
     def _commands(self, path: Path) -> dict[str, str]:
-        """Return the commands that replay a file: beside this instance, and in its place.
+        """Return the commands that replay a file beside this instance, and in place of this instance.
 
-        The page starts no instance itself: a replay in place of this one would stop it. In the first command, PORT
-        stands for the port of the page of the replay.
+        The page does not run them itself, because a replay in place of this instance would stop the
+        page. In the first command, PORT stands for the port of the replay's page.
         """
         served = self.page.served
         name = f"{served.segment.instance[: MAX_INSTANCE - len(BESIDE)]}{BESIDE}"

@@ -28,29 +28,29 @@ INTERVAL_S: Final = 0.2
 """Interval at which changed values of visible rows are sent, in s."""
 MAX_ROWS: Final = 200
 MAX_COUNTED: Final = 2_000_000
-"""Number of visible rows above which they are no longer counted."""
+"""Maximum number of visible rows that are counted."""
 MAX_EXPANDED: Final = 1000
 MAX_OVERRIDES: Final = 64
 """Maximum number of registers that one page may override at a time."""
 MAX_TEXT: Final = 200
-"""Number of characters of a value that are shown."""
+"""Maximum number of characters of a value that are shown."""
 _TEXTS: Final = frozenset({"CHAR", "WCHAR", "STRING", "WSTRING"})
 
 _Path = Annotated[str, Meta(min_length=1, max_length=MAX_PATH)]
 
 
 class Shown(msgspec.Struct, forbid_unknown_fields=True):
-    """Which rows the page shows."""
+    """The arguments of ``rows``: which rows the page shows."""
 
     first: Annotated[int, Meta(ge=0, le=MAX_COUNTED)]
     count: Annotated[int, Meta(ge=0, le=MAX_ROWS)]
     expanded: Annotated[list[_Path], Meta(max_length=MAX_EXPANDED)] | None = None
-    """Paths of the nodes that show what is below them; None: all sources."""
+    """Paths of the expanded nodes; None: all sources are expanded."""
     filter: Annotated[str, Meta(max_length=200)] = ""
 
 
 class Given(msgspec.Struct, forbid_unknown_fields=True):
-    """A value that the user has typed, and its register."""
+    """The arguments of ``set`` and ``override``: a register's path, and the value that the user has typed."""
 
     path: _Path
     value: Annotated[str, Meta(max_length=32_768)]
@@ -63,7 +63,7 @@ class Named(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Followed(msgspec.Struct, forbid_unknown_fields=True):
-    """Registers whose values the page shows."""
+    """The arguments of ``follow``: the registers whose values the page shows."""
 
     paths: Annotated[list[_Path], Meta(max_length=MAX_ROWS)]
 
@@ -92,7 +92,7 @@ class Registers(Tab):
     @call("read", Shown)
     async def rows(self, given: Shown) -> dict[str, Any]:
         """Return rows, and send the values of these rows from now on, whenever they change."""
-        async with self._looking, self.page.served.trees.looking:  # one at a time of a page, and of all pages
+        async with self._looking, self.page.served.trees.looking:  # one search at a time for a page, and for all pages
             found, total = await run_in_threadpool(self._rows, given)
         self._show([(row.path, row.register) for row in found if row.register is not None])
         return {"first": given.first, "total": total, "rows": [self._describe(row) for row in found]}
@@ -104,14 +104,14 @@ class Registers(Tab):
 
     @call("write", Given)
     async def set(self, given: Given) -> dict[str, str]:
-        """Write a value; return its outcome."""
+        """Write a value, and return the outcome."""
         path, value = self._typed(given)
         outcome = (await run_in_threadpool(self._cell.set, {path: value}))[0]
         return {"path": path, "outcome": str(outcome.kind), "reason": outcome.text}
 
     @call("inject", Given)
     async def override(self, given: Given) -> dict[str, str]:
-        """Show consumers this value in place of the source's, until it is lifted or the page is closed."""
+        """Show consumers this value in place of the source's, until the page lifts it or is closed."""
         path, value = self._typed(given)
         shadow = self._overrides.get(path)
         if shadow is None:
@@ -178,7 +178,7 @@ class Registers(Tab):
         return described
 
     def _writable(self, path: str, register: Register) -> bool:
-        """Return whether the configuration allows to write all of a register."""
+        """Return whether the configuration allows writing the whole register."""
         block = self.page.served.segment.blocks.get(path.partition("/")[0])
         if block is None:
             return False
@@ -196,7 +196,7 @@ class Registers(Tab):
     def _send_values(self) -> None:
         """Send the values of all visible rows, if one has changed.
 
-        All of them, because a message that the page has not taken is replaced by the next.
+        Unchanged values are sent, too, because a newer message replaces one that is not sent yet.
         """
         blocks = self.page.served.segment.blocks
         frames = {source: block.latest() for source, block in blocks.items()}
@@ -211,12 +211,12 @@ class Registers(Tab):
 
 
 def _value(found: Reading) -> list[Any]:
-    """Return what a row shows: value as text, quality, reason, provenance, source time."""
+    """Return what a row shows: the value as text, quality, reason, provenance and source time."""
     text = None if found.value is None else _text(found)
     return [text, str(found.quality), found.reason, found.provenance, found.source_time]
 
 
 def _text(found: Reading) -> str:
-    """Return a value as text: JavaScript has no exact numbers above 2**53, and JSON no infinity."""
+    """Return a value as text, because JavaScript has no exact numbers above 2**53, and JSON no infinity."""
     text = to_text(found.value, found.register)
     return text if len(text) <= MAX_TEXT else f"{text[:MAX_TEXT]}…"

@@ -1,4 +1,4 @@
-"""The 3D tab: the bodies of the cell, and which register moves which.
+"""The 3D tab: the bodies of the cell, and the registers that move them.
 
 The page follows these registers as the tabs Plots and Registers do.
 """
@@ -24,5 +24,5 @@ class Scene(Tab):
 
     @call("read", Nothing)
     async def get(self, _: Nothing) -> Mapping[str, Any] | None:
-        """Return the scene."""
+        """Return the bodies of the cell, and the registers that move them."""
         return self.page.served.scene

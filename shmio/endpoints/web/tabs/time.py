@@ -1,4 +1,4 @@
-"""The time tab: steps, plays, pauses and releases the time of the instance."""
+"""The time tab: steps, plays, pauses and releases the instance's clock."""
 
 from __future__ import annotations
 
@@ -12,27 +12,33 @@ from shmio.endpoints.web.page import Nothing, Tab, call
 from shmio.model.clock import Clock
 
 MAX_STEPS: Final = 10_000
-"""Maximum number of steps of one call."""
+"""Maximum number of steps in one call."""
 
 _Seconds = Annotated[float, Meta(ge=1e-6, le=3600)]
 
 
 class Steps(msgspec.Struct, forbid_unknown_fields=True):
-    """Number of steps, and the length of each in s; None: the step size."""
+    """The arguments of ``step``: the number of steps, and the length of each in s; None: the step size."""
 
     count: Annotated[int, Meta(ge=1, le=MAX_STEPS)] = 1
     dt_s: _Seconds | None = None
 
 
 class Rate(msgspec.Struct, forbid_unknown_fields=True):
-    """Speed relative to real time, and the length of a step in s; None: the step size."""
+    """The arguments of ``play``: the speed relative to real time, and the length of a step in s.
+
+    If the length is None, it is the step size.
+    """
 
     rate: Annotated[float, Meta(gt=0, le=1000)] = 1.0
     dt_s: _Seconds | None = None
 
 
 class Time(Tab):
-    """Controls time. The process ``web`` owns the time that a page has taken over, so any page can go on with it."""
+    """Controls the instance's clock.
+
+    The process ``web`` owns the clock after a page has taken control, so any page can continue.
+    """
 
     name: ClassVar[str] = "time"
 
@@ -44,22 +50,22 @@ class Time(Tab):
 
     @call("control", Steps)
     async def step(self, given: Steps) -> dict[str, Any]:
-        """Take steps; return the clock after the last one."""
+        """Step virtual time, and return the clock after the last step."""
         return _described(await run_in_threadpool(self.page.served.cell.step, given.dt_s, given.count))
 
     @call("control", Rate)
     async def play(self, given: Rate) -> dict[str, Any]:
-        """Let time play until it is paused."""
+        """Play virtual time until it is paused."""
         return _described(await run_in_threadpool(self.page.served.cell.play, given.rate, given.dt_s))
 
     @call("control", Nothing)
     async def pause(self, _: Nothing) -> dict[str, Any]:
-        """Stop time."""
+        """Pause virtual time."""
         return _described(await run_in_threadpool(self.page.served.cell.pause))
 
     @call("control", Nothing)
     async def release(self, _: Nothing) -> dict[str, Any]:
-        """Return to real time."""
+        """Release the clock, so that time is real again."""
         return _described(await run_in_threadpool(self.page.served.cell.release))
 
 
