@@ -33,7 +33,7 @@ MAX_STEPS: Final = 256
 STOP_STEPS: Final = 64
 """The same, if the run stops at the first failure: at most so many steps may follow the failure."""
 GOOD_S: Final = 10.0
-"""Time in s to wait at the start until the sources that the expectations read are good."""
+"""Maximum time in s to wait at the start until the sources that the expectations read are good."""
 LOOK_S: Final = 0.02
 BUFFER_BYTES: Final = 256 << 20
 """Maximum number of bytes of the recording that may wait for the disk."""
@@ -48,7 +48,7 @@ class Plan:
         injections: The declared injections, with their seeds; their times count from the run's start.
         expectations: The expectations.
         duration_s: Duration on the instance's clock.
-        folder: Folder of the campaign; the files that it names are relative to it.
+        folder: Folder of the campaign file; paths in the campaign are relative to this folder.
         step_s: Length of a step; None: the shortest period of the sources.
         real_time: Whether to run in real time, even if all sources could be stepped.
         stop: Whether to stop at the first failure.
@@ -103,7 +103,7 @@ class LiveRun:
         self.step_s = 0.0
         """Length of a step of virtual time."""
         self.problem: ShmioError | None = None
-        """What ended the run early."""
+        """What ended the run early; None if nothing did."""
         self._blocks: dict[str, Block] = {source: blocks[source] for source in self.judge.sources}
 
     def run(self, over: threading.Event, begun: Callable[[], None] = lambda: None) -> None:

@@ -1,4 +1,4 @@
-"""Credentials: the gRPC endpoint's bearer tokens, and MQTT passwords.
+"""Reads credentials from files: bearer tokens, passwords, and HTTP headers of webhooks.
 
 Only its owner may have access to a file with credentials. Messages never quote a secret.
 """

@@ -224,7 +224,7 @@ def decode(data: bytes, place: str) -> str:
     """Return the text of the file with the name ``place``.
 
     Raises:
-        ConfigError: The file is not UTF-8.
+        ConfigError: The file is not UTF-8, or has zero bytes.
 
     """
     try:

@@ -1,8 +1,8 @@
 """Masks secrets in the text of a configuration, so that it can be shown to others.
 
-The values of shmio's own keys are files with secrets, or hashes of secrets. A key of another package's
+shmio's own keys name files with secrets, or have hashes of secrets. A key of another package's
 connector may have the secret itself. Therefore the name of a key decides whether its value is masked.
-In doubt, it is.
+In doubt, it is masked.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _WHOLE: Final = frozenset({"webhook"})
 _NO_SECRETS: Final = frozenset({"tokens_in_plain_text"})
 _PATH_SUFFIXES: Final = ("_file", "_path", "_dir")
 _KEY_FILES: Final = re.compile(r"""["']?[^"']*\.(?:pem|key|der|crt|p8)["']?""", re.IGNORECASE)
-"""Matches a path, which is not masked as the value of a key with the name ``key``, as in shmio's own sections."""
+"""Matches a path. It is not masked if its key has the name ``key``, as in shmio's own sections."""
 _WORD: Final = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 _USER: Final = re.compile(r"(?<=://)[^\s/\"']*(?=@)")
 _ASSIGNED: Final = re.compile(r"(?<![A-Za-z0-9_-])([A-Za-z0-9_-]++)[\"']?\s*+(?:=(?!=)|:(?!//))\s*(?=\S)")
@@ -53,7 +53,7 @@ def mask_value(key: str, value: Any) -> Any:
     """Return a value of a parsed configuration with its secrets masked.
 
     Args:
-        key: Name of its key.
+        key: Name of the value's key.
         value: Text, a number, a list or a table.
 
     """

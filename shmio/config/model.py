@@ -412,8 +412,8 @@ class Web(Metrics):
 class Alert(Section):
     """``[[alert]]``: what to watch, and whom to notify.
 
-    It watches one of these: a condition over registers (``when``), the state of processes, or the
-    quality of sources.
+    An alert watches a condition over registers (``when``), the state of processes, or the quality of
+    sources.
     """
 
     name: Name | None = None

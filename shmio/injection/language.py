@@ -22,9 +22,9 @@ Two conditions and a formula:
              | "rise" | "fall" | "rate" | "quality" | "age" | "raw"
     bounds = "[" number "," number "]"
 
-A condition has no ``implies`` and ``until``, no temporal operators, none of the functions of the
-last line, and none of the words ``good``, ``uncertain`` and ``bad``: there, these words are names
-of registers.
+A condition has no ``implies``, no ``until`` and no other temporal operators, none of the functions
+from ``rise`` to ``raw``, and none of the words ``good``, ``uncertain`` and ``bad``. In a condition,
+all these words are names of registers.
 
 A register is a path. Put it in quotes if it has characters other than letters, digits and
 ``_ . / % :``. A path may contain ``/``, so put blanks around the ``/`` of a division. Numbers are
@@ -68,7 +68,7 @@ _FORMULA_KEYWORDS: Final = _KEYWORDS | _OF_FORMULAS | TEMPORAL | {"implies", *_Q
 
 @dataclass(frozen=True, slots=True)
 class Constant:
-    """A number."""
+    """A number in a condition or formula."""
 
     value: Number
 
@@ -86,8 +86,8 @@ class Reference:
 class Operation:
     """An operator or a function with its operands.
 
-    ``name`` is as written, in lower case; ``neg`` is the sign before an operand. ``=`` and ``<>``
-    are written ``==`` and ``!=``.
+    ``name`` is the operator as written, in lower case, with these exceptions: ``neg`` is a minus sign
+    before an operand, and ``==`` and ``!=`` also stand for ``=`` and ``<>``.
     """
 
     name: str

@@ -25,10 +25,10 @@ from shmio.layout.values.codec import REAL_MAX, scalar_codec
 Bytes = npt.NDArray[np.uint8]
 Values = npt.NDArray[Any]
 _MAX_ELEMENTS: Final = 4096
-"""The largest number of single values in one injection. More would make the poll loop too slow."""
+"""Maximum number of single values in one injection. More would make the poll loop too slow."""
 MAX_DELAY_CYCLES: Final = 10_000
 MAX_DELAY_BYTES: Final = 16_000_000
-"""The largest number of bytes in the images that one ``delay`` stores."""
+"""Maximum number of bytes of all images that one ``delay`` stores."""
 _REAL_LIMIT: Final = float(np.float32(REAL_MAX))
 _NUMPY: Final = {
     "b": "i1", "B": "u1", "h": "i2", "H": "u2", "i": "i4", "I": "u4", "q": "i8", "Q": "u8", "f": "f4", "d": "f8",
@@ -60,14 +60,14 @@ class ValueGroup:
 
     @cached_property
     def span(self) -> slice | None:
-        """The bytes of the values if they follow one another, else None."""
+        """The bytes of the values in the block if they are contiguous, else None."""
         flat = self.index.ravel()
         first = int(flat[0])
         return slice(first, first + len(flat)) if (np.diff(flat) == 1).all() else None
 
     @cached_property
     def limits(self) -> tuple[Any, Any]:
-        """The smallest and the largest number of the type, as numbers for calculations."""
+        """The smallest and the largest number of the type, as types that can be compared with :meth:`numbers`."""
         if self.dtype.kind == "f":
             most = _REAL_LIMIT if self.dtype.itemsize == 4 else float(np.finfo(np.float64).max)
             return -most, most

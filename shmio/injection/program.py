@@ -42,7 +42,7 @@ from shmio.model.statuses import trusted_codec
 
 _NS: Final = 1_000_000_000
 MAX_REGISTERS: Final = 4096
-"""The largest number of registers and elements in one target."""
+"""Maximum number of registers and elements in one target."""
 _MAX_REFERENCES: Final = 64
 
 _Operate = Callable[[SeededRandom], Operation]

@@ -102,11 +102,11 @@ class Judge:
         return self._sources[source].signals
 
     def read_by(self, index: int) -> tuple[Signal, ...]:
-        """Return the signals that an expectation reads, by its index."""
+        """Return the signals that the expectation with this index reads."""
         return self._cases[index].formula.signals
 
     def limits(self, index: int, signal: Signal) -> tuple[Piece, Piece] | None:
-        """Return the lower and the upper limit of a signal of an expectation with ``like``, else None."""
+        """Return the lower and the upper limit of a signal, if the expectation has ``like``; else None."""
         case = self._cases[index]
         return case.tubes[case.formula.signals.index(signal)].limits if case.tubes else None
 

@@ -111,7 +111,7 @@ class Digit(_Pointwise):
 
 
 class Not(_Pointwise):
-    """The opposite of a signal."""
+    """The negation of a truth."""
 
     def combine(self, pieces: list[Piece]) -> Piece:
         """Return the opposite at each time."""
@@ -141,7 +141,7 @@ class Extremum(_Pointwise):
 
 
 class Edge(Node):
-    """Whether a signal has become true since the frame before. :class:`Moment` makes it an event.
+    """Whether a signal has become true since the previous frame. :class:`Moment` makes this an event.
 
     Args:
         operand: The signal.
@@ -153,7 +153,7 @@ class Edge(Node):
         self._before: tuple[float, float] = (-np.inf, -np.inf) if first else (np.inf, np.inf)
 
     def turn(self) -> None:
-        """Compare each value with the one before."""
+        """Compare each value with the previous one."""
         time, low, high, end = self._operand.out
         if not len(time):
             self.out = NOTHING
@@ -166,7 +166,7 @@ class Edge(Node):
 
 
 class Moment(Node):
-    """Makes an event of a comparison with the frame before: true at most at the moment of the frame.
+    """Makes an event of a comparison with the previous frame: true at most at the moment of the frame.
 
     Args:
         edge: The comparison.
@@ -198,9 +198,9 @@ class Moment(Node):
 
 
 class Difference(Node):
-    """The difference between a number and the one in the frame before; 0 in the first frame.
+    """The difference between a number and its value in the previous frame; 0 in the first frame.
 
-    With ``per_second``, the difference divided by the time between the frames.
+    With ``per_second``, the difference is divided by the time in s between the frames.
     """
 
     def __init__(self, operand: Node, *, per_second: bool) -> None:
@@ -209,7 +209,7 @@ class Difference(Node):
         self._before: tuple[int, float] | None = None
 
     def turn(self) -> None:
-        """Subtract from each value the one before."""
+        """Subtract the previous value from each value."""
         time, values, _, end = self._operand.out
         if not len(time):
             self.out = NOTHING

@@ -30,8 +30,8 @@ class Frames(NamedTuple):
         quality: 0 bad, 1 uncertain, 2 good; uint8, shape (n,).
         delay_us: Maximum age of the images at publication, uint32, shape (n,).
         images: The images that consumers saw, uint8, shape (n, size).
-        raws: The images that the source delivered, of the same shape; None if they are not known,
-            or the same.
+        raws: The images that the source delivered, of the same shape; None if they are unknown, or
+            the same as ``images``.
     """
 
     number: npt.NDArray[np.uint64]
@@ -141,7 +141,7 @@ class _Waiting(NamedTuple):
     missed: npt.NDArray[np.bool_]
     """Whether frames were missed before each frame."""
     fresh_ns: npt.NDArray[np.int64]
-    """Time after each frame in which it is not stale."""
+    """How long each frame is not stale, in ns."""
 
     @property
     def last(self) -> _Waiting:
@@ -165,9 +165,9 @@ class Source:
         """The first spans of time in which values are unknown, and why."""
         self._noted: dict[str, int] = {}  # the index of the last trouble for each reason
         self.origin_ns: int | None = None
-        """The clock of the first frame; None before it."""
+        """The instance time of the first frame; None before that frame."""
         self.newest_ns = 0
-        """The clock of the newest frame."""
+        """The instance time of the newest frame."""
         self.frames = 0
         """Number of frames."""
         self.rows = _no_rows(len(signals))

@@ -17,7 +17,7 @@ MAX_POINTS: Final = 2000
 class Plot(NamedTuple):
     """A signal for a plot: the least and the greatest value from each time to the next, shape (n,).
 
-    NaN: the value was unknown in all of that time.
+    Both are NaN where the value was unknown the whole time.
     """
 
     time_ns: Times
@@ -26,7 +26,7 @@ class Plot(NamedTuple):
 
 
 class Traces:
-    """Collects the signals of a run. It joins neighbouring values when there are too many."""
+    """Collects the signals of a run. Neighbouring values are joined when there are too many."""
 
     def __init__(self, signals: Mapping[str, Sequence[Signal]], chosen: Collection[Signal]) -> None:
         """Prepare to collect signals.

@@ -64,11 +64,11 @@ class TopLevelInitial(TopLevel):
             self.low, self.high = float(piece.low[0]), float(piece.high[0])
 
     def decided_ns(self) -> int | None:
-        """Return the start."""
+        """Return the start of the judged time."""
         return self._at_ns
 
     def unknown_ns(self) -> int | None:
-        """Return the start."""
+        """Return the start of the judged time."""
         return self._at_ns
 
 

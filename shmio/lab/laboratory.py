@@ -1,7 +1,7 @@
 """Runs the sources of an instance in this process, in virtual time, without a supervisor.
 
-It uses the code of an instance: the loop, the commands and the injections of each source work on a
-segment, which only this process has. So a recording is the same as that of an instance whose
+The laboratory uses the code of an instance: the loop, the commands and the injections of each source
+work on a segment that only this process has. So a recording is the same as that of an instance whose
 configuration says ``clock = "stepped"``.
 """
 
@@ -202,7 +202,7 @@ class Laboratory:
 
 
 class _LabClock:
-    """The clock of a loop that does not run by itself: the laboratory calls its methods."""
+    """The clock of a source's loop that does not run by itself: the laboratory calls the loop's methods."""
 
     loop: SteppedLoop
 

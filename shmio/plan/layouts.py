@@ -36,7 +36,7 @@ class LayoutFiles:
         optimized access, so do not warn about it.
 
         Raises:
-            ConfigError: A file or block is missing, or no block is chosen.
+            ConfigError: A file or block is missing, or the section does not say which block it means.
             LayoutError: The block cannot be compiled.
 
         """

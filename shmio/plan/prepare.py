@@ -308,7 +308,7 @@ def _read_from(key: str, emulator: Emulator, config: Config, files: LayoutFiles)
 
 
 def _reads(source: Source, emulator: Emulator) -> bool:
-    """Return whether a source reads an emulator: by its protocol, at its address."""
+    """Return whether a source has the protocol and the address of an emulator, and so reads it."""
     listen = Address.parse(emulator.listen)
     device = peer(source)
     if "://" in device:

@@ -1,4 +1,4 @@
-"""Plans the blocks and processes of a checked configuration. No I/O."""
+"""Plans the blocks and processes of a checked configuration, without I/O."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ ALERTS: Final = "alerts"
 def rank(name: str, kind: str) -> int:
     """Return a process's place in the order of start.
 
-    A kind that this version does not know stops last.
+    A process of a kind that this version does not know stops last.
     """
     return 0 if (name, kind) == (BROKER, "mqtt") else RANKS.get(kind, 0)
 
@@ -219,7 +219,7 @@ def make_plan(
             outputs and in-outs.
         register_options: For sources that can change without a new connection, by source name: the name
             of the connector's class, and the keys of ``options`` that may then change.
-        origin: The clock's origin in a replayed recording; None if there is none.
+        origin: The instance time at which the clock starts, if a recording is replayed; else None.
         recordings: The directory of the configured recorder, even if it does not run in this mode; None if there is
             no recorder.
         scene: The cell in 3D, which the web page draws; None if the configuration has none.

@@ -1,4 +1,4 @@
-"""``--mode replay``: replaces a configuration's sources by those of a recording."""
+"""Implements ``--mode replay``: replaces a configuration's sources by those of a recording."""
 
 from __future__ import annotations
 

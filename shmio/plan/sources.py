@@ -103,8 +103,8 @@ def _check_source(
             options = msgspec.convert(source.options, connector.Options)
     found.layouts[source.name] = layout
     if issubclass(connector, Connector):
-        layout = layout.base  # names over the block are no registers of the device
-    if options is None:  # its faults have been added, with those that the connector found
+        layout = layout.base  # the device does not know the registers of tag tables over the block
+    if options is None:  # their faults have been added; let the connector check the rest
         options = _filled(connector.Options, source)
         if options is None:
             return

@@ -96,7 +96,7 @@ class _Timer(FunctionBlock):
         return self._et_ns / 1e9
 
     def _elapse(self, now_ns: int) -> bool:
-        """Set ET of a timer that has begun. Return whether PT is over."""
+        """Set ET of a running timer. Return whether PT has elapsed."""
         begun_ns = now_ns if self._begun_ns is None else self._begun_ns
         self._et_ns = min(now_ns - begun_ns, self._pt_ns)
         return self._et_ns >= self._pt_ns

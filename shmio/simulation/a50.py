@@ -14,7 +14,7 @@ big-endian. Bits of a byte are listed from the lowest.
 ======  ===========================================================================================================
 Inputs  plant to controller
 ======  ===========================================================================================================
-0       control voltage on, emergency stop released, fence closed, air pressure good, heartbeat as returned
+0       control voltage on, emergency stop released, fence closed, air pressure good, returned heartbeat
 1       trolley at entry, at station, at exit; conveyor turns
 2       position of the trolley in mm, UINT
 4 - 6   Robot_800, Robot_825, Robot_850: ready, in motion, at home, part in gripper

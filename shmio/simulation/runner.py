@@ -182,7 +182,7 @@ class ModelRunner:
             raise LayoutError(f"model {self.name}: {error}") from None
 
     def close(self) -> None:
-        """Release what the model holds, such as the library of an FMU. It cannot step any more."""
+        """Release what the model holds, such as the library of an FMU. The model cannot step any more."""
         self._model._close()
 
     def _run(self, call: Callable[..., None], *arguments: float, instead: bytes | None = None) -> None:

@@ -1,4 +1,4 @@
-"""The processes of an instance: carries out the decisions of ``policy``."""
+"""Manages the processes of an instance: carries out the decisions of ``policy``."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ TURN_S: Final = 0.05
 LIVELY_S: Final = 0.005
 """Pause after a turn in which a block had many events."""
 LIVELY: Final = 256
-"""More events than this of a block in a turn are many."""
+"""Number of a block's events in one turn above which they count as many."""
 MAX_READ: Final = 1024
 """Maximum number of a block's events to read in one turn, so that the other blocks have theirs."""
 MAX_OPEN: Final = 4096

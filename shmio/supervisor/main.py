@@ -1,4 +1,4 @@
-"""The supervisor: one thread, one selector.
+"""Runs the supervisor in one thread, with one selector.
 
 ``fleet`` manages the processes, and ``reload`` changes them to match a plan.
 """

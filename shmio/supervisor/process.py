@@ -120,7 +120,7 @@ class ChildProcess:
 class AdoptedProcess:
     """A running process that another supervisor has started.
 
-    It is not a child of this process, so that its exit status cannot be known.
+    It is not a child of this process, so its exit status remains unknown.
     """
 
     def __init__(self, pid: int, pidfd: int) -> None:
@@ -214,9 +214,9 @@ def describe_end(code: int | None) -> str:
 def child_environment() -> dict[str, str]:
     """Return the environment of a child, in which it imports the same shmio as the supervisor.
 
-    ``-P`` prevents that modules are imported from the current folder. If shmio is not installed,
-    its folder is therefore added. (With site-packages, this would hide modules of the standard
-    library.)
+    ``-P`` keeps Python from importing modules from the current folder. If shmio is not installed,
+    its folder is therefore added to the path. (Adding site-packages would hide modules of the
+    standard library.)
     """
     environment = dict(os.environ, PYTHONFAULTHANDLER="1")
     # Otherwise gRPC prints a line for each bad handshake of any client, and the log would not rotate.

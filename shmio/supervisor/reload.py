@@ -1,4 +1,4 @@
-"""Reload and take-over: changes an instance to match its plan. ``changes`` compares the two.
+"""Changes an instance to match its plan, after a reload or a take-over. ``changes`` compares the two.
 
 Processes and blocks that already match are not touched. For a reload, a thread makes the plan, so
 that supervision continues meanwhile. The supervisor's loop then applies the plan.
@@ -23,9 +23,9 @@ from shmio.supervisor.health import Notifier
 from shmio.supervisor.policy import Event, Limits, State
 
 PAUSE_S: Final = 6.0
-"""Time-out in s until a source whose registers change waits for its new block; then it is restarted."""
+"""Time in s by which a source whose registers change must wait for its new block; else it is restarted."""
 FOLLOW_S: Final = 20.0
-"""Time-out in s until such a source runs with its new block; then it is restarted."""
+"""Time in s by which such a source must run with its new block; else it is restarted."""
 _SETTLED = (State.RUNNING, State.BACKOFF, State.FATAL, State.STOPPED)
 
 

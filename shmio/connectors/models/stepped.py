@@ -88,7 +88,7 @@ class Inputs:
 
 
 def connected_inputs(source: Computed, block: Block, opened: Callable[[], Segment]) -> Inputs | None:
-    """Return a reader of the values for a source's connected inputs; None if none is connected.
+    """Return a reader of the values for a source's connected inputs; None if no input is connected.
 
     ``opened`` opens the segment a second time, because the reader must notice reloads independently
     of the rest of the process.

@@ -91,7 +91,7 @@ log = logging.getLogger("shmio.source")
 def is_replayed(event: Event, *, keep: bool) -> bool:
     """Return whether a replay publishes a recorded event.
 
-    It publishes events about injections only with ``keep``, which shows recorded injections.
+    A replay publishes events about injections only with ``keep``, which shows recorded injections.
     """
     return event.kind not in _OF_PROCESSES and (keep or not (event.kind in _OF_INJECTIONS or event.injection))
 
@@ -121,7 +121,7 @@ class Player:
         return None if self._next is None else self._next.position_ns
 
     def go(self, position_ns: int | None) -> None:
-        """Continue with the first entry at or after a position; None: at the first entry of all."""
+        """Continue with the first entry at or after a position; None: with the recording's first entry."""
         self._entries = self._recorded.entries(position_ns)
         self._next = next(self._entries, None)
 

@@ -111,7 +111,7 @@ def describe(archive: Archive) -> Description:
 
 
 def _parse(xml: bytes) -> Any:
-    """Return FMPy's description.
+    """Parse the description with FMPy.
 
     Raises:
         ModelError: FMPy is missing, or the description is invalid.
