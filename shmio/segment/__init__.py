@@ -1,7 +1,7 @@
 """The shared-memory segment of an instance: header, process table, and a block for each source.
 
-A block has the frames, events and commands of its source. docs/reference/segment-format.md
-describes the bytes. A local program starts with :func:`shmio.attach`.
+A block contains the frames, events and commands of its source. docs/reference/segment-format.md
+describes the bytes. Local programs use a segment through :func:`shmio.attach`.
 """
 
 from shmio.layout.values.write import Write

@@ -38,12 +38,13 @@ class Frame(NamedTuple):
 
     Attributes:
         number: Number of the frame in its ring, from 1.
-        cycle: Number of the period in the source's schedule; in virtual time, number of the step.
+        cycle: Cycle of the source's schedule; in virtual time, the number of the step.
         publish_ns: CLOCK_MONOTONIC at publication; in virtual time, the virtual clock's equivalent.
         clock_ns: The instance's clock at publication.
         source_ns: The source's time stamp, UTC. A bad frame repeats the last image and its time
             stamp. 0: the source has never delivered an image, and all bytes of the image are zero.
-        incarnation: Number of starts of the source's process, including the present one.
+        incarnation: Number of times that the source's process has been started, including the
+            present start.
         quality: Quality of the image at publication.
         provenance: Where the raw image comes from.
         event: Number of the last event before the frame.
@@ -51,7 +52,7 @@ class Frame(NamedTuple):
             answer.
         reason: Reason why the quality is not good.
         raw: The image that the source delivered, in its own byte order.
-        effective: The image with injections, which consumers see; None if nothing is injected.
+        effective: The image with injections, which consumers see; None if no injection is active.
     """
 
     number: int
@@ -82,7 +83,7 @@ class Frame(NamedTuple):
         return now_ns - self.publish_ns + 1000 * self.delay_us
 
     def assess(self, stale_ns: int, now_ns: int) -> tuple[Quality, str]:
-        """Return quality and reason at ``now_ns``: a frame older than ``stale_ns`` is bad."""
+        """Return the quality at ``now_ns`` and its reason; a frame older than ``stale_ns`` is bad."""
         if self.quality is not Quality.BAD:
             age_ns = self.age_ns(now_ns)
             if age_ns > stale_ns:
@@ -110,9 +111,9 @@ def decode_frame(fields: FrameTuple) -> Frame:
 Entry = TypeVar("Entry")
 
 _POLL_NS: Final = 1_000_000_000
-"""Interval at which a waiting reader checks whether its block has been retired.
+"""Interval in ns at which a waiting reader checks whether its block has been retired.
 
-A supervisor that dies after it has retired the block may not have rung the doorbell.
+The doorbell is not enough: a supervisor may retire the block and die before it rings.
 """
 
 
@@ -148,10 +149,10 @@ class Cursor(Generic[Entry]):
     @property
     def ended(self) -> bool:
         """True if a reload has retired the block, and all its entries have been read."""
-        return self._retired() and not self.behind  # in this order: nothing is published after the end
+        return self._retired() and not self.behind  # in this order: nothing is published after retirement
 
     def take_missed(self) -> int:
-        """Return how many entries were missed since the last call."""
+        """Return the number of entries missed since the last call."""
         missed, self._reported = self.missed - self._reported, self.missed
         return missed
 
@@ -168,7 +169,8 @@ class Cursor(Generic[Entry]):
             if fields is not None:
                 self._last += 1
                 return self._decode(fields)
-            # Lapped: resume with the oldest entry, or further ahead if the writer has overwritten that, too.
+            # The writer has overtaken this reader: go on with the oldest entry, or with a later one if that too
+            # is overwritten.
             resume = max(self._last + 1, ring.head() - ring.slot_count + margin)
             margin = min(2 * margin + 1, ring.slot_count // 2)
             self.missed += resume - self._last
@@ -178,15 +180,14 @@ class Cursor(Generic[Entry]):
     def next(self, timeout_s: float | None = None) -> Entry | None:
         """Return the next entry, waiting at most ``timeout_s`` (None: forever).
 
-        Returns:
-            The entry. None if none came in time, or if a reload has retired the block and all its
-            entries have been read.
+        Return None if no entry came in time, or if a reload has retired the block and all its
+        entries have been read.
         """
         ring = self._ring
         deadline_ns = None if timeout_s is None else time.monotonic_ns() + round(timeout_s * 1e9)
         while True:
             seen = ring.doorbell()  # before polling, so that no wake-up is lost
-            retired = self._retired()  # also before polling: what was published before the end is still read
+            retired = self._retired()  # also before polling, so that all entries are still read
             entry = self.poll()
             if entry is not None or retired:
                 return entry
@@ -274,10 +275,7 @@ class Block:
     ) -> None:
         self.source = source
         self.section = section
-        """Index of the section with the block's layout.
-
-        No other block of this run of the instance has the same index.
-        """
+        """Index of the section with the block's layout, unique within this run of the instance."""
         self._load_layout = load_layout
         self.ring = ring
         self.events = EventRing(events, retired)
@@ -305,7 +303,7 @@ class Block:
 
     @property
     def statuses(self) -> StatusArea | None:
-        """The status area of the block's images; None if its source gives registers no status."""
+        """The status area of the block's images; None if the source gives no statuses to registers."""
         return status_area(self.layout)
 
     @property
@@ -315,9 +313,9 @@ class Block:
 
     @property
     def incarnation(self) -> int:
-        """Number of starts of the source's process, including the present one.
+        """Number of times that the source's process has been started, including the present start.
 
-        A command is only for the incarnation that it names.
+        A process accepts only commands that name its incarnation.
         """
         return self.ring.incarnation
 
@@ -348,8 +346,8 @@ class Block:
     def came_with(self, frame: Frame, step: int) -> bool:
         """Return whether a frame belongs to a step of virtual time, or to a later step.
 
-        For a block that replays a recording, the step is always the present one. The result is
-        always False for a block that does not use the instance clock.
+        For a block that replays a recording, ``step`` must be the present step. For a block that
+        does not use the instance clock, the result is always False.
         """
         if self.playhead is not None:
             return self.playhead.came_now(frame.number)
@@ -391,7 +389,7 @@ class Layouts(Mapping[str, "Layout"]):
         return source in self._blocks
 
     def __getitem__(self, source: str) -> Layout:
-        """Return the layout of a source. FormatError: the layout is inconsistent."""
+        """Return the layout of a source; raise FormatError if the layout is inconsistent."""
         return self._blocks[source].layout
 
     def __iter__(self) -> Iterator[str]:
@@ -435,11 +433,11 @@ class BlockWriter:
         """
         self.block = block
         self._clock_ns = clock_ns
-        self._lock = threading.Lock()  # so that frames and events are in one order
+        self._lock = threading.Lock()  # frames and events must have one common order
         self.cycle = 0
         """The present cycle. Each event gets this number."""
         self.at_ns: int | None = None
-        """Publish time in virtual time, as the equivalent of CLOCK_MONOTONIC; None: now."""
+        """In virtual time, the publish time of frames and events: CLOCK_MONOTONIC's equivalent; None: now."""
         self.utc_ns: Callable[[int], int] | None = None
         """Converts :attr:`at_ns` to the UTC time of events.
 
@@ -549,7 +547,7 @@ class QualityChange(Enum):
     """The quality is not bad, but the previous frame had become stale before the new one came."""
 
 
-_BAD: Final = Quality.BAD  # looking up an enum's member is slow, and each frame needs these
+_BAD: Final = Quality.BAD  # each frame needs these, and looking up a member of an enum is slow
 _NONE: Final = QualityChange.NONE
 
 
@@ -634,7 +632,7 @@ class FrameFollower(Cursor[Frame]):
         if (
             self._notice_gaps
             and last is not None
-            and frame.number == last.number + 1  # otherwise frames in between may have come in time
+            and frame.number == last.number + 1  # otherwise, frames in between may have come in time
             and last.age_ns(frame.publish_ns) > self.block.stale_ns
         ):
             return QualityChange.GAP

@@ -2,8 +2,8 @@
 
 The comparison is of bytes, not of values: a NaN whose bytes stay the same has not changed, but a
 change from 0.0 to -0.0 counts. For a BOOL, only its bit is compared. Padding is ignored. If the
-layout has a status area, a register has also changed if its status code has changed. A change of
-its source time alone does not count.
+layout has a status area, a change of a register's status code counts, but not a change of its
+source time alone.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class ChangeScan:
     """Compares two images over the given registers, in C. Immutable."""
 
     def __init__(self, registers: Sequence[Register], statuses: StatusArea | None = None) -> None:
-        """Prepare a comparison.
+        """Prepare the comparison of these registers.
 
         ``statuses`` is the layout's status area; None: compare no status codes.
         """
@@ -31,7 +31,7 @@ class ChangeScan:
 
     @classmethod
     def joined(cls, parts: Iterable[bytes]) -> ChangeScan:
-        """Create a scan of several groups of registers, each encoded by :func:`entries`."""
+        """Create a scan from parts that :func:`entries` has encoded."""
         scan = cls(())
         scan._table = b"".join(parts)
         return scan
@@ -46,7 +46,7 @@ class ChangeScan:
 
 
 def entries(registers: Sequence[Register], index: int, statuses: StatusArea | None = None) -> bytes:
-    """Encode a part of a scan, which reports ``index`` if any of these registers has changed."""
+    """Encode a part of a scan that reports ``index`` if any of these registers has changed."""
     found = [_ENTRY.pack(*run, index) for register in registers for run in runs(register)]
     if statuses is not None:
         indices = dict.fromkeys(statuses.indices(registers))
@@ -57,7 +57,7 @@ def entries(registers: Sequence[Register], index: int, statuses: StatusArea | No
 def runs(register: Register) -> Iterator[tuple[int, int, int]]:
     """Yield (offset, size, mask) for each run of bytes that hold a register's data.
 
-    ``mask`` has the bits that belong to the register; 0: all bits.
+    In ``mask``, the bits that belong to the register are set; 0: all bits belong to it.
     """
     offset, element = register.offset, register.element
     if register.partial:

@@ -1,8 +1,8 @@
 """The clock page: the instance's time, the requested step, and the steps that processes delivered.
 
 docs/reference/segment-format.md describes its bytes. Only the owner of time writes the instance's
-time and the requested step. Each process writes which step it has delivered, and has a doorbell in
-the page, which wakes it when it must act on a change.
+time and the requested step. Each process writes the number of the step that it has delivered. The
+page has a doorbell for each process, which wakes the process when it must act on a change.
 
 When a program releases time (``Coordinator.release``), real time continues from the last virtual
 time, and cycles continue from the number of the last step. So neither ever decreases. The page has
@@ -67,7 +67,7 @@ class DoubleBuffer:
         self._complaint = complaint
 
     def read(self, size: int) -> bytes:
-        """Return the first ``size`` bytes. SegmentError: both copies are corrupt."""
+        """Return the first ``size`` bytes; raise SegmentError if both copies are corrupt."""
         for at in self._copies * _ATTEMPTS:
             data = _atomics.cell_read(self._memory, at, size)
             if data is not None:
@@ -94,7 +94,7 @@ class ClockPage:
             offset: Offset of the section.
             size: Size of the section in bytes.
             head: The segment's header.
-            owned: Returns whether a living process owns time.
+            owned: Function that returns whether a living process owns time.
 
         Raises:
             ValueError: The section does not match the header.
@@ -125,7 +125,7 @@ class ClockPage:
 
     @property
     def stepped(self) -> bool:
-        """True if the configuration makes time virtual from the start."""
+        """True if time is virtual from the instance's start, as the configuration demands."""
         return bool(_word(self._memory, self._offset + _STEPPED_AT))
 
     def read(self) -> Clock:
@@ -161,17 +161,17 @@ class ClockPage:
         """
         data = _pack(state)
         self._state.write(data)
-        self._last = data, _unpack(data) if state.note else state  # a long note is cut
+        self._last = data, _unpack(data) if state.note else state  # unpack, because a long note is cut
         if ring:
             self.bell.ring()
 
     def now_ns(self) -> int:
-        """Return the present time in ns that determines the age of frames on the instance clock.
+        """Return the present time in ns from which the age of frames on the instance clock is computed.
 
         It equals CLOCK_MONOTONIC until a program takes control of time for the first time. From
         then on, it follows the instance's clock.
         """
-        mode, flags, _, time_ns, dt_ns = _TIME.unpack(self._state.read(_TIME.size))  # a part: this is called often
+        mode, flags, _, time_ns, dt_ns = _TIME.unpack(self._state.read(_TIME.size))  # not all: this is called often
         if not mode:
             offset_ns: int = time_ns - dt_ns
             return time.monotonic_ns() + offset_ns
@@ -183,7 +183,7 @@ class ClockPage:
         return self.now_ns() - self._started_ns
 
     def monotonic_ns(self, time_ns: int) -> int:
-        """Convert a time of the instance's clock to the publish time of frames."""
+        """Convert a time of the instance's clock to a publish time of frames, in ns."""
         return self._started_ns + time_ns
 
     def utc_ns(self, monotonic_ns: int) -> int:
@@ -209,8 +209,8 @@ class ClockPage:
     def deliver(self, index: int, step: int) -> None:
         """Record that the process in a slot has delivered all frames and events up to this step.
 
-        Only that process may call it. From its first call on, each step waits for that process to
-        deliver it, as long as the process is alive.
+        Only that process may call it. From the first call on, each step waits until the process has
+        delivered it or has died.
         """
         _atomics.store64(self._memory, self._entry(index), step + 1)
         self.delivered_bell.ring()
@@ -218,7 +218,7 @@ class ClockPage:
     def abstain(self, index: int) -> None:
         """Stop steps from waiting for the process in a slot until it calls :meth:`deliver` again.
 
-        Only that process may call it.
+        Only that process may call this.
         """
         _atomics.store64(self._memory, self._entry(index), 0)
         self.delivered_bell.ring()
@@ -228,10 +228,7 @@ class ClockPage:
 
 
 def time_lock(head: Header) -> int:
-    """Return the number of the lock byte that the owner of time holds.
-
-    It follows the slots' bytes.
-    """
+    """Return the number of the byte that the owner of time locks; it follows the bytes of the slots."""
     return head.process_capacity + 1
 
 

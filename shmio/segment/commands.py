@@ -36,17 +36,17 @@ MAX_NAME_BYTES: Final = 256
 
 _COMMAND: Final = struct.Struct("<QIIqBBHiQ")
 _WRITE: Final = struct.Struct("<IIB7x")
-_KEEP: Final = 2  # flag beside the direction
+_KEEP: Final = 2  # flag in the byte of the direction
 
 
-_PID_SHIFT: Final = 40  # pids have at most 22 bits, proc(5)
+_PID_SHIFT: Final = 40  # pids have at most 22 bits: proc(5)
 
 
 def first_number(pid: int) -> int:
     """Return the number of the first command of a writer in a process.
 
-    It contains the pid, so that the events of a command tell who sent it. The rest is random: the
-    previous owner of the queue may have commands whose outcomes are still to come.
+    The number contains the pid, so that the events of a command tell which process sent it. The
+    rest is random, because outcomes of commands of the queue's previous owner may still follow.
     """
     return pid << _PID_SHIFT | secrets.randbits(_PID_SHIFT - 1) | 1
 
@@ -110,14 +110,14 @@ class Command:
     Attributes:
         writer: Number of the writer's queue.
         id: Number that the writer gave the command.
-        incarnation: Incarnation of the source's process that the command is for. Any other rejects
-            it.
-        deadline_ns: CLOCK_MONOTONIC after which the command must not be started.
+        incarnation: Incarnation of the source's process that the command is for. Other incarnations
+            reject the command.
+        deadline_ns: Time after which the source must not start the command, CLOCK_MONOTONIC.
         writes: The items.
         kind: Kind of command.
         injection: Number of the injection to lift, or to give values to.
         direction: With INJECT: the direction.
-        priority: With INJECT: the priority; the highest is outermost.
+        priority: With INJECT: the priority; the injection with the highest is outermost.
         keep: With INJECT: whether the injection outlives its client.
         name: With INJECT: the name of the injection. With NOTE: the note. At most MAX_NAME_BYTES in
             UTF-8.
@@ -153,7 +153,7 @@ class Command:
 
     @classmethod
     def unpack(cls, writer: int, record: bytes) -> Command:
-        """Decode a record of a queue. ValueError: it is malformed."""
+        """Decode a record of a queue; raise ValueError if it is malformed."""
         try:
             head = _COMMAND.unpack_from(record)
             number, incarnation, count, deadline_ns, kind, flags, name_size, priority, injection = head
@@ -196,10 +196,10 @@ def section_header(layout_size: int) -> bytes:
 
 
 class CommandQueues:
-    """The commands section of a block. The constructor checks the geometry, and keeps it."""
+    """The commands section of a block, with one queue for each writer."""
 
     def __init__(self, memory: memoryview, offset: int, size: int) -> None:
-        """Check the geometry. ValueError: it is inconsistent."""
+        """Open the section; raise ValueError if its sizes and offsets are inconsistent."""
         self._memory = memory
         self._offset = offset
         if size < _SECTION_HEADER_SIZE:
@@ -218,16 +218,16 @@ class CommandQueues:
             raise ValueError("the queues do not fit in the commands section")
 
     def push(self, writer: int, record: bytes) -> bool:
-        """Append a record to a writer's queue, and ring the doorbell. False: there is no room."""
+        """Append a record to a writer's queue, and ring the doorbell; return False if there is no room."""
         taken = _atomics.queue_push(self._memory, self._queue(writer), self.capacity, record)
-        self.wake()  # even if full: a writer may have died after its push, before it rang
+        self.wake()  # even if the queue is full: a writer may have died before it rang
         return taken
 
     def pop(self, writer: int) -> bytes | None:
         """Remove and return the oldest record of a writer's queue. Only the source may call it.
 
         Raises:
-            ValueError: The queue was corrupt; it has been emptied.
+            ValueError: The queue was corrupt, and is empty now.
         """
         return _atomics.queue_pop(self._memory, self._queue(writer), self.capacity)
 
@@ -236,7 +236,7 @@ class CommandQueues:
         return _atomics.bell(self._memory, self._offset + _BELL_AT)
 
     def wait(self, seen: int, timeout_ns: int = -1) -> None:
-        """Wait until the doorbell is not ``seen``, at most ``timeout_ns`` (negative: forever)."""
+        """Wait until the doorbell's value is not ``seen``, at most ``timeout_ns`` (negative: forever)."""
         _atomics.bell_wait(self._memory, self._offset + _BELL_AT, seen, timeout_ns)
 
     def wake(self) -> None:
@@ -258,15 +258,15 @@ class CommandWrites(NamedTuple):
 
     injection: int
     event: Event
-    """The last event about these writes; it has their time and writer."""
+    """The last event about these writes, which tells their time and writer."""
     writes: tuple[Write, ...]
 
 
 class CommandAssembler:
     """Collects the writes of each command from events of one kind (default: DIVERTED).
 
-    Pass it all events of a block, in order. A command is complete when an event of another kind
-    about the same command follows, or an event about another command. Writes without a command
+    Pass all events of a block in order to :meth:`follow`. The writes of a command are complete when
+    an event of another kind, or one about another command, follows. Writes without a command
     (number 0) are complete with their last item.
     """
 
@@ -297,11 +297,11 @@ class CommandAssembler:
 
 
 End = tuple[EventKind, str]
-"""Outcome of an item and its reason. The kind is one of ``ENDS``, or ACCEPTED."""
+"""Outcome of an item, and the reason. The kind is ACCEPTED or one of ``ENDS``."""
 
 
 def worst(ends: Sequence[End]) -> End:
-    """Return the first outcome that is not a success; if all are successes, the first outcome."""
+    """Return the first outcome that is not a success; if there is none, the first outcome."""
     return next((end for end in ends if end[0] not in DONE), ends[0])
 
 
@@ -339,7 +339,7 @@ class CommandOutcomes:
 
 
 def apply(image: bytearray, writes: Iterable[Write]) -> None:
-    """Apply writes to an image. Ignore writes outside it, which only a faulty process sends."""
+    """Apply writes to an image; ignore writes outside the image, which only a faulty process sends."""
     for write in writes:
         if write.data and write.offset + len(write.data) <= len(image):
             write_to(write, image)
@@ -352,7 +352,7 @@ def decode_writes(
 
     If a write covers only a part of a register, the paths are those of its elements or bits.
     ``names`` are registers of tag tables over the block. If writes set bits of such a register, the
-    result has the register's path and value, and leaves these bits out of all other paths.
+    result contains the register's path and value, and no other path for these bits.
     """
     found: dict[str, Value] = {}
     if names:

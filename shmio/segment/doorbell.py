@@ -9,16 +9,17 @@ from typing import Final, Protocol
 from shmio.segment import _atomics
 
 TURN_NS: Final = 200_000_000
-"""Maximum time between two notifications.
+"""Maximum time in ns between two notifications of a relay.
 
-Listeners also check the age of frames, and look for changes that ring no doorbell.
+At each notification, listeners also check the age of frames, and look for changes that ring no
+doorbell.
 """
 _STOP_AGAIN_S: Final = 0.01
-"""Interval at which :meth:`Relay.join` repeats its request to stop: the thread may miss one."""
+"""Interval in s at which :meth:`Relay.join` repeats its request, because the thread may miss one."""
 
 
 class Doorbell:
-    """A futex word in shared memory. Ringing it wakes all waiters.
+    """A futex word in shared memory on which processes wait until another process rings.
 
     Only :meth:`ring` needs a writable mapping.
     """
@@ -46,7 +47,7 @@ class Doorbell:
     def relay(self, shared: bytearray, descriptor: int, turn_ns: int) -> None:
         """Make ``descriptor`` readable at each ring.
 
-        :class:`Relay` runs this in its thread until stopped.
+        :class:`Relay` runs this in its thread until it is stopped.
         """
         _atomics.bell_relay(self._memory, self._offset, shared, descriptor, turn_ns)
 
@@ -55,7 +56,7 @@ class WakeSource(Protocol):
     """Something that a :class:`Relay` can wait for: a :class:`Doorbell`, or a ring with a doorbell."""
 
     def relay(self, shared: bytearray, descriptor: int, turn_ns: int, /) -> None:
-        """Make ``descriptor`` readable at each ring, until stopped. It does not hold the GIL."""
+        """Make ``descriptor`` readable at each ring, until the relay is stopped; do not hold the GIL."""
 
 
 class Relay:
@@ -81,15 +82,15 @@ class Relay:
         return self._thread.is_alive()
 
     def acknowledge(self) -> None:
-        """Acknowledge a notification.
+        """Make the descriptor unreadable until the next notification.
 
-        Call this before you check for changes, so that you miss none.
+        Call this before you check for changes, so that you miss no change.
         """
         if not self._stopped:  # the descriptor may have been closed and reused
             _atomics.relay_heard(self._shared, self.descriptor)
 
     def stop(self) -> None:
-        """Request the thread to stop. It ends within ``turn_ns``, and closes the descriptor."""
+        """Request that the thread stop. It ends within ``turn_ns``, and closes the descriptor."""
         self._stopped = True
         _atomics.relay_stop(self._shared)
 

@@ -1,8 +1,8 @@
 """Events of a block: commands and their outcomes, injections, changes of quality, starts and ends.
 
-An event ring works like a frame ring, and the same process writes both. Each event has the number
-of the last frame before it, and each frame has the number of the last event before it. So the order
-of frames and events is known.
+An event ring works like a frame ring, and the same process writes both. Each event names the last
+frame before it, and each frame names the last event before it. So the order of frames and events is
+known.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ EVENT_SIZE: Final = _RECORD.size + EVENT_DATA_SIZE
 
 
 class EventKind(IntEnum):
-    """Kind of an event. For each accepted item of a command, an event of :data:`ENDS` follows."""
+    """Kind of an event. For each item with an ACCEPTED event, an event of :data:`ENDS` follows."""
 
     STARTED = 1
     STOPPED = 2
     QUALITY = 3
     ACCEPTED = 4
     REJECTED = 5
-    """The source rejected the whole command, and executed no part of it."""
+    """The source rejected the whole command, and carried out no part of it."""
     WRITTEN = 6
     """The device confirmed the write."""
     REFUSED = 7
@@ -49,8 +49,8 @@ class EventKind(IntEnum):
     INJECTED = 12
     """The source created an injection, which has the number of the command that requested it.
 
-    The event ends that command. Its data is a part of a JSON document. For a declared injection,
-    the document is the declaration with the seed in use. For other injections, it has
+    The event ends that command. Its data are a part of a JSON document. For a declared injection,
+    the document is the declaration with the seed in use. For other injections, it has the keys
     ``direction``, ``priority``, ``keep`` and ``ranges``; each range is (offset, size, bits).
     """
     LIFTED = 13
@@ -59,12 +59,12 @@ class EventKind(IntEnum):
     If a command lifted it, the event ends the command.
     """
     SHADOWED = 14
-    """A client gave these values to an injection. The frame before is the first that has them."""
+    """A client gave these values to an injection. The last frame before the event is the first with them."""
     ACTIVATED = 15
     """A declared injection became active.
 
-    If it covers ``/out``, the previous frame is the first that it changes. ``item`` is the number
-    of activations so far.
+    If it covers ``/out``, the last frame before the event is the first that it changes. ``item`` is
+    the number of activations so far.
     """
     DEACTIVATED = 16
     """A declared injection is no longer active."""
@@ -89,9 +89,9 @@ ENDS: Final = frozenset(
         EventKind.NOTED,
     }
 )
-"""Kinds of events that state the outcome of an item; REJECTED is the outcome of a whole command."""
+"""Kinds of events that tell the outcome of an item; REJECTED is the outcome of a whole command."""
 DONE: Final = frozenset({EventKind.WRITTEN, EventKind.TAKEN, EventKind.SHADOWED})
-"""Kinds of :data:`ENDS` that are a success: the device, consumers or an injection got the value."""
+"""The kinds of :data:`ENDS` that are successes: the device, consumers or an injection got the value."""
 
 
 class Event(NamedTuple):
@@ -106,7 +106,8 @@ class Event(NamedTuple):
         publish_ns: CLOCK_MONOTONIC at publication; in virtual time, the virtual clock's equivalent.
         clock_ns: The instance's clock at publication, in ns.
         utc_ns: UTC at publication, in ns.
-        incarnation: Number of starts of the source's process, including the present one.
+        incarnation: Number of times that the source's process has been started, including the
+            present start.
         quality: Quality after the event.
         writer: Number of the command queue that the command came from, or NO_WRITER.
         command: Number that the writer gave the command; 0: none.
@@ -116,7 +117,7 @@ class Event(NamedTuple):
         mask: Mask of the first item's write; 0: whole bytes.
         size: Size of the first item's write in bytes.
         data: The written bytes, with ACCEPTED, DIVERTED, SHADOWED and INJECTED only.
-        text: The reason, the note, or the name of the injection.
+        text: A reason, the note, or the name of the injection, depending on the kind.
         injection: Number of the injection that the event is about; 0: none.
     """
 

@@ -1,4 +1,4 @@
-"""Explain events: name their registers, values, direction and writer.
+"""Explain events: find the registers, values, direction and writer that they are about.
 
 This module imports numpy, which takes time, so import the module only when you need it.
 """
@@ -36,7 +36,7 @@ _INWARD: Final = frozenset(
         EventKind.REJECTED,
     }
 )
-"""Kinds of events about writes toward the device, also if an injection took the write."""
+"""Kinds of events about writes to the device, even if an injection took the write."""
 _WITH_VALUES: Final = frozenset({EventKind.ACCEPTED, EventKind.DIVERTED, EventKind.SHADOWED})
 _OF_WRITES: Final = frozenset({*_INWARD, EventKind.DIVERTED, EventKind.SHADOWED})
 _OF_INJECTIONS: Final = frozenset(
@@ -48,7 +48,7 @@ _ROLES: Final = {writer: name for name, writer in WRITERS.items()}
 class Place(NamedTuple):
     """A register or a part of a register, with its full path.
 
-    ``valued`` tells whether ``value`` is known.
+    ``valued`` is True if ``value`` is known.
     """
 
     path: str
@@ -73,7 +73,8 @@ class Explained(NamedTuple):
     Attributes:
         places: The registers that the event concerns.
         direction: ``in``, ``out`` or empty.
-        by: Who caused the event, such as grpc, mqtt or ``program 1``; empty: no client, or unknown.
+        by: The client that caused the event, such as ``grpc``, ``mqtt`` or ``program 1``; empty: no
+            client caused it, or the client is unknown.
         definition: Definition of the new injection. Only the last event of the definition has it.
         partial: True if the event has a part of a definition, and further parts follow.
     """
@@ -93,7 +94,7 @@ class _Injection(NamedTuple):
 class Explainer:
     """Explains the events of one block.
 
-    Pass the events in order: each may refer to earlier ones.
+    Pass the events in order, because an event may refer to earlier events.
     """
 
     def __init__(self, source: str, layout: Layout | None, most: int | None = None) -> None:
@@ -101,7 +102,7 @@ class Explainer:
 
         Args:
             source: Name of the source.
-            layout: The block's layout; None if it cannot be read. Then no registers are named.
+            layout: The block's layout; None if it cannot be read, so that no registers are named.
             most: Maximum number of registers to name for an event; None: all.
         """
         self._source = source
@@ -118,7 +119,7 @@ class Explainer:
         """Remember existing injections, so that later events about them can be explained."""
         for one in present:
             if one.number not in self._injections and len(self._injections) < MAX_REMEMBERED:
-                # The event of a declared injection names no registers, so none are named here.
+                # Events of declared injections name no registers, so give them none here.
                 places = self._over(one.ranges) if one.running is None else ()
                 self._injections[one.number] = _Injection(one.direction, places)
 
@@ -137,11 +138,11 @@ class Explainer:
 
     def explain(self, event: Event) -> Explained:
         """Explain the next event."""
-        if self._gone and event.number > self._gone_at:  # by now, their LIFTED events have been explained, or were lost
+        if self._gone and event.number > self._gone_at:  # their LIFTED events were explained or lost
             for number in self._gone:
                 self._injections.pop(number, None)
             self._gone = frozenset()
-        if event.kind == EventKind.STARTED:  # commands to the previous process get no further events
+        if event.kind == EventKind.STARTED:  # commands to the old process get no more events
             for key in [key for key in self._in_flight if key[0] != event.incarnation]:
                 del self._in_flight[key]
         definition = self._definition(event) if event.kind == EventKind.INJECTED else None
@@ -149,7 +150,7 @@ class Explainer:
         direction, places = "", tuple[Place, ...]()
         if event.kind in _OF_INJECTIONS:
             direction = known.direction if known else ""
-        elif event.kind in _INWARD and event.size:  # without a size, it is not about a write
+        elif event.kind in _INWARD and event.size:  # without a size, the event is not about a write
             direction = "in"
         elif event.kind == EventKind.SHADOWED:  # values over /in have the events of writes instead
             direction = "out"
@@ -166,8 +167,8 @@ class Explainer:
     def _of_command(self, event: Event) -> tuple[Place, ...]:
         """Return the registers that the event's items write.
 
-        An event that ends several items at once carries no data. Their registers are known from the
-        ACCEPTED events of the items.
+        An event that ends several items at once has no data. The registers are then those of the
+        items' ACCEPTED events.
         """
         if event.kind in _WITH_VALUES:
             places = self._places(event.offset, len(event.data), event.mask, event.data)
@@ -192,7 +193,7 @@ class Explainer:
             known += (place._replace(value=None, valued=False) for place in self._at_most(places, known))
 
     def _at_most(self, places: Sequence[Place], before: Sequence[Place]) -> Sequence[Place]:
-        """Return the first of these places, as many as may be named in addition to ``before``."""
+        """Return the first of ``places``; together with ``before``, at most the maximum number."""
         return places if self._most is None else places[: self._most - len(before)]
 
     def _places(self, offset: int, size: int, mask: int, data: bytes = b"") -> tuple[Place, ...]:
@@ -223,8 +224,8 @@ class Explainer:
     def _definition(self, event: Event) -> dict[str, Any] | None:
         """Add an event's part to the definition of an injection; return the complete definition.
 
-        Return None if parts are missing. When the definition is complete, remember what the
-        injection covers.
+        Return None while parts are missing. When the definition is complete, remember which
+        registers the injection covers.
         """
         document = (self._documents.pop(event.injection, b"") if event.offset else b"") + event.data
         try:
@@ -247,7 +248,7 @@ class Explainer:
         return definition
 
     def _over(self, ranges: object) -> tuple[Place, ...]:
-        """Return the registers that ranges cover; a range is (offset, size, bits in each byte)."""
+        """Return the registers that ranges cover; a range is (offset, size, bits of each byte)."""
         try:
             parts = msgspec.convert(ranges, list[tuple[int, int, int]])
         except msgspec.ValidationError:
@@ -265,7 +266,7 @@ def _is_whole(register: Register, bits: bytearray) -> bool:
 
 
 def by(writer: int) -> str:
-    """Name the owner of a command queue: an endpoint or a program; empty if there is no owner."""
+    """Return the name of a command queue's owner, an endpoint or a program; empty if it has none."""
     if writer == NO_WRITER:
         return ""
     return _ROLES.get(writer, f"program {writer + 1}" if writer < EXTERNAL_SLOTS else f"writer {writer}")
@@ -305,8 +306,8 @@ def _json(value: Any) -> str:
 def cells_of(explained: Explained, dumps: Callable[[Any], str] = _json) -> tuple[str, ...]:
     """Return what an event is about, as cells of a table with the columns of ``ABOUT``.
 
-    If the event concerns several registers, the cell of the value has one JSON object, encoded by
-    ``dumps``.
+    If the event concerns several registers, the cell with the value is a JSON object that ``dumps``
+    has encoded.
     """
     places = explained.places
     valued = [place for place in places if place.valued]

@@ -23,7 +23,7 @@ MAX_SECTIONS: Final = 2048
 MAX_PROCESSES: Final = 256
 
 # Offsets of the fields that change during the segment's life.
-GENERATION_OFFSET: Final = 48  # u32 generation, u32 section count: one word, so that they move together
+GENERATION_OFFSET: Final = 48  # u32 generation, u32 section count: one word, so that they change together
 CONTROL_OFFSET: Final = 208
 CONTROL_SIZE: Final = 256
 SUPERVISED_SINCE_OFFSET: Final = 496
@@ -70,7 +70,7 @@ class SectionKind(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """The header's fixed fields. Offsets and sizes in bytes, times in ns."""
+    """The header's fixed fields. Offsets and sizes are in bytes, times in ns."""
 
     epoch: int
     size: int
@@ -156,7 +156,7 @@ def change_sections(
 ) -> None:
     """Append entries to the section table, then retire the entries with the indices ``retire``.
 
-    Readers see all new entries before any old entry is retired. Meanwhile, two blocks may have the
+    Readers see all new entries before any old entry is retired. In between, two blocks may have the
     same name; readers use the later one.
 
     Raises:
@@ -195,7 +195,7 @@ def retired(memory: memoryview, header: Header, index: int) -> bool:
 
 
 def read_sections(memory: memoryview, header: Header, count: int, name: str) -> list[SectionEntry]:
-    """Read the first ``count`` entries. FormatError: a section is not within the segment."""
+    """Read the first ``count`` entries; raise FormatError if a section is not within the segment."""
     if count > header.section_capacity:
         raise FormatError(
             f"{name}: the header counts {count} sections, but the section table has room for {header.section_capacity}"
@@ -244,7 +244,7 @@ def _config_field(file: Path) -> bytes:
 def write_supervised_since(memory: memoryview, since_ns: int) -> None:
     """Write the time at which the supervisor started, CLOCK_MONOTONIC in ns.
 
-    This is needed only if the instance's clock was not 0 at that time.
+    Call this only if the instance's clock was not 0 at that time.
     """
     _atomics.store64(memory, SUPERVISED_SINCE_OFFSET, since_ns)
 
@@ -264,12 +264,12 @@ def read_supervisor(memory: memoryview) -> tuple[int, State]:
 
 
 def write_note(memory: memoryview, note: str) -> None:
-    """Write a note about a problem of the instance itself; empty: none."""
+    """Write a note about a problem of the instance itself; empty: there is no problem."""
     _atomics.cell_write(memory, NOTE_CELL, cut(note, NOTE_SIZE).ljust(NOTE_SIZE, b"\0"))
 
 
 def read_note(memory: memoryview) -> str:
-    """Read the note about a problem of the instance itself; empty: none."""
+    """Read the note about a problem of the instance itself; empty: there is no problem."""
     return text(_atomics.cell_read(memory, NOTE_CELL, NOTE_SIZE) or b"")
 
 

@@ -1,8 +1,9 @@
 """Lists of a block's injections: the existing ones, and those that the configuration declares.
 
 Each list is a section of the block: a cell (docs/reference/segment-format.md) with a JSON document
-of at most LIST_SIZE bytes. The source writes the existing injections, which every process can
-read, and which the source resumes after a restart. The supervisor writes the configured ones.
+of at most LIST_SIZE bytes. The source writes the list of existing injections, which every process
+can read, and from which the source resumes them after a restart. The supervisor writes the list of
+configured injections.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ class InjectionEntry(Injection[Declaration], frozen=True, omit_defaults=True):
         return self.active and self.reaches(register)
 
     def reaches(self, register: Register) -> bool:
-        """Return whether the injection covers any bit of a register, also while not in effect."""
+        """Return whether the injection covers any bit of a register, even while it is not in effect."""
         start, stop = register.offset, register.offset + register.size
         own = bits_of(register)
         shared = (
@@ -59,14 +60,14 @@ class InjectionEntry(Injection[Declaration], frozen=True, omit_defaults=True):
         return any(bits & mine for part, bits in shared for mine in (part if register.partial else part[:1]))
 
 
-# As in layout/document.py: built before there are threads.
+# Created before there are threads, as in layout/document.py.
 _ENTRIES = msgspec.json.Decoder(tuple[InjectionEntry, ...])
 _DECLARED = msgspec.json.Decoder(tuple[Declaration, ...])
 _Item = TypeVar("_Item")
 
 
 def ranges_of(cover: bytes) -> tuple[tuple[int, int, int], ...]:
-    """Return the set bits of an image as (offset, size, mask), one for each run of equal bytes."""
+    """Return the set bits of an image as ranges (offset, size, mask), one for each run of equal bytes."""
     ranges: list[tuple[int, int, int]] = []
     for at, bits in enumerate(cover):
         if not bits:
@@ -82,7 +83,7 @@ def encode(items: Iterable[bytes], growth: int = 0) -> bytes:
     """Join JSON items to a document.
 
     Raises:
-        ValueError: The document, with ``growth`` more bytes, would be too long.
+        ValueError: The document would be too long if it had ``growth`` more bytes.
     """
     document = b"[" + b",".join(items) + b"]"
     if len(document) + growth > LIST_SIZE:
@@ -96,7 +97,7 @@ class ListCell(Generic[_Item]):
     """A section of a block that holds a list of items. Only one process writes it."""
 
     def __init__(self, memory: memoryview, offset: int, size: int, decoder: msgspec.json.Decoder[tuple[_Item, ...]]):
-        """Open the section. ValueError: the section is too short."""
+        """Open the section; raise ValueError if it is too short."""
         if size < CELL_SIZE:
             raise ValueError("the section of the source's injections is too short")
         self._memory = memory
@@ -145,5 +146,5 @@ def declared_cell(memory: memoryview, offset: int, size: int) -> DeclaredCell:
 
 
 def declared_document(declarations: Iterable[Declaration]) -> bytes:
-    """Encode configured injections as a document. ValueError: the document is too long."""
+    """Encode configured injections as a document; raise ValueError if the document is too long."""
     return encode(msgspec.json.encode(declaration) for declaration in declarations)

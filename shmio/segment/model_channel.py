@@ -1,8 +1,8 @@
 """The channel between a source and its remote model: requests for steps, and their answers.
 
 docs/reference/segment-format.md describes its section. The source's process writes requests. The
-process to which the model is connected keeps the channel's lock, and writes the model's name and
-its answers.
+process to which the model is connected locks the channel as long as the connection lasts, and
+writes the model's name and answers.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class ModelRequest(NamedTuple):
         step: Number of the step.
         time_ns: The instance's clock after the step.
         dt_ns: Length of the step.
-        until_ns: CLOCK_MONOTONIC at which the source stops waiting for the answer.
+        until_ns: Time at which the source stops waiting for the answer, CLOCK_MONOTONIC.
         doubt: Reason why the model's inputs may be wrong; empty: there is none.
         commanded: The block's image with the values that the model reads.
         shown: The block's image with the present values of the model's outputs.
@@ -79,8 +79,8 @@ class ModelRequest(NamedTuple):
 class ModelAnswer(NamedTuple):
     """A model's answer to a request.
 
-    ``image`` is the block's image with the computed outputs. ``failure`` is the reason if the step
-    failed, and the image is then not used.
+    ``image`` is the block's image with the computed outputs. If the step failed, ``failure`` is the
+    reason, and ``image`` is not used.
     """
 
     image: bytes
@@ -88,9 +88,9 @@ class ModelAnswer(NamedTuple):
 
 
 def model_ports(layout: Layout, outputs: Sequence[str], inouts: Sequence[str]) -> ModelPorts:
-    """Find a model's inputs and outputs. All registers that are not in ``outputs`` are inputs.
+    """Find a model's inputs and outputs. All registers that ``outputs`` does not name are inputs.
 
-    Registers of tag tables over the block have no values of their own, and are none of them.
+    Registers of tag tables over the block have no values of their own, and are neither.
 
     Raises:
         ConfigError: A pattern names no register, or ``outputs`` and ``inouts`` name the same one.
@@ -124,7 +124,7 @@ def _named(layout: Layout, key: str, patterns: Sequence[str]) -> set[int]:
 
 
 def section(ring_header: bytes, slot_bytes: int) -> tuple[int, bytes]:
-    """Return size and first bytes of a new section. Both its rings get ``ring_header``."""
+    """Return the size and the first bytes of a new section, whose two rings have ``ring_header``."""
     ring_size = _atomics.RING_HEADER_SIZE + SLOTS * slot_bytes
     begin = _SIZE.pack(ring_size).ljust(_RINGS_AT, b"\0") + ring_header.ljust(ring_size, b"\0") + ring_header
     return _RINGS_AT + 2 * ring_size, begin
@@ -134,7 +134,7 @@ class ModelChannel:
     """The channel between one block's source and its remote model."""
 
     def __init__(self, shared: SharedObject, memory: memoryview, offset: int, size: int, lock_byte: int) -> None:
-        """Check the geometry. ValueError: it is inconsistent."""
+        """Open the section; raise ValueError if its sizes and offsets are inconsistent."""
         (ring_size,) = _SIZE.unpack_from(memory, offset) if size >= _RINGS_AT else (0,)
         if not 0 < ring_size <= (size - _RINGS_AT) // 2:
             raise ValueError("the model channel's rings do not fit in its section")
@@ -154,10 +154,7 @@ class ModelChannel:
         return self.asked.frame_size
 
     def model(self) -> ConnectedModel | None:
-        """Return the connected model.
-
-        None: there is none, or the process that serves it has died.
-        """
+        """Return the connected model; None if there is none, or if the process that serves it has died."""
         return self._read() if self._shared.locked(self._lock_byte) else None
 
     def _read(self) -> ConnectedModel:
@@ -175,7 +172,7 @@ class ModelChannel:
     # ---- for the source's process --------------------------------------------------------------------------------
 
     def ask(self, ask: ModelRequest, publish_ns: int) -> int:
-        """Send a request, and return its number. ``publish_ns``: publish time of the frame."""
+        """Send a request, and return its number; ``publish_ns`` is the publish time of the frame."""
         return self.asked.publish(
             ask.commanded, ask.shown, ask.step, publish_ns, ask.time_ns, ask.until_ns,
             Quality.UNCERTAIN if ask.doubt else Quality.GOOD, Provenance.SIMULATED, ask.dt_ns, 0,
@@ -185,7 +182,7 @@ class ModelChannel:
     def answer_to(self, number: int) -> ModelAnswer | None:
         """Return the newest answer if it is for this request, else None.
 
-        A late answer is never used.
+        So an answer that comes too late is never used.
         """
         fields = self.answered.latest()
         if fields is None or fields[8] != number:

@@ -25,10 +25,7 @@ from shmio.segment.header import cut, text
 from shmio.segment.shm import SharedObject
 
 OWN_WORDS: Final = "replay: "
-"""Prefix of the reasons and event texts that the replay itself creates.
-
-Recorded texts have no prefix.
-"""
+"""Prefix of the reasons and event texts that the replay itself creates; recorded texts have none."""
 MIN_SPEED: Final = 0.01
 MAX_SPEED: Final = 1000.0
 
@@ -69,7 +66,7 @@ class PlayState(NamedTuple):
         asked: Number of the last request that was answered.
         answer: The answer to request ``asked``.
         begun: Number of the last step of virtual time that the source has begun.
-        head: Number of the newest frame when the source began step ``begun``.
+        head: Number of the newest frame at the start of step ``begun``.
     """
 
     begin_ns: int
@@ -113,10 +110,10 @@ class PlayState(NamedTuple):
         return min(reach_ns, self.until_ns)
 
     def due_ns(self, position_ns: int) -> int:
-        """Return the time of the instance's clock at which a later position is first reached."""
+        """Return the time of the instance's clock at which the playhead first reaches a later position."""
         ahead_ns = position_ns - self.position_ns
         clock_ns = self.anchor_ns + (ahead_ns if self.speed == 1 else math.ceil(ahead_ns / self.speed))
-        while not self.paused and self.reach_ns(clock_ns) < position_ns:  # rounding has made it too early
+        while not self.paused and self.reach_ns(clock_ns) < position_ns:  # rounding may make it too early
             clock_ns += 1
         return clock_ns
 
@@ -143,7 +140,7 @@ class PlayState(NamedTuple):
         return self._replace(anchor_ns=clock_ns, position_ns=self.at_ns(clock_ns))
 
     def moved_as(self, other: PlayState) -> PlayState:
-        """Return this state, but with position, speed, pause and loop of another replay."""
+        """Return this state with position, speed, pause and loop of another replay."""
         return self._replace(
             anchor_ns=other.anchor_ns,
             position_ns=other.position_ns,
@@ -156,10 +153,10 @@ class PlayState(NamedTuple):
 
 
 class MoveRequest(msgspec.Struct, tag="move", forbid_unknown_fields=True, omit_defaults=True):
-    """A request to change a replay at time ``clock_ns`` of the instance's clock. None: no change.
+    """A request to change a replay at time ``clock_ns`` of the instance's clock.
 
-    The replay pauses once, at the position ``until_ns``. If ``position_ns`` is given and
-    ``until_ns`` is None, it plays to the end.
+    A field that is None changes nothing. The replay pauses once, at the position ``until_ns``; if
+    ``position_ns`` is given and ``until_ns`` is None, it plays to the end.
     """
 
     clock_ns: int
@@ -184,8 +181,8 @@ class FindRequest(msgspec.Struct, tag="find", forbid_unknown_fields=True, omit_d
 class PlayheadAnswer(msgspec.Struct, omit_defaults=True):
     """The answer to a request.
 
-    ``error`` is the reason if the request failed; else it is empty. ``position_ns`` is the position
-    that a search has found; None: it has found nothing.
+    If the request failed, ``error`` is the reason; else it is empty. ``position_ns`` is the position
+    that a search has found; None: the search has found nothing.
     """
 
     error: str = ""
@@ -203,7 +200,7 @@ class Playhead:
     def __init__(
         self, shared: SharedObject, memory: memoryview, offset: int, size: int, lock_byte: int, clock: ClockPage
     ) -> None:
-        """Open the section. ValueError: it is too short."""
+        """Open the section; raise ValueError if it is too short."""
         if size < PLAYHEAD_SIZE:
             raise ValueError("the playhead's section is too short")
         self._shared = shared
@@ -219,7 +216,7 @@ class Playhead:
     # ---- for readers ---------------------------------------------------------------------------------------------
 
     def read(self) -> PlayState | None:
-        """Return the state; None if the source has not started yet. SegmentError: it is corrupt."""
+        """Return the state; None if the source has not started yet. Raise SegmentError if it is corrupt."""
         data = self._state.read(_STATE.size)
         (flags, _, begin, end, anchor, position, until, base, utc, speed, step, asked, answer, begun, newest) = (
             _STATE.unpack(data)
@@ -232,9 +229,9 @@ class Playhead:
         )  # fmt: skip
 
     def now_ns(self) -> int:
-        """Return the present time that determines the age of frames.
+        """Return the present time from which the age of frames is computed, in ns.
 
-        It is the publish time of the present position.
+        This is the publish time of a frame at the present position.
         """
         play = self.read()
         return time.monotonic_ns() if play is None else play.base_ns + play.at_ns(self._clock.present_ns())
@@ -245,7 +242,7 @@ class Playhead:
         return play is not None and state.stepping and play.begun == state.step and number > play.head
 
     def clock_ns(self, publish_ns: int) -> int:
-        """Return the clock that a frame or event gets if it is published now.
+        """Return the ``clock_ns`` of a frame or event that is published now.
 
         ``publish_ns`` is its publish time.
         """
@@ -265,7 +262,7 @@ class Playhead:
         self._state.write(data)
 
     def asks(self, answered: int) -> tuple[int, PlayheadRequest | None] | None:
-        """Return the number and the content of the last request, unless its number is ``answered``.
+        """Return (number, content) of the last request; None if its number is ``answered``.
 
         The content is None if the request is invalid.
         """
@@ -299,7 +296,7 @@ class Playhead:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Lock the section, so that only this program makes requests.
+        """Lock the section within a ``with`` block, so that only this program makes requests.
 
         Raises:
             CommandError: Another program did not release the lock in time.
@@ -309,7 +306,7 @@ class Playhead:
             while not self._shared.try_lock(self._lock_byte):
                 if time.monotonic() > until_s:
                     raise CommandError("another program is moving this recording: try again when it is done")
-                time.sleep(_LOCK_TURN_S)  # the release of a lock rings no doorbell
+                time.sleep(_LOCK_TURN_S)  # unlocking rings no doorbell
             try:
                 yield
             finally:
@@ -346,6 +343,6 @@ class Playhead:
 
 
 def with_answer(play: PlayState, number: int, found: PlayheadAnswer) -> PlayState:
-    """Return the state with the answer to request ``number``."""
+    """Return the state with ``found`` as the answer to request ``number``."""
     found = PlayheadAnswer(cut(found.error, _MAX_ERROR).decode(), found.position_ns)
     return play._replace(asked=number, answer=msgspec.json.encode(found).decode())

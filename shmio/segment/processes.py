@@ -1,9 +1,9 @@
 """The process table: the instance's processes, their state and counters.
 
-The table has a slot for each process, which is called its worker. The supervisor writes the slot's
-name, kind and digest, and the cell :class:`Supervised`. The worker locks its slot, and writes its
-heartbeat and the cell :class:`Report`. The kernel releases the lock when the worker dies, so its
-death is always noticed.
+The table has a slot for each process; the process is the *worker* of the slot. The supervisor
+writes the slot's name, kind and digest, and the cell :class:`Supervised`. The worker locks its
+slot, and writes its heartbeat and the cell :class:`Report`. The kernel releases the lock when the
+worker dies, so others always notice its death.
 """
 
 from __future__ import annotations
@@ -42,14 +42,11 @@ COUNTERS: Final[Mapping[str, tuple[str, ...]]] = {
     "web": ("requests", "refused", "connections", "pages", "messages", "bytes"),
     "alerts": ("active", "notices", "suppressed", "waiting", "failed", "missed"),
 }
-"""Names of a worker's counters, at most 8, by kind of process.
-
-:attr:`Report.counters` has this order.
-"""
+"""Names of a worker's counters, at most 8, by kind of process, in the order of :attr:`Report.counters`."""
 
 
 EXTERNAL_SLOTS: Final = 4
-"""Number of external slots: slots for programs that write but are not part of the instance.
+"""Number of external slots, which are for programs that write but do not belong to the instance.
 
 They are the last slots of the table, and have the first command queues.
 """
@@ -82,7 +79,7 @@ class Activity(IntEnum):
     RUNNING = 2
     STOPPING = 3
     PAUSED = 4
-    """A source has stopped its loop, and waits until the supervisor has replaced its block."""
+    """The worker has stopped its loop, and waits until the supervisor has replaced the source's block."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,8 +112,8 @@ class Supervised:
 class Report:
     """The worker's part of a slot.
 
-    :data:`COUNTERS` names the counters. That of an external program is the number of its user; its note
-    is the name of its program. ``note`` describes a problem of the worker.
+    :data:`COUNTERS` names the counters. ``note`` describes a problem of the worker. In an external
+    slot, the counter is the number of the user, and the note is the name of the program.
     """
 
     pid: int = 0
@@ -170,7 +167,7 @@ class ProcessSlot:
     def report(self) -> Report:
         """The worker's part, as last written.
 
-        Between a restart and the first report of the new worker, it is the previous worker's part.
+        Between a restart and the new worker's first report, this is the part of the previous worker.
         """
         data = _atomics.cell_read(self._memory, self._offset + _REPORT_AT, _REPORT.size)
         if data is None:
@@ -191,7 +188,7 @@ class ProcessSlot:
 
     @property
     def heartbeat_ns(self) -> int:
-        """CLOCK_MONOTONIC of the worker's last heartbeat, in ns; 0 before the first."""
+        """Time of the worker's last heartbeat, CLOCK_MONOTONIC in ns; 0 before the first."""
         return _atomics.load64(self._memory, self._offset + _HEARTBEAT_AT)
 
     def beat(self) -> None:
@@ -203,10 +200,9 @@ class ProcessSlot:
         return self._shared.try_lock(self.index + 1)
 
     def alive(self) -> bool:
-        """Return whether the slot's process is alive.
+        """Return whether the slot's process is alive: whether a process has locked the slot.
 
-        It is alive if another process, or another segment object of this process, has locked the
-        slot.
+        A lock by this segment object itself does not count.
         """
         return self._shared.locked(self.index + 1)
 
@@ -268,7 +264,7 @@ class ProcessTable(Sequence[ProcessSlot]):
     def remove(self, slot: ProcessSlot) -> None:
         """Vacate the slot of a process that has ended. Only the supervisor may call this."""
         at = self._header.processes_offset + slot.index * SLOT_SIZE
-        self._memory[at : at + _NAME_SIZE] = bytes(_NAME_SIZE)  # first: a slot without a name is not read
+        self._memory[at : at + _NAME_SIZE] = bytes(_NAME_SIZE)  # first, because readers ignore a slot without a name
         slot.supervised, slot.report, slot.digest = Supervised(), Report(), bytes(_DIGEST_SIZE)
         _atomics.store64(self._memory, at + _HEARTBEAT_AT, 0)
         self._slots = [other for other in self._slots if other.index != slot.index]

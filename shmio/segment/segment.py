@@ -1,4 +1,4 @@
-"""The segment of an instance. The supervisor creates and changes it. Other processes open it."""
+"""The segment of an instance, which the supervisor creates and changes, and other processes open."""
 
 from __future__ import annotations
 
@@ -50,27 +50,27 @@ def _align(size: int, to: int) -> int:
 
 _DAMAGED = "; the segment is damaged: restart the instance"
 _RING_SECONDS = 8
-_SECTIONS_PER_BLOCK = 8  # of a block with every kind of section
+_SECTIONS_PER_BLOCK = 8  # at most: one of every kind
 _SPARE_SECTIONS = 40 * _SECTIONS_PER_BLOCK
 _OWN_SECTIONS = 1  # sections of no block: the clock page
 _SPARE_PROCESSES = 16 + EXTERNAL_SLOTS
 _EVENT_STRIDE = _align(_atomics.RAW_OFFSET + EVENT_SIZE, 64)
 _FIRST_LINK = 2
-"""Used to compute the lock byte of a block's model channel or playhead.
+"""Determines the lock byte of a block's model channel or playhead.
 
-lock byte = number of process slots + this number + index of the block's layout section
+The lock byte is the number of process slots + this number + the index of the block's layout section.
 """
 
 _RING = struct.Struct("<8Iqq")
-_ATTRIBUTES = msgspec.json.Decoder(Attributes)  # as in layout/document.py: built before there are threads
+_ATTRIBUTES = msgspec.json.Decoder(Attributes)  # created before there are threads, as in layout/document.py
 
 
 @dataclass(frozen=True, slots=True)
 class Origin:
     """Start time of an instance that replays a recording.
 
-    ``clock_ns`` is the instance's clock when the instance starts. ``started_utc_ns`` is the UTC
-    time at which the instance's clock is 0.
+    ``clock_ns`` is the instance's clock at the start of the instance. ``started_utc_ns`` is the UTC
+    time at which that clock is 0.
     """
 
     clock_ns: int
@@ -253,10 +253,7 @@ def _build_segment(
     stepped: bool,
     origin: Origin | None = None,
 ) -> None:
-    """Allocate a new shared-memory object, and write the whole segment.
-
-    Write the magic number last.
-    """
+    """Allocate a new shared-memory object, and write the whole segment; the magic number last."""
     now_ns, begin_ns = time.monotonic_ns(), origin.clock_ns if origin else 0
     size = segment_size(blocks, len(processes))
     sections_size, processes_size = _table_sizes(len(blocks), len(processes))
@@ -295,10 +292,10 @@ def _build_segment(
 
 
 def _read_clock(shared: SharedObject, head: Header, entries: Sequence[SectionEntry]) -> ClockPage:
-    """Open the clock page. FormatError: it is missing or inconsistent."""
+    """Open the clock page; raise FormatError if it is missing or inconsistent."""
     for entry in entries:
         if entry.kind == SectionKind.CLOCK:
-            try:  # another mapping, so that frames still age after the segment is closed
+            try:  # use another mapping, so that frames still age after the segment is closed
                 own = memoryview(shared.map())
                 return ClockPage(own, entry.offset, entry.size, head, partial(shared.taken, time_lock(head)))
             except ValueError as error:
@@ -311,7 +308,8 @@ def _read_clock(shared: SharedObject, head: Header, entries: Sequence[SectionEnt
 class Segment:
     """The mapped shared memory of an instance.
 
-    A supervisor uses :meth:`create`. Workers :meth:`open` it writable, and readers read-only.
+    A supervisor calls :meth:`create`. Workers and readers call :meth:`open`: workers to write,
+    readers read-only.
     """
 
     def __init__(self, shared: SharedObject, instance: str) -> None:
@@ -365,7 +363,7 @@ class Segment:
             refuse_second(instance)
             raise AlreadyRunningError(f"a segment of instance {instance!r} is left over or being created") from None
         try:
-            # A process that opens the name before this lock is taken finds no magic: an unfinished segment.
+            # A process that opens the segment before this lock finds no magic number, so takes it as unfinished.
             if not shared.try_lock(SUPERVISOR_LOCK) or not shared.current():
                 raise AlreadyRunningError(f"another supervisor is starting instance {instance}")
             try:
@@ -384,7 +382,7 @@ class Segment:
     def private(
         cls, instance: str, blocks: Sequence[BlockSpec], processes: Sequence[ProcessSpec], *, mode: str = "live"
     ) -> Segment:
-        """Create a segment that only this process can use; its time is virtual from the start.
+        """Create a segment that only this process can use, and whose time is virtual from the start.
 
         Raises:
             SegmentError: There is not enough memory.
@@ -413,7 +411,7 @@ class Segment:
 
         Args:
             instance: Name of the instance.
-            writable: Whether to map it writable.
+            writable: Whether to map the segment writable.
             config: Configuration file from which the instance must have been started; None: any.
 
         Raises:
@@ -476,7 +474,7 @@ class Segment:
     def ended(self) -> list[Block]:
         """Blocks that reloads have retired, the oldest first, as of the last :meth:`refresh`.
 
-        Readers can still read their rings.
+        The rings of these blocks can still be read.
 
         Raises:
             FormatError: A block is inconsistent.
@@ -493,7 +491,7 @@ class Segment:
             if len(self.memory) < self.shared.size:  # the segment has grown; blocks keep their old mapping
                 self.memory = memoryview(self.shared.map())
             entries = header.read_sections(self.memory, self.header, count, self.shared.name)
-            if self.generation == self._generation:  # else the table changed meanwhile
+            if self.generation == self._generation:  # otherwise, the table changed meanwhile
                 return entries
 
     @property
@@ -509,9 +507,7 @@ class Segment:
     def refresh(self) -> bool:
         """Update the blocks and the process table after a reload.
 
-        Remaining blocks stay the same objects.
-
-        Several threads may call it.
+        Remaining blocks stay the same objects. Several threads may call this method.
 
         Returns:
             Whether anything has changed.
@@ -536,7 +532,7 @@ class Segment:
             )
 
     def reserve(self, add: Sequence[BlockSpec]) -> int:
-        """Reserve room for blocks to add, so that :meth:`change` cannot fail.
+        """Reserve room for the blocks ``add``, so that :meth:`change` cannot fail.
 
         Returns:
             The offset of the reserved room.
@@ -577,7 +573,7 @@ class Segment:
         replaced = {block.section for block in self._known.values() if block not in self.blocks.values()}
         parts = enumerate(self._sections())
         ended = {index for index, part in parts if part.kind == SectionKind.LAYOUT and part.retired}
-        self._change((), replaced | ended)  # even if these are none: the generation may not be up to date
+        self._change((), replaced | ended)  # even if empty: the generation may not be up to date
 
     def _change(self, add: Sequence[SectionEntry], ending: Collection[int]) -> None:
         """Append entries, and retire the blocks whose layouts are in the sections ``ending``."""
@@ -592,9 +588,9 @@ class Segment:
         return now_ns - self.header.started_ns
 
     def writer(self, source: str, at: Stamp | None = None) -> BlockWriter:
-        """Open a source's block for writing. Only the process in the source's slot may do so.
+        """Open a source's block for writing. Only the process in the source's slot may call this.
 
-        ``at``: times of the STARTED event; None: now.
+        ``at`` are the times of the STARTED event; None: now.
         """
         block = self.blocks[source]
         return BlockWriter(block, self.clock_ns if block.playhead is None else block.playhead.clock_ns, at)
@@ -606,17 +602,17 @@ class Segment:
 
     @property
     def note(self) -> str:
-        """The supervisor's last note about a problem of the instance itself; empty: none."""
+        """The supervisor's last note about a problem of the instance itself; empty: there is no problem."""
         return header.read_note(self.memory)
 
     @property
     def supervisor_heartbeat_ns(self) -> int:
-        """CLOCK_MONOTONIC of the supervisor's last heartbeat, in ns."""
+        """Time of the supervisor's last heartbeat, CLOCK_MONOTONIC in ns."""
         return _atomics.load64(self.memory, header.HEARTBEAT_OFFSET)
 
     @property
     def supervised_since_ns(self) -> int:
-        """CLOCK_MONOTONIC at the start of the present supervisor, in ns."""
+        """Time at which the present supervisor started, CLOCK_MONOTONIC in ns."""
         return _atomics.load64(self.memory, header.SUPERVISED_SINCE_OFFSET) or self.header.started_ns
 
     @property
@@ -650,7 +646,7 @@ class Segment:
         self.header = Header.read(self.memory, self.shared.name)
 
     def unlink(self) -> None:
-        """Remove the segment's name if it still belongs to this segment.
+        """Remove the segment's name if the name still belongs to this segment.
 
         Call this only when the instance stops cleanly.
         """

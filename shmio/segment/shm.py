@@ -1,7 +1,7 @@
 """A POSIX shared-memory object: create, open, lock, map and unlink. Linux only.
 
-It uses posix-ipc, because ``multiprocessing.shared_memory`` unlinks a segment in use when any
-process that has attached to it ends.
+This module uses posix-ipc, because with ``multiprocessing.shared_memory`` a process that has
+attached to a segment unlinks it at its end, even if others still use the segment.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ class SharedObject:
     """An open shared-memory object with its mapping and its byte locks.
 
     The locks are *open file description* locks (fcntl(2)). The kernel releases them when the
-    process dies, however it dies. They belong to this object, not to the process: two objects in
-    one process exclude each other.
+    process dies, however it dies. They belong to this object and not to the process, so two objects
+    in one process exclude each other.
     """
 
     def __init__(self, name: str, fd: int, *, writable: bool, private: bool = False) -> None:
@@ -67,7 +67,7 @@ class SharedObject:
 
     @classmethod
     def private(cls, name: str) -> SharedObject:
-        """Create an empty object that no other program can open; it ends with the last use of it."""
+        """Create an empty object that no other program can open, and that ends with its last use."""
         return cls(name, os.memfd_create(name, os.MFD_CLOEXEC), writable=True, private=True)
 
     @classmethod
@@ -146,7 +146,7 @@ class SharedObject:
         fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, struct.pack(_FLOCK, fcntl.F_UNLCK, os.SEEK_SET, byte, 1, 0))
 
     def locked(self, byte: int) -> bool:
-        """Return whether another object has locked the byte. Works also for a read-only object."""
+        """Return whether another object has locked the byte. This object may be read-only."""
         query = struct.pack(_FLOCK, fcntl.F_RDLCK, os.SEEK_SET, byte, 1, 0)
         answer = fcntl.fcntl(self._fd, fcntl.F_OFD_GETLK, query)
         kind: int = struct.unpack(_FLOCK, answer)[0]
@@ -159,7 +159,8 @@ class SharedObject:
     def current(self) -> bool:
         """Return whether the name still refers to this object.
 
-        False: the name was removed or reused. A private object has no name, and is always current.
+        Return False if the name was removed or reused. A private object has no name, and is always
+        current.
         """
         if self._private:
             return True
@@ -181,7 +182,7 @@ class SharedObject:
         if self._fd < 0:
             return
         if self._map is not None:
-            with suppress(BufferError):  # a view is still referenced; the mapping ends with it
+            with suppress(BufferError):  # a view is still referenced; the mapping ends with that
                 self._map.close()
             self._map = None
         # The mapping has a copy of the descriptor, which would keep the locks while a view is in use.

@@ -1,4 +1,4 @@
-"""Claim or clear a stale segment, which a supervisor left when it died, perhaps with processes."""
+"""Claim or clear a stale segment: one that a dead supervisor has left, perhaps with processes."""
 
 from __future__ import annotations
 
@@ -32,9 +32,7 @@ class Worker(NamedTuple):
 
 
 def claim(instance: str) -> SharedObject | None:
-    """Take the supervisor's lock of an instance's stale segment.
-
-    Only one of several callers gets it.
+    """Take the supervisor's lock of an instance's stale segment, which only one caller can get.
 
     Returns:
         The segment's object; None if there is no segment.
@@ -82,7 +80,7 @@ def living(instance: str) -> bool:
     """Return whether any process of the instance runs, whatever its version of shmio.
 
     Raises:
-        SegmentError: There is no permission to open the segment.
+        SegmentError: This user may not open the segment.
     """
     try:
         with Segment.open(instance) as segment:
@@ -99,8 +97,8 @@ def clear(instance: str, forget_control: Callable[[str], object] = lambda _: Non
 
     Args:
         instance: Name of the instance.
-        forget_control: Called with the path of the dead supervisor's control socket. While it runs,
-            no new supervisor can create one.
+        forget_control: Called with the path of the dead supervisor's control socket. During the
+            call, no new supervisor can create a socket there.
 
     Returns:
         A line of text for each action.
@@ -124,7 +122,7 @@ def clear_claimed(
     """Do the work of :func:`clear` for a segment that the caller has claimed."""
     try:
         segment = read(shared, instance)
-        segment.set_state(os.getpid(), State.STOPPING)  # status shows this process, not the dead one
+        segment.set_state(os.getpid(), State.STOPPING)  # status then shows this process, and not the dead one
         forget_control(segment.header.control)
         done = _stop_orphans(segment, shared)
     except UnfinishedError:
@@ -146,7 +144,7 @@ def _stop_orphans(segment: Segment, shared: SharedObject) -> list[str]:
     try:
         while alive and time.monotonic() < deadline:
             for index, slot in list(alive.items()):
-                worker = holder(slot, shared)  # a process that has just locked its slot may not have written its pid
+                worker = holder(slot, shared)  # None if a process has locked the slot, but not yet written its pid
                 if worker is not None:
                     found.append(worker)
                 if worker is not None or shared.try_lock(index + 1):
@@ -165,7 +163,7 @@ def _stop_orphans(segment: Segment, shared: SharedObject) -> list[str]:
 
 
 def _stop_mapping(shared: SharedObject, instance: str) -> list[str]:
-    """End this user's workers that have mapped a segment of unknown format writable."""
+    """End all workers of this user that have a writable mapping of a segment of unknown format."""
     with _opened(_workers(shared)) as found:
         end(instance, found)
         return [f"stopped {worker.name}, pid {worker.pid}, which had lost its supervisor" for worker in found]
@@ -190,7 +188,7 @@ def _workers(shared: SharedObject) -> Iterator[Worker]:
 def _module(folder: Path) -> str:
     """Return the shmio module that a process runs with ``python -m``.
 
-    The result is empty if it runs no such module, or a module of ``shmio.cli``.
+    Return "" if the process runs no such module, or a module of ``shmio.cli``.
     """
     with suppress(OSError, ValueError):
         words = (folder / "cmdline").read_bytes().split(b"\0")
@@ -213,7 +211,7 @@ def _opened(workers: Iterable[Worker]) -> Iterator[list[Worker]]:
 def holder(slot: ProcessSlot, shared: SharedObject) -> Worker | None:
     """Return the process that has locked a slot; None if it is unknown or has ended.
 
-    The process must have mapped the segment; otherwise the pid belongs to another program now.
+    A process that has not mapped the segment does not count: it has reused the pid of the worker.
     """
     pid = slot.report.pid
     if not pid:
@@ -221,8 +219,8 @@ def holder(slot: ProcessSlot, shared: SharedObject) -> Worker | None:
     try:
         fd = os.pidfd_open(pid)
     except OSError:
-        # The process has ended. If a thread of another program has its number now, the error is EINVAL,
-        # from Linux 6.14 on ENOENT; the latter also while the process is being reaped.
+        # The process has ended. If a thread of another program now has its number, the error is EINVAL, or
+        # ENOENT from Linux 6.14 on. It is also ENOENT while the process is being reaped.
         return None
     if _maps(pid, shared.inode) and slot.alive():
         return Worker(slot.name, pid, fd)
@@ -233,7 +231,7 @@ def holder(slot: ProcessSlot, shared: SharedObject) -> Worker | None:
 def _maps(pid: int, inode: int, right: str = "") -> bool:
     """Return whether a process has mapped the shared memory ``inode``.
 
-    With ``right`` (a letter such as ``w``), the mapping must have this permission.
+    If ``right`` is given, a letter such as ``w``, the mapping must have this permission.
     """
     device = shm.DIRECTORY.stat().st_dev
     wanted = f"{os.major(device):02x}:{os.minor(device):02x}", str(inode)
@@ -247,7 +245,7 @@ def _maps(pid: int, inode: int, right: str = "") -> bool:
 
 
 def end(instance: str, workers: Iterable[Worker]) -> None:
-    """End processes by SIGTERM, and after ``GRACE_S`` by SIGKILL. Wait until they have ended.
+    """End processes by SIGTERM, after ``GRACE_S`` by SIGKILL, and wait until they have ended.
 
     Raises:
         SegmentError: Some processes do not end, or belong to another user. The message names them.
@@ -300,7 +298,7 @@ def survivor(pid: int) -> str:
 
 
 def _ended(pidfds: Collection[int], timeout_s: float) -> set[int]:
-    """Wait until a process ends; return the pidfds of all that have ended."""
+    """Wait until any of these processes ends; return the pidfds of all that have ended."""
     poll = select.poll()
     for fd in pidfds:
         poll.register(fd, select.POLLIN)
