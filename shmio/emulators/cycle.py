@@ -84,7 +84,7 @@ class Cycle:
                     self._owed_ns -= period_ns
                     if self._active():
                         self._scan(0)
-            except Exception as error:  # noqa: BLE001 - a program's defect is its runner's to report
+            except Exception as error:  # noqa: BLE001 - the process reports defects of the program
                 self.failure = error
 
     def _scan(self, skipped: int) -> None:
@@ -112,5 +112,5 @@ class Cycle:
                         step_s = time.monotonic()
                         self._scan(missed)
                         free_s = 2 * time.monotonic() - step_s
-        except Exception as error:  # noqa: BLE001 - a program's defect is its runner's to report
+        except Exception as error:  # noqa: BLE001 - the process reports defects of the program
             self.failure = error

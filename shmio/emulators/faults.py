@@ -20,7 +20,7 @@ _LENGTHS: Final[Mapping[str, tuple[int, Callable[[bytes | bytearray], int]]]] = 
     "s7": (4, tpkt),
     "modbus": (6, lambda data: 6 + int.from_bytes(data[4:6], "big") if len(data) >= 6 else 0),
 }
-"""For each kind, how many bytes an answer has up to the end of its length field, and what measures an answer."""
+"""For each kind: number of bytes up to the end of an answer's length field, and a function for the whole length."""
 
 
 class FaultControl:

@@ -1,4 +1,4 @@
-"""Runs an event loop in a thread, for an emulator whose server is of an asynchronous library."""
+"""Runs an event loop in a thread, for the emulators whose servers need asyncio."""
 
 from __future__ import annotations
 

@@ -195,7 +195,7 @@ class ModbusEmulator:
         def connect() -> Any:
             handler = connected()
             if len(server.active_connections) >= MAX_CLIENTS:
-                server.loop.call_soon(server.loop.call_soon, handler.close)  # as soon as it has its connection
+                server.loop.call_soon(server.loop.call_soon, handler.close)  # once the handler has its connection
             return handler
 
         server.callback_new_connection = connect

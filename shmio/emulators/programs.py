@@ -130,7 +130,7 @@ class Idle:
 
 @dataclass(frozen=True)
 class UserCode:
-    """How to load and parametrize a program that is a class of the user."""
+    """Where to find a program that is a class of the user, and its parameters."""
 
     folder: str | None = None
     """Folder of modules that are not installed; None if there is none."""

@@ -134,7 +134,7 @@ class ServerOptions:
     """Maximum number of jobs in flight that the server grants."""
     fault: Fault | None = None
     block_size: int | None = None
-    """Size in bytes beyond which data blocks are hidden, as if the controller had older ones; None: no limit."""
+    """Maximum size in bytes of data blocks as clients see them, as if the blocks were older; None: no limit."""
 
     def __post_init__(self) -> None:
         if not (100 <= self.max_pdu_size <= MAX_PDU_SIZE and 1 <= self.max_jobs <= MAX_JOBS):
@@ -173,9 +173,9 @@ class Memory:
 class Jobs:
     """Answers one client's jobs, and keeps the parameters agreed with that client. No I/O.
 
-    Names and codes follow Wireshark's S7 dissector, behaviour follows an S7-1500. Items fail one by
-    one, each with its own return code. A job that is wrong as a whole, or whose answer does not fit
-    the PDU, fails with a header error.
+    Names and codes follow Wireshark's S7 dissector; the behaviour follows an S7-1500. Each item has
+    its own return code, and may fail alone. A job that is wrong as a whole, or whose answer does not
+    fit the PDU, fails with a header error.
     """
 
     def __init__(self, memory: Memory, options: ServerOptions) -> None:

@@ -38,7 +38,7 @@ GATEWAY_RETRY_NS: Final = 1_000_000_000
 MAX_UNIT_RETRY_NS: Final = 10_000_000_000
 """Longest pause before a silent unit is asked again."""
 MAX_COPIES: Final = 10_000
-"""Maximum number of requests for which the places of their bytes are cached."""
+"""Maximum number of requests for which the connector caches where their bytes belong in the image."""
 _STATUS: Final = {
     client.ILLEGAL_FUNCTION: BAD_NOT_SUPPORTED,
     client.ILLEGAL_ADDRESS: BAD_OUT_OF_RANGE,
@@ -179,7 +179,7 @@ class ModbusConnector(Connector):
 
     @property
     def timeout_s(self) -> float:
-        """The longest time that any hook blocks, in s."""
+        """The longest time that any method may block, in s."""
         return self._options.timeout / 1000
 
     def describe(self) -> str:
@@ -333,7 +333,7 @@ class ModbusConnector(Connector):
         copy = self._copies.get(request)
         if copy is None:
             if len(self._copies) > MAX_COPIES:
-                self._copies.clear()  # requests change while refused addresses are searched
+                self._copies.clear()  # requests change while the connector searches for refused addresses
             copy = self._copies[request] = self._copy_of(request)
         image.copy(copy, data)
         for one in request.elements:
@@ -500,7 +500,7 @@ class ModbusConnector(Connector):
         return one.unit, client.MASK_WORD, b"".join(number.to_bytes(2, "big") for number in (start, keep, put))
 
     def _values(self, one: _Register, writes: Sequence[Write]) -> Iterator[tuple[int, int, bytes]]:
-        """Yield the requests for the elements of a register that the writes cover together."""
+        """Yield the requests that write the elements of a register which the writes together contain."""
         register, address = one.register, one.address
         image = bytearray(self._layout.size)
         covered = bytearray(self._layout.size)
@@ -523,7 +523,7 @@ class ModbusConnector(Connector):
             )
 
     def _most(self, one: _Register) -> int:
-        """Return how many elements one request writes at most."""
+        """Return the maximum number of elements that one request may write."""
         kind = one.address.kind
         if one.address.bit is not None or (kind.size == 1 and kind.base not in ("STRING", "BOOL")):
             return 1  # the rest of each word may belong to other registers
@@ -586,7 +586,7 @@ def _cut(write: Write, register: Register) -> Iterator[int]:
     """Yield the offsets of the elements that a write contains only in part."""
     offset, mask, data = write
     stride, size = register.element.stride, register.element.size
-    for byte in (offset, offset + len(data) - 1):  # those in between are whole
+    for byte in (offset, offset + len(data) - 1):  # the write contains all elements in between as a whole
         at = register.offset + max(0, byte - register.offset) // stride * stride
         if at < register.offset + register.size and (mask or at < offset or offset + len(data) < at + size):
             yield at

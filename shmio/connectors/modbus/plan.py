@@ -72,7 +72,7 @@ class Limits(NamedTuple):
 
 
 def plan(elements: Iterable[Element], limits: Limits, refused: Collection[Place] = ()) -> list[ReadRequest]:
-    """Return requests that read all elements, each of them in one request.
+    """Return requests that together read all elements. No element is divided between two requests.
 
     Args:
         elements: The elements.
@@ -113,7 +113,7 @@ def _request(elements: Sequence[Element]) -> ReadRequest:
 
 @dataclass
 class Refusals:
-    """The addresses that a device refuses. The object is kept across connections."""
+    """Keeps the addresses that a device refuses, and the requests without them. It outlives connections."""
 
     elements: Sequence[Element]
     limits: Limits
@@ -160,7 +160,7 @@ class Refusals:
         return [_request(some) for some in list(found.values())[: max(0, most)]]
 
     def accept(self, request: ReadRequest) -> None:
-        """Merge the addresses of a request, which the device has answered again, with the others."""
+        """Read the addresses of this request together with the others again, since the device answers it now."""
         for one in request.elements:
             self.refused.pop(one, None)
         refused = {

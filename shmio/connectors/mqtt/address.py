@@ -60,7 +60,7 @@ class Metric(NamedTuple):
 class Address(NamedTuple):
     """Where a register is read (``source``), and where its writes are published (``target``).
 
-    If ``target`` is None, writes are published at ``source``.
+    If ``target`` is None, writes are published on ``source``.
     """
 
     source: Place | Metric

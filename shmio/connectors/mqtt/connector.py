@@ -30,9 +30,9 @@ from shmio.layout.values.write import Write
 TIMEOUTS: Final = 4
 """The longest time that connecting may take, as a multiple of the option ``timeout``."""
 FIRST_S: Final = 0.1
-"""Time for which a new connection waits for retained messages, in s."""
+"""Maximum time for which a new connection waits for retained messages, in s."""
 ECHO_S: Final = 0.2
-"""Time for which a confirmed write waits until its message comes back from the broker, in s."""
+"""Maximum time for which an acknowledged write waits for its message to come back from the broker, in s."""
 
 
 @dataclass
@@ -227,7 +227,7 @@ class MqttConnector(Connector):
             except ConnectorError as error:
                 raise self._lost(error) from None
             self._take_outcomes(link, sending)
-            accepted = all(one.outcome == "" for one in sending.sent)  # else a message does not come back
+            accepted = all(one.outcome == "" for one in sending.sent)  # a refused message does not come back
             sending.echo_until_s = time.monotonic() + min(ECHO_S, self._options.timeout / 1000) * accepted
         if not self._store.await_expected(min(until_s, sending.echo_until_s)):
             if time.monotonic() < sending.echo_until_s:

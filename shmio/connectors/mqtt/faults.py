@@ -6,7 +6,7 @@ from __future__ import annotations
 class ValueFaultError(Exception):
     """A message contains no value for a register, or a value that does not fit the register.
 
-    ``code`` is the status of the register. ``source_ns`` is the time of the message in ns since
+    ``code`` is the status for the register. ``source_ns`` is the source time of the value in ns since
     1970; 0 if unknown.
     """
 

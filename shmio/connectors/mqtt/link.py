@@ -58,7 +58,7 @@ class Deliver(Protocol):
     """Function that receives the messages of a connection."""
 
     def __call__(self, topic: str, payload: bytes, *, retained: bool) -> None:
-        """Receive a message; ``retained`` if the broker had stored it."""
+        """Receive a message. ``retained`` is true if the broker had stored it."""
 
 
 class UnsupportedVersionError(ConnectorError):
@@ -97,7 +97,7 @@ class _Client(Client):
         return self._last_mid
 
     def ping(self) -> int:
-        """Send a PINGREQ at once, without paho's keep-alive time; return its number."""
+        """Send a PINGREQ at once, without waiting for paho's keep-alive time; return its number."""
         self._send_pingreq()
         return self.pings
 
@@ -122,7 +122,7 @@ class _Client(Client):
             raise
 
     def _handle_publish(self) -> MQTTErrorCode:
-        if self._in_packet["command"] & 0x06 == 0x04:  # paho would keep it without a limit
+        if self._in_packet["command"] & 0x06 == 0x04:  # paho would store such messages without a limit
             self.violation = "it sent a message with QoS 2, which was not asked for"
             return MQTTErrorCode.MQTT_ERR_PROTOCOL
         return super()._handle_publish()
@@ -219,7 +219,7 @@ class Link:
         client.on_connect, client.on_disconnect = self._on_connect, self._on_disconnect
         client.on_subscribe, client.on_publish = self._on_subscribe, self._on_publish
         client.on_message, client.on_pong = self._on_message, self._on_pong
-        client.on_socket_register_write = lambda *_: None  # the thread alone writes, so that packets never mix
+        client.on_socket_register_write = lambda *_: None  # only the receiving thread writes, so that packets never mix
         client.max_inflight_messages_set(0)  # this object counts the messages in flight
         if self._options.username is not None:
             client.username_pw_set(self._options.username, self._password)
@@ -445,7 +445,7 @@ class Link:
         try:
             while not self._closing and client.loop(_TURN_S) == MQTTErrorCode.MQTT_ERR_SUCCESS:
                 pass
-        except Exception as error:  # noqa: BLE001  paho raises all kinds for wrong packets
+        except Exception as error:  # noqa: BLE001  paho raises errors of all kinds for wrong packets
             why = (
                 f"{self.peer} sent a packet that cannot be read: {type(error).__name__}: {printable(str(error))[:200]}"
             )

@@ -1,4 +1,4 @@
-"""Values of Sparkplug B metrics (Eclipse Sparkplug Specification 3.0.0, 6.4.16)."""
+"""Decodes and encodes the values of Sparkplug B metrics (Eclipse Sparkplug Specification 3.0.0, 6.4.16)."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ class Will(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True
 
 
 class MqttOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
-    """Address of the broker, and what counts as a good value.
+    """Address of the broker, how to read and publish, and when a value is good.
 
     Raises:
         ValueError: Some keys contradict each other.
@@ -47,7 +47,7 @@ class MqttOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_on
     timeout: Annotated[int, msgspec.Meta(ge=10, le=600_000)] = 4000
     """Time-out for connecting, for each answer of the broker, and for the writes of a cycle, in ms."""
     version: Literal["auto", "5", "3.1.1"] = "auto"
-    """Version of MQTT. With ``auto``, version 5 is tried first, and then 3.1.1."""
+    """Version of MQTT. ``auto``: first try version 5, and then 3.1.1."""
     client_id: Annotated[str, msgspec.Meta(min_length=1, max_length=128)] | None = None
     keep_alive_s: Annotated[int, msgspec.Meta(ge=5, le=3600)] = 30
     qos: Annotated[int, msgspec.Meta(ge=0, le=1)] = 1
@@ -77,7 +77,7 @@ class MqttOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_on
     certificate: str | None = None
     key: str | None = None
     insecure: bool = False
-    """Allow plain text to hosts other than this one."""
+    """True to allow plain text to other hosts."""
 
     def __post_init__(self) -> None:
         parts = urlsplit(self.url)

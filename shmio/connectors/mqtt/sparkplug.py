@@ -113,7 +113,7 @@ class Device(Origin):
         self.end(died=False)
 
     def end(self, *, died: bool) -> None:
-        """Discard the values and metrics of the device, which has none until its next birth."""
+        """Discard the values and metrics of the device. It has none until its next birth."""
         self.born, self.died = False, died
         self.metrics.clear()
         self._found.clear()
@@ -180,7 +180,8 @@ class Node:
     def filters(self) -> list[str]:
         """The topic filters for all messages of the node.
 
-        All kinds share one sequence of numbers, so a kind that is left out would look like a loss.
+        All kinds of messages share one sequence of numbers. If one kind were left out, its numbers
+        would seem to be lost.
         """
         return [self.topic(kind, "+" if kind.startswith("D") else "") for kind in KINDS]
 
@@ -194,7 +195,7 @@ class Node:
         return self.devices.setdefault(name, Device(self, name))
 
     def reset(self) -> None:
-        """Forget all messages, and note that the node must be asked for its birth."""
+        """Forget all messages, and note that shmio must ask the node for its birth."""
         self._born, self._ask = False, True
         self._session: int | None = None
         self._next: int | None = None
@@ -242,7 +243,7 @@ class Node:
         if self._born and session is not None and self._session is not None and session != self._session:
             log.info("%s: the last will of an earlier session is ignored", self)
             return
-        self._born, self._ask = False, False  # it sends its birth when it is back
+        self._born, self._ask = False, False  # the node sends its birth when it is back
         for one in self.devices.values():
             one.end(died=True)
 

@@ -39,7 +39,7 @@ log = logging.getLogger("shmio.source.mqtt")
 _SPARKPLUG: Final = f"{NAMESPACE}/"
 _NEVER_NS: Final = 1 << 63
 _NONE: Final = -1
-"""No status has been shown yet."""
+"""Value of :attr:`Group.shown` before the image shows any status."""
 
 
 class Group:
@@ -49,7 +49,7 @@ class Group:
         self.origin, self.max_age_ns, self.watches = origin, max_age_ns, watches
         self.registers: list[int] = []
         self.shown = _NONE
-        """The status that the image shows for all registers; GOOD: each register has its own."""
+        """The status that the image shows for all registers; GOOD if each register has its own."""
         self.seen: Message | None = None
         """The message whose values the image shows; None if there is none."""
 
@@ -77,7 +77,7 @@ class Group:
 class Store:
     """The newest messages of a layout's topics.
 
-    One thread delivers messages, another makes images.
+    One thread delivers messages, and another one makes images.
     """
 
     def __init__(self, layout: Layout, options: MqttOptions) -> None:
@@ -376,7 +376,7 @@ class _Ages:
             raise ConfigError(f"max_age_ms: {error}") from None
 
     def of(self, path: str, *, needed: bool) -> int:
-        """Return the maximum age for a register in ns; 0: there is no limit.
+        """Return the maximum age for a register in ns; 0 if there is no limit.
 
         Raises:
             ConfigError: No pattern matches the register, although it is ``needed``.

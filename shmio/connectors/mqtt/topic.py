@@ -64,7 +64,7 @@ class Origin(ABC):
         """Return what the newest message contains for a register.
 
         Raises:
-            ValueFaultError: The message has no usable value for it.
+            ValueFaultError: The message has no usable value for the register.
 
         """
 
@@ -106,7 +106,7 @@ class Topic(Origin):
     def find(self, index: int) -> Found:
         """Return what the newest message contains for a register."""
         message = self.message
-        assert message is not None  # noqa: S101 - as the group's state says
+        assert message is not None  # noqa: S101 - Group.state has checked this
         if len(message.payload) > self._max_bytes:
             raise ValueFaultError(
                 BAD_OUT_OF_RANGE, f"a payload of {len(message.payload)} bytes is larger than max_payload_bytes"

@@ -1,7 +1,7 @@
 """Lists the variables of an OPC UA server, with the types and addresses that a tag table needs.
 
-It follows the hierarchical references from the folder Objects, level by level. It visits each node
-once, so loops of references end. It does not list the parts of a variable that fits a register.
+The search follows the hierarchical references from the folder Objects, level by level. It visits each
+node once, so that loops of references end. It lists no children of a variable that fits a register.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ class _Search:
 
     @property
     def _room(self) -> int:
-        """Number of references that the search may still visit; 0 or less: the search must end."""
+        """Number of references that the search may still visit; 0 or less if it must end."""
         if len(self._seen) >= self._wanted.nodes or self._characters > MAX_CHARACTERS:
             return 0
         left = self._wanted.nodes * REFERENCES_PER_NODE - self._references
@@ -129,7 +129,7 @@ class _Search:
         self._found.incomplete = self._found.incomplete or why
 
     async def _look_into(self, nodes: Sequence[_Node]) -> None:
-        """Find the children of nodes."""
+        """Find the children of nodes, and add them to the nodes."""
         room = self._room
         if room <= 0:
             return

@@ -146,14 +146,14 @@ class OpcUaConnector(Connector):
     def browse(cls, options: OpcUaOptions, wanted: Wanted) -> Browsed:
         """List the variables below the server's folder Objects, without those about the server itself."""
         _need_library()
-        from shmio.connectors.opcua.browse import browse  # noqa: PLC0415  a library that not all need
+        from shmio.connectors.opcua.browse import browse  # noqa: PLC0415  its library is optional
 
         logging.getLogger("asyncua").setLevel(logging.CRITICAL)
         return browse(msgspec.structs.replace(options, mode="poll"), _credentials(options), wanted)
 
     @property
     def timeout_s(self) -> float:
-        """The longest time that any hook blocks, in s."""
+        """The longest time that any method may block, in s."""
         return CONNECT_TIMEOUTS * self._options.timeout / 1000
 
     @property
@@ -444,7 +444,12 @@ def _nodes(options: OpcUaOptions, layout: Layout) -> tuple[list[_Node], list[Mem
 
 
 def _address(options: OpcUaOptions, layout: Layout, register: Register) -> tuple[Address, Member]:
-    """Return the address of a register's node, and the member of its value. Raise ValueError if it is wrong."""
+    """Return the address of a register's node, and which member of the node's value the register is.
+
+    Raises:
+        ValueError: The register's address is wrong.
+
+    """
     if options.nodes == "siemens" and not register.address:
         return siemens.node_address(layout, register), ()
     return parse_member(register.address)
@@ -630,7 +635,7 @@ class _Link(threading.Thread):
 
     def run(self) -> None:
         """Run the sessions until they are lost or the link is closed."""
-        logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # its errors are reported as reasons
+        logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # this connector reports the errors itself
         try:
             self._loop.run_until_complete(self._main())
         except BaseException as error:  # noqa: BLE001  the poll thread reports it

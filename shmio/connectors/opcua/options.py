@@ -15,7 +15,7 @@ _Count = Annotated[int, msgspec.Meta(ge=1, le=100_000)]
 
 
 class OpcUaOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
-    """Address of the server, and how to read it.
+    """Address of the server, and how to read from it.
 
     Raises:
         ValueError: The URL is wrong, or keys contradict each other.
@@ -23,7 +23,7 @@ class OpcUaOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_o
 
     url: Annotated[str, msgspec.Meta(min_length=1, max_length=1000)]
     timeout: Annotated[int, msgspec.Meta(ge=10, le=600_000)] = 4000
-    """Maximum time in ms until each answer, and without any message from the server."""
+    """Time-out in ms for each answer, and for the silence of the server."""
     mode: Literal["subscribe", "poll"] = "subscribe"
     nodes: Literal["addresses", "siemens"] = "addresses"
     """What node ids are made from: the layout's addresses, or the names of an S7-1500's data block."""

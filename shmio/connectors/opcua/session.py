@@ -129,7 +129,7 @@ Deliver = Callable[[list[tuple[Item, Sample]]], None]
 
 
 class Session:
-    """A session, from its connection to its end. Call :meth:`check` in any thread, all else in the event loop's."""
+    """A session, from its connection to its end. Use it only in its event loop, except for :meth:`check`."""
 
     def __init__(
         self, options: OpcUaOptions, credentials: Credentials, items: Sequence[Item], deliver: Deliver
@@ -396,7 +396,7 @@ class Session:
         self._per_read, self._per_write, self._per_path, self._per_items = limits
 
     async def _resolve(self, items: Iterable[Item]) -> None:
-        """Find the node of each address."""
+        """Find the node id for the address of each item."""
         names = await self.namespaces()
         paths: list[tuple[Item, BrowsePath]] = []
         for item in items:
@@ -681,7 +681,7 @@ class Session:
                 code = int(result.StatusCode.value)
                 if code >> 30 == 0:
                     item.monitored = int(result.MonitoredItemId)
-                    if item.code == _BAD_TOO_MANY_ITEMS:  # of another subscription
+                    if item.code == _BAD_TOO_MANY_ITEMS:  # from another subscription
                         item.code = BAD_WAITING_FOR_INITIAL_DATA
                     subscription.items.append(item)
                 elif filters and item.deadband and code & 0xFFFF0000 in _FILTERS:
@@ -878,7 +878,7 @@ class Session:
         self._report_failed(known)
 
     def _report_failed(self, items: Iterable[Item]) -> None:
-        """Deliver the status codes of items that cannot be read. For monitored items, the server sends samples."""
+        """Deliver the status codes of items that cannot be read, but not of monitored items, which get samples."""
         failed = [item for item in items if item.subscription is None and item.code not in _UNDECIDED]
         if failed:
             self._deliver([(item, Sample(0, None, None, item.code, 0)) for item in failed])

@@ -68,7 +68,7 @@ class Structure:
     form: int = _PLAIN
     fields: list[Field] = field(default_factory=list)
     fault: str = ""
-    """Why its values cannot be read; empty if they can."""
+    """Why values of this type cannot be read; empty if they can."""
 
     @property
     def is_union(self) -> bool:

@@ -109,7 +109,8 @@ def _reject(certificate: x509.Certificate, data: bytes, trusted: Path) -> str:
             if sum(1 for _ in rejected.iterdir()) >= MAX_REJECTED:
                 return f"{text}; it cannot be stored, because {rejected} has {MAX_REJECTED} files: delete old ones"
             file.write_bytes(data)
-            log.warning("%s; if it is the right one: mv '%s' '%s/'", text, file, trusted)  # a reason may be cut off
+            # Log the text, too, because the returned text may be cut off where it is shown.
+            log.warning("%s; if it is the right one: mv '%s' '%s/'", text, file, trusted)
     except OSError as error:
         return f"{text}, and cannot be stored in {rejected}: {error.strerror}"
     return f"{text}; if it is the right one: mv '{file}' '{trusted}/'"
@@ -136,7 +137,7 @@ def _folder(trusted: Path) -> list[x509.Certificate]:
 
 
 def _certificates(data: bytes) -> list[x509.Certificate]:
-    """Return the certificates in PEM or DER; none if there is no valid one."""
+    """Return the certificates in ``data`` (PEM or DER); an empty list if they are not valid."""
     try:
         if b"-----BEGIN" in data:
             return list(x509.load_pem_x509_certificates(data))

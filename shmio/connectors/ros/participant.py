@@ -144,7 +144,7 @@ class Participant:
         self._endpoints.clear()
         for entity in (self._participant, self._domain):
             if entity is not None:
-                entity.__del__()  # deletes the entities in it, too; the interpreter would do it at some later time
+                entity.__del__()  # deletes the entities in it, too, and at once
         self._participant = self._domain = None
 
     def publishers(self, topic: str) -> int:

@@ -25,7 +25,7 @@ from shmio.layout.values.write import Write
 
 DEFAULT_PORT: Final = 9090
 FIRST_S: Final = 0.1
-"""Time for which a new connection waits for first messages, in s."""
+"""Maximum time for which a new connection waits for the first messages, in s."""
 
 
 class RosbridgeOptions(TopicOptions, frozen=True, kw_only=True):
