@@ -126,7 +126,7 @@ class Alerts:
 
 
 def run(worker: Worker) -> None:
-    """Serve the alerts until the worker is stopped."""
+    """Evaluate the alerts, and deliver their notices, until the worker is stopped."""
     rate_limit = LogRateLimit()
     log.addFilter(rate_limit)
     try:

@@ -51,7 +51,7 @@ class Lifecycle:
     """True if a notice also reports the end of an announced activation."""
     progress: Progress
     held_ns: int | None = None
-    """Since when the condition has been true; None if it is not, or the alert is active."""
+    """Instance time since which the condition has been true; None: it is not, or the alert is active already."""
 
     def observe(self, holds: bool | None, now_ns: int) -> Iterator[Change]:
         """Process the condition's present value, and yield the changes to report.
@@ -92,7 +92,7 @@ class Lifecycle:
 
     @property
     def due_ns(self) -> int | None:
-        """Instance time at which to call :meth:`advance`, in ns; None: it has nothing to wait for."""
+        """Instance time at which to call :meth:`advance` next, in ns; None: no call is needed."""
         progress = self.progress
         if self.held_ns is not None:
             return self.held_ns + self.for_ns

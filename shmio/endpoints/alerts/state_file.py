@@ -54,7 +54,7 @@ class State(msgspec.Struct):
     waiting: Waiting = msgspec.field(default_factory=Waiting)
 
     def progress(self, alerts: list[Alert]) -> dict[str, Progress]:
-        """Return the saved progress, by name, of the alerts that still watch what they did."""
+        """Return the saved progress, by name, of the alerts that still watch the same as when it was saved."""
         return {
             alert.title: self.alerts[alert.title].progress
             for alert in alerts
@@ -66,7 +66,7 @@ _DECODER: Final = msgspec.json.Decoder(State)
 
 
 def digest(alert: Alert) -> str:
-    """Return a hash of what the alert watches, to detect that a new configuration has changed it."""
+    """Return a hash of what the alert watches, so that a changed configuration can be detected."""
     watched = alert.when, alert.processes, alert.states, alert.sources, alert.qualities
     return hashlib.sha256(msgspec.json.encode(watched)).hexdigest()[:16]
 

@@ -32,7 +32,7 @@ class Finding(NamedTuple):
 
 
 class Watch(Protocol):
-    """What an alert watches."""
+    """Watches something for an alert, and tells whether the alert's condition is true."""
 
     sources: Collection[str]
     """Names of the sources whose frames :meth:`evaluate` needs."""
@@ -164,7 +164,7 @@ RESTARTING: Final = "restarting"
 
 
 def make_watch(alert: Alert, segment: Segment) -> Watch:
-    """Create the watch of what an alert's configuration names."""
+    """Create the watch that an alert's configuration describes."""
     if alert.when is not None:
         return RegisterWatch(alert.when, segment.blocks)
     if alert.sources:

@@ -220,7 +220,7 @@ class _Reply:
         self._qos = min(1, message.qos)
         self._answer = answer
         self.asked = ""
-        """Text with the response topic; empty if there is none. It is the only hint at who sent the command."""
+        """Text with the response topic, the only hint at who sent the command; empty if there is none."""
         properties = vars(message.properties) if message.properties is not None else {}
         self._correlation: bytes | None = properties.get("CorrelationData")
         wanted = properties.get("ResponseTopic")

@@ -23,7 +23,7 @@ CALM_PAUSES: Final = 4
 CALM_S: Final = 60.0
 """Time in s without a break, after which the next break is short again."""
 MOST_WAITING: Final = 1000
-"""Maximum number of topics to correct. If there are more, all topics are published again."""
+"""Maximum number of topics that wait for a correction. If there are more, all topics are published again."""
 MAX_FOREIGN_MESSAGES: Final = 2000
 """Maximum number of other clients' messages in one second.
 

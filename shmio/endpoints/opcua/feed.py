@@ -38,7 +38,7 @@ class Listener(Protocol):
 
 
 class Watch:
-    """The changes of one variable, for all clients that monitor it.
+    """Tracks the changes of one variable for all clients that monitor it.
 
     The value is encoded once for all clients, when the first of them needs it.
     """

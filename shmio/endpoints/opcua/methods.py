@@ -29,7 +29,7 @@ class Stepping:
         self._coordinator = Coordinator(segment)
 
     async def step(self, length_ms: float) -> list[ua.Variant]:
-        """Make a step of ``length_ms``; 0: of the step size. Return the step's number and its time in s.
+        """Step virtual time by ``length_ms`` (0: by the step size). Return the step's number and time in s.
 
         Raises:
             ServiceError: The length is not valid.

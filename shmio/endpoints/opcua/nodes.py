@@ -366,7 +366,7 @@ def _id(source: str, path: str) -> ua.NodeId:
 
 
 def child_id(owner: Node, name: str) -> ua.NodeId:
-    """Return the node id of a property or method. No path contains the ``#`` that separates its name."""
+    """Return the node id of a property or method. Its name follows a ``#``, which no path contains."""
     head = "" if owner.id == ROOT else owner.id.Identifier
     return ua.NodeId(f"{head}#{name}", NAMESPACE)
 

@@ -1,4 +1,4 @@
-"""A client's session: serves its requests, after checks of its role and of limits."""
+"""A client's session: checks the client's roles and the limits, and serves its requests."""
 
 from __future__ import annotations
 
@@ -365,7 +365,7 @@ class Session(InternalSession):
         return [ua.TransferResult(ua.StatusCode(Fault.BadSubscriptionIdInvalid)) for _ in params.SubscriptionIds]
 
     def publish(self, acks: Iterable[ua.SubscriptionAcknowledgement] | None = None) -> tuple[int, list[ua.StatusCode]]:
-        """Process a client's acknowledgements. Return the number of its subscriptions, and a status for each."""
+        """Process acknowledgements. Return the session's number of subscriptions, and each acknowledgement's status."""
         own = self.iserver.subscriptions
         mine = own.of(self)
         if not mine:

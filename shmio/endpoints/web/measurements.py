@@ -66,11 +66,11 @@ class SourceTiming:
         self.period = Histogram()
         """Times from one cycle's frame to the next cycle's."""
         self.lateness = Histogram()
-        """Times from when a cycle was due to the publication of its frame."""
+        """Times from the due time of a cycle to the publication of its frame."""
         self.round_trip = Histogram()
         """Times that the device took to answer."""
         self.wake_up = Histogram()
-        """Times from the publication of a frame until this process, which waited for it, ran."""
+        """Times from the publication of a frame until this process, which waited for it, woke up."""
         self.command = Histogram()
         """Times from the acceptance of a command by the source until its outcome was known."""
         self.connections: deque[tuple[float, bool]] = deque(maxlen=MAX_CHANGES)
@@ -116,7 +116,7 @@ class SourceTiming:
 
 
 class Measurements:
-    """Follows all sources in a thread."""
+    """Measures the timing of all sources, in a thread."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment

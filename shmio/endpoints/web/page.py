@@ -205,7 +205,7 @@ class Page:
         return task
 
     def push(self, topic: str, data: object) -> None:
-        """Send data of a topic soon, in place of the topic's data that is not sent yet."""
+        """Send data of a topic soon. It replaces data of the topic that is not sent yet."""
         self._newest[topic] = msgspec.json.encode({"topic": topic, "data": data})
         self._waiting.set()
 

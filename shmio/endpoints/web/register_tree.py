@@ -71,7 +71,7 @@ class Trees:
         """Held during a search for rows. Simultaneous searches would delay the data of all pages."""
 
     def of(self, block: Block, blocks: Iterable[Block]) -> Node:
-        """Return the tree of a block. To create it also drops the trees of blocks that are not in ``blocks``."""
+        """Return the tree of a block. If it is new, drop the trees of blocks that are not in ``blocks``."""
         with self._making:
             node = self._trees.get(block.section)
             if node is None:
@@ -98,7 +98,7 @@ def _elements(node: Node, depth: int, layout: Layout, array: Register) -> Iterat
 
 
 def root_of(path: str) -> str:
-    """Return the source of a path."""
+    """Return the name of the source in a path."""
     return path.partition("/")[0]
 
 

@@ -30,7 +30,7 @@ from shmio.segment import Block
 from shmio.segment.block import Frame
 
 INTERVAL_S: Final = 0.04
-"""Interval at which new frames are packed and sent, in s. A page redraws as often."""
+"""Interval at which new frames are packed and sent, in s. A page redraws at the same interval."""
 HISTORY_S: Final = 8.0
 """A new follower first gets the frames of this time in s, as far as the ring still has them."""
 MAX_HISTORY: Final = 2_000
@@ -82,12 +82,12 @@ class Feed:
         self._utc_ns = utc_ns
 
     def history(self, last: int) -> tuple[list[bytes], Frame | None]:
-        """Return the batches of the frames before the feed's start, and the last of these frames.
+        """Return batches of older frames for a new follower, and the last of these frames.
 
         You may call this from another thread.
 
         Args:
-            last: Number of the last frame before the start.
+            last: Number of the last frame to return.
 
         """
         block = self.block
@@ -121,7 +121,7 @@ class Feed:
         return list(self._live.batches(islice(iter(cursor.poll, None), MAX_BEHIND)))
 
     def pack(self, before: Frame | None, frames: Sequence[Frame]) -> bytes:
-        """Return a batch.
+        """Return a batch of frames.
 
         Args:
             before: The frame before these; None after a gap.
@@ -185,7 +185,7 @@ class _Packer:
         )
 
     def batches(self, frames: Iterable[Frame]) -> Iterator[bytes]:
-        """Yield the batches of frames."""
+        """Split frames into batches, and yield these."""
         start = self.before
         waiting: list[Frame] = []
         for frame in frames:

@@ -31,7 +31,7 @@ CONNECT_S: Final = 4.0
 SLOW_S: Final = 15.0
 SLOW: Final = "no answer yet: the broker, the name server, or the file system of mqtt.tls or mqtt.password_file is slow"
 MAX_PACKET_BYTES: Final = 1 << 21
-"""Maximum packet size that the bridge accepts, in bytes. It cannot tell a broker without MQTT 5."""
+"""Maximum packet size that the bridge accepts, in bytes. Only brokers with MQTT 5 learn this number."""
 # Reason codes: MQTT 5.0, section 2.4. Paho uses the same numbers for MQTT 3.1.1.
 _WHO: Final = frozenset({0x86, 0x87})
 _BUSY: Final = frozenset({0x88, 0x89, 0x97, 0x9F})
@@ -71,8 +71,8 @@ class ConnectAttempt:
             policy: Chooses the broker.
             protocol: The version of MQTT.
             will: The will of the connection, or None.
-            most: Maximum number of messages that the broker may send without acknowledgement. The
-                bridge cannot tell a broker without MQTT 5.
+            most: Maximum number of messages that the broker may send without acknowledgement. Only
+                brokers with MQTT 5 learn this number.
             wake: Called by the thread when the attempt ends, unless the attempt was abandoned.
 
         """
