@@ -49,10 +49,10 @@ class Plan:
         expectations: The expectations.
         duration_s: Duration on the instance's clock.
         folder: Folder of the campaign file; paths in the campaign are relative to this folder.
-        step_s: Length of a step; None: the shortest period of the sources.
+        step_s: Length of a step in s; if None, the shortest period of the sources.
         real_time: Whether to run in real time, even if all sources could be stepped.
         stop: Whether to stop at the first failure.
-        record: The file to create for a recording; None: do not record.
+        record: The file to create for a recording; if None, nothing is recorded.
     """
 
     injections: Sequence[Declaration]

@@ -250,10 +250,7 @@ def hint(word: str, names: Iterable[str], otherwise: str) -> str:
 
 
 def meant(word: str, names: Iterable[str]) -> str:
-    """Return "; did you mean …?" to append to a message about an unknown word.
-
-    "" if no name is similar.
-    """
+    """Return "; did you mean …?" to append to a message about an unknown word; "" if no name is similar."""
     return "".join(f"; did you mean {name}?" for name in near(word, names))
 
 
@@ -388,7 +385,7 @@ class Faults:
             self.count += 1
 
     def include(self, other: Faults) -> None:
-        """Add the faults and warnings of another file. They are shown after those of this one."""
+        """Add the faults and warnings of another file, to show them after those of this file."""
         for message in sorted(other._found, key=other._found.__getitem__):
             self._note(message, math.inf)
         self._warnings += other._warnings
@@ -411,7 +408,7 @@ class Faults:
         except LayoutError as error:
             self._layout = error
             for line in str(error).splitlines():
-                self._note(line, math.inf)  # of another file: shown after those of this one
+                self._note(line, math.inf)  # a fault of another file is shown after those of this file
 
     def raise_any(self) -> None:
         """Raise the collected faults, if there are any.

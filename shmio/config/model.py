@@ -354,7 +354,7 @@ class MqttAccount(Section):
 
 
 class Mqtt(Section):
-    """``[mqtt]``: the bridge to a broker, and the broker itself unless it is ``external``."""
+    """``[mqtt]``: the bridge to a broker, and shmio's own broker unless ``broker`` is ``external``."""
 
     broker: BrokerName = "embedded"
     listen: Text | None = None
@@ -439,7 +439,7 @@ class Alert(Section):
 
     @property
     def title(self) -> str:
-        """The name; without one, what the alert watches."""
+        """The name of the alert; if it has no name, what it watches."""
         return self.watches if self.name is None else self.name
 
     @property

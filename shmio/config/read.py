@@ -117,8 +117,7 @@ class Examined(NamedTuple):
     config: Config
     faults: Faults
     broken: dict[int, tuple[str, dict[str, Any], dict[str, str]]]
-    """For each faulty source, by index: its connector, its own keys and those of its properties file.
-    """
+    """The connector, the connector's keys and the keys of the properties file of each faulty source, by index."""
 
 
 def examine(file: Path) -> Examined:
@@ -296,7 +295,7 @@ def _fields(kind: type[Section]) -> tuple[msgspec.structs.FieldInfo, ...]:
 
 
 class Structure:
-    """Checks each key by itself: whether it is known, present where needed, and of the right type."""
+    """Checks of each key whether it is known, is present where needed, and has the right type."""
 
     def __init__(
         self, faults: Faults, whole: type[Section], kinds: Mapping[str, type[Section]], several: Collection[str]

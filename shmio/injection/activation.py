@@ -28,7 +28,7 @@ class Window:
     """Limits on when, how long and how often an injection is active.
 
     ``start_ns`` and ``end_ns`` are times of the instance's clock. ``for_ns`` is the length of each
-    activation. ``times`` is the largest number of activations. None means no limit.
+    activation. ``times`` is the maximum number of activations. None means no limit.
     """
 
     start_ns: int = 0
@@ -39,7 +39,7 @@ class Window:
 
 @dataclass(slots=True)
 class Activation:
-    """Says whether an injection is active, and how often it has been active.
+    """Tracks whether an injection is active, and how often it has been active.
 
     ``runs`` is the number of activations so far. ``cycle`` and ``time_ns`` are the cycle and the
     instance's clock at which the last activation began.
@@ -51,10 +51,7 @@ class Activation:
     cycle: int = 0
     time_ns: int = 0
     met: bool | None = None
-    """True if the last cycle was in the window and its condition was true.
-
-    None before the first cycle.
-    """
+    """True if the last cycle was in the window and the condition was true; None before the first cycle."""
 
     def advance(self, time_ns: int, cycle: int, *, holds: bool) -> bool:
         """Update the state for a cycle, and return whether the state has changed.

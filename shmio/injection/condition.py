@@ -60,7 +60,7 @@ class Expression(NamedTuple):
     """The registers that the expression reads, as written."""
 
     def holds(self, values: Sequence[Number | None], memory: Memory) -> bool:
-        """Return whether the expression is known to be true.
+        """Return whether the expression is true; False if that is unknown.
 
         Args:
             values: The value of each reference; None if it is unknown.

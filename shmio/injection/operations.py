@@ -254,7 +254,7 @@ class Arithmetic(Operation):
         Args:
             places: The values.
             change: Computes new numbers of a group.
-            single: Computes the same for a single number, but faster; None: use ``change`` for it, too.
+            single: Computes the same for a single number, but faster; if None, ``change`` does it.
 
         """
         self._places = places
@@ -447,8 +447,8 @@ class Flip(Operation):
         """Create the operation.
 
         Args:
-            mask: An image in which the bits to invert are set, of shape (size,). None: invert one
-                random covered bit in each cycle.
+            mask: An image in which the bits to invert are set, of shape (size,). If None, one random
+                covered bit is inverted in each cycle.
             cover: An image in which the bits that the injection covers are set, of shape (size,).
             draw: The source of randomness.
 

@@ -25,10 +25,10 @@ class Formula:
 
     Attributes:
         expectation: The expectation.
-        tree: Its formula, whose truth at the start of the judged time is the verdict. None: its
+        tree: The formula, whose truth at the start of the judged time is the verdict; None if the
             signals must be like those of a recording.
-        trigger: A condition that must become true at least once; otherwise the verdict is
-            inconclusive. None: there is no such condition.
+        trigger: A condition that must become true at least once, or else the verdict is
+            inconclusive; None if there is no such condition.
         signals: What the formula reads.
         failure: What a failure means, as text.
     """

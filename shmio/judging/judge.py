@@ -54,7 +54,7 @@ class Judge:
             expectations: The expectations.
             layouts: The layout of each source.
             stale_ns: The age from which a frame of a source is stale, in ns.
-            golden: Reads signals of recordings, for ``like``; None: there are no recordings.
+            golden: Reads signals of recordings, for ``like``; None if there are no recordings.
 
         Raises:
             ConfigError: An expectation is invalid; the message starts as ``expect[0].formula: …``.

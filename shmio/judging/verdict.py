@@ -31,7 +31,7 @@ class TopLevel:
     low: float = -np.inf
     high: float = np.inf
     extreme_ns: int | None = None
-    """The moment of the value that is closest to deciding otherwise; None: unknown."""
+    """The moment of the value that is closest to changing the decision; None if it is unknown."""
 
     def turn(self) -> None:
         """Read what has become known of the operands."""
@@ -78,7 +78,7 @@ class TopLevelExtremum(TopLevel):
     Args:
         function: ``np.minimum`` for always, ``np.maximum`` for eventually.
         operand: The signal.
-        bounds_ns: The span, relative to the start; None: the whole judged time.
+        bounds_ns: The span, relative to the start; None if it is the whole judged time.
     """
 
     def __init__(self, function: np.ufunc, operand: Node, bounds_ns: tuple[int, int] | None) -> None:

@@ -146,10 +146,10 @@ class Laboratory:
         return segment
 
     def attach(self, segment: Segment | None = None) -> Attachment:
-        """Attach to the laboratory: a cell as :func:`shmio.attach` returns it for an instance.
+        """Return a cell that is attached to the laboratory, as :func:`shmio.attach` does for an instance.
 
         Args:
-            segment: A segment from :meth:`open`; None: a new one.
+            segment: A segment from :meth:`open`; if None, a new one is opened.
 
         """
         segment = segment or self.open()
@@ -214,7 +214,7 @@ class _LabClock:
         return time.monotonic_ns()
 
     def wait_ns(self, duration_ns: int | None) -> bool:  # noqa: ARG002
-        """Return True without waiting: the loop must not go on by itself."""
+        """Return True without waiting, because the loop must not run by itself."""
         return True
 
     def nudge(self) -> None:

@@ -492,9 +492,9 @@ def _unread(emulated: dict[str, tuple[Served, ...]]) -> Iterator[str]:
 
 
 def _covers(pattern: str, layout: Layout, types: Sequence[str] = ()) -> bool:
-    """Return whether a pattern matches a register of these types, a part of it, or its container.
+    """Return whether a pattern matches a register of these types, or a part or the container of such a register.
 
-    Without ``types``, all types count.
+    Without ``types``, registers of all types count.
 
     Raises:
         PathError: The pattern is invalid.

@@ -97,7 +97,7 @@ class Job:
     """The part of a source's section that says how to connect to its device.
 
     While this part stays the same, the process can follow other changes without a new connection.
-    None if the process can follow no change.
+    None if the process must be restarted for each change.
     """
 
     def connects_like(self, other: Job) -> bool:

@@ -121,7 +121,7 @@ def _check_source(
 
 
 def note_options(index: int, connector: str, options: dict[str, Any], texts: dict[str, str], faults: Faults) -> None:
-    """Add to ``faults`` those of a source's connector and its keys; ``index`` is the source's index in the file."""
+    """Add the faults in a source's connector and the keys for it; ``index`` is the source's index in the file."""
     key = f"source[{index}]"
     if what := registry.clash(connector):
         faults.add(f"{key}.connector: {what}")

@@ -34,8 +34,8 @@ class ModelRunner:
 
     There are two images. The commanded image has the values that clients and connections have
     written: to inputs, to the ``/in`` of in-out registers, and to registers that the model does not
-    declare. The shown image has the values that readers see. It shows a value that was written to
-    an input or to an undeclared register from the next step on.
+    declare. The shown image has the values that readers see. A value that was written to an input or
+    to an undeclared register appears in it with the next step.
     """
 
     def __init__(

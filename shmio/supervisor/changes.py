@@ -36,7 +36,8 @@ def reconcile(plan: Plan, epoch: int, fleet: Fleet, blocks: Iterable[Block]) -> 
     """Compare a plan with the present processes and blocks.
 
     A source is replaced together with its block, because the process of a source writes to one
-    block only. If the new source connects as before, its process goes on with the new block.
+    block only. If the new source connects as before, the process keeps its connection, and continues
+    with the new block.
     """
     present = {block.source: block for block in blocks}
     add = tuple(spec for spec in plan.blocks if spec.source not in present or not _same(spec, present[spec.source]))

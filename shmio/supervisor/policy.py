@@ -280,7 +280,7 @@ def adopted(spawned_ns: int, restarts: int) -> Life:
 
 
 def ended(returncode: int | None) -> Event:
-    """Return the event for the end of a process; ``returncode`` is None if it is not known."""
+    """Return the event for the end of a process; ``returncode`` is None if the exit status is unknown."""
     return Event.REFUSAL if returncode == REFUSED_STATUS else Event.EXIT
 
 

@@ -90,19 +90,13 @@ class ChildProcess:
         self._popen.kill()
 
     def reap(self) -> int:
-        """Return the exit code of a process that has ended (-n: killed by signal n).
-
-        Close its pidfd.
-        """
+        """Close the pidfd of the ended process, and return the exit code (-n if signal n killed the process)."""
         code = self._popen.wait()
         os.close(self.pidfd)
         return code
 
     def waited_ns(self) -> int:
-        """Return how long the process's main thread has waited for a processor, in ns.
-
-        0 if unknown.
-        """
+        """Return how long the process's main thread has waited for a processor, in ns; 0 if unknown."""
         with suppress(OSError, IndexError, ValueError):  # proc(5): a kernel may lack the file
             return int(Path(f"/proc/{self.pid}/schedstat").read_text().split()[1])
         return 0
@@ -164,7 +158,7 @@ class AdoptedProcess:
         return 0
 
     def last_words(self) -> str:
-        """Return "", because it is not known which lines of the log file are from this process."""
+        """Return "", because nobody knows which lines of the log file are from this process."""
         return ""
 
 
@@ -200,7 +194,7 @@ def _open_log(file: Path) -> int:
 
 
 def describe_end(code: int | None) -> str:
-    """Return an exit code in words; ``code`` is None if it is not known."""
+    """Return an exit code in words; ``code`` is None if the exit code is unknown."""
     if code is None:
         return "ended; its exit status is unknown, because an earlier supervisor started it"
     if code >= 0:

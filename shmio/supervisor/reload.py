@@ -133,10 +133,7 @@ class InstanceChange:
         return [job for job in self.plan.jobs if job.name in names]
 
     def step(self) -> bool:
-        """Continue as far as possible now.
-
-        Return True when each new process runs or has failed once.
-        """
+        """Continue as far as possible now; return True when each new process runs or has failed once."""
         if not self._stopped:
             self._stopped = self._stop()
             if self._stopped:
@@ -309,8 +306,8 @@ class Reloader:
     def preview(self, answer: Answer) -> None:
         """Make a new plan, and answer what a reload would do with it. This never delays a reload.
 
-        Requests that come while a plan is made share the next plan, because the files may have
-        changed since the present one was begun.
+        Requests that arrive while a plan is being made share the next plan, because the files may
+        have changed in the meantime.
         """
         if reason := self.busy():
             answer.error(reason)

@@ -168,9 +168,9 @@ class PageClock:
 
 
 class SteppedLoop:
-    """Runs one computed source: it computes and publishes frames, and carries out writes.
+    """Runs one computed source: computes and publishes frames, and carries out writes.
 
-    In virtual time it publishes a frame for every step. If a step fails, the frame is bad and
+    In virtual time, the loop publishes a frame for every step. If a step fails, the frame is bad and
     states the reason.
     """
 

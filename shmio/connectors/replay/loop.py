@@ -112,7 +112,7 @@ class Player:
         self._bad = False  # the last published frame was bad
         self._missing = False  # the last frame was a bad one of the replay itself, not a recorded one
         self.stopped = False
-        """True if the last frame is the bad one that the previous process published at its end."""
+        """True if the last frame is the bad frame that the previous process published at its end."""
         self.published = 0
 
     @property
@@ -121,7 +121,7 @@ class Player:
         return None if self._next is None else self._next.position_ns
 
     def go(self, position_ns: int | None) -> None:
-        """Continue with the first entry at or after a position; None: with the recording's first entry."""
+        """Continue with the first entry at or after a position; with the recording's first entry if it is None."""
         self._entries = self._recorded.entries(position_ns)
         self._next = next(self._entries, None)
 

@@ -24,7 +24,7 @@ class Replay(Replayed):
     class Options(msgspec.Struct, forbid_unknown_fields=True):
         """Keys of the source.
 
-        With ``own_clock``, each frame has the instance time of its recording. Otherwise it has the
+        With ``own_clock``, each frame has its recorded instance time. Otherwise, it has the instance
         time at which it is played.
         """
 
@@ -107,7 +107,7 @@ class ReplayStart(NamedTuple):
 
     @property
     def at(self) -> Stamp:
-        """The time stamp for the start event: that of the position at which playing continues."""
+        """The time stamp for the start event, which is that of the position at which playing continues."""
         play, done_ns = self
         position_ns = play.begin_ns if done_ns is None else done_ns
         return stamp(play, position_ns, position_ns)

@@ -120,7 +120,7 @@ class Instance:
             group.show()
 
     def do_step(self, now_s: float, size_s: float) -> float | None:
-        """Make one step.
+        """Let the FMU make one step.
 
         Returns:
             The time that the FMU has reached, if that is less than the end of the step; infinity if
