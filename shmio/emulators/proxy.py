@@ -214,10 +214,10 @@ class FaultProxy:
 
         Args:
             target: Address of the server.
-            listen: Address to listen on; None: a free loopback port.
+            listen: Address to listen on; None for a free loopback port.
             up_s: Delay of each byte to the server, in s. It does not limit the throughput.
             down_s: Delay of each byte from the server, in s.
-            framing: Function that returns the length of a frame. None: the result of each ``recv``
+            framing: Function that returns the length of a frame. If None, the result of each ``recv``
                 is a frame.
 
         Raises:

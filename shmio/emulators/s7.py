@@ -134,7 +134,7 @@ class ServerOptions:
     """Maximum number of jobs in flight that the server grants."""
     fault: Fault | None = None
     block_size: int | None = None
-    """Maximum size in bytes of data blocks as clients see them, as if the blocks were older; None: no limit."""
+    """Maximum size in bytes of data blocks as clients see them, as if the blocks were older; None for no limit."""
 
     def __post_init__(self) -> None:
         if not (100 <= self.max_pdu_size <= MAX_PDU_SIZE and 1 <= self.max_jobs <= MAX_JOBS):

@@ -110,7 +110,7 @@ class ModbusClient:
             start: First entry.
             count: Number of entries.
             until_ns: When to give up with SilentError, in ns of CLOCK_MONOTONIC; the connection then stays
-                open. None: wait for the time-out, which closes it.
+                open. If None, wait until the time-out, which closes the connection.
 
         Raises:
             RefusedError: The device refuses the request. The connection stays open.

@@ -74,7 +74,7 @@ class ModbusOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_
     unit: Annotated[int, msgspec.Meta(ge=0, le=255)] = 1
     """Unit id for addresses that name no unit."""
     word_order: Order = "big"
-    """Order of the words within a number; ``big``: the highest word comes first."""
+    """Order of the words within a number. With ``big``, the highest word comes first."""
     byte_order: Order = "big"
     """Order of the bytes within a word. The protocol specifies ``big``."""
     max_registers: Annotated[int, msgspec.Meta(ge=1, le=125)] = 125

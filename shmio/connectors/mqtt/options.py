@@ -47,7 +47,7 @@ class MqttOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_on
     timeout: Annotated[int, msgspec.Meta(ge=10, le=600_000)] = 4000
     """Time-out for connecting, for each answer of the broker, and for the writes of a cycle, in ms."""
     version: Literal["auto", "5", "3.1.1"] = "auto"
-    """Version of MQTT. ``auto``: first try version 5, and then 3.1.1."""
+    """Version of MQTT. With ``auto``, the source tries version 5 first, and then 3.1.1."""
     client_id: Annotated[str, msgspec.Meta(min_length=1, max_length=128)] | None = None
     keep_alive_s: Annotated[int, msgspec.Meta(ge=5, le=3600)] = 30
     qos: Annotated[int, msgspec.Meta(ge=0, le=1)] = 1
@@ -56,13 +56,13 @@ class MqttOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_on
     retain: bool = False
     """True to publish written values with the retain flag."""
     max_age_ms: _Age | dict[_Text, _Age] | None = None
-    """Age in ms above which a topic's last message is too old; 0: never.
+    """Age in ms above which a topic's last message is too old; 0 if it never is.
 
     A single number applies to all registers; a table has a number for each pattern of registers.
     """
     will: _Text | Annotated[list[Will], msgspec.Meta(max_length=1000)] = msgspec.field(default_factory=list)
     time: _Text | None = None
-    """Path of the source time in JSON payloads; None: the time when the message was received."""
+    """Path of the source time in JSON payloads. If None, it is the time when the message was received."""
     texts: tuple[_Text, _Text] = ("false", "true")
     """The texts published for a BOOL register: the first for false, the second for true."""
     templates: Annotated[dict[_Text, str], msgspec.Meta(max_length=10_000)] = msgspec.field(default_factory=dict)

@@ -81,13 +81,13 @@ class Topic(Origin):
 
         Args:
             name: The topic's name.
-            time: The path of the source time in JSON; None: the time when a message was received.
+            time: The path of the source time in JSON. If None, the source time is the time of receipt.
             max_bytes: The size of the largest payload that is read.
 
         """
         self.name = name
         self.places: dict[int, Steps | None] = {}
-        """By register index, the path of its value in JSON; None: the payload is the value as text."""
+        """By register index, the path of its value in JSON; None if the payload is the value as text."""
         self.refused = False
         """True if the broker refuses the subscription."""
         self._time, self._max_bytes = time, max_bytes

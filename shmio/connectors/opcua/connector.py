@@ -71,7 +71,7 @@ class _Node(NamedTuple):
     address: Address
     is_structure: bool
     deadband: float
-    """Dead-band in the numbers of the node, before scaling; 0: none."""
+    """Dead-band in the numbers of the node, before scaling; 0 if there is none."""
     registers: list[int]
 
 

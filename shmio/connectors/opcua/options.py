@@ -28,7 +28,7 @@ class OpcUaOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_o
     nodes: Literal["addresses", "siemens"] = "addresses"
     """What node ids are made from: the layout's addresses, or the names of an S7-1500's data block."""
     sampling_ms: Annotated[int, msgspec.Meta(ge=-1, le=3_600_000)] = 50
-    """Interval at which the server samples a node; 0: as fast as it can; -1: the publishing interval."""
+    """Interval in ms at which the server samples a node. 0 is its fastest, -1 the publishing interval."""
     publishing_ms: Annotated[int, msgspec.Meta(ge=1, le=3_600_000)] = 100
     queue: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 1
     """Maximum number of samples of a node that the server keeps between two publications."""

@@ -84,7 +84,7 @@ class Item:
     index: int
     address: Address
     deadband: float
-    """Dead-band in the numbers of the node, before scaling; 0: none."""
+    """Dead-band in the numbers of the node, before scaling; 0 if there is none."""
     session: int
     """Index of the session that reads the node."""
     node: Any = None
@@ -99,7 +99,7 @@ class Item:
     last: Sample | None = None
     """The newest sample with a value."""
     settles_ns: int = 0
-    """Time (ns of CLOCK_MONOTONIC) until which samples from before the last write may arrive; 0: none may."""
+    """Time (ns of CLOCK_MONOTONIC) until which samples from before the last write may arrive; 0 if none may."""
     written_ns: int = 0
     """Source time of the value that was read back after the last write."""
     is_structure: bool = False
@@ -890,7 +890,7 @@ class _Protocol(UASocketProtocol):
     reason = ""
     """Why this client closed the connection."""
     refused = 0
-    """Status code with which the server has closed the connection; 0: none."""
+    """Status code with which the server has closed the connection; 0 if it sent none."""
 
     def _fail_all_pending(self, exc: BaseException) -> None:
         """Remember the server's error: the library loses one that answers the request for a secure channel."""

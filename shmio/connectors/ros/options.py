@@ -15,7 +15,7 @@ class TopicOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_o
     timeout: Annotated[int, msgspec.Meta(ge=10, le=600_000)] = 4000
     """Time-out for connecting, for each answer, and for the writes of a cycle, in ms."""
     max_age: Annotated[int, msgspec.Meta(ge=0, le=86_400_000)] = 1000
-    """Age in ms above which the last message of a topic is too old; 0: never."""
+    """Age in ms above which the last message of a topic is too old; 0 if it never is."""
     latched: Annotated[list[_Topic], msgspec.Meta(max_length=10_000)] = msgspec.field(default_factory=list)
     """Topics whose last message stays valid for ever."""
     time: Literal["stamp", "receipt"] = "stamp"

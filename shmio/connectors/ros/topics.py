@@ -39,7 +39,7 @@ class Topic:
         self.message: Any = None
         """The last message; None before the first one, and if the last one cannot be read."""
         self.received_ns = 0
-        """When the last message was received, ns of CLOCK_MONOTONIC; 0: never."""
+        """When the last message was received, ns of CLOCK_MONOTONIC; 0 if there was none."""
         self.utc_ns = 0
         self.fault = GOOD
         """The status that makes all of the topic's registers bad; GOOD if there is none."""
