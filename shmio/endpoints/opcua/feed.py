@@ -183,7 +183,7 @@ class Feed:
         return self._details[key]
 
     def adopt(self, watch: Watch, path: str | None, get: Callable[[], ua.DataValue] | None) -> None:
-        """Take over a watch after a reload, from the feed that this feed replaces.
+        """Take over a watch after a reload, usually from the feed that this feed replaces.
 
         Args:
             watch: The watch.

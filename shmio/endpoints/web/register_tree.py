@@ -71,7 +71,7 @@ class Trees:
         """Held during a search for rows. Simultaneous searches would delay the data of all pages."""
 
     def of(self, block: Block, blocks: Iterable[Block]) -> Node:
-        """Return the tree of a block. If it is new, drop the trees of blocks that are not in ``blocks``."""
+        """Return the tree of a block. If the tree is new, drop the trees of blocks that are not in ``blocks``."""
         with self._making:
             node = self._trees.get(block.section)
             if node is None:
