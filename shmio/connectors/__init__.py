@@ -1,1 +1,1 @@
-"""Connectors read and write devices: a class for each protocol, and a process for each source."""
+"""Connectors, which read and write devices: one class for each protocol, run in one process for each source."""

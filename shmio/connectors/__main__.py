@@ -23,10 +23,10 @@ from shmio.worker import BEAT_S, Worker
 if TYPE_CHECKING:
     from shmio.connectors.replay.loop import ReplayLoop
 
-SWITCH_S = 0.0005  # Python's default of 5 ms would delay the poll thread too long
+SWITCH_S = 0.0005  # with Python's default of 5 ms, other threads would delay the poll thread too long
 LAST_WORDS_S = 4.0  # less than the supervisor's grace period
 REPLAY_TIMEOUT_S = 1.0
-HANG_MARGIN_S = 30.0  # added to the time-out, because asyncio's look-up of a host name has none of its own
+HANG_MARGIN_S = 30.0  # added to the time-out, because asyncio's look-up of a host name has no time-out
 
 
 class _LoopHandle(NamedTuple):
@@ -40,9 +40,9 @@ class _LoopHandle(NamedTuple):
 def run(worker: Worker) -> None:
     """Run the poll loop and the commands in two threads, and send reports from the calling thread.
 
-    Therefore, a method of the source that blocks delays neither commands nor reports. If the
-    supervisor writes a new configuration, another loop with it replaces the loop, and takes over
-    the connection to the device.
+    So if a method of the source blocks, this delays neither commands nor reports. If the supervisor
+    writes a new configuration for a device, another loop replaces the present one, and takes over
+    the connection if it can.
     """
     sys.setswitchinterval(SWITCH_S)
     woken = threading.Event()
@@ -79,7 +79,7 @@ class _Running:
         """Report that the loop runs.
 
         Raises:
-            ConnectorError: It has ended.
+            ConnectorError: The loop has ended.
 
         """
         if not self.poll.is_alive() or not self.commands.is_alive():
@@ -87,7 +87,7 @@ class _Running:
         loop = self.part.loop
         busy_s = _busy_s(loop.counters.busy_since_ns)
         if busy_s > self.part.timeout_s + HANG_MARGIN_S:
-            return  # without a heartbeat the supervisor replaces the process
+            return  # without a heartbeat, so that the supervisor replaces the process
         counters = loop.counters
         note = f"a cycle takes longer than {self.part.timeout_s:g} s" if busy_s > self.part.timeout_s else loop.note
         worker.report(
@@ -103,7 +103,7 @@ class _Running:
         )
 
     def stop(self, meanwhile: Callable[[], None] = lambda: None) -> bool:
-        """Stop the loop, and call ``meanwhile`` again and again; return whether it has ended."""
+        """Stop the loop, and call ``meanwhile`` repeatedly while it ends; return whether it has ended."""
         self.part.stop()
         deadline_s = time.monotonic() + min(self.part.timeout_s + 0.5, LAST_WORDS_S)
         while self.poll.is_alive() and (left_s := deadline_s - time.monotonic()) > 0:
@@ -118,8 +118,8 @@ def _replaced(
 ) -> _LoopHandle | None:
     """Stop a loop, wait until the supervisor has changed the segment, and return the next loop.
 
-    None: the process must stop. If the supervisor has died and has not changed the segment, the next
-    loop continues with the present configuration.
+    Return None if the process must stop. If the supervisor dies before it has changed the segment,
+    the next loop continues with the present configuration.
 
     Raises:
         ConnectorError: The loop does not end.
@@ -149,7 +149,7 @@ def _replaced(
 
 
 def _loop_of(worker: Worker, predecessor: SourceLoop | None = None) -> _LoopHandle:
-    """Create the loop that runs this source; ``predecessor``: the loop that it replaces."""
+    """Create the loop that runs this source; ``predecessor`` is the loop that it replaces, if any."""
     segment, name = worker.segment, worker.config["connector"]
     found = registry.load(name)
     options = registry.convert_options(name, worker.config["options"])
@@ -157,7 +157,7 @@ def _loop_of(worker: Worker, predecessor: SourceLoop | None = None) -> _LoopHand
         return _replay_loop(worker, options)
     layout = segment.blocks[worker.name].layout
     if issubclass(found, Connector):
-        layout = layout.base  # names over the block are no registers of the device
+        layout = layout.base  # without registers over the block, which the device does not have
         found = found.for_layout(layout)
     source = found(options, layout)
     writer = segment.writer(worker.name)  # after the source: a configuration error must not change the segment
@@ -225,7 +225,7 @@ def _busy_s(since_ns: int) -> float:
 
 
 class _Rate:
-    """The rate of polls over about the last second, in polls per 1000 s."""
+    """Measures the rate of polls over about the last second, in polls per 1000 s."""
 
     def __init__(self) -> None:
         self._marks: list[tuple[float, int]] = []

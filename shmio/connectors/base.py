@@ -31,15 +31,15 @@ class Lost(Enum):
 
 
 class WriteLostError(ConnectorError):
-    """The connection was lost before the device had answered all writes."""
+    """The connection was lost before the device answered all writes."""
 
     def __init__(self, message: str, outcomes: Sequence[str | Lost]) -> None:
         """Create the error.
 
         Args:
             message: Why the connection was lost.
-            outcomes: For each write, its result as :meth:`Connector.write` returns it if the device
-                has answered, or else a :class:`Lost`.
+            outcomes: For each write that the device has answered, the result as
+                :meth:`Connector.write` returns it; for each other write, a :class:`Lost`.
 
         """
         super().__init__(message)
@@ -47,19 +47,19 @@ class WriteLostError(ConnectorError):
 
 
 class UnconfirmedError(WriteLostError):
-    """The device did not confirm all writes in time. The connection is in order, and stays open."""
+    """The device did not confirm all writes in time. The connection still works, and stays open."""
 
 
 class Connector(ABC):
     """Base class for the protocol of one device.
 
     The loop calls all methods in one thread, and none may block longer than ``timeout_s``. If a
-    method has raised an exception, the loop calls :meth:`close`, and later :meth:`connect` again. A
-    late reply is therefore never taken for the reply to a later request. A connector that sends a
-    request and waits for its reply implements :meth:`read`. A connector that can have several
-    requests in flight implements :meth:`submit`, :meth:`collect` and ``depth``. A connector
-    that can write implements :meth:`write`, or :meth:`send` and :meth:`confirm`. The text of a
-    ConnectorError is for the operator of the cell.
+    method raises an exception, the loop calls :meth:`close`, and later :meth:`connect` again. So a
+    late reply is never taken for the reply to a later request. A connector that sends a request and
+    waits for its reply implements :meth:`read`. A connector that can have several requests in
+    flight implements :meth:`submit`, :meth:`collect` and ``depth``. A connector that can write
+    implements :meth:`write`, or :meth:`send` and :meth:`confirm`. The operator of the cell reads
+    the text of a ConnectorError.
     """
 
     Options: ClassVar[type[msgspec.Struct]]
@@ -69,12 +69,12 @@ class Connector(ABC):
     """True if the connector can write."""
 
     provenance: ClassVar[Provenance] = Provenance.LIVE
-    """Where the values come from; each frame of the source states it."""
+    """Where the values come from, as each frame of the source says."""
 
     register_quality: ClassVar[bool] = False
     """True if the device gives each register its own status and time.
 
-    If it does, the layout has a status area, and the connector makes its images with
+    Then the layout has a status area, and the connector creates its images with
     :class:`shmio.connectors.register_image.RegisterImage`.
     """
 
@@ -91,18 +91,19 @@ class Connector(ABC):
     """
 
     register_options: ClassVar[frozenset[str] | None] = None
-    """The keys of ``Options`` that say what is read or written, and not how to connect.
+    """The keys of ``Options`` that determine what is read or written, and not how to connect.
 
-    If a reload changes only these and the layout, a new connector takes over the connection of the
-    old one by :meth:`take_over`. None: the connector cannot, and its process is restarted.
+    If a reload changes only these keys and the layout, a new connector takes over the connection of
+    the old one by :meth:`take_over`. None: the connector cannot do this, so a reload restarts its
+    process.
     """
 
     @classmethod
     def for_layout(cls, layout: Layout) -> type[Connector]:  # noqa: ARG003  most read all layouts
         """Return the connector class for a layout; it has the same ``Options``.
 
-        A connector that needs ``register_quality`` for some layouts only returns another class for
-        them.
+        If a connector needs ``register_quality`` only for some layouts, this returns another class
+        for those.
         """
         return cls
 
@@ -112,7 +113,7 @@ class Connector(ABC):
 
         Args:
             options: An instance of ``Options``.
-            wanted: Which part to list, and the limits of the search.
+            wanted: The part of the device to list, and the limits of the search.
 
         Raises:
             ConfigError: An option is wrong, or this connector cannot browse.
@@ -154,9 +155,9 @@ class Connector(ABC):
         No answer to a request of the other connector may become a value of this one.
 
         Args:
-            other: A connector of the same class. Its options are the same except for
-                ``register_options``. No read and no write of it is in flight. If this method
-                returns True, the connection no longer belongs to it.
+            other: A connector of the same class, with the same options except for
+                ``register_options``. It has no read and no write in flight. If this method returns
+                True, the connection no longer belongs to ``other``.
 
         Returns:
             Whether this connector has taken over the connection. If not, the loop closes ``other``,
@@ -185,22 +186,19 @@ class Connector(ABC):
         """Close the connection. The loop may call this at any time and more than once."""
 
     def describe(self) -> str:
-        """Return what was negotiated with the device, for the log."""
+        """Return the parameters of the connection that were negotiated with the device, for the log."""
         return ""
 
     @property
     def doubt(self) -> str:
-        """Why the image read last is uncertain, and what to do about it.
-
-        Empty if the image is good.
-        """
+        """Why the last image is uncertain, with the remedy; empty if the image is good."""
         return ""
 
     def cycle_requests(self) -> CycleRequests | None:
-        """Return what a cycle requests from the device; None if this is not known.
+        """Return the requests that a cycle sends to the device; None if they are not known.
 
-        ``shmio-supervisor check`` shows it. The method is called without a connection, and opens
-        none.
+        ``shmio-supervisor check`` shows them. The method is called without a connection, and must
+        open none.
         """
         return None
 
@@ -220,10 +218,10 @@ class Connector(ABC):
         """
 
     def collect(self, until_ns: int) -> bytes | None:  # noqa: ARG002  read() has its own time-out
-        """Wait for the image that :meth:`submit` requested first, of those not yet collected.
+        """Wait for the oldest image that :meth:`submit` has requested and that is not yet collected.
 
         Args:
-            until_ns: When to stop waiting, ns of CLOCK_MONOTONIC.
+            until_ns: Time at which to stop waiting, CLOCK_MONOTONIC in ns.
 
         Returns:
             The image, ``layout.size`` bytes; None if it has not arrived by ``until_ns``.
@@ -251,7 +249,7 @@ class Connector(ABC):
             it.
 
         Raises:
-            WriteLostError: The connection was lost; the error says what is known of each write.
+            WriteLostError: The connection was lost; the error contains what is known of each write.
             ConnectorError: It is not known whether the device carried out any of the writes.
 
         """
@@ -260,11 +258,11 @@ class Connector(ABC):
     _outcomes: Sequence[str] = ()
 
     def send(self, writes: Sequence[Write]) -> None:
-        """Send writes, and do not wait until the device confirms them.
+        """Send writes without waiting until the device confirms them.
 
-        A connector implements this and :meth:`confirm` if a device that works may take longer to
-        confirm a write than a cycle. The loop sends further writes after the outcomes of these. By
-        default, :meth:`write` waits for the outcomes.
+        A connector implements this and :meth:`confirm` if a device in good order may take longer
+        than a cycle to confirm a write. The loop sends no further writes before it has the outcomes
+        of these. By default, this method calls :meth:`write`, which waits.
 
         Args:
             writes: As for :meth:`write`.
@@ -279,14 +277,14 @@ class Connector(ABC):
         """Wait for the outcomes of the writes that :meth:`send` has sent.
 
         Args:
-            until_ns: When to stop waiting, ns of CLOCK_MONOTONIC.
+            until_ns: Time at which to stop waiting, CLOCK_MONOTONIC in ns.
 
         Returns:
             The outcomes as :meth:`write` returns them; None if some are not known by ``until_ns``.
 
         Raises:
-            UnconfirmedError: Some outcomes have not come within the connector's own time-out. The
-                connection stays open.
+            UnconfirmedError: The device has not confirmed all writes within the connector's own
+                time-out. The connection stays open.
             ConnectorError: As for :meth:`write`.
 
         """
@@ -294,10 +292,10 @@ class Connector(ABC):
 
 
 class Computed(ABC):
-    """Base class for a source that computes its registers, and which follows the instance clock.
+    """Base class for a source that computes its registers, and that follows the instance clock.
 
     The loop calls all methods in one thread, except :meth:`interrupt`. A method that fails raises a
-    ShmioError, whose text is for the operator of the cell. The loop tries again in the next cycle.
+    ShmioError, whose text the operator of the cell reads. The loop tries again in the next cycle.
     """
 
     Options: ClassVar[type[msgspec.Struct]]
@@ -355,10 +353,7 @@ class Computed(ABC):
 
     @abstractmethod
     def begin(self) -> bytes:
-        """Return the image before the first step.
-
-        If the source is ``prompt``, its present image.
-        """
+        """Return the image before the first step; for a ``prompt`` source, its present image."""
 
     def has_changed(self) -> bool:
         """Return whether :meth:`begin` would return a changed image; called between two steps."""
@@ -368,7 +363,7 @@ class Computed(ABC):
         """End a :meth:`step` that is waiting. Any thread may call this."""
 
     def close(self) -> None:  # noqa: B027  most hold nothing
-        """Release what the source holds. The loop calls it last."""
+        """Release all resources of the source. The loop calls this last."""
 
     @abstractmethod
     def write(self, writes: Sequence[Write]) -> list[str]:
@@ -389,9 +384,9 @@ class Computed(ABC):
 
 
 class Replayed(ABC):
-    """Base class for a source that plays the frames of a recording with the recording's layout.
+    """Base class for a source that plays the frames of a recording, with the recording's layout.
 
-    It follows the instance clock.
+    Such a source follows the instance clock.
     """
 
     Options: ClassVar[type[msgspec.Struct]]

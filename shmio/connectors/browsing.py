@@ -20,8 +20,8 @@ class Offer:
 
     Attributes:
         names: The name of each level from the top to this value, as the device spells it.
-        type: The type that a register of this value has in a tag table; empty for a group, and for
-            a value that cannot be a register.
+        type: The type in a tag table of a register with this value; empty for a group, and for a
+            value that cannot be a register.
         columns: Other columns of the tag table: ``address``, ``unit``, ``comment``, ``writable``.
         refused: Why the value cannot be a register; empty if it can, and for a group.
 
@@ -39,7 +39,7 @@ class Browsed:
 
     Attributes:
         offers: The values and groups. Each follows the group that contains it.
-        incomplete: Why the device may offer more, with the remedy; empty if these are all.
+        incomplete: Why the device may offer more values, with the remedy; empty if these are all.
 
     """
 
@@ -48,14 +48,14 @@ class Browsed:
 
 
 class Wanted:
-    """Which part of a device the user wants to list, and the limits of the search."""
+    """The part of a device that the user wants to list, and the limits of the search."""
 
     def __init__(self, patterns: Iterable[str] = (), *, depth: int = DEFAULT_DEPTH, nodes: int = DEFAULT_NODES) -> None:
         """Create the choice.
 
         Args:
-            patterns: Paths and globs, written like those of registers; if there are none,
-                everything is wanted.
+            patterns: Paths and globs, written like those of registers. If there are none, the user
+                wants everything.
             depth: Maximum number of levels.
             nodes: Maximum number of nodes to look at.
 
@@ -85,7 +85,7 @@ class Wanted:
 
 
 def _path(names: Iterable[str]) -> str | None:
-    """Return the path with these names as its segments; None if they cannot form a path."""
+    """Return the path that has these names as its segments; None if they cannot form a path."""
     try:
         return "/".join(encode_segment(name) for name in names)
     except PathError:

@@ -1,9 +1,9 @@
 """Accepts or rejects the commands to a source, and carries out accepted ones in the next cycle.
 
 A command consists of items, which are writes. A separate thread accepts and rejects commands, so
-that a slow device does not delay this decision. The loop's thread writes to the device before it
-reads, so that the next frame shows the new values. It writes all items accepted for a cycle in one
-batch. From the outcomes of the batch's writes, it derives the outcome of each item.
+that a slow device does not delay this decision. In each cycle, the loop's thread writes all
+accepted items to the device in one batch, and derives the outcome of each item from the outcomes of
+the batch's writes. Then it reads the device, so that the next frame shows the new values.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from shmio.segment import NO_WRITER, Command, CommandKind, EventKind, Record
 MAX_WAITING: Final = 256
 """The largest number of items that may wait for a cycle; further commands stay in their queues.
 
-A single command may have more items if none is waiting.
+While no items wait, a single command may have more.
 """
 MAX_WAITING_BLOCKS: Final = 4
 """The largest number of bytes that may wait for a cycle, as a multiple of the block's size."""
@@ -42,13 +42,13 @@ TELL_NS: Final = 1_000_000_000
 _UNARMED: Final = "an injection toward a device needs `armed = true` in the source's configuration"
 _SUPERSEDED: Final = "superseded by a later write of the same cycle"
 _EXPONENTS: Final = {"REAL": b"\x7f\x80\0\0", "LREAL": b"\x7f\xf0\0\0\0\0\0\0"}
-"""The exponent bits of each type of number, most significant byte first.
+"""The mask of the exponent bits, by type of number, most significant byte first.
 
 A number is NaN or infinite if all its exponent bits are set.
 """
 
 End = tuple[EventKind, str]
-"""The kind and the text of the last event about an item."""
+"""Kind and text of the last event about an item."""
 _Outcome = TypeVar("_Outcome", str, str | Lost)
 
 log = logging.getLogger("shmio.source")
@@ -60,7 +60,7 @@ log = logging.getLogger("shmio.source")
 class FiniteCheck:
     """Refuses writes of NaN and infinities to REAL and LREAL registers that are not exempt.
 
-    Programs in devices seldom handle such values.
+    The reason is that programs in devices seldom handle such values.
     """
 
     def __init__(self, layout: Layout, allowed: Iterable[str]) -> None:
@@ -78,7 +78,7 @@ class FiniteCheck:
                     self._starts[starts + at] = starts
         self._guarded = (self._exponents != 0).tobytes()
         over = (one for one in layout.registers[len(layout.own) :] if one.type in _EXPONENTS and not one.dims)
-        self._names = {one.offset: one.path for one in over}  # views of bytes
+        self._names = {one.offset: one.path for one in over}  # by offset: numbers that are views of bytes
 
     def refusal(self, writes: Iterable[Write]) -> str:
         """Return why these writes are refused, naming one register; empty if they are allowed.
@@ -114,19 +114,19 @@ def _starts_of(layout: Layout, kind: str) -> np.ndarray[tuple[int], np.dtype[np.
 
 
 class Item(NamedTuple):
-    """One accepted write of a command; ``place`` is its index in the command."""
+    """An accepted write of a command; ``place`` is its index in the command."""
 
     command: Command
     place: int
     bits: bytes | None = None
     """Mask of the bits to send to the device; None: all bits of the write.
 
-    Injections have kept the other bits from the device.
+    Injections have taken the other bits.
     """
     data: bytes | None = None
     """The values after injections have changed them; None if they are unchanged."""
     changed_by: str = ""
-    """Name or number of the injection that changed the values last; empty if none did."""
+    """Name or number of the last injection that changed the values; empty if none did."""
 
     @property
     def write(self) -> Write:
@@ -143,21 +143,21 @@ class Item(NamedTuple):
 
 
 def coalesce(items: Sequence[Item], size: int) -> tuple[list[Write], set[int]]:
-    """Merge items into writes; if several items write a bit, the value of the last item is written.
+    """Merge items into writes. If several items write a bit, the value of the last item counts.
 
     Adjacent bytes become one write only if they belong to the same command. So if the device
-    refuses a write, this affects no other command.
+    refuses a write, this affects only one command.
 
     Args:
         items: Accepted items, oldest first.
         size: Size of the block in bytes.
 
     Returns:
-        The writes, and the indices of superseded items: later items overwrite all bits of these.
+        The writes, and the indices of superseded items, all of whose bits later items overwrite.
 
     """
     taken = bytearray(size)
-    kept: list[tuple[Item, bytes]] = []  # the last item first, each with the bits that no later item writes
+    kept: list[tuple[Item, bytes]] = []  # last item first, each with a mask of the bits that no later item writes
     superseded = set()
     for place in reversed(range(len(items))):
         offset, mask, data = items[place].write
@@ -189,7 +189,7 @@ def coalesce(items: Sequence[Item], size: int) -> tuple[list[Write], set[int]]:
 def ends(
     items: Sequence[Item], writes: Sequence[Write], superseded: set[int], outcomes: Sequence[str | Lost], error: str
 ) -> list[End]:
-    """Return for each item the kind and text of its last event.
+    """Return the kind and text of each item's last event.
 
     Args:
         items: The items of the batch.
@@ -205,7 +205,7 @@ def ends(
     for place, item in enumerate(items):
         if found[place][0] is not EventKind.WRITTEN:
             continue
-        if place in superseded:  # the item that superseded it was written
+        if place in superseded:  # the later items were written
             found[place] = EventKind.WRITTEN, _SUPERSEDED
         elif item.changed_by:
             found[place] = EventKind.WRITTEN, f"after the injection {item.changed_by!r} changed the value"
@@ -213,9 +213,9 @@ def ends(
 
 
 class _WriteOutcomes:
-    """Finds the outcomes of writes by byte range; a binary search keeps this fast for many writes.
+    """Finds the outcomes of writes by byte range, with a binary search, because there may be many.
 
-    The caller may leave out confirmed writes, unless a write was lost.
+    If no write was lost, the caller may leave out the confirmed writes.
     """
 
     def __init__(self, known: Iterable[tuple[Write, str | Lost]]) -> None:
@@ -248,7 +248,7 @@ def _share_bits(one: Write, other: Write) -> bool:
 
 
 def one_each(outcomes: Sequence[_Outcome], writes: Sequence[Write]) -> Sequence[_Outcome]:
-    """Return ``outcomes`` after checking that there is one for each write.
+    """Return ``outcomes``, after a check that there is one for each write.
 
     Raises:
         ConnectorError: The connector returned fewer or more outcomes.
@@ -262,8 +262,7 @@ def one_each(outcomes: Sequence[_Outcome], writes: Sequence[Write]) -> Sequence[
 def records(items: Sequence[Item], ends: Sequence[End]) -> Iterator[Record]:
     """Yield the last events of items.
 
-    Consecutive items of a command share one event if the event's kind and text are the same for
-    all.
+    Consecutive items of a command share one event if the kind and text of their events are equal.
     """
     both = zip(items, ends, strict=True)
     for (_, (kind, text)), group in groupby(both, key=lambda pair: (id(pair[0].command), pair[1])):
@@ -273,10 +272,7 @@ def records(items: Sequence[Item], ends: Sequence[End]) -> Iterator[Record]:
 
 
 def _runs(items: Sequence[Item]) -> Iterator[tuple[Item, int]]:
-    """Group a command's items by consecutive ``place``.
-
-    Yield the first item and length of each group.
-    """
+    """Group items that follow each other in a command; yield the first item and the length of each group."""
     first, count = items[0], 1
     for item in items[1:]:
         if item.place == first.place + count:
@@ -330,7 +326,7 @@ class CommandProcessor:
             allow_nonfinite: Patterns of the registers to which NaN and infinities may be written.
             armed: True if injections may change what is written to the device.
             owner_of: Returns the process that uses a command queue.
-            blocks: Returns the blocks of all sources, for conditions. Default: only this source's.
+            blocks: Returns the blocks of all sources, for conditions. Default: only this source.
             accepted: Called when newly accepted items wait for a cycle.
 
         """
@@ -347,7 +343,7 @@ class CommandProcessor:
         blocks = blocks or (lambda: {output.writer.block.source: output.writer.block})
         self._injections = InjectionProcessor(output, self._writable, refuse_in, owner_of, blocks)
         self._lock = threading.Lock()
-        self._verdict = threading.Lock()  # held from the publication of acceptances until the items are in _items
+        self._verdict = threading.Lock()  # locked while acceptances are published, until the items are in _items
         self._closed = "the source is not connected yet"
         self._items: list[Item] = []
         self._unconfirmed: _Batch | None = None
@@ -366,7 +362,7 @@ class CommandProcessor:
     def close(self, reason: str) -> None:
         """Stop accepting commands, because the connection was lost.
 
-        Waiting items expire for ``reason``, and the outcomes of unconfirmed ones remain unknown.
+        Waiting items expire with the text ``reason``; the outcomes of unconfirmed items are unknown.
         """
         if (lost := self._unconfirmed) is not None:
             self._unconfirmed = None
@@ -379,12 +375,12 @@ class CommandProcessor:
         self._make_room()
 
     def settle(self) -> None:
-        """Wait until each item whose acceptance was published also waits for :meth:`carry_out`."""
+        """Wait until each item with a published acceptance also waits for :meth:`carry_out`."""
         with self._verdict:
             pass
 
     def release(self, cycle: int) -> None:
-        """Accept the writes whose delay by an injection ends in a cycle.
+        """Accept the writes whose delay by an injection ends in this cycle.
 
         Call it before :meth:`carry_out`.
         """
@@ -399,16 +395,16 @@ class CommandProcessor:
 
     @property
     def unconfirmed(self) -> bool:
-        """True if the outcomes of a batch are not known yet, so that :meth:`confirm` must follow."""
+        """True while the outcomes of a batch are not known, so that :meth:`confirm` must follow."""
         return self._unconfirmed is not None
 
     def carry_out(self, write: Callable[[Sequence[Write]], Sequence[str] | None]) -> None:
         """Write all waiting items in one batch, and publish the outcome of each.
 
         If two items write the same bit, the value of the item accepted later is written. If
-        ``write`` raises an exception, the outcomes are published before the exception is raised
-        again. If it returns None, call :meth:`confirm` until the batch is no longer ``unconfirmed``,
-        before this method is called again.
+        ``write`` raises an exception, publish the outcomes, then raise the exception again. If
+        ``write`` returns None, call :meth:`confirm` until the batch is no longer ``unconfirmed``,
+        before you call this method again.
         """
         items = self._take(lambda _: True)
         now_ns = self._now_ns()
@@ -424,8 +420,7 @@ class CommandProcessor:
     def confirm(self, ask: Callable[[], Sequence[str] | None]) -> None:
         """Publish the outcomes of the unconfirmed batch, if ``ask`` returns them.
 
-        If ``ask`` raises an exception, the outcomes are published before the exception is raised
-        again.
+        If ``ask`` raises an exception, publish the outcomes, then raise the exception again.
         """
         if self._unconfirmed is not None:
             self._ask(self._unconfirmed, ask)
@@ -435,7 +430,7 @@ class CommandProcessor:
         self._ask(_Batch(items, writes, superseded), lambda: write(writes))
 
     def _ask(self, batch: _Batch, ask: Callable[[], Sequence[str] | None]) -> None:
-        """Publish the outcomes that ``ask`` returns or raises; None: the batch remains unconfirmed."""
+        """Publish the outcomes that ``ask`` returns or raises; if it returns None, keep the batch as unconfirmed."""
         self._unconfirmed = None
         outcomes: Sequence[str | Lost] = [Lost.UNKNOWN] * len(batch.writes)
         error = ""
@@ -490,7 +485,7 @@ class CommandProcessor:
         self._end(items, [(EventKind.EXPIRED, f"{why} before the command's deadline")] * len(items))
 
     def _patience_ns(self) -> int:
-        """Return how long :meth:`run` may wait for a command, in ns; negative: without limit."""
+        """Return the time that :meth:`run` may wait for a command, in ns; negative: without limit."""
         with self._lock:
             deadlines = [item.command.deadline_ns for item in self._items]
         waits = [max(0, min(deadlines) - self._now_ns()) + 1_000_000] if deadlines else []
@@ -498,7 +493,7 @@ class CommandProcessor:
         return min(waits, default=-1)
 
     def _make_room(self) -> None:
-        """Wake the command thread, so that it tries again a command that had to wait for room."""
+        """Wake the command thread, so that it retries a command that had to wait for room."""
         if self._held is not None:
             self._writer.block.commands.wake()
 
@@ -592,7 +587,7 @@ class CommandProcessor:
         return len(items) + len(command.writes) <= MAX_WAITING and size <= self._most_bytes
 
     def _refusal(self, command: Command) -> str:
-        """Return why the command arrived too late or for an earlier process; "" if it did not."""
+        """Return why the command is too late, or for an earlier process; "" if it is neither."""
         if command.incarnation != self._writer.incarnation:
             return "the source was restarted after the command was sent: send it again"
         late_ns = self._now_ns() - command.deadline_ns
@@ -627,8 +622,8 @@ def _divert(
     """Apply the layers below ``above`` to a command's items, and publish what the layers changed.
 
     Returns:
-        Two lists. The first has each item of which bits are left for the device, with the layer
-        that changed the item last (``above`` if none did). The second has the items without any bit
+        Two lists. The first contains each item with bits left for the device, and the last layer
+        that changed the item (``above`` if none did). The second contains the items with no bits
         left.
 
     """

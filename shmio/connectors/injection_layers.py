@@ -3,7 +3,7 @@
 Each injection is a layer over the source's block. Images on ``/out`` pass the layers from the
 innermost to the outermost; writes on ``/in`` pass them from the outermost to the innermost. The
 layer with the highest priority is outermost. Of layers with the same priority, the newest is
-outermost. The values of a layer come from a client or from the operation of a declared injection.
+outermost. The values of a layer come from a client, or from the operation of a declared injection.
 """
 
 from __future__ import annotations
@@ -29,24 +29,21 @@ from shmio.segment import NO_WRITER, Direction
 MAX_INJECTIONS: Final = 64
 """The largest number of injections on one source at a time."""
 MAX_HELD: Final = 256
-"""The largest number of writes that one injection may delay at once.
-
-Further writes are rejected.
-"""
+"""The largest number of writes that one injection may delay at once; further writes are rejected."""
 
 Bits = np.ndarray[Any, np.dtype[np.uint8]]
 
 
 @dataclass(frozen=True)
 class Owner:
-    """The owner of an injection: a command queue, and the process that used the queue at that time."""
+    """The owner of an injection: a command queue, and the process that used it to create the injection."""
 
     writer: int
     pid: int
 
 
 class CycleImage(NamedTuple):
-    """The image that the device delivered in a cycle, and the cycle's instance time in ns."""
+    """The image that the device delivered in a cycle, and the instance time of the cycle in ns."""
 
     cycle: int
     time_ns: int
@@ -57,7 +54,7 @@ class CycleImage(NamedTuple):
 class Layer:
     """One injection, as the process of its source applies it.
 
-    ``cover`` is an array of the block's size. The bits set in it are those that the layer covers.
+    ``cover`` is an array of the block's size, in which the bits that the layer covers are set.
     """
 
     id: int
@@ -74,8 +71,8 @@ class Layer:
     def given(self) -> bool:
         """True if the layer covers ``/out`` and a client supplies its values.
 
-        That client receives the values that the layer hides: those of the device or the next inner
-        layer.
+        That client receives the values that the layer hides, which are those of the device or of
+        inner layers.
         """
         return self.direction is Direction.OUT
 
@@ -92,8 +89,8 @@ class Layer:
         """Apply the layer to the given bits of a write to the device.
 
         Returns:
-            The new data, or the same object if they are unchanged. None if the bits must not reach
-            the device.
+            The new data, or the same object if nothing changes. None if the bits must not reach the
+            device.
 
         """
         return None
@@ -103,7 +100,7 @@ class DivertedWrite(NamedTuple):
     """A write to the device after all layers were applied to it."""
 
     met: list[tuple[Layer, list[Write]]]
-    """The layers that changed or kept the write, each with the parts that it received."""
+    """The layers that changed or took parts of the write, each with the parts that it received."""
     left: bytes
     """Mask of the bits that still go to the device."""
     data: bytes
@@ -141,10 +138,7 @@ class LayerStack:
         return lifted
 
     def effective(self, raw: bytes) -> bytes | None:
-        """Return the image that readers see instead of ``raw``.
-
-        None if no active layer covers ``/out``.
-        """
+        """Return the image that readers see instead of ``raw``; None if no active layer covers ``/out``."""
         layers = [layer for layer in self.layers if layer.direction is Direction.OUT and layer.active]
         return self.seen(raw, layers).tobytes() if layers else None
 
@@ -160,12 +154,12 @@ class LayerStack:
         return self.seen(raw, self.inner(layer))
 
     def inner(self, layer: Layer) -> list[Layer]:
-        """Return the active layers over ``/out`` inside ``layer``."""
+        """Return the active layers over ``/out`` that are inside ``layer``."""
         inner = self.layers[: self.layers.index(layer)]
         return [other for other in inner if other.direction is Direction.OUT and other.active]
 
     def outer(self, layer: Layer) -> list[Layer]:
-        """Return the layers over ``/out`` outside ``layer`` whose values come from clients.
+        """Return the layers over ``/out`` that are outside ``layer`` and whose values come from clients.
 
         The list is empty if ``layer`` covers ``/in``.
         """
@@ -176,7 +170,7 @@ class LayerStack:
     def inner_values(self, raw: bytes, layer: Layer) -> list[Write]:
         """Return the values that inner layers over ``/out`` supply for bits that ``layer`` covers.
 
-        The result excludes bits whose values come from the device.
+        Leave out bits whose values come from the device.
         """
         inner = self.inner(layer)
         bits = np.zeros(self.size, np.uint8)
@@ -187,8 +181,8 @@ class LayerStack:
     def onward(self, raw: bytes, layer: Layer, write: Write) -> list[tuple[Layer, list[Write]]]:
         """Return the parts of a client's values over ``/out`` that outer layers hide from readers.
 
-        Each part comes with the layer whose client receives it. The layers between the two are
-        already applied to the values.
+        Return each part with the layer whose client receives it. To its values, the layers between
+        ``layer`` and that layer are already applied.
         """
         taken: list[tuple[Layer, list[Write]]] = []
         bits = np.full(len(write.data), write.mask or 0xFF, np.uint8)
@@ -206,8 +200,8 @@ class LayerStack:
 
         Args:
             write: The write.
-            above: The layer that sends the write; only layers inside it apply. None if no layer
-                sends the write; then all layers apply.
+            above: The layer that sends the write, so that only layers inside it apply. None: no
+                layer sends the write, so that all layers apply.
 
         """
         met: list[tuple[Layer, list[Write]]] = []
@@ -233,7 +227,7 @@ class LayerStack:
 
 
 def shadow(injection: Layer, writes: Sequence[Write]) -> str:
-    """Set the values of a layer over ``/out``; return which bytes it does not cover, or ""."""
+    """Set the values of a layer over ``/out``; return a message if it does not cover all bytes, or ""."""
     if reason := uncovered(injection, writes):
         return reason
     for write in writes:
@@ -242,10 +236,7 @@ def shadow(injection: Layer, writes: Sequence[Write]) -> str:
 
 
 def uncovered(injection: Layer, writes: Iterable[Write]) -> str:
-    """Return a message that names bytes outside the layer's cover.
-
-    Empty if the layer covers all.
-    """
+    """Return a message that names written bytes that the layer does not cover; "" if it covers all."""
     for write in writes:
         cover = injection.cover[write.offset : write.offset + len(write.data)]
         if len(cover) < len(write.data) or (~cover & (write.mask or 0xFF)).any():
@@ -270,7 +261,7 @@ def covering(size: int, writes: Sequence[Write]) -> Bits:
 
 
 def parts_of(write: Write, bits: Bits) -> list[Write]:
-    """Return those parts of a write whose bits are set in the mask ``bits``."""
+    """Return the parts of a write that set bits of the mask ``bits``."""
     return [
         Write(write.offset + part.offset, part.mask, part.data)
         for part in merge(write.data, bits.tobytes(), [(0, len(write.data))])
@@ -293,7 +284,7 @@ class DeclaredLayer(Layer):
     """The layer of one declared injection.
 
     ``writes`` counts the writes over ``/in`` since the injection became active. ``held`` contains
-    the writes that it delays at present.
+    the writes that the injection delays at present.
     """
 
     program: Program
@@ -333,7 +324,7 @@ class DeclaredLayer(Layer):
         return Running(declaration, now.state.value, self.seed, now.runs, now.cycle, now.time_ns)
 
     def resume(self, running: Running[Declaration], seen: Bits) -> None:
-        """Restore the state of the previous process. ``seen`` is the image last seen by readers."""
+        """Restore the state of the previous process. ``seen`` is the image that readers saw last."""
         state = State(running.state)
         self.activation = Activation(self.program.window, state, running.runs, running.cycle, running.time_ns)
         if self.active and self.direction is Direction.OUT:
@@ -400,7 +391,7 @@ class DeclaredLayer(Layer):
         at = self._moment(0, now)
         while self.held:
             write, cycle, time_ns = self.held[0]
-            # Delay is measured from the next cycle, which would have written an undelayed write.
+            # Without a delay, the cycle after the arrival would have written it. The delay starts there.
             if at.cycle <= cycle or not self.operation.due(cycle + 1, time_ns, at):
                 break
             due.append(write)
@@ -416,7 +407,7 @@ class DeclaredLayer(Layer):
 
 
 def declared(number: int, program: Program, owner: Owner, seed: int, *, keep: bool) -> DeclaredLayer:
-    """Create the layer of a declared injection that has just been added."""
+    """Create the layer of a new declared injection."""
     declaration = program.declaration
     draw = SeededRandom(seed, declaration.name)
     return DeclaredLayer(

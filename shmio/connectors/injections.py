@@ -46,9 +46,9 @@ from shmio.segment.events import EVENT_SLOTS
 from shmio.segment.injection_list import InjectionEntry
 
 LOOK_NS: Final = 400_000_000
-"""Period in ns at which owners are checked, so that an injection ends within 1 s after its client."""
+"""Interval in ns at which owners are checked, so that an injection ends within 1 s after its client."""
 SEED_BITS: Final = 53
-"""Length of a generated seed in bits; every JSON reader can represent such integers exactly."""
+"""Length of a generated seed in bits; every JSON reader represents such integers exactly."""
 CONFIGURED: Final = Owner(NO_WRITER, 0)
 """The owner of injections that the configuration declares."""
 
@@ -63,10 +63,7 @@ log = logging.getLogger("shmio.source")
 
 
 def owner_of(segment: Segment, writer: int) -> Owner | None:
-    """Return the process that uses the command queue ``writer`` at present.
-
-    None if no live process does.
-    """
+    """Return the process that uses the command queue ``writer`` at present; None if no live process does."""
     segment.refresh()
     for slot in (*segment.processes, *segment.processes.external):
         if slot.writer == writer and slot.alive():
@@ -86,7 +83,7 @@ def blocks_of(segment: Segment) -> Mapping[str, Block]:
 class ConditionValues:
     """Reads the register values that conditions need in one cycle.
 
-    It fetches each image once, and only if a condition needs it. The images are without injections,
+    Each image is fetched once, and only if a condition needs it. The images are without injections,
     so that no injection can influence its own condition. A value is unknown if its source has bad
     quality or its register has a bad status.
     """
@@ -98,8 +95,8 @@ class ConditionValues:
             own: The name of the source to which the image belongs.
             image: The source's next image.
             blocks: The blocks of all sources.
-            before: The number of the present step; None outside steps. If another source has
-                already completed this step, its values from before the step are used.
+            before: The number of the present step; None outside steps. Of a source that has already
+                completed this step, the values from before the step count.
 
         """
         self._blocks = blocks
@@ -133,9 +130,9 @@ class ConditionValues:
 
 
 def newest(block: Block, before: int | None) -> Frame | None:
-    """Return the newest frame of a block, or the newest from before the step ``before``.
+    """Return the newest frame of a block; if ``before`` is a step, the newest one before this step.
 
-    A source therefore sees the same frames of others in each run, whichever source completes the
+    So in each run, a source sees the same frames of other sources, whichever of them completes the
     step first (the Jacobi method).
     """
     frame = block.latest()
@@ -147,8 +144,8 @@ def newest(block: Block, before: int | None) -> Frame | None:
 class DeclaredInjections:
     """Adds, evaluates and lifts the declared injections of one source.
 
-    The loop's thread publishes images, which evaluates the injections, and calls :meth:`release`
-    and :meth:`forget`. The command thread calls the other methods.
+    The loop's thread evaluates the injections by publishing images, and calls :meth:`release` and
+    :meth:`forget`. The command thread calls the other methods.
     """
 
     def __init__(self, publisher: LayerPublisher, blocks: Blocks) -> None:
@@ -162,7 +159,7 @@ class DeclaredInjections:
 
     @property
     def overload(self) -> str:
-        """Why no write can be accepted at present; empty if writes can be accepted."""
+        """Why no write can be accepted at present; empty if writes can."""
         full = next((layer for layer in self._layers if layer.full), None)
         return f"the injection {full.name} delays {MAX_HELD} writes already, which is the maximum" if full else ""
 
@@ -193,10 +190,7 @@ class DeclaredInjections:
         self._settle()
 
     def declare(self, command: Command, owner: Owner) -> str:
-        """Add the injection that a command declares.
-
-        Return the reason why it cannot be added, or "".
-        """
+        """Add the injection that a command declares; return why it cannot be added, or ""."""
         try:
             declaration = _DECODER.decode(b"".join(write.data for write in command.writes))
             for complaint in contradictions(declaration):
@@ -208,9 +202,9 @@ class DeclaredInjections:
         return self._add(layer, command)
 
     def lift(self, layer: DeclaredLayer, command: Command) -> str:
-        """Lift a configured injection; it stays lifted until its declaration changes.
+        """Lift a configured injection; return why it cannot be lifted, or "".
 
-        Return the reason why it cannot be lifted, or "".
+        The injection stays lifted until its declaration changes.
         """
         if layer.activation.state is State.LIFTED:
             return f"the injection {layer.name} was lifted already"
@@ -290,7 +284,7 @@ class DeclaredInjections:
         return program
 
     def rebind(self) -> None:
-        """Compile each condition again that reads a source which a reload has changed."""
+        """Compile those conditions again that read sources that a reload has changed."""
         if not self.reads_other_sources:
             return
         blocks = dict(self._blocks_of())
@@ -313,8 +307,9 @@ class DeclaredInjections:
     def _advance(self, image: Image) -> list[Record]:
         """Evaluate all declared injections for the next image, and return events about the changes.
 
-        The caller holds the output's ``lock``. Only the first image of a cycle is evaluated: how
-        many images follow it depends on timing, which must not influence the result.
+        The caller holds the output's ``lock``. Conditions are evaluated only for the first image of
+        a cycle, because the number of further images depends on timing, which must not influence
+        the result.
         """
         looked = self._publisher.injections.now.cycle
         state = self._own.clock.last_written()
@@ -372,7 +367,7 @@ class DeclaredInjections:
         period_ns = self._own.period_ns
         if self._own.attributes.stepped:
             return (cycle - state.lead(period_ns)) * period_ns
-        return cycle * period_ns + state.offset_ns  # a device's cycles always follow real time
+        return cycle * period_ns + state.offset_ns  # the cycles of a device always follow real time
 
 
 def _seed(declaration: Declaration) -> int:
@@ -380,9 +375,9 @@ def _seed(declaration: Declaration) -> int:
 
 
 def _finished(layer: DeclaredLayer) -> bool:
-    """Return whether the injection is over and has to be lifted.
+    """Return whether the injection is over and must be lifted.
 
-    Injections of the configuration stay listed when they are over.
+    Injections of the configuration stay in the list when they are over.
     """
     return layer.activation.state is State.OVER and not layer.configured and not layer.held
 
@@ -393,7 +388,7 @@ def _activation_event(layer: DeclaredLayer) -> Record:
 
 
 def _injected_events(layer: DeclaredLayer, command: Command | None) -> Iterator[Record]:
-    """Yield the events of a new injection, which together carry its declaration including its seed."""
+    """Yield the events about a new injection, whose data together are its declaration with the seed."""
     document = msgspec.json.encode(msgspec.structs.replace(layer.program.declaration, seed=layer.seed))
     return in_parts(layer_event(EventKind.INJECTED, layer, layer.name, command), document)
 
@@ -437,10 +432,7 @@ class InjectionProcessor:
         return max(0, self._look_ns - time.monotonic_ns())
 
     def toward_device(self, command: Command) -> Layer | None:
-        """Return the injection over ``/in`` whose client sends the device values by this command.
-
-        None if the command does anything else.
-        """
+        """Return the injection over ``/in`` to which this command gives values for the device, or None."""
         layer = self.injections.find(command.injection) if command.kind is CommandKind.SHADOW else None
         if layer is None or layer.direction is not Direction.IN or isinstance(layer, DeclaredLayer):
             return None
@@ -449,7 +441,7 @@ class InjectionProcessor:
     def take(self, command: Command) -> str:
         """Carry out an INJECT, DECLARE or LIFT command, or a SHADOW command over ``/out``.
 
-        Return the reason why the command is rejected, or "".
+        Return why the command is rejected, or "".
         """
         if command.kind in (CommandKind.INJECT, CommandKind.DECLARE):
             owner = self._owner_of(command.writer)
@@ -470,10 +462,10 @@ class InjectionProcessor:
         return ""
 
     def follow_changes(self) -> None:
-        """Apply changes of the configuration, and every ``LOOK_NS`` check owners and conditions.
+        """Apply changes of the configuration; in intervals of ``LOOK_NS``, check owners and conditions.
 
-        The check lifts each injection without ``keep`` whose client has ended. It compiles
-        conditions again if they read sources that a reload has changed.
+        Lift each injection without ``keep`` whose client has ended. Compile conditions again if
+        they read sources that a reload has changed.
         """
         self.declared.follow()
         if self.patience_ns != 0:
@@ -552,10 +544,10 @@ class InjectionProcessor:
                 layer.values ^= (layer.values ^ self._given(layer, raw)) & hidden
 
     def _given(self, layer: Layer, raw: bytes) -> Bits:
-        """Return the image below ``layer``, overwritten by the values from the layer's client.
+        """Return the image that ``layer`` receives, overwritten with the values that its client gave.
 
-        Outer layers hide these values in the last image. They are therefore read from the events
-        that are still in the segment.
+        These values are read from the events in the segment, because outer layers may hide them in
+        the last image.
         """
         values = self.injections.before(raw, layer)
         events = self._writer.block.events

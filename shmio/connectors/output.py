@@ -1,4 +1,4 @@
-"""Publishes a source's images with injections applied, and the list and events of injections.
+"""Publishes the images of a source with its injections applied, and the injections' list and events.
 
 The order of the injections is defined in :mod:`shmio.connectors.injection_layers`.
 """
@@ -20,12 +20,12 @@ from shmio.segment.events import EVENT_DATA_SIZE
 from shmio.segment.injection_list import InjectionEntry, encode, ranges_of
 
 EXTRA_FRAMES: Final = 4
-"""Largest number of frames in a period in addition to the cycle's own frame.
+"""Largest number of frames in a period in addition to the frame of the cycle.
 
-A ring has room for 8 s of frames at this rate.
+At this rate, a ring has room for the frames of 8 s.
 """
 GROWTH: Final = 64
-"""Bytes reserved for each injection in the segment, because the numbers in its text grow longer."""
+"""Bytes reserved in the segment for each injection, because the numbers in its text get longer."""
 
 
 class Image(NamedTuple):
@@ -42,9 +42,9 @@ class Image(NamedTuple):
     reason: str
     asked_ns: int | None = None
     shown: bytes | None = None
-    """The image that consumers saw when it was recorded, if injections changed it then.
+    """For a recorded image that injections had changed, the changed image that consumers saw.
 
-    Else None.
+    None for any other image.
     """
     at: Stamp | None = None
     """The times to publish the image with; None: the present time."""
@@ -92,18 +92,18 @@ class Output:
 
     @property
     def raw(self) -> bytes:
-        """The bytes published last, without injections of this instance.
+        """The image published last, without injections of this instance.
 
-        Until this process has published, those of the source's previous process; zeros if there are
-        none.
+        Before this process has published an image, this is the last one of the source's previous
+        process, or all zeros.
         """
         return bytes(self.writer.block.layout.size) if self._last is None else self._last.raw
 
     @property
     def base(self) -> bytes:
-        """The image to which injections are applied: :attr:`raw`.
+        """The image to which injections are applied: usually :attr:`raw`.
 
-        A replay that shows recorded injections applies them to the recorded image that includes these.
+        For a replay that shows recorded injections, this is the recorded image with these injections.
         """
         return self.raw if self._last is None else self._last.base
 
@@ -114,7 +114,7 @@ class Output:
 
     @property
     def source_ns(self) -> int:
-        """When the device had the values of the image published last, in ns since 1970.
+        """Time at which the device had the values of the image published last, UTC in ns since 1970.
 
         0 if the device has not delivered an image yet.
         """
@@ -127,10 +127,7 @@ class Output:
 
     @property
     def patience_ns(self) -> int:
-        """The time in ns until changes that wait must be published by :meth:`flush`.
-
-        Negative if no changes wait.
-        """
+        """Time in ns until :meth:`flush` must publish waiting changes; negative if none wait."""
         return max(0, self._next_ns - self._now_ns()) if self._changed else -1
 
     def publish(self, image: Image) -> None:
@@ -157,7 +154,7 @@ class Output:
             self._publish()
 
     def flush(self) -> None:
-        """Publish the changes that wait, if it is time."""
+        """Publish the waiting changes, if their time has come."""
         with self.lock:
             if self._changed and self._now_ns() >= self._next_ns:
                 self._publish()
@@ -201,7 +198,7 @@ class LayerPublisher:
         self.output = output
         self._writable = np.frombuffer(writable, np.uint8)
         self._refuse_in = refuse_in
-        self._shown: dict[int, tuple[object, bytes]] = {}  # by number: the state, and the JSON made from it
+        self._shown: dict[int, tuple[object, bytes]] = {}  # by number: the state, and its JSON
         self._ranges: dict[int, tuple[tuple[int, int, int], ...]] = {}
         self._computed: dict[int, list[Write]] = {}  # by number: the values published last
 
@@ -211,7 +208,7 @@ class LayerPublisher:
         return self.output.injections
 
     def add(self, layer: Layer) -> str:
-        """Add a layer; return the reason why it was refused, or "".
+        """Add a layer; return why it was refused, or "".
 
         The caller holds the output's ``lock``.
         """
@@ -261,19 +258,19 @@ class LayerPublisher:
         return [*lost_values, *self.inner_values(left, ends[0]), *ends] if ends else []
 
     def inner_values(self, layers: Iterable[Layer], end: Record) -> Iterator[Record]:
-        """Yield events with the values that clients now receive from layers inside their own.
+        """Yield events with the values that clients now receive from layers inside ``layers``, their own.
 
-        The events precede ``end``, the event that caused the change.
+        The events precede ``end``, the last event of the command that caused the change.
         """
         for layer in layers:
             record = Record(EventKind.DIVERTED, layer.name, end.writer, end.command, injection=layer.id)
             yield from _parts(record, self.injections.inner_values(self.output.base, layer))
 
     def computed(self, base: bytes) -> Iterator[Record]:
-        """Yield the changes of values that declared injections supply to clients' outer layers.
+        """Yield events about changes of the values that declared injections supply to clients' outer layers.
 
-        The events are also sent when the last such injection has become inactive. No command causes
-        them: their command number is 0, and ``item`` and ``items`` count them.
+        Also yield events when the last such injection becomes inactive. Because no command causes
+        the events, their command number is 0, and ``item`` and ``items`` count them.
         """
         for layer in self.injections.layers:
             if not layer.given:
@@ -291,7 +288,7 @@ class LayerPublisher:
                 yield from (part._replace(item=item, items=len(parts)) for item, part in enumerate(parts))
 
     def created(self, layer: Layer, end: Record) -> Iterator[Record]:
-        """Yield the events about a client's new layer: direction, priority, ``keep`` and ranges."""
+        """Yield the events about a client's new layer, with its direction, priority, ``keep`` and ranges."""
         how = {
             "direction": layer.direction.name.lower(),
             "priority": layer.priority,
@@ -304,7 +301,7 @@ class LayerPublisher:
         """Write the list of injections into the segment. The caller holds the output's ``lock``.
 
         Raises:
-            ValueError: The list is too long, or would be too long if it grew by ``growth`` bytes.
+            ValueError: The list would be too long if it had ``growth`` more bytes.
 
         """
         items = (self._item(layer) for layer in self.injections.layers)
@@ -333,7 +330,7 @@ def lost(layer: DeclaredLayer, reason: str) -> Iterator[Record]:
 def pieces(
     kind: EventKind, command: Command, place: int, writes: Iterable[Write], layer: Layer | None
 ) -> Iterator[Record]:
-    """Yield events with the data of parts of an item; a long part needs several events."""
+    """Yield events with the data of ``writes``, parts of an item; a long part needs several events."""
     name, number = (layer.name, layer.id) if layer else ("", 0)
     return _parts(Record(kind, name, command.writer, command.id, place, 1, injection=number), writes)
 
@@ -351,6 +348,6 @@ def in_parts(record: Record, document: bytes) -> Iterator[Record]:
 
 
 def layer_event(kind: EventKind, layer: Layer, text: str, command: Command | None = None) -> Record:
-    """Return an event about an injection; without ``command``, its owner counts as the cause."""
+    """Return an event about an injection, caused by ``command``; None: by the injection's owner."""
     writer, number = (layer.owner.writer, layer.id) if command is None else (command.writer, command.id)
     return Record(kind, text, writer, number, 0, 1, injection=layer.id)

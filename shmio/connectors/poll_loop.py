@@ -1,8 +1,8 @@
 """The loop that polls a device and publishes what its connector reads, cycle by cycle.
 
-The loop handles time, quality and recovery, so that these are alike for all connectors. It keeps an
-absolute schedule and counts overruns. When quality turns bad, it publishes one bad frame. After any
-error it closes the connection, and connects again after a back-off.
+The loop handles time, quality and recovery in the same way for all connectors. It keeps an absolute
+schedule and counts overruns. When quality turns bad, it publishes one bad frame. After any error,
+it closes the connection, and connects again after a back-off.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from shmio.segment import BlockWriter, EventKind, Provenance, Quality, Record
 RECONNECT: Final = Backoff(0.1, 2.0)
 """The waiting times before attempts to connect again."""
 STABLE_NS: Final = 1_000_000_000
-"""A connection that has lasted longer than this time in ns resets the back-off."""
+"""After a connection that lasted longer than this time in ns, the back-off starts anew."""
 CONFIRM_NS: Final = 10_000_000
-"""Longest time in ns that a cycle waits for the confirmation of its writes, and at most half a period.
+"""Longest time in ns that a cycle waits for the confirmation of its writes, but at most half a period.
 
-If it comes later, a later cycle notices it.
+If the confirmation comes later, a later cycle notices it.
 """
 _MEASURES: Final = re.compile(r"\b[0-9]+(?= (?:ms|s|bytes)\b)")
-"""Numbers that may differ between two texts of the same reason: times and sizes."""
+"""Matches the numbers that may differ between two texts of the same reason: times and sizes."""
 
 _Result = TypeVar("_Result")
 
@@ -47,7 +47,7 @@ log = logging.getLogger("shmio.source")
 class Due(NamedTuple):
     """The next cycle.
 
-    ``due_ns`` is the time when it is due, which may have passed. ``skipped`` is the number of
+    ``due_ns`` is the time at which it is due, which may have passed. ``skipped`` is the number of
     cycles skipped before it.
     """
 
@@ -57,10 +57,10 @@ class Due(NamedTuple):
 
 
 class Schedule:
-    """Counts cycles from the start of the instance, so that cycles lost by a restart show as a gap.
+    """Numbers cycles from the start of the instance, so that a restart of the process shows as a gap.
 
-    A cycle that begins late still runs. A cycle whose whole period has passed is an overrun and is
-    skipped.
+    A cycle that begins late still runs. A cycle whose whole period has passed is skipped, and counts
+    as an overrun.
     """
 
     def __init__(self, start_ns: int, period_ns: int) -> None:
@@ -69,14 +69,11 @@ class Schedule:
         self._last: int | None = None
 
     def moved(self, ahead_ns: int, lead: int) -> Schedule:
-        """Return a schedule for a clock that is ``ahead_ns`` ahead.
-
-        Cycle numbers are ``lead`` higher.
-        """
+        """Return a schedule for a clock that is ``ahead_ns`` ahead; cycle numbers are ``lead`` higher."""
         return Schedule(self._start_ns - ahead_ns - lead * self._period_ns, self._period_ns)
 
     def next(self, now_ns: int) -> Due:
-        """Return the next cycle. It skips cycles whose whole period has passed."""
+        """Return the next cycle; skip cycles whose whole period has passed."""
         current = self.at(now_ns)
         if self._last is None:
             cycle, skipped = current + 1, 0
@@ -87,18 +84,15 @@ class Schedule:
         return Due(cycle, self.due_ns(cycle), skipped)
 
     def due_ns(self, cycle: int) -> int:
-        """Return when a cycle is due, in ns."""
+        """Return the time at which a cycle is due, in ns."""
         return self._start_ns + cycle * self._period_ns
 
     def at(self, now_ns: int) -> int:
-        """Return the number of the cycle that was due last.
-
-        A later process begins with a higher number.
-        """
+        """Return the number of the cycle that was due last; a later process begins with a higher one."""
         return (now_ns - self._start_ns) // self._period_ns
 
     def restart(self) -> None:
-        """Forget the last cycle: the time until the next cycle is an outage and not an overrun."""
+        """Forget the last cycle, so that the time until the next cycle counts as no overrun but an outage."""
         self._last = None
 
 
@@ -112,13 +106,10 @@ class Counters:
     connects: int = 0
     round_trip_us: int = 0
     busy_since_ns: int = 0
-    """When the loop called the method that is now running, in ns; 0 between calls."""
+    """Time at which the loop called the source's method that is now running, in ns; 0 between calls."""
 
     def watch(self, now_ns: Callable[[], int], hook: Callable[[], _Result]) -> _Result:
-        """Call a method of the source, and record when the call began.
-
-        Other threads detect a hang by it.
-        """
+        """Call a method of the source, and record when the call began, so that others detect a hang."""
         self.busy_since_ns = now_ns()
         try:
             return hook()
@@ -138,7 +129,7 @@ class QualityLog:
     def update(self, quality: Quality, reason: str, cycle: int, well: str = "") -> bool:
         """Report the quality if the quality or its reason has changed.
 
-        Times and sizes in the text of a reason do not count as changes.
+        A change of the times and sizes in the text of a reason does not count.
 
         Args:
             quality: The present quality.
@@ -241,14 +232,14 @@ class SourceLoop:
             armed: Whether injections may change what is written to the device.
             owner_of: Returns the process that uses a command queue.
             blocks: Returns the blocks of all sources.
-            predecessor: A loop that has ended, and whose counters this loop continues. If it has kept
-                its connection, this loop takes that over.
+            predecessor: A loop that has ended. This loop continues its counters, and takes over its
+                connection if it has kept that.
 
         """
         self._connector = connector
         self._offered = None if predecessor is None else predecessor.kept
         self.kept: Connector | None = None
-        """After the end of the loop, the connector with its open connection, if :meth:`keep` has asked for it."""
+        """After the end of the loop, the connector with its open connection, if :meth:`keep` was called."""
         self._keep = False
         self._writer = writer
         self._schedule = schedule
@@ -283,7 +274,7 @@ class SourceLoop:
         self._keep = True
 
     def run(self) -> None:
-        """Poll until the clock tells the loop to stop, then publish that the source has stopped."""
+        """Poll until the clock stops the loop, then publish that the source has stopped."""
         try:
             while True:
                 due = self._schedule.next(self._clock.now_ns())
@@ -313,8 +304,8 @@ class SourceLoop:
         An answer that comes after the end of its cycle is still published, with the number of the
         cycle that requested it. While ``depth`` requests are in flight, a cycle requests nothing
         and counts as an overrun. If an answer takes longer than ``stale_ms`` or the connector's
-        time-out, the loop publishes a bad frame, closes the connection and connects again; no
-        answer of the old connection is published any more.
+        time-out, the loop publishes a bad frame, closes the connection and connects again; it
+        publishes no more answers from the old connection.
 
         Returns:
             False if the loop was stopped during back-off.
@@ -333,7 +324,7 @@ class SourceLoop:
                 self._call(self._connector.submit)
                 self._collect(end_ns)
             else:
-                self.counters.overruns += 1  # all requests that may be in flight are
+                self.counters.overruns += 1  # no further request may be in flight
         except ConnectorError as error:
             return self._fail(cycle, str(error) or "the connector gave no reason")
         return True
@@ -362,7 +353,7 @@ class SourceLoop:
             self._call(lambda: self.commands.confirm(lambda: self._connector.confirm(0)))
 
     def _drain(self) -> None:
-        """Publish all requested images before a write: its event must not precede older frames."""
+        """Publish all requested images before a write, whose event must not precede older frames."""
         while self._in_flight:
             self._collect(self._clock.now_ns() + round(self._connector.timeout_s * 1e9))
 
@@ -406,7 +397,7 @@ class SourceLoop:
         self._accepting = False
 
     def _taken_over(self) -> bool:
-        """Take over the connection of the predecessor, if it is offered; return whether this was done."""
+        """Take over the connection that the predecessor has kept, if any; return whether this succeeded."""
         if (other := self._offered) is None:
             return False
         self._offered = None
@@ -416,7 +407,7 @@ class SourceLoop:
             other.close()
 
     def _settled(self) -> bool:
-        """Wait until nothing is in flight on the connection; return whether it is open and this is so."""
+        """Wait until nothing is in flight; return whether this succeeded and the connection is open."""
         if self._connected_ns is None:
             return False
         try:
@@ -445,15 +436,12 @@ class SourceLoop:
         return not stop
 
     def _confirm_last(self) -> None:
-        """Publish what is known of unconfirmed writes before the connection ends."""
+        """Before the connection ends, publish what is known of unconfirmed writes."""
         with suppress(ConnectorError):
             self._confirm()
 
     def _disconnected(self, cycle: int, reason: str) -> None:
-        """Stop accepting commands.
-
-        If the reason is new, publish a bad frame with the last bytes.
-        """
+        """Stop accepting commands; if the reason is new, publish a bad frame with the last image."""
         self.commands.close(reason)
         if self._quality_log.update(Quality.BAD, reason, cycle):
             provenance = self._connector.provenance

@@ -21,11 +21,11 @@ from shmio.model.statuses import (
 
 
 class Copy(NamedTuple):
-    """Registers whose bytes are those of a device's answer, in another order.
+    """Registers whose bytes all occur in a device's answer, in another order.
 
     Attributes:
-        sources: For each byte its place in the answer.
-        targets: For each byte its place in the image.
+        sources: The offset in the answer of each byte.
+        targets: The offset in the image of each byte.
         indices: The registers' indices in the layout.
 
     """
@@ -38,9 +38,9 @@ class Copy(NamedTuple):
 class RegisterImage:
     """Collects the registers of a block, and returns whole images for :meth:`Connector.read`.
 
-    At first, the status of each register is bad, because it waits for a value. If a register turns
-    bad later, it keeps its last value. The layout must have a status area, as the layouts of
-    connectors with ``register_quality`` do.
+    At first, each register has a bad status, because it waits for a value. If a register turns bad
+    later, it keeps its last value. The layout must have a status area, as the layouts of connectors
+    with ``register_quality`` do.
     """
 
     def __init__(self, layout: Layout) -> None:
@@ -64,8 +64,8 @@ class RegisterImage:
         Args:
             index: The register's index in the layout.
             value: A value as for :meth:`Codec.encode_into`: text for times, lists for arrays.
-            source_ns: When the device had the value, UTC in ns since 1970. 0 if unknown; readers
-                then use the time of the frame.
+            source_ns: Time at which the device had the value, UTC in ns since 1970. 0: unknown, so
+                that readers use the time of the frame.
             code: OPC UA status code. The value is stored even if the code is bad.
 
         Returns:
@@ -81,7 +81,7 @@ class RegisterImage:
         return fault
 
     def put_bytes(self, index: int, data: bytes, source_ns: int = 0, code: int = GOOD) -> None:
-        """Store the value of a register, given as its ``size`` bytes in the layout."""
+        """Store the value of a register, given as its bytes in the image."""
         register = self._layout.registers[index]
         self._image[register.offset : register.offset + register.size] = data
         self._set_status(index, code, source_ns)
@@ -89,7 +89,7 @@ class RegisterImage:
     def copy(self, copy: Copy, answer: bytes) -> None:
         """Store the values of many registers, and make their statuses good.
 
-        The registers must never have been given a source time.
+        Use it only for registers that never get a source time.
         """
         self._bytes[copy.targets] = np.frombuffer(answer, np.uint8)[copy.sources]
         for index in self._not_good & copy.indices:

@@ -35,7 +35,7 @@ BUILT_IN = {
 }
 
 BROWSED = {"opc.tcp": "opcua", "mqtt": "mqtt", "mqtts": "mqtt"}
-"""The connector that lists what a device offers, by the scheme of the device's URL."""
+"""The connector that can browse a device, by the scheme of the device's URL."""
 
 
 def names() -> list[str]:
@@ -99,7 +99,7 @@ def load(name: str) -> type[Connector] | type[Computed] | type[Replayed]:
 
 
 def options_type(name: str) -> type[msgspec.Struct]:
-    """Return the struct type of the keys of ``[[source]]`` that belong to this connector."""
+    """Return the struct type for the connector's own keys of ``[[source]]``."""
     return load(name).Options
 
 

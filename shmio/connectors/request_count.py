@@ -1,4 +1,4 @@
-"""Counts the requests of a source's cycle, as far as they are known without the device."""
+"""The requests that a source sends in a cycle, as far as they are known without the device."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ def counted(count: int, noun: str) -> str:
 
 @dataclass(frozen=True)
 class Requests:
-    """The number of requests in a cycle."""
+    """The number of requests in a cycle, under an assumption about the device."""
 
     count: int
     """The largest number of requests in a cycle."""
     in_flight: int = 1
-    """Number of requests at once that the device is certain to accept."""
+    """Number of requests in flight that the device certainly accepts."""
     assumption: str = ""
-    """Condition for this count, such as ``PDU of 240 bytes``; empty if there is none."""
+    """The assumption, such as ``PDU of 240 bytes``; empty if there is none."""
 
     @property
     def round_trips(self) -> int:
@@ -29,11 +29,11 @@ class Requests:
 
 @dataclass(frozen=True)
 class CycleRequests:
-    """The requests of a source to its device in each cycle."""
+    """The requests that a source sends to its device in each cycle."""
 
     reads: str
-    """Description of the read registers, such as ``340 registers in DB5, DB7 and inputs``."""
+    """Description of what is read, such as ``340 registers in DB5, DB7 and inputs``."""
     requests: tuple[Requests, ...] = ()
     """The requests of a cycle under each assumption; empty if the device sends values unasked."""
     note: str = ""
-    """A remark for the user, such as why a cycle may take fewer or more requests; may be empty."""
+    """A remark for the user, for example why a cycle may need fewer or more requests; may be empty."""

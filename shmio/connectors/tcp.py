@@ -16,8 +16,8 @@ Place = tuple[socket.AddressFamily, socket.SocketKind, int, str, Any]
 def look_up(host: str, port: int, timeout_s: float) -> Sequence[Place]:
     """Return the addresses of a host, as ``socket.getaddrinfo`` does.
 
-    The system's own time-out may be half a minute if no name server answers. A look-up that takes
-    too long is abandoned in a thread of its own.
+    The look-up runs in a thread of its own, which is abandoned after ``timeout_s``: if no name server
+    answers, the time-out of the system may be half a minute.
 
     Raises:
         OSError: The host has no address, or no name server has answered within ``timeout_s``.
@@ -26,7 +26,7 @@ def look_up(host: str, port: int, timeout_s: float) -> Sequence[Place]:
     try:
         return socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_NUMERICHOST)
     except socket.gaierror:
-        pass  # it is a name
+        pass  # the host is a name
     found: Future[Sequence[Place]] = Future()
 
     def ask() -> None:
@@ -46,14 +46,14 @@ def connect(places: Sequence[Place], timeout_s: float) -> socket.socket:
     """Connect to the first address that answers. ``timeout_s`` limits all attempts together.
 
     Raises:
-        OSError: No address answers. The error is that of the last address.
+        OSError: No address answers; this is the error of the last address.
 
     """
     deadline_ns = time.monotonic_ns() + round(timeout_s * 1e9)
     for attempt, (family, kind, protocol, _, address) in enumerate(places, 1):
         opened = socket.socket(family, kind, protocol)
         try:
-            # Equal shares of what is left, so that a silent address does not use up that of the next one.
+            # Each address gets an equal share of the time left, so that a silent one leaves time for the next.
             left_s = (deadline_ns - time.monotonic_ns()) / 1e9
             opened.settimeout(max(0.001, left_s / (len(places) - attempt + 1)))
             opened.connect(address)

@@ -16,10 +16,10 @@ def written_registers(layout: Layout, write: Write, present: Callable[[int], Val
 
     Args:
         layout: The layout of the block.
-        write: The write. It may set some elements of an array. All other registers must be set as a
+        write: The write. It may set some elements of an array, but must set any other register as a
             whole.
-        present: Returns the present value of an array, for the elements that are not written. It
-            raises ValueRangeError if the value is not known.
+        present: Returns the present value of an array, given its index in the layout, for the
+            elements that are not written. It raises ValueRangeError if the value is not known.
 
     Yields:
         The index of each register, and its new value.
@@ -58,7 +58,7 @@ def written_registers(layout: Layout, write: Write, present: Callable[[int], Val
 
 
 def _whole_elements(register: Register, share: bytes) -> bool:
-    """Return whether the bits ``share`` of a register consist of whole elements of an array."""
+    """Return whether the written bits, ``share``, are those of whole elements of an array."""
     if not register.dims:
         return False
     if register.type == "BOOL":
