@@ -1,9 +1,9 @@
 """Notices that a data block in the controller is not the one that its layout describes. No I/O.
 
-S7-300 and S7-400 report a block's length, its checksum and when it was compiled. The connector asks
-for them at the beginning of each session and once a minute, and compares them with the last answer.
-S7-1200 and S7-1500 refuse this question; there, a block that is too short is noticed when it is
-read.
+S7-300 and S7-400 report a block's length, checksum and time of compilation. The connector asks for
+them at the start of each session and once a minute, and compares them with the last answer.
+S7-1200 and S7-1500 refuse this question. With these, the connector notices only a block that is too
+short, when it reads the block.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from shmio.connectors.s7.userdata import BLOCK_INFO, BlockInfo, block_data, pars
 
 INTERVAL_NS: Final = 60_000_000_000
 MAX_BLOCKS: Final = 200
-"""Largest number of a table's blocks that are watched."""
-_MOST_CHANGES: Final = 5  # of a checksum alone, which are reported
+"""Largest number of a tag table's blocks that are watched."""
+_MOST_CHANGES: Final = 5  # largest number of reports about changes of checksum or time only
 
 log = logging.getLogger("shmio.source")
 
@@ -31,11 +31,11 @@ class ExpectedBlock(NamedTuple):
 
     db_number: int
     name: str
-    """The name of the layout; empty for a block of a tag table, which names only its number."""
+    """The name of the layout; empty for a block of a tag table, which gives only the number."""
     size: int
     """Number of bytes of the layout, or up to the last register of a tag table."""
     ends: Sequence[tuple[int, str]]
-    """For each register, in the order of addresses: the offset after its last byte, and its name."""
+    """Of each register, in the order of addresses, the offset after its last byte, and its name."""
     whole: bool
     """True if the layout describes the whole block, and not only some addresses."""
 
@@ -50,11 +50,11 @@ class BlockChangeMonitor(Query):
     optional = True
 
     def __init__(self, blocks: Iterable[ExpectedBlock]) -> None:
-        """Create the watch for these blocks; only the first ``MAX_BLOCKS`` are watched."""
+        """Create a monitor of these blocks; it watches only the first ``MAX_BLOCKS``."""
         super().__init__(BLOCK_INFO, INTERVAL_NS)
         self._blocks = list(blocks)[:MAX_BLOCKS]
-        self._round: list[ExpectedBlock] = []  # blocks that are still to be asked for, the next one last
-        self._refused: set[int] = set()  # numbers of blocks, in this session
+        self._round: list[ExpectedBlock] = []  # blocks to ask for in this round, the next one last
+        self._refused: set[int] = set()  # numbers of blocks for which this session got a refusal
         self._last: dict[int, tuple[BlockInfo, float]] = {}
         self._changes: dict[int, int] = {}
         self._doubts: dict[int, str] = {}
@@ -62,7 +62,7 @@ class BlockChangeMonitor(Query):
 
     @property
     def doubts(self) -> Mapping[int, str]:
-        """Description of the change in each block that no longer fits its layout, by block number."""
+        """The change in each block that no longer fits its layout, as text by block number."""
         return self._doubts
 
     def data(self) -> bytes:
@@ -72,7 +72,7 @@ class BlockChangeMonitor(Query):
         return block_data(self._round[-1].db_number)
 
     def answered(self, data: bytes) -> None:
-        """Compare the information about a block with the last, and go on to the next block."""
+        """Compare the information about a block with the previous one, and go on to the next block."""
         block = self._round[-1]
         self._compare(block, parse_block(data, block.db_number))
         self._continue()
@@ -83,7 +83,7 @@ class BlockChangeMonitor(Query):
         self._continue()
 
     def given_up(self, why: str) -> None:
-        """Log that changes will not be noticed, and why."""
+        """Log that shmio will not notice changes, and why."""
         log.debug("no more questions about blocks: the controller %s; a change of a block will not be noticed", why)
 
     def lost(self, *, alive: bool = True) -> None:
@@ -133,7 +133,7 @@ class BlockChangeMonitor(Query):
         )  # fmt: skip
 
     def _compare_first(self, block: ExpectedBlock, info: BlockInfo) -> None:
-        """Report a wrong length at the first information about a block.
+        """Log a wrong length when the first information about a block arrives.
 
         A block may be longer than a tag table needs, but not longer than a layout.
         """

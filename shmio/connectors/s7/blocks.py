@@ -37,7 +37,7 @@ class BlockRead:
     """
 
     def __init__(self, db_number: int, size: int, chunk: int) -> None:
-        """Plan reads of at most ``chunk`` bytes."""
+        """Prepare requests that read at most ``chunk`` bytes each."""
         self._db_number = db_number
         self._size = size
         self._chunk = chunk
@@ -78,7 +78,7 @@ class BlockRead:
         return self._requests_view[begin * size : self.sent * size]
 
     def accept(self, index: int, frame: memoryview) -> None:
-        """Process the answer to request ``index``; answers may come in any order.
+        """Process the answer to request number ``index``; answers may come in any order.
 
         Raises:
             ConnectorError: The answer does not match the request.
@@ -105,12 +105,12 @@ class BlockRead:
 
 
 def byte_item(db_number: int, start: int, data: bytes, area: int = pdu.DATA_BLOCK) -> tuple[bytes, bytes]:
-    """Return the encoded address and value of an item of bytes."""
+    """Return the encoded address and value of an item that writes bytes."""
     return pdu.address(db_number, 8 * start, len(data), area=area), _ITEM_HEAD.pack(0, _SIZE_BITS, 8 * len(data)) + data
 
 
 def bit_item(db_number: int, start: int, bit: int, value: bool, area: int = pdu.DATA_BLOCK) -> tuple[bytes, bytes]:
-    """Return the encoded address and value of an item of one bit.
+    """Return the encoded address and value of an item that writes one bit.
 
     The controller does not change the other bits of the byte.
     """
@@ -120,14 +120,14 @@ def bit_item(db_number: int, start: int, bit: int, value: bool, area: int = pdu.
 
 
 def write_request(reference: int, items: Sequence[tuple[bytes, bytes]]) -> bytes:
-    """Return a job that writes items, which ``byte_item`` and ``bit_item`` have encoded."""
+    """Return a job that writes items, encoded by ``byte_item`` and ``bit_item``."""
     parameters = bytes((pdu.WRITE, len(items))) + b"".join(address for address, _ in items)
     values = b"".join(value + b"\0" * (len(value) & 1) for _, value in items[:-1]) + items[-1][1]
     return pdu.request(reference, parameters, values)
 
 
 def parse_write_answer(frame: memoryview, count: int) -> bytes:
-    """Return the return codes of ``count`` written items.
+    """Return the return codes of ``count`` written items, one byte each.
 
     Raises:
         RefusedError: The controller refused the whole job.
@@ -182,7 +182,7 @@ class BlockWrite:
         )
 
     def accept(self, index: int, frame: memoryview) -> None:
-        """Process the answer to request ``index``.
+        """Process the answer to request number ``index``.
 
         Raises:
             ConnectorError: The answer does not match the request.
@@ -201,9 +201,9 @@ class BlockWrite:
         self._answered.add(index)
 
     def unanswered(self) -> Iterator[tuple[int, Lost | None]]:
-        """Yield, for each item, the index of its write and what is known of the item.
+        """Yield, for each item, the index of its write and the item's state.
 
-        This is None if the controller has answered the item.
+        The state is None if the controller has answered the item.
         """
         for index, job in enumerate(self._jobs):
             known = None if index in self._answered else Lost.UNKNOWN if index < self.sent else Lost.UNSENT
@@ -240,7 +240,7 @@ def waves(db_number: int, pdu_size: int, writes: Sequence[Write], outcomes: list
 def ends(outcomes: Sequence[str], begun: Iterable[BlockWrite]) -> list[str | Lost]:
     """Return the outcome of each write after the session was lost.
 
-    ``begun`` are the waves that were sent, completely or in part.
+    ``begun`` are the waves of which at least a part was sent.
     """
     parts: list[set[Lost | None]] = [set() for _ in outcomes]
     for wave in begun:
@@ -284,7 +284,7 @@ def _items(db_number: int, pdu_size: int, place: int, write: Write) -> Iterator[
 
 
 def _fill(items: Sequence[WriteItem], pdu_size: int) -> Iterator[list[WriteItem]]:
-    """Group items into jobs, in order, with as many items in each as fit into a PDU."""
+    """Group items into jobs, in order; each job has as many items as fit into a PDU."""
     job: list[WriteItem] = []
     size = JOB_OVERHEAD
     for item in items:
@@ -305,17 +305,17 @@ def _fill(items: Sequence[WriteItem], pdu_size: int) -> Iterator[list[WriteItem]
 class SizeProbe:
     """Finds the real length of a block that is shorter than its layout.
 
-    Each job reads single bytes at several places. This narrows the range of possible lengths by a
+    Each job reads single bytes at several places, and so narrows the range of possible lengths by a
     factor of about twenty.
     """
 
     count = 1
 
     def __init__(self, db_number: int, size: int, pdu_size: int) -> None:
-        """Search for a length below ``size`` bytes; the last of these bytes cannot be read."""
+        """Prepare the search for a length below ``size`` bytes."""
         self._db_number = db_number
         self._most = max(1, min(_MOST_PROBED, (pdu_size - 14) // 12))
-        self._low, self._high = 0, size - 1  # bounds, both inclusive, of the first missing byte's offset
+        self._low, self._high = 0, size - 1  # inclusive bounds of the first missing byte's offset
 
     def begin(self) -> None:
         """Plan the next job."""
@@ -369,7 +369,7 @@ def parse_readable(frame: memoryview, count: int) -> list[bool]:
         code, _, _ = _ITEM_HEAD.unpack_from(frame, at)
         good = code == ITEM_OK
         readable.append(good)
-        at += 6 if good else 4  # one byte of data, and one of padding
+        at += 6 if good else 4  # with one byte of data and one of padding
     if at - len(frame) not in {0, 1}:  # the last item may have no padding
         raise ConnectorError(f"the controller's answer has {len(frame)} bytes, but only {at} belong to its items")
     return readable

@@ -1,4 +1,4 @@
-"""The S7 connector for layouts: the client that reads and writes one data block."""
+"""The S7 connector for layouts, which reads and writes one data block."""
 
 from __future__ import annotations
 
@@ -52,10 +52,7 @@ class S7Client(S7Session):
         return waves(self.db_number, self.pdu_size, writes, outcomes)
 
     def _explained(self, refusal: RefusedError, deadline_ns: int) -> RefusedError:
-        """Return the refusal of a read.
-
-        If the block is too short, the text names its real length.
-        """
+        """Return the refusal of a read. If the block is too short, the text gives its real length."""
         if refusal.code != OUT_OF_RANGE:
             return refusal
         probe = SizeProbe(self.db_number, self.size, self.pdu_size)
@@ -109,10 +106,7 @@ class S7Connector(S7Client, Connector):
 
     @property
     def doubt(self) -> str:
-        """Why values may be frozen, or may differ from what the layout says.
-
-        Empty if there is no reason.
-        """
+        """Why values may be frozen, or may not fit the layout; empty if there is no reason for doubt."""
         return "; ".join(filter(None, (*self._watch.doubts.values(), super().doubt)))
 
     def _explain_size(self, found: int) -> str:
@@ -124,6 +118,6 @@ class S7Connector(S7Client, Connector):
         return f"to {self.options.peer} DB{self.db_number} pdu={self.pdu_size} jobs={self.jobs} depth={self.depth}"
 
     def cycle_requests(self) -> CycleRequests:
-        """Return how many requests read the block, for each PDU size that the controller may grant."""
+        """Return the number of requests that read the block, for each PDU size that a controller may grant."""
         requests = by_pdu_size(lambda pdu_size: -(-self.size // self._chunk(pdu_size)))
         return CycleRequests(f"bytes 0 to {self.size - 1} of DB{self.db_number}", requests, NOTE)

@@ -1,10 +1,10 @@
-"""Registers of a tag table that have values of the CPU itself: its mode, its clock, its identity.
+"""Registers of a tag table that have values of the CPU itself, such as its mode, clock and identity.
 
 Their addresses are ``cpu.state``, ``cpu.clock``, ``cpu.order_code`` and the like. The session asks
 for these values between reads. If the CPU refuses a question, only the registers that need its
-answer turn bad. The lists and their records are those of Siemens, System Software for S7-300/400,
-A5E00739858, 33.3, 33.5 and 33.21. On S7-1200 and S7-1500 too, record 7 of list 0x0011 contains the
-firmware; users of python-snap7 have found this (its ``szl.py``).
+answer turn bad. Siemens describes the lists and their records in System Software for S7-300/400,
+A5E00739858, 33.3, 33.5 and 33.21. Users of python-snap7 have found that record 7 of list 0x0011
+contains the firmware on S7-1200 and S7-1500, too (its ``szl.py``).
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ class CpuValues:
         self._tags = tags
         self._mode = mode
         self._mode_seen = -1
-        self._changes: dict[int, tuple[Value, int, int]] = {}  # by index: value, status, UTC time of the answer
+        self._changes: dict[int, tuple[Value, int, int]] = {}  # by index: value, status, UTC time of the answer in ns
         self._bad: set[int] = set()
         self.queries: list[Query] = []
         for szl in (_MODULES, _COMPONENTS):
@@ -134,14 +134,14 @@ class CpuValues:
         self._states = [tag for tag in tags if tag.name == _STATE]
 
     def begin(self) -> None:
-        """Forget all values at the start of a session, which may be with another CPU."""
+        """Forget all values, because the session that starts may be with another CPU."""
         self._mode_seen = -1
         for tag in self._tags:
-            if tag.place not in self._bad:  # of a bad one, its status says more
+            if tag.place not in self._bad:  # a bad register keeps its status, which says more
                 self._changes[tag.place] = None, BAD_WAITING_FOR_INITIAL_DATA, 0
 
     def store(self, image: RegisterImage) -> None:
-        """Put all values that have changed since the last call into the image."""
+        """Store all values that are new since the last call in the image."""
         if self._states:
             self._look_at_mode()
         for index, (value, status, source_ns) in self._changes.items():
@@ -169,9 +169,9 @@ class CpuValues:
         return mode.mode if base in INTEGERS else MODES.get(mode.mode or 0)
 
     def _note(self, tags: Iterable[CpuTag], value_of: Callable[[CpuTag], Value], status: int, why: str) -> None:
-        """Note new values of registers.
+        """Record new values of registers.
 
-        A register without a value gets ``status``; ``why`` is for the log.
+        A register without a value gets ``status``; ``why`` is the reason for the log.
         """
         now_ns = time.time_ns()
         good, bad = [], []
@@ -197,20 +197,20 @@ _Note = Callable[[Iterable[CpuTag], Callable[[CpuTag], Value], int, str], None]
 
 
 class _CpuQuery(Query):
-    """A question whose answer gives registers their values; they are bad if there is no answer."""
+    """A question whose answer gives registers their values; without an answer they are bad."""
 
     def __init__(self, service: Service, interval_ns: int | None, tags: Sequence[CpuTag], note: _Note) -> None:
         super().__init__(service, interval_ns)
         self.tags, self.note = tags, note
 
     def refused(self, refusal: RefusedError) -> None:
-        """Turn the registers bad, and ask again in the next session."""
+        """Make the registers bad, and ask again only in the next session."""
         self.skip()
         status = BAD_USER_ACCESS_DENIED if refusal.code == ACCESS_DENIED else BAD_NOT_SUPPORTED
         self.note(self.tags, lambda _: None, status, str(refusal))
 
     def given_up(self, why: str) -> None:
-        """Turn the registers bad; the question is never asked again."""
+        """Make the registers bad, because the question is never asked again."""
         self.note(self.tags, lambda _: None, BAD_NOT_SUPPORTED, f"the controller {why}; shmio does not ask again")
 
 
@@ -239,7 +239,7 @@ class _TextsQuery(_CpuQuery):
 
 
 def _text(name: str, records: Mapping[int, bytes]) -> str | None:
-    """Return a text from records, by the number of the record; None if they do not contain it."""
+    """Return the text ``name`` from records by their numbers; None if they do not contain the text."""
     place = _TEXTS[name]
     record = records.get(place.record, b"")
     if name == "firmware":

@@ -22,7 +22,7 @@ ACCESS_DENIED, OUT_OF_RANGE, NO_SUCH_TYPE, OTHER_SIZE, NO_SUCH_OBJECT = 0x03, 0x
 KNOWN_CODES: Final = frozenset(
     {ITEM_OK, *range(0x02), 0x03, *range(0x05, 0x08), 0x0A, *range(0x10, 0x15), *range(0x19, 0x1F), 0x20, 0x21}
 )
-"""The codes of which python-snap7 knows the texts. It is imported for a rare text only, because that takes long."""
+"""The codes for which python-snap7 has texts. It is imported only when a text is needed, because that is slow."""
 
 _NO_OPTIMIZED = "clear 'Optimized block access' of the block, compile and load, or read it by OPC UA"
 _ACCESS_DENIED = (
@@ -31,7 +31,7 @@ _ACCESS_DENIED = (
 )
 _PROTECTED = "the CPU's protection level forbids the access {where}: choose 'Full access' in its protection settings"
 
-# Errors of a whole job, where the texts of python-snap7 do not name the remedy.
+# Errors of a whole job for which the texts of python-snap7 do not name the remedy.
 _ERRORS = {
     0x8104: _ACCESS_DENIED,  # S7-1200/1500: any job if PUT/GET is off, or the block is optimized
     0x8304: _ACCESS_DENIED,  # S7-1200/1500: writes if PUT/GET is off
@@ -75,7 +75,7 @@ def explain_read(code: int, db_number: int, size: int) -> str:
 def explain_size(db_number: int, size: int, found: int, name: str = "", gone: Sequence[str] = ()) -> str:
     """Return a message for a block that has ``found`` bytes instead of ``size`` as in its layout.
 
-    ``name`` is the name of the layout. ``gone`` are the registers beyond the block's end.
+    ``name`` is the name of the layout. ``gone`` are the names of registers beyond the block's end.
     """
     if not found:
         return (
@@ -95,7 +95,7 @@ def explain_size(db_number: int, size: int, found: int, name: str = "", gone: Se
 
 
 def block_name(db_number: int, name: str) -> str:
-    """Return a block's number, and its name unless this only repeats the number."""
+    """Return a text with a block's number, and with its name unless this only repeats the number."""
     return f"DB{db_number}" if name.upper() in {"", f"DB{db_number}"} else f'DB{db_number} "{shorten(name, 40)}"'
 
 
@@ -116,13 +116,13 @@ def explain_write(code: int, db_number: int, last: int) -> str:
 
 
 def explain_place(code: int, text: str, db_number: int, last: int) -> str:
-    """Return a message for the return code of an item that has one register of a tag table.
+    """Return a message for the return code of an item that reads one register of a tag table.
 
     Args:
         code: The return code.
         text: The register's address.
         db_number: The number of the register's data block; 0 in other areas.
-        last: The register's last byte.
+        last: The offset of the register's last byte.
 
     """
     if code == OUT_OF_RANGE and db_number:
@@ -134,7 +134,7 @@ def explain_place(code: int, text: str, db_number: int, last: int) -> str:
 
 
 def is_known(code: int) -> bool:
-    """Return whether a controller may send this return code for an item."""
+    """Return whether this return code of an item has a known meaning."""
     return code in KNOWN_CODES
 
 

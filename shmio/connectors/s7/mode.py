@@ -2,7 +2,8 @@
 
 The mode is the low half of the fourth byte of a record of SZL W#16#0424; the high half is the
 previous mode. The numbers are from Siemens, System Software for S7-300/400, A5E00739858, 33.21. If
-a controller refuses this list, it is not queried again in the session, and STOP is not noticed.
+a controller refuses this list, shmio does not query it again in the session, and does not notice
+STOP.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ _DOUBTS = {
 }
 """The modes in which values do not change, with texts that say so.
 
-In the other modes the program runs: RUN is 8. A redundant pair has 9, and 0xB and 0xC while its
+In all other modes, the program runs. RUN is 8; a redundant pair has 9, and 0xB and 0xC while its
 controllers synchronize.
 """
 MODES: Final = {
@@ -65,7 +66,7 @@ class ModeQuery(Query):
 
     @property
     def runs(self) -> bool:
-        """True if the mode is known, and the program runs in this mode."""
+        """True if the mode is known to be one in which the program runs."""
         return self.mode in MODES and self.mode not in _DOUBTS
 
     def data(self) -> bytes:
@@ -98,7 +99,7 @@ class ModeQuery(Query):
         super().lost(alive=alive)
 
     def given_up(self, why: str) -> None:
-        """Log once that STOP will not be noticed, and why."""
+        """Log that shmio will not notice STOP, and why."""
         self._forget()
         self.unknown = True
         if not self._logged:

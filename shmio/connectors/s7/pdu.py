@@ -1,4 +1,4 @@
-"""Encodes and parses S7 over ISO-on-TCP: frames, session set-up, jobs, reads. No I/O.
+"""Encodes and parses S7 over ISO-on-TCP: frames, the set-up of a session, jobs and reads. No I/O.
 
 A frame is ``TPKT | COTP | S7``: RFC 1006, section 6 (TPKT: version 3, length of the whole frame),
 ISO 8073 class 0 (COTP: CR and CC open a connection, DT carries data), and the S7 job (ROSCTR 1). A
@@ -39,7 +39,7 @@ _HEADER = struct.Struct(">4x 3s BB2x2xHH")  # the common header of all S7 PDUs
 _REQUEST = struct.Struct(">BBHHHH")  # protocol, ROSCTR, reserved, reference, length of parameters, length of data
 _ADDRESS = struct.Struct(">BBBBHHI")  # 18, 10, S7-Any; type, count, block; area and offset in bits
 _ITEM = struct.Struct(">BB BBH")
-_USUAL = struct.Struct(">4x 5s2x2x HHH 4sH")  # an answer to a read; the constant parts are one field each
+_USUAL = struct.Struct(">4x 5s2x2x HHH 4sH")  # an answer to a read; each constant part is one field
 _USUAL_HEAD, _USUAL_ITEM = b"\x02\xf0\x80\x32\x03", b"\x04\x01\xff\x04"
 HEADER_END = 19  # end of the headers of an answer to a job; its parameters follow
 USERDATA_END = 17  # the same for userdata, whose header has no error code
@@ -55,7 +55,7 @@ TYPE_BIT, TYPE_BYTE = 1, 2
 CONNECTION_TYPES: Final = {"pg": 1, "op": 2, "basic": 3}
 _READ_ITEM = struct.Struct(">BBH")
 _IN_BITS, _IN_BYTES = {0x04, 0x05}, {0x07, 0x09}
-_BITS, _OCTETS = 0x04, 0x09  # transport sizes: whether an item's length counts bits or bytes
+_BITS, _OCTETS = 0x04, 0x09  # transport sizes that mean: an item's length counts bits, or bytes
 
 
 class Session(NamedTuple):
@@ -71,7 +71,7 @@ class ReadAnswer(NamedTuple):
     """The answer to a read of one item."""
 
     code: int
-    """The item's return code. The answer has data only if this is ITEM_OK."""
+    """The item's return code. The answer has data only if the code is ITEM_OK."""
     data: memoryview
 
 
@@ -79,9 +79,7 @@ class ReadAnswer(NamedTuple):
 
 
 def frame_length(inbox: memoryview, start: int, longest: int) -> int:
-    """Return the length in bytes of the frame at ``start``.
-
-    Its first four bytes must have been received.
+    """Return the length in bytes of the frame at ``start``, of which four bytes must have been received.
 
     Raises:
         ConnectorError: The bytes are not a frame, or the frame is longer than ``longest`` bytes.
@@ -115,7 +113,7 @@ def _frame(payload: bytes) -> bytes:
 
 
 def reference_of(frame: memoryview) -> int:
-    """Return the reference of the request to which an answer belongs; check nothing else."""
+    """Return the reference of the request that an answer answers, without any checks of the answer."""
     if len(frame) < USERDATA_END:
         _check_cotp(frame)
         raise ConnectorError(f"the controller's answer of {len(frame)} bytes is too short")
@@ -125,7 +123,7 @@ def reference_of(frame: memoryview) -> int:
 def check_envelope(frame: memoryview) -> tuple[int, int, int]:
     """Check the common header of all S7 PDUs.
 
-    Return ROSCTR and the lengths in bytes of parameters and data.
+    Return ROSCTR, and the lengths of parameters and data in bytes.
     """
     if len(frame) < USERDATA_END:
         _check_cotp(frame)
@@ -211,15 +209,12 @@ def parse_connect_confirm(frame: memoryview) -> int:
 
 
 def setup_request(reference: int, jobs: int, pdu_size: int) -> bytes:
-    """Return the request "setup communication".
-
-    It asks for a number of parallel jobs, and for a PDU size in bytes.
-    """
+    """Return the request "setup communication", for this number of parallel jobs and PDU size in bytes."""
     return request(reference, struct.pack(">BBHHH", _SETUP, 0, jobs, jobs, pdu_size))
 
 
 def parse_setup_answer(frame: memoryview, reference: int, asked: Session) -> Session:
-    """Return the session that the controller grants, limited to what was requested."""
+    """Return the session that the controller grants, with no parameter above that of ``asked``."""
     data_length = check_answer(frame)
     if (answered := reference_of(frame)) != reference:
         raise ConnectorError(f"the controller answered a request that was not sent (reference {answered})")
@@ -248,7 +243,7 @@ def parse_read_answer(frame: memoryview) -> ReadAnswer:
 
     """
     if len(frame) >= _ITEM_END:
-        # Nearly all answers have this form. Others are parsed field by field, for a precise error.
+        # Nearly all answers have this form. Parse any other field by field, for a precise error.
         head, parameter_length, data_length, error, item, bits = _USUAL.unpack_from(frame)
         if (
             head == _USUAL_HEAD
@@ -304,7 +299,7 @@ def parse_items(frame: memoryview, sizes: Sequence[int]) -> list[ReadAnswer]:
         code, transport, length = _READ_ITEM.unpack_from(frame, at)
         end = at + 4
         if code != ITEM_OK:
-            if length and not is_known(code):  # rather data, after an item that was too short
+            if length and not is_known(code):  # probably data, after an item that was too short
                 raise ConnectorError(
                     f"the controller's answer has an inconsistent item with return code 0x{code:02X} and length "
                     f"{length}"

@@ -1,4 +1,4 @@
-"""Plans the jobs and their items that read the registers of a tag table. No I/O."""
+"""Plans the jobs that read the registers of a tag table, and the items of each job. No I/O."""
 
 from __future__ import annotations
 
@@ -11,13 +11,10 @@ from shmio.layout.s7.address import Area
 MAX_ITEMS: Final = 20
 """Largest number of items in a job that all known controllers accept."""
 MAX_GAP: Final = 16
-"""Largest number of unused bytes between two fields of a range.
-
-Another item costs about as much.
-"""
+"""Largest number of unused bytes between two fields of a range; about the cost of another item."""
 _REQUEST_HEAD, _REQUEST_ITEM = 12, 12
 _ANSWER_HEAD, _ANSWER_ITEM = 14, 4
-_OPEN_JOBS: Final = 8  # jobs in which a place is sought, so that planning takes linear time
+_OPEN_JOBS: Final = 8  # largest number of jobs in which to look for room, so that planning takes linear time
 
 
 class Field(NamedTuple):
@@ -31,7 +28,7 @@ class Field(NamedTuple):
     """Offset of the first byte. For a timer or counter, twice its number."""
     stop: int
     every: int = 1
-    """The field is read once in this number of cycles."""
+    """Number of cycles in which the field is read once."""
 
 
 class Range:
@@ -44,12 +41,12 @@ class Range:
         self.start = min(one.start for one in fields)
         self.stop = max(one.stop for one in fields)
         self.alone = False
-        """True if the range needs its own job, because the controller refused it in a shared job."""
+        """True if the range needs its own job, because the controller refused the job that it shared."""
         self.last = b""
-        """The bytes of the range that were stored last."""
+        """The last bytes of the range that were stored in the image."""
 
     def halves(self) -> list[Range]:
-        """Return two ranges with half of the fields each; a range of one field returns itself."""
+        """Return two ranges with half of the fields each; for a range of one field, return the range."""
         middle = len(self.fields) // 2
         if not middle:
             return [self]
@@ -60,7 +57,7 @@ class Range:
 
 
 class Piece(NamedTuple):
-    """The part of a range that one item reads; nearly always the whole range."""
+    """The part of a range that one item reads, which is nearly always the whole range."""
 
     range: Range
     start: int
@@ -81,9 +78,8 @@ Job = tuple[Piece, ...]
 def merge(fields: Iterable[Field], most: int, max_gap: int = MAX_GAP) -> list[Range]:
     """Return ranges that cover the fields.
 
-    Fields that are read at different rates do not share a range.
-
-    A range has at most ``most`` bytes, unless one field is longer.
+    Fields that are read at different rates do not share a range. A range has at most ``most``
+    bytes, unless it has only one, longer field.
     """
     ranges: list[Range] = []
     run: list[Field] = []
@@ -106,16 +102,13 @@ def merge(fields: Iterable[Field], most: int, max_gap: int = MAX_GAP) -> list[Ra
 def most_bytes(pdu_size: int) -> int:
     """Return the largest number of bytes in an item.
 
-    It is even, because timers and counters have two bytes each.
+    The result is even, because timers and counters have two bytes each.
     """
     return pdu_size - _ANSWER_HEAD - _ANSWER_ITEM & ~1
 
 
 def pack(ranges: Iterable[Range], pdu_size: int) -> list[Job]:
-    """Return jobs whose requests and answers fit into a PDU.
-
-    A job has at most ``MAX_ITEMS`` items.
-    """
+    """Return jobs of at most ``MAX_ITEMS`` items, whose requests and answers fit into a PDU."""
     jobs: list[list[Piece]] = []
     room: list[tuple[int, int]] = []  # of each job: bytes left in the answer, and items left
     items = min(MAX_ITEMS, (pdu_size - _REQUEST_HEAD) // _REQUEST_ITEM)

@@ -1,8 +1,8 @@
-"""A question about the controller itself, asked between the reads of its data. No I/O.
+"""A question about the controller itself, which the session asks between reads of data. No I/O.
 
 Only one question is open at a time, and its request is sent after those of a read. A controller may
-refuse a question, or never answer it: some close the connection instead. A question without an
-answer may therefore end the connection only a few times. After that it is not asked again.
+refuse a question, or may close the connection without an answer. So a question may end the
+connection only a few times. After that, the session never asks it again.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from shmio.connectors.s7.userdata import Service, next_request, parse_answer, re
 from shmio.errors import ConnectorError
 
 PATIENCE: Final = 2
-"""Largest number of connections that a question may end by not being answered properly."""
+"""Number of connections without a proper answer to a question after which it is not asked again."""
 MAX_PARTS: Final = 64
 MAX_ANSWER_BYTES: Final = 16_384
 
 
 class Query(ABC):
-    """A question that is asked periodically, or once in each session."""
+    """A question that the session asks periodically, or once in each session."""
 
     optional: ClassVar[bool] = False
-    """True to skip this query if the controller has never answered the query for its mode."""
+    """True if the session skips this question once the controller has failed to answer the one for its mode."""
 
     def __init__(self, service: Service, interval_ns: int | None) -> None:
         """Create a question; if ``interval_ns`` is None, it is asked once in each session."""
@@ -37,7 +37,7 @@ class Query(ABC):
         self._known = False  # the controller has answered at least once
         self._failures = self._malformed = 0
         self.supported = True
-        """False if the question is not asked again in any session."""
+        """False if no session asks the question again."""
         self.silent = False
         """True if ``supported`` is False because the controller never answered the question."""
         self.count = 1
@@ -51,7 +51,7 @@ class Query(ABC):
         """Called to send the request for the next part of an answer."""
 
     def due(self, now_ns: int) -> bool:
-        """Return whether the question is to be asked now."""
+        """Return whether it is time to ask the question."""
         return self.supported and self.complete and self._due_ns is not None and now_ns >= self._due_ns
 
     def overdue(self, now_ns: int) -> bool:
@@ -59,7 +59,7 @@ class Query(ABC):
         return not self.complete and now_ns >= self.deadline_ns
 
     def begin(self, now_ns: int, deadline_ns: int) -> None:
-        """Open the question, which must be answered by ``deadline_ns``."""
+        """Open the question, which the controller must answer by ``deadline_ns``."""
         self._due_ns = None if self._interval_ns is None else now_ns + self._interval_ns
         self.deadline_ns = deadline_ns
         self.count, self.sent = 1, 0
@@ -67,7 +67,7 @@ class Query(ABC):
         self._answer.clear()
 
     def take(self, count: int, first: int) -> bytes:
-        """Return the request: for the whole answer at first, then for its next part."""
+        """Return the request of the question, or after the first one, the request for the answer's next part."""
         begin, self.sent = self.sent, self.sent + count
         if begin:
             return next_request(first & 0xFFFF, self.service, self._sequence)
@@ -106,11 +106,11 @@ class Query(ABC):
             raise
 
     def lost(self, *, alive: bool = True) -> None:
-        """Forget an open question, because the connection was lost.
+        """Close an open question, because the connection was lost.
 
-        Stop asking if connections were lost repeatedly while the question was open. Only
-        connections count on which the controller was ``alive``: it answered other requests in the
-        meantime.
+        If repeatedly a connection is lost while the question is open, never ask it again. This
+        counts only connections on which the controller was ``alive``, and so answered other requests
+        in the meantime.
         """
         self._due_ns = 0
         if self.complete:
@@ -152,7 +152,7 @@ class Query(ABC):
 
     @abstractmethod
     def given_up(self, why: str) -> None:
-        """Process that the question is not asked again.
+        """Handle that the question is never asked again.
 
-        ``why`` continues the words "the controller …".
+        ``why`` is the reason; it continues the words "the controller …".
         """

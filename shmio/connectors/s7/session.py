@@ -1,6 +1,6 @@
 """A session with an S7 controller: its configuration keys, reads in flight, and writes.
 
-``submit`` sends the requests of a read and returns at once. ``collect`` waits for the image. Up to
+``submit`` sends the requests of a read and returns at once; ``collect`` waits for the image. Up to
 ``depth`` reads may be in flight, and you may write at any time. Use a session in one thread only.
 """
 
@@ -29,12 +29,12 @@ from shmio.connectors.s7.transport import Operation, Transport, Window
 from shmio.errors import ConnectorError
 from shmio.layout.values.write import Write
 
-MAX_DEPTH = 4  # reads in flight at once; with more, images would only be older
+MAX_DEPTH = 4  # largest number of reads in flight; with more, images would only be older
 REGISTER_OPTIONS = frozenset({"dbNumber", "every", "packetSize"})
-"""The keys that say what is read, and not how to connect."""
-LONGEST_WRITE_S = 20  # limit for a whole batch; ``timeout`` if that is longer
+"""The keys that determine what is read, and not how to connect."""
+LONGEST_WRITE_S = 20  # time limit for a whole batch, or ``timeout`` if that is longer
 
-# The slot of the CPU in its rack by family, unless the key slot is configured.
+# The usual slot of the CPU in its rack, by family.
 _CPU_SLOT = {"S7_300": 2, "S7_400": 3, "S7_1200": 1, "S7_1500": 1}
 
 
@@ -57,7 +57,7 @@ class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only
     local_tsap: Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)] = 0x0100
     """TSAP of shmio."""
     remote_tsap: Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)] | None = None
-    """TSAP of the controller; None: it is made from ``connection``, ``rack`` and ``slot``."""
+    """TSAP of the controller; None: the one for ``connection``, ``rack`` and ``slot``."""
     timeout: Annotated[int, msgspec.Meta(ge=1, le=600_000)] = 5000
     """Time-out in ms for connecting, for reading the block, and for each answer to a write."""
     packetSize: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None  # noqa: N815 - a key of plc.ini
@@ -68,7 +68,7 @@ class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only
     dbNumber: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None  # noqa: N815 - a key of plc.ini
     """Number of the data block; None: the number in the layout's name."""
     every: Annotated[dict[str, Annotated[int, msgspec.Meta(ge=2, le=10_000)]], msgspec.Meta(max_length=8)] = {}
-    """For a tag table: by pattern, n for registers that are read only in every n-th cycle."""
+    """For a tag table, by pattern: the number n for registers that are read only in every n-th cycle."""
     maxJobs: Annotated[int, msgspec.Meta(ge=1, le=255)] | None = None  # noqa: N815 - named like the other keys
     """Largest number of requests in flight; the number that the controller grants limits it too."""
 
@@ -89,7 +89,7 @@ class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only
 
     @property
     def called_tsap(self) -> int:
-        """The configured TSAP of the controller, or else that of connection type, rack and slot."""
+        """The configured TSAP of the controller, or else the one for connection type, rack and slot."""
         if self.remote_tsap is not None:
             return self.remote_tsap
         return pdu.CONNECTION_TYPES[self.connection] << 8 | self.rack << 5 | self.cpu_slot
@@ -115,7 +115,7 @@ def _is_host(text: str) -> bool:
 
 
 def _is_name(text: str) -> bool:
-    """Return whether every label of a host name has 1 to 63 bytes, so that it can be looked up."""
+    """Return whether a host name can be looked up: whether each of its labels has 1 to 63 bytes."""
     try:
         text.encode("idna")
     except UnicodeError:
@@ -159,7 +159,7 @@ class S7Session(ABC):
         self._idle: list[Read] = []
         self._mode = ModeQuery()
         self._queries: list[Query] = []
-        self._answers = 0  # in this session, without those that set it up
+        self._answers = 0  # number in this session, without those of its set-up
         self._add_query(self._mode)
         self._close_on_error = _CloseOnError(self.close, options)
 
@@ -170,7 +170,7 @@ class S7Session(ABC):
 
     @property
     def connected(self) -> bool:
-        """True if a session is open. The controller may have closed it unnoticed."""
+        """True if a session is open. The controller may have closed it without shmio's notice."""
         return self._transport is not None
 
     @property
@@ -222,9 +222,9 @@ class S7Session(ABC):
         self._begin(deadline_ns)
 
     def take_over(self, other: S7Session) -> bool:
-        """Take over the open session of another object with the same options of the session.
+        """Take over the open session of another object that has the same options for the session.
 
-        Wait until the controller has answered all questions of that object.
+        First wait until the controller has answered all questions of that object.
 
         Returns:
             Whether the session was taken over.
@@ -250,7 +250,7 @@ class S7Session(ABC):
         return True
 
     def _begin(self, deadline_ns: int) -> None:
-        """Ask for the operating mode as the first question of the session."""
+        """Ask for the operating mode, which is the first question of a session."""
         with self._close_on_error:
             self._ask()
             self._flush()
@@ -328,9 +328,9 @@ class S7Session(ABC):
     def write(self, writes: Sequence[Write]) -> list[str]:
         """Write a batch, and wait until the controller has answered. Reads may be in flight.
 
-        If writes change the same bits, the last write determines them. A batch that does not fit
-        into one PDU takes several jobs, and is not atomic. The controller may execute jobs in
-        flight in any order. Each answer must come within ``timeout`` after the previous one.
+        If several writes change the same bit, the last one counts. A batch that does not fit into
+        one PDU needs several jobs, and is not atomic. The controller may carry out jobs in flight in
+        any order. Each answer must come within ``timeout`` after the previous one.
 
         Returns:
             For each write, "" if the controller confirmed it, or else why it refused the write.
@@ -369,14 +369,14 @@ class S7Session(ABC):
         self._window = Window(0, self._window.reference)
         self._in_flight.clear()
         self._idle.clear()
-        for query in self._queries:  # a controller that has just set a session up is alive too
+        for query in self._queries:  # a controller that has just set up a session is alive, too
             query.lost(alive=not self._answers or self._answers > query.begun_after)
         self._answers = 0
 
     # -- session -------------------------------------------------------------------------------------------------------
 
     def _use(self, granted: pdu.Session, transport: Transport) -> None:
-        """Create the requests and buffers for the reads of a new session."""
+        """Start to use a new session: create the requests and buffers for its reads."""
         jobs = min(granted.jobs, self.options.maxJobs or granted.jobs)
         self._session = pdu.Session(granted.pdu_size, jobs)
         self._window = Window(jobs, self._window.reference)
@@ -397,10 +397,7 @@ class S7Session(ABC):
     # -- requests and answers ------------------------------------------------------------------------------------------
 
     def _add_query(self, query: Query) -> None:
-        """Add a question to those that the session asks.
-
-        Questions added earlier have precedence.
-        """
+        """Add a question to those that the session asks; questions added earlier have precedence."""
         query.again = self._continue
         self._queries.append(query)
 
@@ -416,7 +413,7 @@ class S7Session(ABC):
         """
         now_ns = time.monotonic_ns()
         for query in self._queries:
-            if not query.complete:  # after a long period the answer may be in the socket
+            if not query.complete:  # after a long time between calls, the answer may already be in the socket
                 self._advance(query, now_ns)
                 if query.overdue(now_ns):
                     raise TimeoutError
@@ -441,9 +438,9 @@ class S7Session(ABC):
                 raise
 
     def _advance(self, operation: Operation, until_ns: int) -> bool:
-        """Send and receive until the operation is complete, or until ``until_ns``.
+        """Send and receive until the operation is complete or ``until_ns`` has come.
 
-        Return whether it is complete.
+        Return whether the operation is complete.
         """
         while not operation.complete:
             if self._step(until_ns) is None:
@@ -456,7 +453,7 @@ class S7Session(ABC):
         """Receive once, then send waiting requests, as many as may be in flight.
 
         Returns:
-            The number of answers; None if nothing was received until ``until_ns``.
+            The number of answers; None if nothing was received by ``until_ns``.
 
         """
         transport, window = self._transport, self._window
@@ -478,7 +475,7 @@ class S7Session(ABC):
             raise TimeoutError
 
     def _finish_wave(self, wave: BlockWrite, end_ns: int) -> None:
-        """Wait until a wave is complete, but not longer than ``timeout`` for an answer.
+        """Wait until a wave is complete, at most ``timeout`` for each answer.
 
         Raises:
             TimeoutError: No answer came within ``timeout``.
@@ -500,10 +497,7 @@ class S7Session(ABC):
                 )
 
     def _explained(self, refusal: RefusedError, deadline_ns: int) -> RefusedError:  # noqa: ARG002
-        """Return the refusal of a read.
-
-        A subclass may ask the controller for details until ``deadline_ns``.
-        """
+        """Return the refusal of a read; a subclass may first ask for details, until ``deadline_ns``."""
         return refusal
 
 
@@ -511,7 +505,7 @@ class S7Session(ABC):
 
 
 def _named(error: BaseException, options: S7Options, *, opening: bool = False) -> ConnectorError | None:
-    """Return a ConnectorError that explains a connection error; None for any other error."""
+    """Return a ConnectorError that explains ``error``; None if it is not a connection error."""
     peer = options.peer
     if isinstance(error, TimeoutError):
         return ConnectorError(f"no answer within {options.timeout} ms from {peer}")
@@ -533,7 +527,7 @@ def _named(error: BaseException, options: S7Options, *, opening: bool = False) -
 
 
 class _CloseOnError:
-    """Context manager that closes the connection on any error, and raises an explained error."""
+    """Context manager that, on any error, closes the connection, and explains connection errors."""
 
     def __init__(self, close: Callable[[], None], options: S7Options, *, opening: bool = False) -> None:
         self._close = close

@@ -1,9 +1,9 @@
 """The S7 connector for tag tables: registers at addresses in several blocks and areas.
 
-If the controller refuses a range, the range is halved within the same read until the refused
-registers are known. Only these registers turn bad. They are read again from time to time, and as
-usual again once the controller does not refuse them. This knowledge survives a loss of the
-connection.
+If the controller refuses a range, the same read halves the range until the refused registers are
+known. Only these registers turn bad. They are tried again from time to time, and are read as usual
+once the controller no longer refuses them. The connector remembers refused registers when the
+connection is lost.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from shmio.model.statuses import (
 )
 
 RETRY_NS: Final = 10_000_000_000
-"""Time in ns after which a refused register is read again."""
+"""Time in ns after which a refused register is tried again."""
 MAX_RETRIED: Final = 20
 """Largest number of refused registers that one read tries again."""
 _STATUS: Final = {
@@ -68,17 +68,17 @@ _AREA_NAMES: Final = {
     Area.COUNTER: "counters", Area.TIMER: "timers",
 }  # fmt: skip
 MAX_PLACES: Final = 200
-"""Largest number of characters of a text that lists blocks and areas."""
-_MOST_LOGGED: Final = 20  # refused registers that the log names one by one
+"""Largest length, in characters, of a text that lists blocks and areas."""
+_MOST_LOGGED: Final = 20  # largest number of refused registers that the log names one by one
 
 log = logging.getLogger("shmio.source")
 
 
 class Planner:
-    """Decides which ranges each cycle reads, and remembers the registers that are refused."""
+    """Decides which ranges each cycle reads, and remembers the registers that the controller refuses."""
 
     def __init__(self, tags: Mapping[int, Tag]) -> None:
-        """Create a planner for these tags, by index in the layout."""
+        """Create a planner for tags, given by their indices in the layout."""
         self._tags = tags
         self.pdu_size = 0
         self._ranges: dict[Range, None] = {}  # a set in order
@@ -86,14 +86,14 @@ class Planner:
         self._jobs: dict[tuple[int, ...], list[Job]] = {}  # by the rates that are due
         self._cycle = 0
         self.refused: dict[Field, tuple[int, int]] = {}
-        """For each refused field, its status and when to try it again, ns of CLOCK_MONOTONIC."""
+        """For each refused field, its status and the time to try it again, CLOCK_MONOTONIC in ns."""
         self.changes: dict[int, int] = {}
-        """Statuses of refused registers that the image does not show yet, by index in the layout."""
+        """Statuses of refused registers that are not in the image yet, by index in the layout."""
 
     def use(self, pdu_size: int) -> None:
-        """Plan for the PDU size of a new session; its first read is of all registers.
+        """Plan for the PDU size of a new session, whose first read includes all registers.
 
-        What is known about refused registers is kept.
+        The planner keeps what it knows about refused registers.
         """
         self._cycle = 0
         if pdu_size != self.pdu_size:
@@ -101,10 +101,7 @@ class Planner:
             self._merge()
 
     def jobs(self, now_ns: int) -> list[Job]:
-        """Return the jobs of the next read.
-
-        It includes refused registers that are due for an attempt.
-        """
+        """Return the jobs of the next read, including refused registers that are due for an attempt."""
         jobs = self._due(self._cycle)
         self._cycle += 1
         if not self.refused:
@@ -118,7 +115,7 @@ class Planner:
 
     @property
     def count(self) -> int:
-        """Largest number of jobs of a cycle, without attempts to read refused registers."""
+        """Largest number of jobs in a cycle, without those that try refused registers."""
         return len(self._due(0))
 
     def _due(self, cycle: int) -> list[Job]:
@@ -130,25 +127,25 @@ class Planner:
         return jobs
 
     def split(self, whole: Range, parts: Sequence[Range]) -> None:
-        """From now on, read the parts of a range instead of the range, if it is still in use."""
+        """From now on, read ``parts`` instead of the range ``whole``, if this range is still in use."""
         if whole in self._ranges:
             del self._ranges[whole]
             self._ranges |= dict.fromkeys(parts)
             self._jobs = {}
 
     def replan(self) -> None:
-        """Divide the ranges among jobs again, because some need their own job now."""
+        """Divide the ranges among jobs anew, because some now need their own job."""
         self._jobs = {}
 
     def together(self, ranges: Iterable[Range]) -> None:
-        """Let ranges share jobs again, because the cause of refusals is known now."""
+        """Let ranges share jobs again, because the cause of the refusals is now known."""
         for whole in ranges:
             if whole.alone:
                 whole.alone = False
                 self._jobs = {}
 
     def refuse(self, part: Range, status: int, why: str) -> None:
-        """Note that the only field of a range is refused; read it again only after ``RETRY_NS``."""
+        """Remember that the only field of a range is refused; try it again only after ``RETRY_NS``."""
         field = part.fields[0]
         if field not in self.refused:
             self._note(field, why)
@@ -164,7 +161,7 @@ class Planner:
         return explain_place(code, tag.address.text, tag.address.db, part.stop - 1)
 
     def accept(self, part: Range) -> None:
-        """Read a range's fields with the others again, if the controller had refused them."""
+        """If the fields of a range had been refused, read them together with other fields again."""
         if self.refused and any(field in self.refused for field in part.fields):
             for field in part.fields:
                 if self.refused.pop(field, None):
@@ -173,7 +170,7 @@ class Planner:
             self._merge()
 
     def forget(self) -> None:
-        """Make the next read store the values of all ranges, even if they have not changed."""
+        """Make the next read store the values of all ranges, even values that have not changed."""
         for one in self._ranges:
             one.last = b""
 
@@ -194,7 +191,7 @@ class Planner:
 
 
 class TableRead:
-    """One read of all registers: its jobs, and the bytes in their answers."""
+    """The read of one cycle: its jobs, and the bytes in their answers."""
 
     def __init__(
         self, planner: Planner, again: Callable[[TableRead], None], store: Callable[[TableRead], bytes]
@@ -204,7 +201,7 @@ class TableRead:
         Args:
             planner: Returns the jobs of the read.
             again: Called to queue the read again, after jobs were added to it.
-            store: Puts the results into the image, and returns the image.
+            store: Stores the results in the image, and returns the image.
 
         """
         self._planner, self._again, self._store = planner, again, store
@@ -225,7 +222,7 @@ class TableRead:
         self._parts: list[Range] = []  # halves of these, which the next jobs read
         self.data_of: dict[Range, bytearray] = {}
         """The bytes of each range that was received."""
-        self._found = False  # whether it is known what was refused
+        self._found = False  # whether a refused register was found
 
     @property
     def count(self) -> int:
@@ -251,7 +248,7 @@ class TableRead:
         )
 
     def accept(self, index: int, frame: memoryview) -> None:
-        """Process the answer to a job.
+        """Process the answer to job number ``index``.
 
         After the last answer, add jobs for the halves of refused ranges.
 
@@ -286,12 +283,10 @@ class TableRead:
         buffer[at : at + piece.size] = data
 
     def _refuse(self, whole: Range, status: int, why: str) -> None:
-        """Halve a range that the controller refused.
+        """Halve a range that the controller refused; if it has only one register, remember that as refused.
 
-        If it has only one register, note that this is refused.
-
-        The planner keeps the result at once. If a session ends before the search, the next one
-        continues it.
+        The planner stores the result at once. So if the session ends before the search does, the
+        next session continues the search.
         """
         if whole in self._gone:
             return
@@ -306,7 +301,7 @@ class TableRead:
             self._found = True
 
     def _refuse_all(self, job: Job, refusal: RefusedError) -> None:
-        """Note that the controller refused a whole job. One of the job's items may be the cause."""
+        """Remember that the controller refused a whole job, perhaps because of only one of its items."""
         self._denied += 1
         self._denial = refusal
         ranges = dict.fromkeys(piece.range for piece in job)
@@ -318,14 +313,11 @@ class TableRead:
                 self._codes[whole] = BAD_COMMUNICATION_ERROR, str(refusal)
 
     def _settle(self) -> None:
-        """Halve refused ranges and queue jobs for the halves.
-
-        If there are none, update the planner.
-        """
+        """Halve refused ranges and queue jobs for the halves; if there are none, update the planner."""
         refused, self._codes = self._codes, {}
         planner = self._planner
         if self._denied == len(self._jobs) and self._jobs and not self._again_alone:
-            self.refusal = self._denial  # nothing can be read, so it is not the fault of some addresses
+            self.refusal = self._denial  # every job was refused, so single addresses are not the cause
             planner.together(refused)
             return
         for whole, (status, why) in refused.items():
@@ -348,10 +340,7 @@ class TableWrite(BlockWrite):
     """One wave of writes to registers of a tag table."""
 
     def __init__(self, pdu_size: int, items: Sequence[WriteItem], outcomes: list[str], names: dict[int, str]) -> None:
-        """Create a wave.
-
-        ``names`` has the name of the written register by the index of the write.
-        """
+        """Create a wave; ``names`` are the names of the written registers by the index of the write."""
         super().__init__(0, pdu_size, items, outcomes)
         self._names = names
 
@@ -407,7 +396,7 @@ class S7TableConnector(S7Session, Connector):
         self._image = RegisterImage(layout) if layout.status_offset is not None else None
 
     def describe(self) -> str:
-        """Return the peer, the session's parameters and the number of requests in a cycle, for the log."""
+        """Return the peer, the session's parameters and the number of requests in a cycle, as text for the log."""
         requests = self._planner.count
         return (
             f"to {self.options.peer} {len(self._layout.registers)} registers pdu={self.pdu_size} jobs={self.jobs} "
@@ -457,7 +446,7 @@ class S7TableConnector(S7Session, Connector):
         self._window.add(read, urgent=True)
 
     def _store(self, read: TableRead) -> bytes:
-        """Put the results of a read into the image, and return a copy of the image."""
+        """Store the results of a read in the image, and return a copy of the image."""
         image = self._image
         assert image is not None  # noqa: S101 - _reads() checked it
         self._cpu.store(image)
@@ -470,13 +459,13 @@ class S7TableConnector(S7Session, Connector):
             planner.forget()
         for whole, data in read.data_of.items():
             code = UNCERTAIN if whole.area is Area.BLOCK and whole.db in self._uncertain else GOOD
-            # A register that is read in every cycle has the time of the frame.
+            # To a register that is read in every cycle, the time of the frame applies.
             source_ns = read.begun_ns if whole.every > 1 else 0
-            if whole.last == data and not source_ns:  # then the registers have these values already
+            if whole.last == data and not source_ns:  # the image already has these values
                 continue
             whole.last = bytes(data)
             for field in whole.fields:
-                if planner.refused and field in planner.refused:  # by another read: its value is not read again
+                if planner.refused and field in planner.refused:  # by another read; the image keeps the bad status
                     continue
                 tag = self._tags[field.register]
                 found = tag.image_bytes(whole.last[field.start - whole.start : field.stop - whole.start])
@@ -524,8 +513,8 @@ class S7TableConnector(S7Session, Connector):
         """Yield each change that a write makes in the controller, as (tag, first byte, bit, data).
 
         Raises:
-            ValueError: The controller cannot take the value, or the write sets no register that can
-                be written.
+            ValueError: The controller cannot hold the value, or the write sets no register, or one
+                that cannot be written.
 
         """
         offset, mask, data = write
@@ -612,15 +601,15 @@ def _rates(every: dict[str, int], layout: Layout) -> list[tuple[Glob, int]]:
 
 
 def _linear(tag: Tag, start: int, bit: int | None) -> int:
-    """Return a number for a bit in the controller; it increases over all areas and blocks."""
+    """Return the number of a bit in a sequence of all bits of all areas and blocks."""
     return ((tag.address.area << 16 | tag.address.db) << 24) + 8 * start + (bit or 0)
 
 
 def _covered(register: Register, there: bytes | bytearray) -> Iterator[tuple[int, int]]:
-    """Yield (first, count) for each run of elements that a write covers.
+    """Yield (first, count) for each run of elements that a write sets.
 
     Raises:
-        ValueError: The write covers only a part of an element.
+        ValueError: The write sets only a part of an element.
 
     """
     size, stride = register.element.size, register.element.stride

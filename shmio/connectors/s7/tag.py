@@ -1,4 +1,4 @@
-"""A register of a tag table, with its field: the bytes that are read for it."""
+"""A register of a tag table, with its field, which is the bytes to read for the register."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from shmio.layout.s7.conversion import Conversion
 
 
 class Tag(Conversion):
-    """A register, its address, the conversion of its values, and how often it is read."""
+    """A register with its address, the conversion of its values, and the rate at which it is read."""
 
     def __init__(self, index: int, register: Register, address: Address, byte_order: ByteOrder, every: int = 1) -> None:
         super().__init__(register, address, byte_order)

@@ -1,8 +1,8 @@
 """The TCP connection to a controller, and the window of requests in flight on it.
 
-Every wait has a deadline. Reads, writes and questions share the connection and the number of jobs
-that the controller granted. Every request has a unique reference. Each answer is passed once: to
-the operation whose request has the answer's reference.
+Every wait has a deadline. Reads, writes and questions share the connection, and the number of jobs
+in flight that the controller granted. Every request in flight has a unique reference, by which an
+answer finds the operation that sent the request.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from shmio.errors import ConnectorError
 class Transport:
     """One TCP connection.
 
-    Deadlines are in ns of CLOCK_MONOTONIC. They are met with an accuracy of about 0.1 ms.
+    Deadlines are CLOCK_MONOTONIC in ns. Methods meet them with an accuracy of about 0.1 ms.
     """
 
     def __init__(self, host: str, port: int, timeout_ns: int) -> None:
-        """Connect within ``timeout_ns``, after a look-up of the host name within ``timeout_ns``.
+        """Look up the host name, then connect; each of the two may take ``timeout_ns``.
 
         Raises:
             OSError: No connection could be opened.
@@ -33,11 +33,11 @@ class Transport:
         """
         places = tcp.look_up(host, port, timeout_ns / 1e9)
         self.deadline_ns = time.monotonic_ns() + timeout_ns
-        """The end of ``timeout_ns``, in ns of CLOCK_MONOTONIC."""
+        """The time by which the connection must be open, CLOCK_MONOTONIC in ns."""
         self._socket = tcp.connect(places, timeout_ns / 1e9)
         self._socket.setblocking(False)
         self.taken = 0
-        """Number of bytes that the kernel accepted in the last ``send``, even if that failed."""
+        """Number of bytes that the kernel accepted in the last ``send``, even if ``send`` failed."""
         self.reserve(1, 512)  # longer than any connection confirm
 
     def reserve(self, frames: int, longest: int) -> None:
@@ -57,7 +57,7 @@ class Transport:
     def send(self, data: bytes | memoryview, deadline_ns: int) -> None:
         """Send all of ``data``.
 
-        The kernel's buffer is large enough for answers that arrive meanwhile.
+        Answers that arrive meanwhile fit into the buffer of the kernel.
 
         Raises:
             TimeoutError: The peer has not accepted the data by ``deadline_ns``.
@@ -95,10 +95,7 @@ class Transport:
         return True
 
     def frame(self) -> memoryview | None:
-        """Return the next complete frame, valid until the next ``receive``.
-
-        None if there is none.
-        """
+        """Return the next complete frame, valid until the next ``receive``; None if there is none."""
         if self._end - self._start < 4:
             return None
         length = pdu.frame_length(self._inbox, self._start, self._longest)
@@ -130,7 +127,7 @@ def _left_s(until_ns: int) -> float:
 
 
 class Operation(Protocol):
-    """A group of requests that together have one result, such as the read of a block."""
+    """A group of requests that together give one result, such as the read of a block."""
 
     @property
     def count(self) -> int:
@@ -144,13 +141,13 @@ class Operation(Protocol):
         """True if the operation expects no more answers."""
 
     def take(self, count: int, first: int) -> bytes | memoryview:
-        """Return the next ``count`` requests as frames; references begin at ``first``.
+        """Return the next ``count`` requests as frames, with references from ``first`` on.
 
         References have 16 bits and wrap.
         """
 
     def accept(self, index: int, frame: memoryview) -> None:
-        """Process the answer to request ``index``.
+        """Process the answer to request number ``index``.
 
         Raises:
             ConnectorError: The answer does not match the request.
@@ -169,7 +166,7 @@ class Window:
         self.reference = reference
         self._queue: deque[Operation] = deque()
         self._in_flight: dict[int, tuple[Operation, int]] = {}
-        self._given: list[tuple[Operation, int]] = []  # by the last ``due``: operations, each with its first request
+        self._given: list[tuple[Operation, int]] = []  # of the last ``due``: operations, each with its first request
 
     @property
     def idle(self) -> bool:
@@ -189,10 +186,7 @@ class Window:
             self._queue.append(operation)
 
     def due(self) -> bytes | memoryview:
-        """Return the requests that may be sent now, as one sequence of bytes.
-
-        Empty if there are none.
-        """
+        """Return the requests that may be sent now, as one sequence of bytes; empty if there are none."""
         parts: list[bytes | memoryview] = []
         self._given.clear()
         while self._queue and (free := self.jobs - len(self._in_flight)) > 0:
@@ -208,7 +202,7 @@ class Window:
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
     def take_back(self) -> None:
-        """After the connection was lost, mark the requests that ``due`` returned last as not sent."""
+        """Mark the requests that ``due`` returned last as not sent, because the connection was lost."""
         for operation, begin in self._given:
             operation.sent = begin
 
@@ -222,6 +216,6 @@ class Window:
         reference = pdu.reference_of(frame)
         owner = self._in_flight.pop(reference, None)
         if owner is None:
-            pdu.check_answer(frame)  # raises a more precise error if it is not an answer
+            pdu.check_answer(frame)  # raises a more precise error if the frame is not an answer
             raise ConnectorError(f"the controller answered a request that is not in flight (reference {reference})")
         owner[0].accept(owner[1], frame)

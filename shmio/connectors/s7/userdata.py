@@ -2,10 +2,10 @@
 
 No I/O.
 
-Userdata (ROSCTR 7) are requests for what a CPU knows about itself. Names follow Wireshark's S7
-dissector. An answer that does not fit into a PDU comes in parts, and each part after the first must
-be requested. SZLs are described in Siemens, System Software for S7-300/400, A5E00739858, chapter
-33.
+Userdata (ROSCTR 7) are requests for information about the CPU itself, and their answers. Names
+follow Wireshark's S7 dissector. An answer that does not fit into a PDU comes in parts, and each part
+after the first must be requested. Siemens describes SZLs in System Software for S7-300/400,
+A5E00739858, chapter 33.
 
 Every parser in this module raises only ConnectorError, for any input.
 """
@@ -46,7 +46,7 @@ Fields: number; bytes in load memory; ms and day of the last change of the code,
 interface; bytes in work memory; checksum.
 """
 _DATA_BLOCK_CODE = b"0A"
-_ACTIVE = b"A"  # the block in the work memory
+_ACTIVE = b"A"  # asks for the block in the work memory
 
 
 class Part(NamedTuple):
@@ -60,14 +60,14 @@ class Part(NamedTuple):
 
 
 def request(reference: int, service: Service, data: bytes = b"") -> bytes:
-    """Return a request with its data."""
+    """Return a request for a service, with its data."""
     parameters = _PARAMETERS_HEAD + bytes((4, _REQUEST, 0x40 | service.group, service.function, 0))
     item = _ITEM.pack(ITEM_OK, _OCTETS, len(data)) if data else _ITEM.pack(0x0A, 0, 0)
     return pdu.request(reference, parameters, item + data, pdu.USERDATA)
 
 
 def next_request(reference: int, service: Service, sequence: int) -> bytes:
-    """Return a request for the next part of an answer."""
+    """Return a request for the next part of an answer, whose last part had the number ``sequence``."""
     parameters = _PARAMETERS.pack(
         _PARAMETERS_HEAD, 8, _ANSWER, 0x40 | service.group, service.function, sequence, 0, 0, 0
     )
@@ -99,7 +99,7 @@ def parse_answer(frame: memoryview, service: Service) -> Part:
     code, _, length = _ITEM.unpack_from(frame, begin)
     if error:
         raise _refused(service, f"error 0x{error:04X}")
-    if code != ITEM_OK:  # some servers name another service when they refuse one
+    if code != ITEM_OK:  # in a refusal, some servers name another service
         raise _refused(service, f"item code 0x{code:02X}", code)
     if (group, function) != (0x80 | service.group, service.function):
         raise ConnectorError(what)
@@ -121,7 +121,7 @@ def szl_records(data: bytes, szl: int) -> list[bytes]:
     """Return the complete records in the data of an answer.
 
     Raises:
-        ConnectorError: The answer is for another list, or its head is missing.
+        ConnectorError: The answer is about another list, or its head is missing.
 
     """
     if len(data) < _SZL_HEAD.size:
@@ -138,10 +138,7 @@ def szl_records(data: bytes, szl: int) -> list[bytes]:
 
 
 def parse_clock(data: bytes) -> datetime | None:
-    """Return the time of a CPU's clock, without a time zone.
-
-    None if the data are not a valid time.
-    """
+    """Return the time of a CPU's clock, without a time zone; None if the data are not a valid time."""
     digits = (
         data[2:9].hex() + data[9:10].hex()[:1]
     )  # after a reserved byte and the century, which CPUs fill in differently
@@ -158,12 +155,12 @@ def parse_clock(data: bytes) -> datetime | None:
 
 
 class BlockInfo(NamedTuple):
-    """Description of a data block by the CPU. It changes when a changed block is loaded."""
+    """The CPU's description of a data block, which differs after a changed block was loaded."""
 
     load_size: int
     """The block's size in load memory, in bytes."""
     code_changed: tuple[int, int]
-    """When the block was changed last: days since 1984-01-01, and ms within the day."""
+    """Time of the block's last change: days since 1984-01-01, and ms within the day."""
     interface_changed: tuple[int, int]
     size: int
     """Length of the data in bytes."""
