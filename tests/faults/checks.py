@@ -319,7 +319,8 @@ def check_restarts(
         before: The processes before the faults.
         after: The processes now.
         hit: Names of processes that were restarted.
-        renewed: Names of processes that were replaced and whose restarts count from 0.
+        renewed: Names of sources that a reload changed. They keep their process, unless a fault of the device
+            kept it from handing over; then it was replaced, and its restarts count from 0.
         replaced: Whether the instance has another segment, so that every process must be new.
         complain: Takes each violation.
     """
@@ -330,10 +331,10 @@ def check_restarts(
         then = before[name]
         if now.pid is None:
             complain(f"{name} is not there")
-        elif replaced or name in hit | renewed:
+        elif replaced or name in hit:
             if now.pid == then.pid:
                 complain(f"{name} was to be replaced, but is pid {now.pid} as before")
             if not (replaced or name in renewed) and now.restarts <= then.restarts:
                 complain(f"{name} was restarted, but counts {now.restarts} restarts as before")
-        elif now != then:
+        elif now != then and name not in renewed:
             complain(f"{name} was not hit, but went from {then} to {now}")

@@ -35,7 +35,7 @@ WEIGHTS: Final = PROCESS_FAULTS | DEVICE_FAULTS | OTHER_FAULTS
 RESTARTING: Final = {"kill", "hang", "restart", "torn", "broker_kill"}
 """Kinds of faults that replace the target's process."""
 RENEWING: Final = {"relayout"}
-"""Kinds of faults that replace the target and reset its number of restarts to 0."""
+"""Kinds of faults that may replace the target and reset its number of restarts to 0."""
 
 
 @dataclass(frozen=True, slots=True)

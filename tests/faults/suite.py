@@ -117,7 +117,7 @@ class Run:
             self.complain(f"segments left behind: {left}")
         if processes := marked(self._instance):
             self.complain(f"processes left behind: {processes}")
-        known = {".toml", ".db", ".truth", ".mem", ".so", ".log", ".1", ".2", ".3", ".py"}
+        known = {".toml", ".db", ".truth", ".mem", ".so", ".log", ".jsonl", ".1", ".2", ".3", ".py"}
         found = [file for file in self._folder.rglob("*") if not file.is_dir() and file.parent.name != "__pycache__"]
         files = [file for file in found if file.suffix not in known]
         names = {str(file.relative_to(self._folder)) for file in files} - {"clock", "reader", "logs/.instance"}
@@ -181,9 +181,7 @@ class Suite(Run):
         hit = {fault.target for fault in turn.faults if fault.kind in RESTARTING}
         renewed = {fault.target for fault in turn.faults if fault.kind in RENEWING}
         ended_ns, last = max(ended)
-        took_s = self._await_recovery(
-            rig, panel, ended_ns, {name: before[name] for name in hit | renewed}, bystanders=bystanders
-        )
+        took_s = self._await_recovery(rig, panel, ended_ns, {name: before[name] for name in hit}, bystanders=bystanders)
         self.record.rounds += 1
         self.record.faults.update(fault.kind for fault in turn.faults)
         if took_s is not None:

@@ -92,7 +92,7 @@ def test_copies_have_bodies_and_registers_of_their_own(tmp_path: Path) -> None:
     [
         (f'{BODY}joint = {{ type = "revolute", register = "cell/a/poss" }}\n', 3, ["body[0].joint.register", "a/pos"]),
         (f'{BODY}joint = {{ type = "revolute", register = "cell/bits" }}\n', 3, ["array", "cell/bits/0"]),
-        (f'{BODY}joint = {{ type = "revolute", register = "cell/name" }}\n', 3, ["STRING", "no number"]),
+        (f'{BODY}joint = {{ type = "revolute", register = "cell/name" }}\n', 3, ["STRING", "not a number"]),
         (f'{BODY}joint = {{ type = "revolute", register = "cell/a/pos/in" }}\n', 3, ["/in"]),
         (f'{BODY}[body.joint]\ntype = "revolve"\nregister = "x"\n', 4, ["revolve", "revolute, prismatic"]),
         (f'{BODY}[body.joint]\ntype = "revolute"\nregister = "cell/a/pos"\naxis = [0, 0, 0]\n', 6, ["direction"]),

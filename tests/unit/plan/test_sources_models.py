@@ -170,7 +170,7 @@ def test_remote_model_without_an_endpoint_is_a_warning(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ("", "source[0].outputs: this key is needed"),
+        ("", "source[0].outputs: name the registers"),
         ('outputs = ["axes"]', "source[0].outputs: 'axes' names no register of drive"),
         ('outputs = ["axis"]\ninouts = ["axis/position"]', "source[0].inouts: axis/position is in outputs, too"),
         ('output = ["axis"]', "source[0].output: unknown key"),

@@ -364,7 +364,7 @@ def test_model_is_asked_once_a_period_in_wall_time(instance: str) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, "outputs: this key is needed"),
+        ({}, "outputs: name the registers"),
         ({"outputs": ["total"]}, "outputs: 'total' names no register of model"),
         ({"outputs": ["sum"], "timeout_ms": 0}, "timeout_ms"),
         ({"outputs": ["sum"], "timeout_ms": 10_000}, "timeout_ms"),
