@@ -159,7 +159,7 @@ class DeclaredInjections:
 
     @property
     def overload(self) -> str:
-        """Why no write can be accepted at present; empty if writes can."""
+        """Why the source can accept no write at present; empty if it can accept writes."""
         full = next((layer for layer in self._layers if layer.full), None)
         return f"the injection {full.name} delays {MAX_HELD} writes already, which is the maximum" if full else ""
 

@@ -92,7 +92,7 @@ class Schedule:
         return (now_ns - self._start_ns) // self._period_ns
 
     def restart(self) -> None:
-        """Forget the last cycle, so that the time until the next cycle counts as no overrun but an outage."""
+        """Forget the last cycle, so that the time until the next one is an outage, and not an overrun."""
         self._last = None
 
 

@@ -1,8 +1,8 @@
 """Compile data-block sources to layouts: decode, parse, place, emit.
 
 No I/O: the caller reads the files. Sources are exports of TIA Portal (``.db``, ``.udt``, ``.scl``)
-and of STEP 7 classic (``.awl``). Files are compiled together when one uses types, function blocks
-or constants of another.
+and of STEP 7 classic (``.awl``). Files that use each other's types, function blocks or constants
+must be compiled together.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from shmio.layout.source.syntax import (
 
 MAX_ALL_REGISTERS = 500_000
 MAX_ALL_STRUCTURES = 500_000
-"""Limit for all blocks that are compiled together: a small source can declare many large ones."""
+"""Limit for all blocks that are compiled together, because a small source can declare many large blocks."""
 
 _Declaration = TypeVar("_Declaration", TypeDeclaration, BlockDeclaration, ConstantDeclaration)
 

@@ -113,7 +113,7 @@ def _member_values(text: str, group: Group) -> dict[str, str]:
     """Split a structure's initial value into the texts of its members.
 
     Returns:
-        The text of each member that has one, by the member's name in lower case.
+        The texts of the members that have an initial value, by name in lower case.
 
     Raises:
         ValueRangeError: The text is not a list of values, names an unknown member, or has too many

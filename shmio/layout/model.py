@@ -199,7 +199,7 @@ class Register(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True
 
     @property
     def element(self) -> ElementType:
-        """The elementary type. KeyError: its name is unknown; a validated layout has no such name."""
+        """The elementary type; raises KeyError for an unknown name, which no validated layout has."""
         found = element_type(self.type)
         if found is None:
             raise KeyError(self.type)

@@ -65,8 +65,8 @@ def overlay_register(base: Layout, path: str, over: str, kind: tuple[ElementType
 def needed(layout: Layout, register: Register) -> set[str]:
     """Return the paths of those registers of the layout that must be known to read a register, element or part.
 
-    These are the register itself, or the one that contains it, and the register over which that
-    lies.
+    These are the register that is or contains it and, if that lies over the block, the own register
+    of the block below.
     """
     over = _over(layout, register)
     paths = [path for path in holders(over) if path in layout.by_path] if over else []
@@ -76,7 +76,7 @@ def needed(layout: Layout, register: Register) -> set[str]:
 def names_in(layout: Layout, patterns: Iterable[str]) -> list[Register]:
     """Return the registers over the block that patterns name.
 
-    Leave out those of which the patterns name all bits by registers of the block, too.
+    Leave out a register if the patterns also name all its bits through the block's own registers.
 
     Raises:
         PathError: A pattern is malformed, or names a part that its register does not have.

@@ -26,7 +26,7 @@ class Report:
     def add(self, diagnostic: Diagnostic) -> None:
         """Keep a diagnostic, unless it is a duplicate or a consequence of the last error.
 
-        An error at the same place as the one before counts as its consequence.
+        An error counts as a consequence if it is at the same place as the error before it.
 
         Raises:
             TooManyErrors: The report has reached ``MAX_ERRORS``.

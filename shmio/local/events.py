@@ -46,7 +46,7 @@ class EventReader:
         return self._cursor.ended
 
     def next(self) -> Event | None:
-        """Return the next event if there is one, without waiting."""
+        """Return the next event without waiting; None if there is none yet."""
         while (event := self._cursor.poll()) is not None:
             if missed := self._cursor.take_missed():
                 self._missed += missed

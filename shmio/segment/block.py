@@ -71,7 +71,7 @@ class Frame(NamedTuple):
 
     @property
     def image(self) -> bytes:
-        """The image that consumers see: the effective one if there is one, else the raw one."""
+        """The image that consumers see: ``effective``, or ``raw`` if that is None."""
         return self.raw if self.effective is None else self.effective
 
     def age_ns(self, now_ns: int) -> int:
@@ -161,7 +161,7 @@ class Cursor(Generic[Entry]):
         self._last = after
 
     def poll(self) -> Entry | None:
-        """Return the next entry if there is one, without waiting."""
+        """Return the next entry without waiting; None if there is none yet."""
         ring = self._ring
         margin = 0
         while ring.head() > self._last:
@@ -600,7 +600,7 @@ class FrameFollower(Cursor[Frame]):
             yield frame
 
     def newest(self) -> Frame | None:
-        """Return the newest frame, and continue reading after it. None: there is no frame yet.
+        """Return the newest frame, and continue reading after it; None if there is no frame yet.
 
         Raises:
             SegmentError: The writer overtook the reader at every attempt to copy.

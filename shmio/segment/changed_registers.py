@@ -20,7 +20,7 @@ _ENTRY = struct.Struct("=IIII")  # offset, size, mask, index: scan_entry in _ato
 
 
 class ChangeScan:
-    """Compares two images over the given registers, in C. Immutable."""
+    """Compares the given registers in two images, in C code. Immutable."""
 
     def __init__(self, registers: Sequence[Register], statuses: StatusArea | None = None) -> None:
         """Prepare the comparison of these registers.

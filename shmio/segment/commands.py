@@ -236,7 +236,7 @@ class CommandQueues:
         return _atomics.bell(self._memory, self._offset + _BELL_AT)
 
     def wait(self, seen: int, timeout_ns: int = -1) -> None:
-        """Wait until the doorbell's value is not ``seen``, at most ``timeout_ns`` (negative: forever)."""
+        """Wait until the doorbell's value differs from ``seen``, at most ``timeout_ns`` (negative: forever)."""
         _atomics.bell_wait(self._memory, self._offset + _BELL_AT, seen, timeout_ns)
 
     def wake(self) -> None:

@@ -37,7 +37,7 @@ class Doorbell:
         _atomics.bell_ring(self._memory, self._offset)
 
     def wait(self, seen: int, timeout_ns: int = -1) -> int:
-        """Wait until the value is not ``seen``, at most ``timeout_ns`` (negative: forever).
+        """Wait until the value differs from ``seen``, at most ``timeout_ns`` (negative: forever).
 
         Returns:
             The value after the wait.

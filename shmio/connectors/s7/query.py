@@ -67,7 +67,7 @@ class Query(ABC):
         self._answer.clear()
 
     def take(self, count: int, first: int) -> bytes:
-        """Return the request of the question, or after the first one, the request for the answer's next part."""
+        """Return the question's request at first, and then requests for the next parts of the answer."""
         begin, self.sent = self.sent, self.sent + count
         if begin:
             return next_request(first & 0xFFFF, self.service, self._sequence)

@@ -61,16 +61,13 @@ class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only
     timeout: Annotated[int, msgspec.Meta(ge=1, le=600_000)] = 5000
     """Time-out in ms for connecting, for reading the block, and for each answer to a write."""
     packetSize: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None  # noqa: N815 - a key of plc.ini
-    """Largest number of data bytes in one read.
-
-    The PDU size that the controller grants limits it too.
-    """
+    """Largest number of data bytes in one read, unless the PDU size that the controller grants is too small for it."""
     dbNumber: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None  # noqa: N815 - a key of plc.ini
     """Number of the data block; None: the number in the layout's name."""
     every: Annotated[dict[str, Annotated[int, msgspec.Meta(ge=2, le=10_000)]], msgspec.Meta(max_length=8)] = {}
     """For a tag table, by pattern: the number n for registers that are read only in every n-th cycle."""
     maxJobs: Annotated[int, msgspec.Meta(ge=1, le=255)] | None = None  # noqa: N815 - named like the other keys
-    """Largest number of requests in flight; the number that the controller grants limits it too."""
+    """Largest number of requests in flight, unless the controller grants fewer."""
 
     def __post_init__(self) -> None:
         if not _is_host(self.host):

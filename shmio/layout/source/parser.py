@@ -244,7 +244,7 @@ class _Declarations:
 
 @dataclass(slots=True)
 class _Header:
-    """Properties between a block's name and its body."""
+    """The properties that a source gives between a block's name and its body."""
 
     optimized: bool = False
     protected: bool = False

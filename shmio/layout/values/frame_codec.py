@@ -52,7 +52,7 @@ _NAT = np.iinfo(np.int64).min
 
 
 class FrameCodec:
-    """Decodes frames of one layout. Creating one is slow, decoding is fast."""
+    """Decodes frames of one layout. Creating the codec is slow; decoding is fast."""
 
     def __init__(self, layout: Layout) -> None:
         registers = layout.registers
