@@ -426,7 +426,7 @@ class InjectionProcessor:
 
     @property
     def patience_ns(self) -> int:
-        """Time in ns until :meth:`look` must be called; negative if no call is needed."""
+        """Time in ns until :meth:`follow_changes` must be called; negative if no call is needed."""
         if all(layer.keep for layer in self.injections.layers) and not self.declared.reads_other_sources:
             return -1
         return max(0, self._look_ns - time.monotonic_ns())

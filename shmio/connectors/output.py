@@ -258,7 +258,7 @@ class LayerPublisher:
         return [*lost_values, *self.inner_values(left, ends[0]), *ends] if ends else []
 
     def inner_values(self, layers: Iterable[Layer], end: Record) -> Iterator[Record]:
-        """Yield events with the values that clients now receive from layers inside ``layers``, their own.
+        """Yield events with the values that the clients of ``layers`` now receive from inner layers.
 
         The events precede ``end``, the last event of the command that caused the change.
         """

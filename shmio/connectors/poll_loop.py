@@ -57,7 +57,7 @@ class Due(NamedTuple):
 
 
 class Schedule:
-    """Numbers cycles from the start of the instance, so that a restart of the process shows as a gap.
+    """Numbers the cycles from the start of the instance on, so that cycles lost by a restart show as a gap.
 
     A cycle that begins late still runs. A cycle whose whole period has passed is skipped, and counts
     as an overrun.
@@ -69,7 +69,7 @@ class Schedule:
         self._last: int | None = None
 
     def moved(self, ahead_ns: int, lead: int) -> Schedule:
-        """Return a schedule for a clock that is ``ahead_ns`` ahead; cycle numbers are ``lead`` higher."""
+        """Return a schedule for a clock that is ``ahead_ns`` ahead of this one's; cycle numbers are ``lead`` higher."""
         return Schedule(self._start_ns - ahead_ns - lead * self._period_ns, self._period_ns)
 
     def next(self, now_ns: int) -> Due:

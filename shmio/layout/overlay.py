@@ -63,10 +63,10 @@ def overlay_register(base: Layout, path: str, over: str, kind: tuple[ElementType
 
 
 def needed(layout: Layout, register: Register) -> set[str]:
-    """Return the paths of those registers of the layout that must be known to read a register, element or part.
+    """Return the paths of the layout's registers that are necessary to read a register, element or part.
 
-    These are the register that is or contains it and, if that lies over the block, the own register
-    of the block below.
+    These are the register itself or the register that contains it. If that lies over the block, it
+    is also the block's own register below it.
     """
     over = _over(layout, register)
     paths = [path for path in holders(over) if path in layout.by_path] if over else []

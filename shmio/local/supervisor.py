@@ -1,4 +1,4 @@
-"""Ask the supervisor of a local instance to do something."""
+"""Send requests to the supervisor of a local instance."""
 
 from __future__ import annotations
 

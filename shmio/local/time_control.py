@@ -543,7 +543,7 @@ def _take_over_note(segment: Segment, participants: Sequence[Block]) -> str:
 
 
 def _unmoved_note(segment: Segment, participants: Sequence[Block]) -> str:
-    """Return a note about sources on which a step has no effect, with the remedy; empty: none."""
+    """Return a note about sources on which a step has no effect, with the remedy; empty: there are none."""
     if not _moves(segment, participants):
         return _NOBODY if segment.clock.stepped else f"{_NOBODY}{_REAL}"
     found: dict[str, list[str]] = {"paused": [], "over": []}

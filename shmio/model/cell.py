@@ -43,7 +43,7 @@ class Update(Protocol):
 
     @property
     def cycle(self) -> int:
-        """Cycle of the source's schedule; in virtual time the number of the step."""
+        """Cycle of the source's schedule; in virtual time, the number of the step."""
 
     @property
     def incarnation(self) -> int:

@@ -52,9 +52,9 @@ They are the last slots of the table, and have the first command queues.
 """
 
 WRITERS: Final[Mapping[str, int]] = {"grpc": 4, "mqtt": 5, "opcua": 6}
-"""Number of the command queue of each process of the instance that sends commands, by name.
+"""The number of the command queue of each process of the instance that sends commands.
 
-The name of such a process equals its kind.
+The keys are the names of the processes, which equal their kinds.
 """
 
 
@@ -99,7 +99,7 @@ class ProcessSpec:
 class Supervised:
     """The supervisor's part of a slot.
 
-    ``note`` says why the process is not running; else it is empty.
+    ``note`` says why the process is not running; empty if it runs.
     """
 
     phase: Phase = Phase.STOPPED

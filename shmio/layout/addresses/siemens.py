@@ -23,8 +23,8 @@ _INDEX: Final = re.compile(r"-?[0-9]+")
 def node_address(layout: Layout, register: Register) -> NodeAddress:
     """Return the node id of a register of a data block.
 
-    Each segment of the path that is a number counts as the index of an array. If it is the name of
-    a member, the result is wrong; then a tag table must give the register's address.
+    Each number in the path counts as the index of an array. If a member's name is a number, the
+    result is wrong; a tag table must then give the register's address.
     """
     parts: list[str] = [f'"{layout.name}"']
     indices: list[str] = []

@@ -33,7 +33,7 @@ class Conversion:
         self._order = byte_order
         unit = 2 if address.area.numbered else 1
         self.start = address.start * unit
-        """First byte in the area."""
+        """Offset of the first byte in the area."""
         self.stop = self.start + address.size
         element = register.element
         self._converted = (

@@ -428,7 +428,7 @@ class _Moment:
 
 
 def _date_to_ns(unpack: struct.Struct) -> Callable[[Buffer, int], int]:
-    """Return the decoder of DATE: 16 bits, days since 1990-01-01."""
+    """Return the decoder of DATE, which has 16 bits: days since 1990-01-01."""
     return lambda data, at: (unpack.unpack_from(data, at)[0] + calendar.DATE_EPOCH_DAYS) * calendar.NS_PER_DAY
 
 
@@ -438,9 +438,10 @@ def _date_from_ns(pack: struct.Struct) -> Callable[[int], bytes]:
 
 
 def _dt_to_ns(data: Buffer, offset: int) -> int | None:
-    """Decode DATE_AND_TIME: BCD bytes year, month, day, hour, minute, second, milliseconds.
+    """Decode DATE_AND_TIME to nanoseconds since 1970; None for an invalid time.
 
-    The last half-byte is the day of the week.
+    Its BCD bytes are year, month, day, hour, minute, second and milliseconds; the last half-byte is
+    the day of the week.
     """
     digits = [_from_bcd(0, byte) for byte in data[offset : offset + 7]]
     last = data[offset + 7] >> 4
@@ -455,7 +456,7 @@ def _dt_to_ns(data: Buffer, offset: int) -> int | None:
 
 
 def _dt_from_ns(ns: int) -> bytes:
-    """Encode DATE_AND_TIME."""
+    """Encode nanoseconds since 1970 as DATE_AND_TIME."""
     text = calendar.format_moment(ns, 3)  # 2024-02-29T12:34:56.789
     digits = text[2:].translate(str.maketrans("", "", "-T:."))
     return bytes.fromhex(f"{digits}{calendar.weekday(ns)}")
