@@ -212,7 +212,7 @@ class Layout:
 
     Attributes:
         registers: First the registers of the block (:attr:`own`), in address order and without
-            overlaps. Then the registers of tag tables over the block, which lie over the first.
+            overlaps. Then the registers of tag tables over the block, which share bytes of the first.
         size: Size of an image of the block in bytes, including its status area.
         status_offset: Offset of the status area in an image; None: the image has no status area. The
             area holds a status code and a source time for each of the :attr:`own` registers: see

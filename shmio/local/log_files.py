@@ -100,7 +100,7 @@ def _stamped(file: Path, count: int) -> Iterable[tuple[bytes, bytes]]:
 
 
 def _start(stream: BinaryIO, count: int) -> int:
-    """Return the offset of a line with a time stamp, from which on there are at least ``count`` lines; else 0."""
+    """Return the offset at which to start to read the last ``count`` lines: that of a line with a time stamp, or 0."""
     at = stream.seek(0, os.SEEK_END)
     lines = 0
     while at > 0:

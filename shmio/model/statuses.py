@@ -312,7 +312,7 @@ class _StatusCodec:
         self.encode_into = self._codec.encode_into
 
     def decode(self, data: Buffer) -> Value:
-        """Return the register's value in an image; None for invalid bytes, and if its status is bad."""
+        """Return the register's value in an image; None if its bytes are invalid or its status is bad."""
         return None if self._area.quality(data, self._index) is Quality.BAD else self._codec.decode(data)
 
 

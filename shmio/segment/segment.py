@@ -308,8 +308,7 @@ def _read_clock(shared: SharedObject, head: Header, entries: Sequence[SectionEnt
 class Segment:
     """The mapped shared memory of an instance.
 
-    A supervisor calls :meth:`create`. Workers and readers call :meth:`open`: workers to write,
-    readers read-only.
+    A supervisor calls :meth:`create`. Other processes call :meth:`open`, workers with ``writable``.
     """
 
     def __init__(self, shared: SharedObject, instance: str) -> None:

@@ -113,7 +113,7 @@ def _frame(payload: bytes) -> bytes:
 
 
 def reference_of(frame: memoryview) -> int:
-    """Return the reference of the request that an answer answers, without any checks of the answer."""
+    """Return the reference of the request to which an answer belongs; do not check the answer."""
     if len(frame) < USERDATA_END:
         _check_cotp(frame)
         raise ConnectorError(f"the controller's answer of {len(frame)} bytes is too short")

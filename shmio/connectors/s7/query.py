@@ -108,9 +108,8 @@ class Query(ABC):
     def lost(self, *, alive: bool = True) -> None:
         """Close an open question, because the connection was lost.
 
-        If repeatedly a connection is lost while the question is open, never ask it again. This
-        counts only connections on which the controller was ``alive``, and so answered other requests
-        in the meantime.
+        Never ask it again if this happens on several connections. A connection counts only if the
+        controller was ``alive``, which means that it answered other requests in the meantime.
         """
         self._due_ns = 0
         if self.complete:

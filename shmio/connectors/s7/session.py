@@ -167,7 +167,7 @@ class S7Session(ABC):
 
     @property
     def connected(self) -> bool:
-        """True if a session is open. The controller may have closed it without shmio's notice."""
+        """True if a session is open as far as shmio knows; the controller may have closed it."""
         return self._transport is not None
 
     @property
