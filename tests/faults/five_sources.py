@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import os
 import random
+import re
 import shutil
 import signal
 import statistics
@@ -132,8 +133,7 @@ class Example:
         shutil.copytree(EXAMPLE, folder, dirs_exist_ok=True)
         ports = {PORTS[number]: stack.enter_context(reserved_port()) for number in PORTS}
         text = (folder / "supervisor.toml").read_text().replace('name = "five-sources"', f'name = "{instance}"')
-        for number, name in PORTS.items():
-            text = text.replace(number, str(ports[name].port))
+        text = re.sub(rf"\b({'|'.join(PORTS)})\b", lambda found: str(ports[PORTS[found[0]]].port), text)
         self._domain = 100 + os.getpid() % 100
         text = text.replace(f"domain = {DOMAIN}", f"domain = {self._domain}")
         (folder / "supervisor.toml").write_text(text)

@@ -72,7 +72,7 @@ def test_alerts_reach_a_command_a_broker_and_a_server(make_cell: Callable[..., C
             assert told["values"] == {"cell/Outputs/13.%X0": True}
             until(lambda: len(lines(tmp_path / "told")) == len(server.requests) == 1, "the command and the webhook")
             assert lines(tmp_path / "told")[0] == json.loads(server.requests[0][2]) == told
-            assert cell.processes()["alerts"]["note"] == "active: pause"
+            until(lambda: cell.processes()["alerts"]["note"] == "active: pause", "the note of the process")
             assert cell.status()["state"] == "running"
 
             kill(cell.processes()["alerts"]["pid"])
