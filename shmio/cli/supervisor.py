@@ -142,8 +142,8 @@ def _add_replay(parser: argparse.ArgumentParser) -> None:
     """Add the options that override the keys of ``[replay]``."""
     group = parser.add_argument_group("with --mode replay, in place of the keys of [replay]")
     group.add_argument("--from", nargs="+", metavar="FILE", help="the recording: one .mem, or several of one run")
-    group.add_argument("--start", metavar="TIME", help="seconds from its beginning, or a date and time")
-    group.add_argument("--end", metavar="TIME", help="the same")
+    group.add_argument("--start", metavar="TIME", help="where to start: seconds from its beginning, or a date and time")
+    group.add_argument("--end", metavar="TIME", help="where to end, in the same form as --start")
     group.add_argument("--speed", type=float, metavar="X", help="a factor of real time, 0.01 to 1000 (default: 1)")
     group.add_argument(
         "--injections", choices=("keep", "leave out"), help="the injections of the recording (default: keep)"

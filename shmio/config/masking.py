@@ -39,7 +39,8 @@ _OWN_TABLES: Final = frozenset({("grpc", "token")})
 def is_secret(key: str) -> bool:
     """Return whether a key of this name, without its table, may have a secret as its value.
 
-    The value of a key with the name ``key`` may also be the path of a file. The value then decides.
+    It returns True for the name ``key``, although the value may be the path of a key file. The caller
+    may then check the value.
     """
     folded = key.lower()
     if folded in _NO_SECRETS or folded.endswith(_PATH_SUFFIXES):

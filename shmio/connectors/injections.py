@@ -252,7 +252,7 @@ class DeclaredInjections:
         number = int.from_bytes(hashlib.sha256(document).digest()[:8], "little") | 1
         layer = declared(number, program, CONFIGURED, _seed(declaration), keep=True)
         if reason := self._add(layer, None):
-            log.warning("injection %s: %s", declaration.name, reason)
+            log.warning("injection %s was not created: %s", declaration.name, reason)
 
     def _add(self, layer: DeclaredLayer, command: Command | None) -> str:
         with self._output.lock:

@@ -102,7 +102,9 @@ class Wave:
         """Find the registers to move. Raise ConfigError if there are none."""
         moved = [one for one in layout.registers if not one.writable and (one.type in NUMBERS or one.type == "BOOL")]
         if not moved:
-            raise ConfigError("program wave: the layout has no number or BOOL that commands cannot write")
+            raise ConfigError(
+                "program wave: there is nothing to move: the layout has no number or BOOL that is not writable"
+            )
         self._moved = [(codec(one, layout.byte_order), one.shape, one.type) for one in moved]
 
     def step(self, time_s: float, frame: bytearray) -> None:

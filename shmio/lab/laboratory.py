@@ -236,7 +236,7 @@ class _LabCoordinator(Coordinator):
 
         Raises:
             TimeError: A source failed, or another program owns time.
-            ValueRangeError: The length is not within 1 us and 1 h.
+            ValueRangeError: The length is not between 1 us and 1 h.
 
         """
         lab, page = self._lab, self._lab.page

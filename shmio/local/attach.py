@@ -507,7 +507,7 @@ class Attachment:
         Raises:
             TimeError: Another program owns time, or a step failed. The message names the source
                 that failed or did not answer.
-            ValueRangeError: The length is not within 1 us and 1 h, or the count is below 1.
+            ValueRangeError: The length is not between 1 us and 1 h, or the count is below 1.
         """
         dt_ns = _ns(dt_s)
         if count < 1:

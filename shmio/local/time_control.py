@@ -181,7 +181,7 @@ class Coordinator:
         """Take over time, and set the default length of a step.
 
         Raises:
-            ValueRangeError: The length is not within 1 us and 1 h.
+            ValueRangeError: The length is not between 1 us and 1 h.
             TimeError: Another process owns time.
         """
         check_step(dt_ns)
@@ -213,7 +213,7 @@ class Coordinator:
         Raises:
             TimeError: Another process owns time, a source failed, or a source or a delivering
                 process did not answer within the hard time-out.
-            ValueRangeError: The length is not within 1 us and 1 h.
+            ValueRangeError: The length is not between 1 us and 1 h.
         """
         with self._lock, closing(self.stepping(dt_ns)) as stepping:
             while True:
@@ -419,7 +419,7 @@ class Timekeeper:
 
         Raises:
             TimeError: As for :meth:`Coordinator.step`; or time is being played.
-            ValueRangeError: The length is not within 1 us and 1 h.
+            ValueRangeError: The length is not between 1 us and 1 h.
         """
         if self._player is not None:
             raise TimeError("time is playing: pause it before you step it")

@@ -157,7 +157,7 @@ class Participant:
         return 0 if writer is None else len(writer.get_matched_subscriptions())
 
     def incompatible(self, topic: str) -> bool:
-        """Return whether a publisher of the topic offers less than the reader requests."""
+        """Return whether any publisher of the topic so far has offered a QoS that does not satisfy the reader's."""
         return bool(self._endpoints[topic].reader.get_requested_incompatible_qos_status().total_count)
 
     def take(self) -> Iterator[tuple[str, Any]]:

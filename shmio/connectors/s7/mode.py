@@ -1,8 +1,8 @@
-"""Queries the controller's operating mode about once a second, to notice a PLC in STOP. No I/O.
+"""The query for the controller's operating mode, made about once a second to notice a PLC in STOP. No I/O.
 
-The mode is the low half of the fourth byte of a record of SZL W#16#0424; the high half is the
-previous mode. The numbers are from Siemens, System Software for S7-300/400, A5E00739858, 33.21. If
-a controller refuses this list, shmio does not query it again in the session, and does not notice
+The mode is the low half of the fourth byte of a record of the system status list (SZL) W#16#0424;
+the high half is the previous mode. The numbers are from Siemens, System Software for S7-300/400,
+A5E00739858, 33.21. If a controller refuses this list, shmio does not query it again in the session, and does not notice
 STOP.
 """
 

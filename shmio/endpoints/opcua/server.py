@@ -205,7 +205,7 @@ class Server(Library):
         )
 
     async def init(self, shelf_file: Any = None) -> None:
-        """Create the standard's nodes."""
+        """Create the nodes of the OPC UA standard; set the namespace, the build info and the limits."""
         await super().init(shelf_file)
         await self.register_namespace(self.namespace)
         await self.set_build_info(

@@ -218,7 +218,7 @@ class Page:
         self._tasks.discard(task)
         error = None if task.cancelled() else task.exception()
         if error is not None and not isinstance(error, (WebSocketDisconnect, RuntimeError)):
-            _log.error("a page's work failed", exc_info=error)
+            _log.error("a background task of an open page failed", exc_info=error)
 
     async def _receive(self) -> str | None:
         """Return the next message; None if the page is closed or sends anything but text."""

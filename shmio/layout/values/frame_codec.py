@@ -203,7 +203,7 @@ def _s5time(words: Array) -> Array:
 
 
 def _days(year: Array, month: Array, day: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """Return the days since 1970, and whether the dates exist."""
+    """Return the days since 1970-01-01, and whether each date exists and is in the years 1970 to 2262."""
     inside = (month >= 1) & (month <= 12) & (day >= 1) & (year >= 1970) & (year <= 2262)
     months = np.where(inside, (year - 1970) * 12 + month - 1, 0)
     first = months.view("M8[M]").astype("M8[D]").astype(np.int64)

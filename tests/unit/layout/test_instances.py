@@ -223,7 +223,7 @@ def test_a_protected_block_with_its_declaration_compiles() -> None:
 )
 def test_a_protected_block_without_its_declaration_is_refused(text: str) -> None:
     message = error(text)
-    assert "the block 'DB5' is know-how protected and its declaration is not in the source" in message
+    assert "'DB5' is know-how protected and its declaration is not in the source" in message
     assert "remove the protection" in message
 
 

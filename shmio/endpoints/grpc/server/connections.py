@@ -38,7 +38,7 @@ def peer_of(text: str) -> Peer | None:
 
 
 def connected() -> frozenset[Peer]:
-    """Return the remote ends of the TCP connections of this host that the kernel lists."""
+    """Return the remote address and port of each established TCP connection, from the kernel's tables."""
     return frozenset(peer for table in _TABLES for peer in _read(table))
 
 
