@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import msgspec
 
-from shmio.config.model import Declaration
+from shmio.config.model import Declaration, Expectation
 from shmio.errors import ConfigError
 
 MAX_DECLARATIONS: Final = 256
 """Maximum number of declarations in one file."""
+_Table = TypeVar("_Table", Declaration, Expectation)
 MAX_DIMENSIONS: Final = 6  # of an array; the same as in layout/model.py, which cannot be imported here
 
 
@@ -78,16 +79,32 @@ def check_declarations(declarations: Sequence[Declaration]) -> None:
 
 def declaration_faults(declarations: Sequence[Declaration]) -> Iterator[str]:
     """Yield each fault that can be found without a layout; each begins with its key."""
-    if len(declarations) > MAX_DECLARATIONS:
-        yield f"injection: there are {len(declarations)} injections, but at most {MAX_DECLARATIONS} are allowed"
+    return faults_of_tables("injection", "injections", declarations, MAX_DECLARATIONS, contradictions)
+
+
+def faults_of_tables(
+    key: str, what: str, tables: Sequence[_Table], most: int, contradictions_of: Callable[[_Table], Iterable[str]]
+) -> Iterator[str]:
+    """Yield each fault of the tables of one kind, such as ``[[injection]]``; each begins with its key.
+
+    Args:
+        key: The key of the tables.
+        what: What the tables are, in the plural.
+        tables: The tables. Each needs a name of its own.
+        most: Maximum number of tables.
+        contradictions_of: Returns the contradictions within a table; each begins with its key.
+
+    """
+    if len(tables) > most:
+        yield f"{key}: there are {len(tables)} {what}, but at most {most} are allowed"
         return
     seen: dict[str, int] = {}
-    for index, declaration in enumerate(declarations):
-        first = seen.setdefault(declaration.name, index)
+    for index, table in enumerate(tables):
+        first = seen.setdefault(table.name, index)
         if first != index:
-            yield f"injection[{index}].name: {declaration.name!r} is already the name of injection[{first}]"
-        for contradiction in contradictions(declaration):
-            yield f"injection[{index}].{contradiction}"
+            yield f"{key}[{index}].name: {table.name!r} is already the name of {key}[{first}]"
+        for contradiction in contradictions_of(table):
+            yield f"{key}[{index}].{contradiction}"
 
 
 def contradictions(declaration: Declaration) -> Iterator[str]:

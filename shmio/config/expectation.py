@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
+from shmio.config.declaration import faults_of_tables
 from shmio.config.model import Expectation
 
 MAX_EXPECTATIONS: Final = 256
@@ -38,16 +39,7 @@ def form_of(expectation: Expectation) -> str:
 
 def expectation_faults(expectations: Sequence[Expectation]) -> Iterator[str]:
     """Yield each fault that can be found without a layout; each begins with its key."""
-    if len(expectations) > MAX_EXPECTATIONS:
-        yield f"expect: there are {len(expectations)} expectations, but at most {MAX_EXPECTATIONS} are allowed"
-        return
-    seen: dict[str, int] = {}
-    for index, expectation in enumerate(expectations):
-        first = seen.setdefault(expectation.name, index)
-        if first != index:
-            yield f"expect[{index}].name: {expectation.name!r} is already the name of expect[{first}]"
-        for contradiction in _contradictions(expectation):
-            yield f"expect[{index}].{contradiction}"
+    return faults_of_tables("expect", "expectations", expectations, MAX_EXPECTATIONS, _contradictions)
 
 
 def _contradictions(expectation: Expectation) -> Iterator[str]:

@@ -11,6 +11,7 @@ Nothing waits for a slow page: newer data replaces data of the same topic that i
 from __future__ import annotations
 
 import asyncio
+import inspect
 import logging
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping
@@ -98,8 +99,7 @@ class Tab:
         """Collect the calls of the class."""
         cls.calls = {
             f"{cls.name}.{name}": Call(method.page_call[0], method.page_call[1], method)
-            for name, method in vars(cls).items()
-            if hasattr(method, "page_call")
+            for name, method in inspect.getmembers(cls, lambda member: hasattr(member, "page_call"))
         }
 
     def __init__(self, page: Page) -> None:
@@ -112,6 +112,33 @@ class Tab:
 
     def close(self) -> None:
         """Release the tab's resources, because the page has been closed."""
+
+
+class FollowedTab(Tab):
+    """A tab that sends its data whenever it changes, while the page shows the tab."""
+
+    name: ClassVar[str] = ""
+
+    def __init__(self, page: Page) -> None:
+        super().__init__(page)
+        self._following: asyncio.Task[None] | None = None
+
+    @call("read", Nothing)
+    async def follow(self, _: Nothing) -> None:
+        """Send the tab's data now, and then whenever it changes, until ``leave``."""
+        await self.leave(_)
+        self._following = self.page.start(self._follow())
+
+    @call("read", Nothing)
+    async def leave(self, _: Nothing) -> None:
+        """Stop sending what ``follow`` started to send."""
+        if self._following is not None:
+            self._following.cancel()
+            self._following = None
+
+    async def _follow(self) -> None:
+        """Send the tab's data whenever it changes."""
+        raise NotImplementedError
 
 
 _ACTIONS: Final = {

@@ -11,7 +11,7 @@ from msgspec import Meta
 
 from shmio.control import Reload
 from shmio.endpoints.web.configuration import version
-from shmio.endpoints.web.page import Nothing, Page, Tab, call
+from shmio.endpoints.web.page import FollowedTab, Nothing, Page, call
 from shmio.errors import CommandError
 
 INTERVAL_S: Final = 1.0
@@ -28,7 +28,7 @@ class Seen(msgspec.Struct, forbid_unknown_fields=True):
     version: Annotated[str, Meta(max_length=200)]
 
 
-class Configuration(Tab):
+class Configuration(FollowedTab):
     """Shows the configuration file, and reloads it. It never changes the file."""
 
     name: ClassVar[str] = "configuration"
@@ -36,20 +36,6 @@ class Configuration(Tab):
     def __init__(self, page: Page) -> None:
         super().__init__(page)
         self._file = page.served.configuration
-        self._following: asyncio.Task[None] | None = None
-
-    @call("read", Nothing)
-    async def follow(self, _: Nothing) -> None:
-        """Send the file and its state now, and then whenever one changes, until ``leave``."""
-        await self.leave(_)
-        self._following = self.page.start(self._follow())
-
-    @call("read", Nothing)
-    async def leave(self, _: Nothing) -> None:
-        """Stop sending what ``follow`` started to send."""
-        if self._following is not None:
-            self._following.cancel()
-            self._following = None
 
     @call("read", Nothing)
     async def check(self, _: Nothing) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from starlette.concurrency import run_in_threadpool
 
 from shmio.config import Declaration
 from shmio.config.campaign import parse_campaign
-from shmio.endpoints.web.page import Nothing, Page, Tab, call, release
+from shmio.endpoints.web.page import FollowedTab, Nothing, Page, call, release
 from shmio.errors import CommandError, ConfigError
 from shmio.injection.condition import Memory
 from shmio.injection.language import Number
@@ -66,7 +66,7 @@ class Chosen(msgspec.Struct, forbid_unknown_fields=True):
     """The number as text, because JavaScript has no exact numbers above 2**53."""
 
 
-class Injections(Tab):
+class Injections(FollowedTab):
     """Shows, starts and lifts injections, and shows the events of all sources."""
 
     name: ClassVar[str] = "injections"
@@ -74,7 +74,6 @@ class Injections(Tab):
     def __init__(self, page: Page) -> None:
         super().__init__(page)
         self._campaigns: list[Campaign] = []
-        self._following: asyncio.Task[None] | None = None
 
     def close(self) -> None:
         """Lift the campaigns of this page, except those with ``keep``."""
@@ -82,19 +81,6 @@ class Injections(Tab):
         if campaigns:
             named = {", ".join(f"{one.source}: {one.name}" for one in held.declared): held for held in campaigns}
             asyncio.get_running_loop().run_in_executor(None, release, named, self.page.user)
-
-    @call("read", Nothing)
-    async def follow(self, _: Nothing) -> None:
-        """Send injections and events now, and then whenever they change, until ``leave``."""
-        await self.leave(_)
-        self._following = self.page.start(self._follow())
-
-    @call("read", Nothing)
-    async def leave(self, _: Nothing) -> None:
-        """Stop sending what ``follow`` started to send."""
-        if self._following is not None:
-            self._following.cancel()
-            self._following = None
 
     @call("inject", Chosen)
     async def lift(self, given: Chosen) -> None:
