@@ -16,7 +16,7 @@ from tests.unit.judging.traces import LAYOUT, NAMES, PERIOD_NS, STALE_NS, frames
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
-    import rtamt
+    rtamt = pytest.importorskip("rtamt", reason="there is no rtamt for this Python")
 
 SAMPLES = 60
 
