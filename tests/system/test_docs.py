@@ -15,8 +15,6 @@ from tests.system.page import printed
 
 ROOT = Path(__file__).parents[2]
 BLOCK = re.compile(r"^```sh( background)?\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)")
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def blocks(page: Path) -> Iterator[tuple[bool, str]]:
@@ -47,15 +45,3 @@ def test_the_readme_runs_as_shown() -> None:
             cell.communicate(timeout=30)
     assert cell.returncode == 0
     assert "a50" not in instances()
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_have_existing_targets(page: Path) -> None:
-    for target in LINK.findall(page.read_text()):
-        assert (page.parent / target).exists(), f"{page}: {target}"
-
-
-def test_every_page_is_in_the_index() -> None:
-    index = (ROOT / "docs/index.md").read_text() + (ROOT / "docs/decisions/README.md").read_text()
-    for page in (ROOT / "docs").rglob("*.md"):
-        assert page.name in index or page.name in ("index.md", "README.md"), f"{page} is in no index"
