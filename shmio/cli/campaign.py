@@ -55,7 +55,7 @@ def _parser() -> argparse.ArgumentParser:
     _reports(judge)
     add_json(judge)
 
-    live = verb("run", "run a campaign on an instance, and judge it")
+    live = verb("run", "run a campaign on an instance or in this process, and judge it")
     live.add_argument("campaign", type=Path, metavar="CAMPAIGN.toml")
     where = live.add_mutually_exclusive_group()
     where.add_argument(
@@ -63,13 +63,17 @@ def _parser() -> argparse.ArgumentParser:
     )
     where.add_argument("--instance", metavar="NAME", help="a running instance (default: the only one)")
     live.add_argument(
+        "--lab", action="store_true", help="run in this process, without an instance: if all sources are computed"
+    )
+    _settings(live)
+    live.add_argument(
         "--for", dest="for_s", type=seconds, metavar="S", help="duration (default: duration_s of the file)"
     )
     live.add_argument(
         "--step-ms",
         type=milliseconds,
         metavar="N",
-        help="length of a step (default: the shortest period)",
+        help="length of a step (default: step_ms of the file, or the shortest period)",
     )
     live.add_argument("--real-time", action="store_true", help="run in real time, even if all sources could be stepped")
     live.add_argument(
@@ -80,6 +84,17 @@ def _parser() -> argparse.ArgumentParser:
     _reports(live)
     add_json(live)
     return parser
+
+
+def _settings(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument(
+        "--set",
+        dest="settings",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="a value for a range of the campaign, such as late.start_s=3",
+    )
 
 
 def _reports(verb: argparse.ArgumentParser) -> None:

@@ -1,37 +1,163 @@
-"""Reads campaign files, which declare injections and what is expected of signals."""
+"""Reads campaign files: injections, parameters of models, and what is expected of signals."""
 
 from __future__ import annotations
 
+import json
+import random
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
+import msgspec
 from msgspec import Meta, field
 
 from shmio.config.declaration import check_declarations
 from shmio.config.expectation import expectation_faults
 from shmio.config.faults import named
-from shmio.config.model import Declaration, Expectation, Section
+from shmio.config.model import Declaration, Expectation, Milliseconds, Section, Text
+from shmio.config.ranges import Choice, Point, Space, key_of
 from shmio.config.read import check_text, convert, read_tables
 from shmio.errors import ConfigError
 
+SAMPLES: Final = 20
+"""Number of random points at which a campaign with ranges is checked, besides the corners and the middle."""
+_BARE: Final = re.compile(r"[A-Za-z0-9_-]+")
 
-class Campaign(Section):
-    """The contents of a campaign file."""
 
+class Campaign(Section, omit_defaults=True):
+    """The contents of a campaign file.
+
+    Attributes:
+        config: The ``supervisor.toml`` of the instance, relative to the campaign file.
+        duration_s: Duration on the instance's clock.
+        step_ms: Length of a step of virtual time.
+        parameters: Parameters of models, by source and name. Only laboratories can set them.
+        injection: The injections.
+        expect: The expectations.
+
+    """
+
+    config: Text | None = None
     duration_s: Annotated[float, Meta(gt=0, le=1e6)] | None = None
+    step_ms: Milliseconds | None = None
+    parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
     injection: list[Declaration] = field(default_factory=list)
     expect: list[Expectation] = field(default_factory=list)
 
 
-def load_campaign(file: Path) -> Campaign:
+class CampaignFile:
+    """A campaign file that may have ranges: a campaign for each point of its space."""
+
+    def __init__(self, file: Path) -> None:
+        """Read a file with expectations.
+
+        Raises:
+            ConfigError: The file is invalid, or has no expectation; the message names the file, the
+                key and the remedy.
+
+        """
+        self.file = file
+        self.tables = tables = read_tables(file)
+        try:
+            _check_brackets(tables)
+            check_text(tables, "")
+            self.space = Space(tables)
+            self._check()
+        except ConfigError as error:
+            raise ConfigError(f"{file}: {named(str(error), tables)}") from None
+
+    def at(self, point: Point) -> Campaign:
+        """Return the campaign at a point.
+
+        Args:
+            point: A value for each dimension.
+
+        Raises:
+            ConfigError: A name is unknown, a range has no value yet, or the values contradict each
+                other. The message names the file, the key and the remedy.
+
+        """
+        try:
+            self.space.check_names(point)
+            for one in self.space.dimensions:
+                if one.name not in point:
+                    raise ConfigError(
+                        f"{key_of(one.place)}: this is a range, which only shmio-campaign falsify searches; "
+                        f"or choose a value with shmio-campaign run --set {one.name}=VALUE"
+                    )
+            return _parse(self.space.at(point), "expect")
+        except ConfigError as error:
+            raise ConfigError(f"{self.file}: {named(str(error), self.tables)}") from None
+
+    @property
+    def expect(self) -> list[Expectation]:
+        """The expectations, which have no ranges."""
+        return _parse({"expect": self.tables["expect"]}, "expect").expect
+
+    def _check(self) -> None:
+        """Check each end of each range alone, and the whole at some points.
+
+        Raises:
+            ConfigError: A value of a range is invalid, or no point is valid.
+
+        """
+        space, first = self.space, self.space.shares(0)
+        for one in space.dimensions:
+            for value in one.options if isinstance(one, Choice) else (one.low, one.high):
+                if one.place[0] == "injection":
+                    convert({"injection": space.at({**first, one.name: value})["injection"]}, Campaign)
+        draw = random.Random(0)  # noqa: S311  not for a secret
+        points = [space.shares(0.5), first, space.shares(1)]
+        points += [{one.name: one.at(draw.random()) for one in space.dimensions} for _ in range(SAMPLES)]
+        problem: ConfigError | None = None
+        for point in points if space.dimensions else points[:1]:
+            try:
+                _parse(space.at(point), "expect")
+            except ConfigError as error:
+                problem = problem or error
+            else:
+                return
+        if problem is not None:
+            raise problem
+
+
+def load_campaign(file: Path, settings: Sequence[str] = ()) -> Campaign:
     """Read a campaign file with expectations.
 
+    Args:
+        file: The file.
+        settings: Values for ranges, as ``NAME=VALUE`` in TOML.
+
     Raises:
-        ConfigError: The file is invalid, or has no expectation; the message names the file, the key
-            and the remedy.
+        ConfigError: The file is invalid, has no expectation, or has a range without a value; the
+            message names the file, the key and the remedy.
 
     """
-    return _read(file, "expect")
+    return CampaignFile(file).at(read_settings(settings))
+
+
+def read_settings(settings: Sequence[str]) -> dict[str, Any]:
+    """Return the point that texts such as ``late.start_s=3`` describe.
+
+    Raises:
+        ConfigError: A text has no ``=``, or its value is not TOML.
+
+    """
+    point: dict[str, Any] = {}
+    for text in settings:
+        name, equals, value = text.partition("=")
+        if not equals or not name:
+            raise ConfigError(f"--set {text}: expected NAME=VALUE, such as late.start_s=3")
+        try:
+            tables = tomllib.loads(f"value = {value}")
+        except ValueError:
+            tables = {}
+        if set(tables) != {"value"}:
+            raise ConfigError(f"--set {text}: {value!r} is not a TOML value; write text in double quotes")
+        point[name] = tables["value"]
+    return point
 
 
 def read_campaign(file: Path) -> list[Declaration]:
@@ -41,7 +167,17 @@ def read_campaign(file: Path) -> list[Declaration]:
         ConfigError: The file is invalid; the message names the file, the key and the remedy.
 
     """
-    return _read(file, "injection").injection
+    tables = read_tables(file)
+    try:
+        found = _parse(tables, "injection")
+        if found.parameters:
+            raise ConfigError(
+                "parameters: a running instance cannot change the parameters of its models; "
+                "use shmio-campaign run --lab"
+            )
+    except ConfigError as error:
+        raise ConfigError(f"{file}: {named(str(error), tables)}") from None
+    return found.injection
 
 
 def parse_campaign(tables: dict[str, Any]) -> list[Declaration]:
@@ -54,19 +190,59 @@ def parse_campaign(tables: dict[str, Any]) -> list[Declaration]:
     return _parse(tables, "injection").injection
 
 
-def _read(file: Path, needed: str) -> Campaign:
-    tables = read_tables(file)
-    try:
-        return _parse(tables, needed)
-    except ConfigError as error:
-        raise ConfigError(f"{file}: {named(str(error), tables)}") from None
+def campaign_text(campaign: Mapping[str, Any], comment: Sequence[str] = ()) -> str:
+    """Return the tables of a campaign as TOML.
+
+    Args:
+        campaign: The tables, as of :func:`msgspec.to_builtins`.
+        comment: Lines for a comment at the top.
+
+    """
+    parts = ["".join(f"# {line}\n" if line else "#\n" for line in comment)]
+    parts.append("".join(_line(key, value) for key, value in campaign.items() if not isinstance(value, list | dict)))
+    parts += [
+        f"[parameters.{_key(source)}]\n" + "".join(_line(key, value) for key, value in table.items())
+        for source, table in campaign.get("parameters", {}).items()
+    ]
+    for name in ("injection", "expect"):
+        parts += [
+            f"[[{name}]]\n" + "".join(_line(key, value) for key, value in table.items())
+            for table in campaign.get(name, [])
+        ]
+    return "\n".join(part for part in parts if part)
 
 
-def _parse(tables: dict[str, Any], needed: str) -> Campaign:
+def _line(key: str, value: Any) -> str:
+    """Return a key with its value.
+
+    Numbers, lists and texts without control characters look as in JSON.
+    """
+    return f"{_key(key)} = {json.dumps(value, ensure_ascii=False)}\n"
+
+
+def _key(text: str) -> str:
+    return text if _BARE.fullmatch(text) else json.dumps(text, ensure_ascii=False)
+
+
+def tables_of(campaign: Campaign) -> dict[str, Any]:
+    """Return a campaign as the tables of its file."""
+    tables: dict[str, Any] = msgspec.to_builtins(campaign)
+    return tables
+
+
+def _check_brackets(tables: Mapping[str, Any]) -> None:
     for key in ("injection", "expect"):
         if isinstance(tables.get(key), dict):
             raise ConfigError(f"{key}: write [[{key}]] with double brackets, because there can be several")
+
+
+def _parse(tables: dict[str, Any], needed: str) -> Campaign:
+    _check_brackets(tables)
     check_text(tables, "")
+    for one in Space(tables).dimensions:
+        raise ConfigError(
+            f"{key_of(one.place)}: this is a range, which only shmio-campaign falsify searches; write a value"
+        )
     campaign = convert(tables, Campaign)
     if needed not in tables:
         raise ConfigError(f"{needed}: this key is needed")

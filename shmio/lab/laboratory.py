@@ -155,18 +155,26 @@ class Laboratory:
         segment = segment or self.open()
         return Attachment(segment, _LabCoordinator(self, segment))
 
-    def run(
-        self,
-        plan: RunPlan,
-        over: threading.Event | None = None,
-        seen: Callable[[Mapping[str, Rows]], None] = lambda _rows: None,
-    ) -> LiveRun:
+    def prepare(self, plan: RunPlan, seen: Callable[[Mapping[str, Rows]], None] = lambda _rows: None) -> LiveRun:
+        """Return a run of a campaign, which has not begun.
+
+        Args:
+            plan: What to do.
+            seen: Called with the new values of the signals, by source, in order of time.
+
+        Raises:
+            ConfigError: An expectation is invalid.
+
+        """
+        attachments: AttachedFiles = ConfigFiles(self.plan.config_file)
+        return LiveRun(self.open(), plan, attachments, seen, self.attach)
+
+    def run(self, plan: RunPlan, over: threading.Event | None = None) -> LiveRun:
         """Run a campaign, judge it and record it, as ``shmio-campaign run`` does on an instance.
 
         Args:
             plan: What to do.
             over: Ends the run when it is set.
-            seen: Called with the new values of the signals, by source, in order of time.
 
         Returns:
             The run, with its verdicts.
@@ -177,8 +185,7 @@ class Laboratory:
             RecordingError: The file of the recording cannot be created.
 
         """
-        attachments: AttachedFiles = ConfigFiles(self.plan.config_file)
-        work = LiveRun(self.open(), plan, attachments, seen, self.attach)
+        work = self.prepare(plan)
         work.run(over or threading.Event())
         return work
 

@@ -9,7 +9,7 @@ from shmio.campaigns.digests import of_campaign, of_file, of_layouts
 from shmio.cli.campaigns.reports import Reports
 from shmio.cli.campaigns.verdicts import tell
 from shmio.cli.recordings.common import DamageReport, time_range
-from shmio.config.campaign import load_campaign
+from shmio.config.campaign import CampaignFile
 from shmio.errors import ConfigError
 from shmio.recording.injection_times import InjectionTimes
 from shmio.recording.judge import GoldenRecordings, judge_recording, recording_judge
@@ -23,13 +23,13 @@ def judge(arguments: argparse.Namespace) -> int:
         RecordingError: A file is not a recording.
 
     """
-    campaign = load_campaign(arguments.campaign)
+    expectations = CampaignFile(arguments.campaign).expect  # its injections are not laid, so they may have ranges
     report = DamageReport()
     with report.open(arguments.files) as dump:
         begin, end = time_range(arguments, dump.begin_ns)
         reports = Reports(arguments)
         try:
-            found = recording_judge(dump, campaign.expect, GoldenRecordings(arguments.campaign.parent))
+            found = recording_judge(dump, expectations, GoldenRecordings(arguments.campaign.parent))
             judge_recording(dump, found, begin, end, reports.collector(lambda: found))
         except ConfigError as error:
             raise ConfigError(f"{arguments.campaign}: {error}") from None
@@ -37,7 +37,7 @@ def judge(arguments: argparse.Namespace) -> int:
         for _, block, event in dump.events(None, begin, end):
             if block is not None:
                 times.follow(block.source, event)
-        facts = [*of_campaign(arguments.campaign, campaign.expect)]
+        facts = [*of_campaign(arguments.campaign, expectations)]
         facts += [("recording", f"{file}, sha256 {of_file(file)}") for file in arguments.files]
         facts += of_layouts({block.source: block.layout for block in dump.blocks})
     words = ["shmio-campaign", "judge", *map(str, arguments.files), "-f", str(arguments.campaign)]

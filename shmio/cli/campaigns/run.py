@@ -1,4 +1,4 @@
-"""``shmio-campaign run``: runs a campaign on an instance, and judges what it expects."""
+"""``shmio-campaign run``: runs a campaign on an instance or in a laboratory, and judges what it expects."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ import argparse
 import secrets
 import shlex
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from shmio import control
 from shmio.campaigns.digests import of_campaign, of_configuration, of_layouts
@@ -24,7 +25,10 @@ from shmio.config.campaign import Campaign, load_campaign
 from shmio.config.declaration import with_seed
 from shmio.errors import ConfigError, ControlError, DeclarationError
 from shmio.judging.expectation import check_texts
+from shmio.lab import Laboratory, prepare_laboratory
 from shmio.recorder.recorder import AttachedFiles, ConfigFiles, no_attachments
+from shmio.recording.digest import digest_of_contents
+from shmio.recording.dump import open_dump
 from shmio.segment import Segment, running_instances
 
 SEED_BITS: Final = 32
@@ -40,12 +44,10 @@ def run(arguments: argparse.Namespace) -> int:
         ShmioError: The instance does not start, does not run, or cannot be controlled.
 
     """
-    campaign = load_campaign(arguments.campaign)
-    duration_s = arguments.for_s or campaign.duration_s
-    if duration_s is None:
-        raise ConfigError(
-            f"{arguments.campaign}: duration_s: this key is needed, or --for S: how long the campaign runs"
-        )
+    campaign = load_campaign(arguments.campaign, arguments.settings)
+    if arguments.config is None and arguments.instance is None:
+        arguments.config = configuration_of(arguments.campaign, campaign)
+    duration_s = duration_of(arguments, campaign)
     try:  # before an instance is started
         check_texts(campaign.expect)
     except ConfigError as error:
@@ -53,36 +55,36 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.record is not None and arguments.record.exists():
         raise ConfigError(f"--record {arguments.record}: the file exists already; no recording is overwritten")
     seed = secrets.randbits(SEED_BITS) if arguments.seed is None else arguments.seed
+    step_ms = arguments.step_ms or (None if arguments.real_time else campaign.step_ms)
     plan = Plan(
         [with_seed(one, seed) for one in campaign.injection],
         campaign.expect,
         duration_s,
         arguments.campaign.parent,
-        None if arguments.step_ms is None else arguments.step_ms / 1000,
+        None if step_ms is None else step_ms / 1000,
         arguments.real_time,
         arguments.stop,
         arguments.record,
     )
-    with stop_on_signals() as over, _instance(arguments) as wanted:
-        segment = wanted.open(writable=True)
-        reports = Reports(arguments)
-        with segment:
-            file = _configuration(segment)
-            attachments: AttachedFiles = no_attachments if file is None else ConfigFiles(file)
-            facts = [*of_campaign(arguments.campaign, campaign.expect), ("seed", str(seed))]
-            facts += [] if file is None else of_configuration(file)
-            facts += of_layouts({source: block.layout for source, block in segment.blocks.items()})
-            try:
-                work = LiveRun(segment, plan, attachments, reports.collector(lambda: work.judge))
-                work.run(over, lambda: _told(arguments, campaign, seed, wanted.name, work))
-            except (ConfigError, DeclarationError) as error:
-                raise ConfigError(f"{arguments.campaign}: {error}") from None
+    reports = Reports(arguments)
+    facts = [*of_campaign(arguments.campaign, campaign.expect), ("seed", str(seed))]
+    with stop_on_signals() as over:
+        try:
+            execute = _in_laboratory if arguments.lab else _on_instance
+            name, work = execute(arguments, campaign, plan, reports, facts, over)
+        except (ConfigError, DeclarationError) as error:
+            raise ConfigError(f"{arguments.campaign}: {error}") from None
     how = f"virtual, steps of {work.step_s * 1000:g} ms" if work.virtual else "real"
-    facts += [("instance", wanted.name), ("time", how), ("duration", f"{duration_s:g} s")]
+    facts += [("instance", name), ("time", how), ("duration", f"{duration_s:g} s")]
     command = _command(arguments, seed, duration_s, work)
     reports.write(work.judge, f"Campaign {arguments.campaign.name}", facts, command, work.injections.spans)
-    found = {"instance": wanted.name, "seed": seed, "virtual": work.virtual, "command": command}
+    found: dict[str, Any] = {"instance": name, "seed": seed, "virtual": work.virtual, "command": command}
+    if arguments.record is not None and work.virtual:
+        with open_dump(arguments.record) as dump:
+            found["contents_sha256"] = digest_of_contents(dump)
     status = tell(work.judge, found, as_json=arguments.json)
+    if "contents_sha256" in found and not arguments.json:
+        say(f"{arguments.record}: contents sha256 {found['contents_sha256']}", sys.stderr)
     if work.problem is not None:
         say(f"the run ended early: {work.problem}", sys.stderr)
         return status or UNDECIDED
@@ -90,6 +92,75 @@ def run(arguments: argparse.Namespace) -> int:
         say("the run ended early, by a signal", sys.stderr)
         return status or UNDECIDED
     return status
+
+
+def configuration_of(file: Path, campaign: Campaign) -> Path | None:
+    """Return the configuration that a campaign names; None if it names none."""
+    return None if campaign.config is None else file.parent / campaign.config
+
+
+def duration_of(arguments: argparse.Namespace, campaign: Campaign) -> float:
+    """Return how long a campaign runs, in s.
+
+    Raises:
+        ConfigError: Neither the file nor the command line says it.
+
+    """
+    duration_s: float | None = arguments.for_s or campaign.duration_s
+    if duration_s is None:
+        raise ConfigError(
+            f"{arguments.campaign}: duration_s: this key is needed, or --for S: how long the campaign runs"
+        )
+    return duration_s
+
+
+def _in_laboratory(
+    arguments: argparse.Namespace,
+    campaign: Campaign,
+    plan: Plan,
+    reports: Reports,
+    facts: list[tuple[str, str]],
+    over: threading.Event,
+) -> tuple[str, LiveRun]:
+    """Run the campaign in this process, without an instance. Return the instance's name and the run."""
+    file: Path | None = arguments.config
+    if file is None:
+        raise ConfigError("--lab: name the configuration with -c FILE, or with the key config of the campaign")
+    if arguments.real_time:
+        raise ConfigError("--real-time: the time of a laboratory is always virtual")
+    prepared = prepare_laboratory(file)
+    with Laboratory(prepared, campaign.parameters) as lab:
+        work = lab.prepare(plan, reports.collector(lambda: work.judge))
+        facts += of_configuration(file)
+        facts += of_layouts({block.source: block.layout for block in prepared.blocks})
+        work.run(over, lambda: _told(arguments, campaign, plan, "laboratory", work))
+    return prepared.instance, work
+
+
+def _on_instance(
+    arguments: argparse.Namespace,
+    campaign: Campaign,
+    plan: Plan,
+    reports: Reports,
+    facts: list[tuple[str, str]],
+    over: threading.Event,
+) -> tuple[str, LiveRun]:
+    """Run the campaign on an instance. Return the instance's name and the run."""
+    if campaign.parameters:
+        raise ConfigError(
+            "parameters: an instance cannot change the parameters of its models; use --lab, "
+            "or set them in supervisor.toml"
+        )
+    with _instance(arguments) as wanted:
+        segment = wanted.open(writable=True)
+        with segment:
+            file = _configuration(segment)
+            attachments: AttachedFiles = no_attachments if file is None else ConfigFiles(file)
+            facts += [] if file is None else of_configuration(file)
+            facts += of_layouts({source: block.layout for source, block in segment.blocks.items()})
+            work = LiveRun(segment, plan, attachments, reports.collector(lambda: work.judge))
+            work.run(over, lambda: _told(arguments, campaign, plan, wanted.name, work))
+    return wanted.name, work
 
 
 @contextmanager
@@ -120,12 +191,15 @@ def _configuration(segment: Segment) -> Path | None:
         return None
 
 
-def _told(arguments: argparse.Namespace, campaign: Campaign, seed: int, instance: str, work: LiveRun) -> None:
+def _told(arguments: argparse.Namespace, campaign: Campaign, plan: Plan, instance: str, work: LiveRun) -> None:
     if arguments.json:
         return
     how = f"virtual time, steps of {work.step_s * 1000:g} ms" if work.virtual else "real time"
     say(f"{instance}: {len(campaign.injection)} injections, {len(campaign.expect)} expectations, {how}", sys.stderr)
-    if any(one.seed is None for one in campaign.injection):
+    seed = next(
+        (laid.seed for laid, one in zip(plan.injections, campaign.injection, strict=True) if one.seed is None), None
+    )
+    if seed is not None:
         say(f"seed {seed}: --seed {seed} does the same again", sys.stderr)
 
 
@@ -134,6 +208,8 @@ def _command(arguments: argparse.Namespace, seed: int, duration_s: float, work: 
     words = ["shmio-campaign", "run", str(arguments.campaign), "--seed", str(seed), "--for", f"{duration_s:.12g}"]
     if work.virtual:
         words += ["--step-ms", f"{work.step_s * 1000:.12g}"]
+    words += [word for text in arguments.settings for word in ("--set", text)]
+    words += ["--lab"] if arguments.lab else []
     words += ["--real-time"] if arguments.real_time else []
     words += ["--stop"] if arguments.stop else []
     if arguments.config is not None:

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
-from typing import Any
-
-import msgspec
 
 from shmio.cli.common import say
 from shmio.cli.recordings.common import DamageReport
+from shmio.config.campaign import Campaign, campaign_text, tables_of
 from shmio.config.declaration import check_declarations
 from shmio.errors import ConfigError, RecordingError
 from shmio.logs import printable
@@ -32,20 +29,7 @@ def campaign(arguments: argparse.Namespace) -> int:
         check_declarations(declarations)
     except ConfigError as error:
         raise RecordingError(f"{dump.files[0]}: its injections cannot form a campaign: {error}") from None
-    tables = [_table(msgspec.to_builtins(one)) for one in declarations]
     with new_file(arguments.output) as stream:
-        stream.write("\n".join(tables).encode())
-    say(f"{arguments.output}: {len(tables)} injections; shmio inject --file {arguments.output} creates them")
+        stream.write(campaign_text(tables_of(Campaign(injection=list(declarations)))).encode())
+    say(f"{arguments.output}: {len(declarations)} injections; shmio inject --file {arguments.output} creates them")
     return int(report.any)
-
-
-def _table(keys: dict[str, Any]) -> str:
-    return "".join(["[[injection]]\n", *(f"{key} = {_text(value)}\n" for key, value in keys.items())])
-
-
-def _text(value: Any) -> str:
-    """Return a value as TOML.
-
-    Numbers, lists and texts without control characters look as in JSON.
-    """
-    return json.dumps(value, ensure_ascii=False)
