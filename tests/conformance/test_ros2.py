@@ -55,29 +55,44 @@ class NodeFaults:
     def thaw(self) -> None:
         self._peer.thaw()
 
+    def cut(self, *, reset: bool) -> None:  # noqa: ARG002  a node has only one way to leave
+        self.refuse()
+
+    def pass_all(self) -> None:
+        self.thaw()
+        self.admit()
+
 
 class Ros2Rig:
     """The node that the suites read and write."""
 
     proxy: Any
 
-    def __init__(self, peer: Peer) -> None:
+    def __init__(self, peer: Peer, *, changed: bool = False) -> None:
         self.peer = peer
         self.proxy = NodeFaults(peer)
         counted = peer.address("counted", "std_msgs/Float64MultiArray data")
-        tags: dict[str, object] = {
-            "counted": {"type": f"ARRAY[1..{COUNTS}] OF LREAL", "address": counted},
-        }
-        for at in range(SPARE):
+        tags: dict[str, object] = {}
+        if changed:
+            tags["added"] = {"type": "STRING[20]", "address": peer.address("mode", "std_msgs/String data")}
+        tags["counted"] = {"type": f"ARRAY[1..{COUNTS}] OF LREAL", "address": counted}
+        self._at = len(tags) - 1
+        for at in range(0 if changed else SPARE):
             address = peer.address("spare", f"std_msgs/Int16MultiArray data[{at}]")
             tags[f"spare/{at}"] = {"type": "BYTE", "address": address, "writable": True}
-        tags["fixed"] = {"type": "INT", "address": "/nobody std_msgs/Int16 data", "writable": True}
+        if not changed:
+            tags["fixed"] = {"type": "INT", "address": "/nobody std_msgs/Int16 data", "writable": True}
         self.layout: Layout = place_tags("device", tags).with_statuses()
         self.area = StatusArea(self.layout)
         by_path = {register.path: register for register in self.layout.registers}
         self._counted = codec(by_path["counted"], "little")
+        if changed:
+            return
         self.spare = self.flags = by_path["spare/0"].offset
         self.refused = Write(by_path["fixed"].offset, 0, b"\1\0")
+
+    def changed(self) -> Ros2Rig:
+        return Ros2Rig(self.peer, changed=True)
 
     def connector(self) -> Connector:
         return Ros2Connector(Ros2Options(domain=self.peer.domain, timeout=500, max_age=100), self.layout)
@@ -91,7 +106,7 @@ class Ros2Rig:
 
     def counted(self, frame: Frame) -> bool:
         """Return whether the counted register of a frame is good."""
-        return self.area.get(frame.raw, 0).code == 0
+        return self.area.get(frame.raw, self._at).code == 0
 
 
 @pytest.fixture(scope="module")
@@ -159,6 +174,22 @@ class TestRos2(WriteConformance):
         assert rig.area.get(frame.raw, 0).code == BAD_TIMEOUT
         rig.proxy.thaw()
         run.until(rig.counted)
+
+    def test_a_reload_that_adds_and_removes_registers_without_reconnecting(  # type: ignore[override]
+        self, others: Iterator[Ros2Rig], run: Run, rig: Ros2Rig
+    ) -> None:
+        """Such reloads keep the participant: the node discovers no other one."""
+        last = rig.generation(run.until(rig.counted).raw)
+        present = rig.peer.ask("participants")
+        for _ in range(4):
+            run.reload(other := next(others))
+            frame = run.good()
+            assert len(run.frames) == 1, "the participant has left"
+            assert other.counted(frame)
+            assert other.generation(frame.raw) >= last
+            last = other.generation(run.newer(last).raw)
+        assert run.loop.counters.connects == 1
+        assert rig.peer.ask("participants") == present
 
     @pytest.mark.parametrize("garbage", [b"\0" * 64, b"\xff" * 64, b"RTPS\2\1\1\x10" + random.Random(1).randbytes(200)])
     def test_garbage(self, run: Run, rig: Ros2Rig, garbage: bytes) -> None:  # type: ignore[override]

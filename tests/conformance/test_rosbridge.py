@@ -21,10 +21,13 @@ COUNTS = 20
 ARRAY = {"layout": {"dim": [], "data_offset": 0}}
 
 
-def layout() -> Layout:
-    tags: dict[str, object] = {
-        "counted": {"type": f"ARRAY[1..{COUNTS}] OF LREAL", "address": "/counted std_msgs/Float64MultiArray data"}
-    }
+def layout(*, changed: bool = False) -> Layout:
+    tags: dict[str, object] = {"added": {"type": "INT", "address": "/added std_msgs/Int16 data"}} if changed else {}
+    tags["counted"] = {
+        "type": f"ARRAY[1..{COUNTS}] OF LREAL", "address": "/counted std_msgs/Float64MultiArray data"
+    }  # fmt: skip
+    if changed:
+        return place_tags("device", tags).with_statuses()
     tags |= {
         f"spare/{at}": {"type": "BYTE", "address": f"/spare std_msgs/Int16MultiArray data[{at}]", "writable": True}
         for at in range(SPARE)
@@ -36,13 +39,18 @@ def layout() -> Layout:
 class RosbridgeRig:
     """The server behind a proxy."""
 
-    def __init__(self, proxy: FaultProxy) -> None:
+    def __init__(self, proxy: FaultProxy, *, changed: bool = False) -> None:
         self.proxy = proxy
-        self.layout = layout()
+        self.layout = layout(changed=changed)
         by_path = {register.path: register for register in self.layout.registers}
         self._counted = codec(by_path["counted"], "little")
+        if changed:
+            return
         self.spare = self.flags = by_path["spare/0"].offset
         self.refused = Write(by_path["fixed"].offset, 0, b"\1\0")
+
+    def changed(self) -> RosbridgeRig:
+        return RosbridgeRig(self.proxy, changed=True)
 
     def connector(self) -> Connector:
         return RosbridgeConnector(RosbridgeOptions(url=f"ws://{self.proxy.address}", timeout=200), self.layout)
@@ -59,6 +67,7 @@ class RosbridgeRig:
 def bridge() -> Iterator[Bridge]:
     with Bridge() as bridge:
         bridge.ask("publish", "/fixed", {"data": 7})
+        bridge.ask("publish", "/added", {"data": 9})
         bridge.ask("refuse", "/fixed", "it is fixed")
         bridge.ask("count", "/counted", COUNTS, 4)
         yield bridge

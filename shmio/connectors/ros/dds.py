@@ -13,7 +13,7 @@ import msgspec
 from shmio.connectors.base import Connector, Lost, UnconfirmedError, WriteLostError
 from shmio.connectors.request_count import CycleRequests, counted
 from shmio.connectors.ros.commands import Publication, Sending, plan, stamped
-from shmio.connectors.ros.options import TopicOptions
+from shmio.connectors.ros.options import REGISTER_OPTIONS, TopicOptions
 from shmio.connectors.ros.topics import Topics
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.model import Layout
@@ -63,6 +63,7 @@ class Ros2Connector(Connector):
     Options = Ros2Options
     can_write = True
     register_quality = True
+    register_options = REGISTER_OPTIONS | {"reliability"}
 
     def __init__(self, options: Ros2Options, layout: Layout) -> None:
         if importlib.util.find_spec("cyclonedds") is None:
@@ -112,6 +113,30 @@ class Ros2Connector(Connector):
             options.domain, configured, self._topics.by_name.values(), timeout_s,
             reliable=options.reliability == "reliable", loopback=options.interface == "lo",
         )  # fmt: skip
+        self._meet(joined, end_s)
+
+    def take_over(self, other: Ros2Connector) -> bool:
+        """Take over the participant, and the last messages of the topics that both connectors have."""
+        joined = other._participant
+        if joined is None:
+            return False
+        self._participant, other._participant = joined, None
+        end_s = time.monotonic() + self._options.timeout / 1000
+        other._pull(joined)
+        self._topics.inherit(other._topics)
+        self._incompatible = other._incompatible & self._topics.by_name.keys()
+        joined.change(self._topics.by_name.values(), reliable=self._options.reliability == "reliable")
+        self._meet(joined, end_s)
+        return True
+
+    def _meet(self, joined: Participant, end_s: float) -> None:
+        """Wait until another participant publishes or subscribes to one of the topics.
+
+        Raises:
+            ConnectorError: None does so by ``end_s``, a time of CLOCK_MONOTONIC.
+
+        """
+        options = self._options
         while not self._met(joined):
             if time.monotonic() > end_s:
                 self.close()

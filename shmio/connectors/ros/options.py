@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import msgspec
 
+REGISTER_OPTIONS: Final = frozenset({"max_age", "latched", "time"})
+"""The keys of both connectors that say how values are read, and not how to connect."""
 _Topic = Annotated[str, msgspec.Meta(min_length=2, max_length=256)]
 
 

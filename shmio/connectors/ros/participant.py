@@ -7,7 +7,7 @@ import os
 import socket
 import stat
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -83,19 +83,44 @@ class _Endpoint:
     """The reader of a topic, and the writer of a command topic."""
 
     def __init__(self, participant: Any, topic: Topic, *, reliable: bool, blocking_ns: int) -> None:
-        self.topic, self.kind = topic, plain(topic.type)
-        dds = DdsTopic(participant, dds_topic(topic.name), sample_type(self.kind))
-        durable = Policy.Durability.TransientLocal if topic.latched else Policy.Durability.Volatile
-        sure = Policy.Reliability.Reliable(blocking_ns)
-        self.reader = DataReader(participant, dds, qos=Qos(
-            sure if reliable or topic.latched else Policy.Reliability.BestEffort, durable,
+        self.kind = plain(topic.type)
+        self.qos = _qos_of(topic, reliable)
+        self._participant, self._blocking_ns = participant, blocking_ns
+        self._dds = DdsTopic(participant, dds_topic(topic.name), sample_type(self.kind))
+        self._durable = Policy.Durability.TransientLocal if topic.latched else Policy.Durability.Volatile
+        self._sure = Policy.Reliability.Reliable(blocking_ns)
+        self.reader = DataReader(participant, self._dds, qos=Qos(
+            self._sure if reliable or topic.latched else Policy.Reliability.BestEffort, self._durable,
             Policy.History.KeepLast(1), Policy.IgnoreLocal.Participant,
         ))  # fmt: skip
-        self.writer = None
-        if topic.writable:
-            self.writer = DataWriter(participant, dds, qos=Qos(
-                sure, durable, Policy.History.KeepLast(WRITER_DEPTH), Policy.IgnoreLocal.Participant,
+        self.writer: Any = None
+        self.set_writable(topic.writable)
+
+    def set_writable(self, writable: bool) -> None:
+        """Create the writer if the topic is writable and has none; delete it if the topic is not writable."""
+        if not writable:
+            _delete(self.writer)
+            self.writer = None
+        elif self.writer is None:
+            self.writer = DataWriter(self._participant, self._dds, qos=Qos(
+                self._sure, self._durable, Policy.History.KeepLast(WRITER_DEPTH), Policy.IgnoreLocal.Participant,
             ))  # fmt: skip
+
+    def close(self) -> None:
+        """Delete the reader, the writer and the topic at once."""
+        for entity in (self.writer, self.reader, self._dds):
+            _delete(entity)
+
+
+def _qos_of(topic: Topic, reliable: bool) -> tuple[str, bool, bool]:
+    """Return what a reader of a topic requests: the type of messages, whether stored ones, and whether reliably."""
+    return plain(topic.type), topic.latched, reliable
+
+
+def _delete(entity: Any) -> None:
+    """Delete an entity of the library, with the entities in it, at once."""
+    if entity is not None:
+        entity.__del__()
 
 
 class Participant:
@@ -119,6 +144,7 @@ class Participant:
 
         """
         self._endpoints: dict[str, _Endpoint] = {}
+        self._blocking_ns = round(timeout_s * 1e9)
         self._domain = self._participant = None
         try:
             before = set(_sockets())
@@ -126,10 +152,7 @@ class Participant:
             if loopback:
                 _keep_to_loopback(before)
             self._participant = DomainParticipant(domain)
-            for topic in topics:
-                self._endpoints[topic.name] = _Endpoint(
-                    self._participant, topic, reliable=reliable, blocking_ns=round(timeout_s * 1e9)
-                )
+            self._add(topics, reliable=reliable)
         except ConnectorError:
             self.close()
             raise
@@ -139,12 +162,38 @@ class Participant:
                 f"cannot join DDS domain {domain}: {error.msg or error}; does the interface exist, and is it up?"
             ) from None
 
+    def _add(self, topics: Iterable[Topic], *, reliable: bool) -> None:
+        for topic in topics:
+            if topic.name not in self._endpoints:
+                self._endpoints[topic.name] = _Endpoint(
+                    self._participant, topic, reliable=reliable, blocking_ns=self._blocking_ns
+                )
+
+    def change(self, topics: Collection[Topic], *, reliable: bool) -> None:
+        """Read and write these topics, and no others. Topics that stay the same keep their readers and writers.
+
+        Raises:
+            ConnectorError: The library reports an error.
+
+        """
+        wanted = {topic.name: topic for topic in topics}
+        try:
+            for name, endpoint in list(self._endpoints.items()):
+                topic = wanted.get(name)
+                if topic is not None and endpoint.qos == _qos_of(topic, reliable):
+                    endpoint.set_writable(topic.writable)
+                else:
+                    endpoint.close()
+                    del self._endpoints[name]
+            self._add(topics, reliable=reliable)
+        except DDSException as error:
+            raise ConnectorError(f"cannot change the topics that are read: {error.msg or error}") from None
+
     def close(self) -> None:
         """Leave the domain."""
         self._endpoints.clear()
         for entity in (self._participant, self._domain):
-            if entity is not None:
-                entity.__del__()  # deletes the entities in it, too, and at once
+            _delete(entity)
         self._participant = self._domain = None
 
     def publishers(self, topic: str) -> int:

@@ -16,8 +16,8 @@ from shmio.connectors.base import Connector, Lost, WriteLostError
 from shmio.connectors.request_count import CycleRequests, counted
 from shmio.connectors.ros.commands import Publication, Sending, plan, stamped
 from shmio.connectors.ros.messages import finite
-from shmio.connectors.ros.options import TopicOptions
-from shmio.connectors.ros.topics import Topics
+from shmio.connectors.ros.options import REGISTER_OPTIONS, TopicOptions
+from shmio.connectors.ros.topics import Topic, Topics
 from shmio.connectors.ros.websocket import Link, decode
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.model import Layout
@@ -70,6 +70,7 @@ class RosbridgeConnector(Connector):
     Options = RosbridgeOptions
     can_write = True
     register_quality = True
+    register_options = REGISTER_OPTIONS | {"throttle_ms"}
 
     def __init__(self, options: RosbridgeOptions, layout: Layout) -> None:
         if importlib.util.find_spec("websockets") is None:
@@ -108,17 +109,47 @@ class RosbridgeConnector(Connector):
         )
         try:
             for topic in self._topics.by_name.values():
-                link.send(
-                    op="subscribe", id=f"subscribe:{topic.name}", topic=topic.name, type=topic.type, queue_length=1,
-                    throttle_rate=options.throttle_ms,
-                )  # fmt: skip
+                self._subscribe(link, topic)
                 if topic.writable:
-                    link.send(op="advertise", id=f"advertise:{topic.name}", topic=topic.name, type=topic.type)
+                    _advertise(link, topic)
             link.wait_newest(time.monotonic() + min(FIRST_S, options.timeout / 1000))
             link.check()
         except ConnectorError:
             self.close()
             raise
+
+    def take_over(self, other: RosbridgeConnector) -> bool:
+        """Take over the connection, and the last messages of the topics that both connectors have."""
+        link = other._link
+        if link is None:
+            return False
+        self._link, other._link = link, None
+        link.check()
+        other._pull(link)
+        self._topics.inherit(other._topics)
+        link.keep(self._topics.by_name)
+        self._numbers = other._numbers
+        same_rate = self._options.throttle_ms == other._options.throttle_ms
+        before, after = other._topics.by_name, self._topics.by_name
+        for name, topic in before.items():
+            there = after.get(name)
+            if topic.writable and not (there and there.writable and there.type == topic.type):
+                link.send(op="unadvertise", id=f"advertise:{name}", topic=name)
+            if not (there and there.type == topic.type and same_rate):
+                link.send(op="unsubscribe", id=f"subscribe:{name}", topic=name)
+        for name, topic in after.items():
+            there = before.get(name)
+            if not (there and there.type == topic.type and same_rate):
+                self._subscribe(link, topic)
+            if topic.writable and not (there and there.writable and there.type == topic.type):
+                _advertise(link, topic)
+        return True
+
+    def _subscribe(self, link: Link, topic: Topic) -> None:
+        link.send(
+            op="subscribe", id=f"subscribe:{topic.name}", topic=topic.name, type=topic.type, queue_length=1,
+            throttle_rate=self._options.throttle_ms,
+        )  # fmt: skip
 
     def read(self) -> bytes:
         """Return the image of the newest messages, after checking that the server still answers.
@@ -198,3 +229,7 @@ class RosbridgeConnector(Connector):
         if "header" not in message or stamped(self._topics, publication.topic):
             return message
         return message | {"header": {name: one for name, one in message["header"].items() if name != "stamp"}}
+
+
+def _advertise(link: Link, topic: Topic) -> None:
+    link.send(op="advertise", id=f"advertise:{topic.name}", topic=topic.name, type=topic.type)

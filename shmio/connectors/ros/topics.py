@@ -52,6 +52,11 @@ class Topic:
         self.message, self.received_ns, self.utc_ns, self.fault = None, 0, 0, GOOD
         self.changed, self.shown = False, GOOD
 
+    def inherit(self, other: Topic) -> None:
+        """Take the last message from the same topic of an earlier layout."""
+        self.message, self.received_ns, self.utc_ns = other.message, other.received_ns, other.utc_ns
+        self.changed = bool(other.received_ns)
+
 
 class Topics:
     """All topics of a layout."""
@@ -114,6 +119,13 @@ class Topics:
         for topic in self.by_name.values():
             topic.reset()
             self._fail(topic, BAD_WAITING_FOR_INITIAL_DATA)
+
+    def inherit(self, other: Topics) -> None:
+        """Take the last messages of the topics that an earlier layout also has; the others wait for a value."""
+        self.reset()
+        for name, topic in self.by_name.items():
+            if (before := other.by_name.get(name)) is not None and plain(before.type) == plain(topic.type):
+                topic.inherit(before)
 
     def take(self, name: str, message: Any, received_ns: int, utc_ns: int) -> None:
         """Store the newest message of a topic; None stands for a message that cannot be read."""

@@ -136,6 +136,12 @@ class Link:
             found, self._newest = self._newest, {}
         return found
 
+    def keep(self, topics: Collection[str]) -> None:
+        """From now on, keep the messages of these topics, and of no others."""
+        with self._condition:
+            self._topics = topics
+            self._newest = {name: one for name, one in self._newest.items() if name in topics}
+
     def wait_newest(self, until_s: float) -> None:
         """Wait until each topic has a message, at most until ``until_s`` (CLOCK_MONOTONIC, in s)."""
         with self._condition:
@@ -255,10 +261,10 @@ class Link:
             self._take_status(envelope)
 
     def _take_message(self, envelope: _Envelope) -> None:
-        if envelope.topic not in self._topics:
-            return
         json = envelope.msg.copy()
         with self._condition:
+            if envelope.topic not in self._topics:
+                return
             self._newest[envelope.topic] = Received(json, self.heard_ns, time.time_ns())
             if self._expected is not None and self._expected[0] == envelope.topic:
                 message = decode(json)

@@ -9,6 +9,7 @@ import threading
 from dataclasses import dataclass
 from typing import Any
 
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsParticipant
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import float64, int16, int32, sequence, uint32
@@ -111,6 +112,11 @@ class Node:
         for entity in reversed(self.entities):
             entity.__del__()
         self.entities = []
+
+    def participants(self) -> list[str]:
+        """Return the keys of the participants in the domain."""
+        reader = BuiltinDataReader(self.entities[1], BuiltinTopicDcpsParticipant)
+        return sorted(str(one.key) for one in reader.take(100))
 
     def state(self, names: list[str], positions: list[float], sec: int = 0) -> None:
         self.states.write(JointState_(Header_(Time_(sec, 7), ""), names, [float(one) for one in positions], [], []))

@@ -38,7 +38,9 @@ function handle(socket, client, { op, id, topic, type, msg }) {
       client.subscribed.add(topic)
       if (found.last !== null) socket.send(JSON.stringify({ op: 'publish', topic, msg: found.last }))
     }
-  } else if (op === 'publish') {
+  } else if (op === 'unsubscribe') client.subscribed.delete(topic)
+  else if (op === 'unadvertise') client.advertised.delete(topic)
+  else if (op === 'publish') {
     if (!client.advertised.has(topic)) return status(socket, id, `${topic} was not advertised`)
     if (found.refused) return status(socket, id, found.refused)
     if (msg.header && !msg.header.stamp) msg.header.stamp = { sec: 1700000000, nanosec: 5 }
@@ -55,6 +57,7 @@ const commands = {
   history: topic => topicOf(topic).history,
   forget: topic => { topics.delete(topic) },
   clients: () => clients.size,
+  subscribed: () => [...clients.values()].flatMap(client => [...client.subscribed]),
   advertised: () => [...clients.values()].flatMap(client => [...client.advertised]),
   count: (topic, size, ms) => {
     let number = 0
