@@ -26,7 +26,11 @@ from tests.unit.connectors.mqtt.peer import Peer, framing, layout_of
 COUNTS = 20
 
 
-def layout() -> Layout:
+def layout(*, changed: bool = False) -> Layout:
+    if changed:
+        return layout_of(
+            {"added": ("INT", "plant/added"), "counted": (f"ARRAY[1..{COUNTS}] OF LREAL", "plant/counted $")}
+        )
     return layout_of(
         {
             "counted": {"type": f"ARRAY[1..{COUNTS}] OF LREAL", "address": "plant/counted $"},
@@ -43,14 +47,19 @@ def layout() -> Layout:
 class MqttRig:
     """The broker behind a proxy."""
 
-    def __init__(self, proxy: FaultProxy, version: Literal["auto", "5", "3.1.1"]) -> None:
+    def __init__(self, proxy: FaultProxy, version: Literal["auto", "5", "3.1.1"], *, changed: bool = False) -> None:
         self.proxy = proxy
-        self.layout = layout()
+        self.layout = layout(changed=changed)
         self._version = version
         by_path = {register.path: register for register in self.layout.registers}
         self._counted = codec(by_path["counted"], "little")
+        if changed:
+            return
         self.spare = self.flags = by_path["spare"].offset
         self.refused = Write(by_path["fixed"].offset, 0, b"\1\0")
+
+    def changed(self) -> MqttRig:
+        return MqttRig(self.proxy, self._version, changed=True)
 
     def connector(self) -> Connector:
         options = MqttOptions(url=f"mqtt://{self.proxy.address}", timeout=200, max_age_ms=0, version=self._version)
@@ -87,7 +96,7 @@ def mosquitto(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Addres
     if reason := missing():
         pytest.skip(reason)
     folder: Path = tmp_path_factory.mktemp("mosquitto")
-    open_topics = ("plant/counted", "plant/spare", "types/#", "arrays/#", "many/#")
+    open_topics = ("plant/counted", "plant/spare", "plant/added", "types/#", "arrays/#", "many/#")
     rules = [*(f"topic readwrite {topic}" for topic in open_topics), "topic read plant/fixed", ""]
     (folder / "acl").write_text("\n".join(rules))
     lines = ("allow_anonymous true", f"acl_file {folder / 'acl'}")

@@ -55,7 +55,7 @@ class NodeFaults:
     def thaw(self) -> None:
         self._peer.thaw()
 
-    def cut(self, *, reset: bool) -> None:  # noqa: ARG002  a node has only one way to leave
+    def cut(self, *, reset: bool) -> None:
         self.refuse()
 
     def pass_all(self) -> None:

@@ -57,6 +57,9 @@ class MqttConnector(Connector):
     Options = MqttOptions
     can_write = True
     register_quality = True
+    register_options = frozenset(
+        {"max_age_ms", "will", "time", "texts", "templates", "rebirth", "max_payload_bytes", "write_qos"}
+    )
     path_options: ClassVar[tuple[str, ...]] = ("ca", "certificate", "key", "password_file")
 
     def __init__(self, options: MqttOptions, layout: Layout) -> None:
@@ -135,6 +138,22 @@ class MqttConnector(Connector):
             min(time.monotonic() + FIRST_S, until_s),
         )
         link.check()
+
+    def take_over(self, other: MqttConnector) -> bool:
+        """Take over the connection, and the newest messages of the topics that both connectors have."""
+        link, store = other._link, self._store
+        if link is None:
+            return False
+        self._link, other._link = link, None
+        self._client_id, self._version = other._client_id, other._version
+        link.check()
+        until_s = time.monotonic() + (TIMEOUTS - 1) * self._options.timeout / 1000
+        fresh = link.hand_over(store.take, store.wake, lambda: store.inherit(other._store))
+        wanted = {*store.filters}
+        link.unsubscribe([one for one in other._store.filters if one not in wanted])
+        for topic in link.subscribe(fresh, until_s):
+            store.refuse(topic)
+        return True
 
     def _ask(self, link: Link) -> None:
         """Ask Sparkplug nodes for their births, if some are due."""

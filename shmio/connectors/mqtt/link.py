@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, TypeVar
 
 from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags, MQTTMessage, MQTTv5, MQTTv311
 from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode, MQTTProtocolVersion
@@ -45,6 +45,7 @@ HEAD_BYTES: Final = 128
 """Largest size of a PUBLISH without its topic and payload."""
 CLOSE_S: Final = 0.5
 _TURN_S: Final = 1.0
+_Result = TypeVar("_Result")
 # Reason codes: MQTT 5.0, section 2.4. Paho uses the same numbers for MQTT 3.1.1.
 _UNSUPPORTED: Final = "Unsupported protocol version"
 _LOGIN: Final = frozenset({0x86, 0x87})
@@ -179,6 +180,8 @@ class Link:
         self._condition = threading.Condition()
         self._client: _Client | None = None
         self._thread: threading.Thread | None = None
+        self._delivering = threading.Lock()
+        """Held while a message is delivered."""
         self._closing = False
         self._failure = ""
         self._connack: ReasonCode | None = None
@@ -239,7 +242,7 @@ class Link:
             raise ConnectorError(f"{self.peer} refuses the connection: {self._refusal(self._connack)}")
         if self._options.retain and not self._limits.get("RetainAvailable", 1):
             raise ConnectorError(f"{self.peer} does not retain messages: remove retain = true")
-        return self._subscribe(client, list(filters), until_s)
+        return self.subscribe(list(filters), until_s)
 
     def _connected_socket(self, until_s: float) -> socket.socket:
         peer = self.peer
@@ -268,8 +271,18 @@ class Link:
         """Return when to stop waiting for a single answer, s of CLOCK_MONOTONIC."""
         return min(until_s, time.monotonic() + self._options.timeout / 1000)
 
-    def _subscribe(self, client: Client, filters: list[str], until_s: float) -> list[str]:
-        asked: dict[int, list[str]] = {}
+    def subscribe(self, filters: Sequence[str], until_s: float) -> list[str]:
+        """Subscribe to topic filters, and wait for the answers, at most until ``until_s``.
+
+        Returns:
+            The filters that the broker refuses.
+
+        Raises:
+            ConnectorError: The connection is lost, or there is no answer in time.
+
+        """
+        client = self._connected()
+        asked: dict[int, Sequence[str]] = {}
         for at in range(0, len(filters), MAX_FILTERS):
             part = filters[at : at + MAX_FILTERS]
             qos = self._options.qos
@@ -283,11 +296,47 @@ class Link:
         self._wait(lambda: asked.keys() <= self._subacks.keys(), self._soon(until_s), "to SUBSCRIBE")
         refused: list[str] = []
         for number, part in asked.items():
-            codes = self._subacks[number]
+            codes = self._subacks.pop(number)
             if len(codes) != len(part):
                 raise ConnectorError(f"{self.peer} broke the protocol: it answered {len(codes)} of {len(part)} filters")
             refused += [one for one, code in zip(part, codes, strict=True) if code.is_failure]
         return refused
+
+    def unsubscribe(self, filters: Sequence[str]) -> None:
+        """End subscriptions, without waiting for the answers.
+
+        Raises:
+            ConnectorError: The connection is lost.
+
+        """
+        client = self._connected()
+        for at in range(0, len(filters), MAX_FILTERS):
+            client.unsubscribe([*filters[at : at + MAX_FILTERS]])
+
+    def _connected(self) -> _Client:
+        """Return the open client. Raise ConnectorError if the connection is lost."""
+        client = self._client
+        if client is None or self._failure:
+            raise ConnectorError(self._failure or f"not connected to {self.peer}")
+        return client
+
+    def hand_over(self, deliver: Deliver, wake: Callable[[], None], inherit: Callable[[], _Result]) -> _Result:
+        """Deliver messages to another object from now on.
+
+        Args:
+            deliver: As for the constructor.
+            wake: As for the constructor.
+            inherit: Called between the last message to the old object and the first one to the new
+                object.
+
+        Returns:
+            The result of ``inherit``.
+
+        """
+        with self._delivering:
+            found = inherit()
+            self._deliver, self._wake = deliver, wake
+            return found
 
     def close(self) -> None:
         """Close the connection; it may be called more than once."""
@@ -316,9 +365,7 @@ class Link:
             ConnectorError: The connection is lost, or the broker has not answered a ping in time.
 
         """
-        client = self._client
-        if client is None or self._failure:
-            raise ConnectorError(self._failure or f"not connected to {self.peer}")
+        client = self._connected()
         silent_ns, timeout_ns = time.monotonic_ns() - client.pinged_ns, self._options.timeout * 1_000_000
         if client.pongs < client.pings:
             if silent_ns > timeout_ns:
@@ -364,9 +411,7 @@ class Link:
             ConnectorError: The connection is lost, and nothing was sent.
 
         """
-        client = self._client
-        if client is None or self._failure:
-            raise ConnectorError(self._failure or f"not connected to {self.peer}")
+        client = self._connected()
         properties = None
         qos = min(publication.qos, self._limits.get("MaximumQoS", 1))
         if self.version == MQTTv5 and not publication.retain:
@@ -506,7 +551,8 @@ class Link:
         if self._closing:
             return
         try:
-            self._deliver(topic, bytes(message.payload), retained=message.retain)
+            with self._delivering:
+                self._deliver(topic, bytes(message.payload), retained=message.retain)
         except Exception:
             log.exception("a message on %s could not be handled", printable(topic))
             self._fail(f"a message on {printable(topic)[:200]} could not be handled: see the log")

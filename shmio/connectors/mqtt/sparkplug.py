@@ -68,6 +68,8 @@ class Device(Origin):
         """The definitions in the device's birth, by name, of the metrics that registers have."""
         self.born = False
         self.died = False
+        self.missed = False
+        """True if the last birth had metrics, or was of a device, that no register had then."""
         self._birth_order = 0
         self._found: dict[int, tuple[Found | ValueFaultError, int]] = {}
 
@@ -101,6 +103,10 @@ class Device(Origin):
 
         """
         found = self._found.get(index)
+        if found is None and self.missed:
+            raise ValueFaultError(
+                BAD_WAITING_FOR_INITIAL_DATA, f"{self} has sent no birth since the register was added"
+            )
         if found is None:
             raise ValueFaultError(BAD_NOT_FOUND, f"the birth of {self} does not contain the metric of this register")
         if isinstance(found[0], ValueFaultError):
@@ -114,9 +120,20 @@ class Device(Origin):
 
     def end(self, *, died: bool) -> None:
         """Discard the values and metrics of the device. It has none until its next birth."""
-        self.born, self.died = False, died
+        self.born, self.died, self.missed = False, died, False
         self.metrics.clear()
         self._found.clear()
+
+    def inherit(self, other: Device) -> None:
+        """Take the values of the same device of an earlier layout."""
+        self.born, self.died, self.message = other.born, other.died, other.message
+        self._birth_order = other._birth_order
+        self.metrics = {name: known for name, known in other.metrics.items() if name in self.wanted}
+        for name, places in self.wanted.items():
+            before = other.wanted.get(name)
+            if before is not None and (found := other._found.get(before[0])) is not None:
+                self._found |= dict.fromkeys(places, found)
+        self.missed = other.missed or (other.born and not self.wanted.keys() <= other.wanted.keys())
 
     def begin(self, order: int) -> None:
         """Prepare for the metrics of a birth of the device: discard all earlier values and metrics."""
@@ -203,6 +220,25 @@ class Node:
         for device in self.devices.values():
             device.reset()
 
+    def inherit(self, other: Node) -> None:
+        """Take the values of the same node of an earlier layout.
+
+        The births of the node had the definitions of other metrics, which were not kept. So if more
+        metrics are wanted now, shmio must ask for a birth.
+        """
+        self._born, self._ask, self._session, self._next = other._born, other._ask, other._session, other._next
+        self._asks, self._asked_ns = other._asks, other._asked_ns
+        for name, device in self.devices.items():
+            if (before := other.devices.get(name)) is not None:
+                device.inherit(before)
+            else:
+                device.missed = self._born
+        for alias, found in other._aliases.items():
+            now = self.devices.get(found[0].name) if found is not None else None
+            wanted = found is not None and now is not None and found[1].name in now.wanted
+            self._aliases[alias] = (now, found[1]) if wanted and now is not None and found is not None else None
+        self._ask = self._ask or any(device.missed for device in self.devices.values())
+
     # -- messages ------------------------------------------------------------------------------------------------------
 
     def take(self, kind: str, device: str, message: Message) -> None:
@@ -263,6 +299,8 @@ class Node:
         elif kind == "DDEATH":
             if device is not None:
                 device.end(died=True)
+        elif device is not None and device.missed and not device.born:
+            return  # shmio has asked for its birth
         elif device is not None and not device.born:
             self._lose(f"{device} sends data without a birth")
         else:
@@ -379,6 +417,12 @@ class Host:
         for node in self._nodes.values():
             if (found := node.request(now_ns)) is not None:
                 yield found
+
+    def inherit(self, other: Host) -> None:
+        """Take the values of the nodes that an earlier layout also has."""
+        for key, node in self._nodes.items():
+            if (before := other._nodes.get(key)) is not None:
+                node.inherit(before)
 
     def reset(self) -> None:
         """Forget all messages."""

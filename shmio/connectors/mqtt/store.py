@@ -202,6 +202,23 @@ class Store:
             self._expected.clear()
             self._all_changed = True
 
+    def inherit(self, other: Store) -> list[str]:
+        """Take the messages of an earlier layout's store.
+
+        Returns:
+            The filters to subscribe to, also again, for what the other store does not know.
+
+        """
+        with self._changed, other._changed:
+            self._order, self._all_changed = other._order, True
+            fresh = self._topics.keys() - other._topics.keys()
+            for name in self._topics.keys() & other._topics.keys():
+                self._topics[name].inherit(other._topics[name])
+            fresh |= {watch.place.topic for watch in self._watches if not watch.inherit(other._watches)}
+            self.host.inherit(other.host)
+            fresh |= {*self.host.filters} - {*other.host.filters}
+        return [one for one in self.filters if one in fresh]
+
     def refuse(self, topic: str) -> None:
         """Note that the broker refuses the subscription to a topic."""
         log.warning("the broker refuses the subscription to %s", topic)

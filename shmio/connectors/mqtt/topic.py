@@ -139,6 +139,10 @@ class Topic(Origin):
         self.message = self._document = self._decoded = None
         self.refused = False
 
+    def inherit(self, other: Topic) -> None:
+        """Take the message of the same topic from an earlier layout."""
+        self.message, self.refused = other.message, other.refused
+
 
 def time_ns(found: Any) -> int:
     """Return a time in JSON as ns since 1970; 0 if the value is not a time.

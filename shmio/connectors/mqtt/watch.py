@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Final
 
 from shmio.connectors.mqtt import json_path
@@ -42,6 +43,14 @@ class Watch:
         """True if the device is online; None before the first message about it."""
         self._gone_order = 0
         self._said = ""
+
+    def inherit(self, watches: Iterable[Watch]) -> bool:
+        """Take what was received by the same watch of an earlier layout, if there is one; return whether there is."""
+        for other in watches:
+            if (other.place, other._good) == (self.place, self._good):
+                self.there, self._gone_order, self._said = other.there, other._gone_order, other._said
+                return True
+        return False
 
     @property
     def problem(self) -> str:

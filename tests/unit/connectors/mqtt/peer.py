@@ -89,6 +89,17 @@ class Source:
         self._area = StatusArea(layout)
         self.image = b""
 
+    def reload(self, tags: Mapping[str, tuple[str, str] | dict[str, Any]], **options: Any) -> None:
+        """Let a connector with other tags, and with some other options, take over the connection."""
+        before, self.layout = self.connector, layout_of(tags)
+        given = msgspec.structs.asdict(before._options) | options  # type: ignore[attr-defined]
+        self.connector = type(before)(msgspec.convert(given, before.Options), self.layout)
+        self._area = StatusArea(self.layout)
+        try:
+            assert self.connector.take_over(before)
+        finally:
+            before.close()
+
     def read(self) -> None:
         self.image = self.connector.read()
 
@@ -126,12 +137,12 @@ def connected(
 ) -> Iterator[Source]:
     layout = layout_of(tags)
     given: dict[str, Any] = {"url": f"mqtt://{address}", "timeout": 2000, "max_age_ms": 0} | options
-    connector = MqttConnector(msgspec.convert(given, MqttOptions), layout)
+    source = Source(MqttConnector(msgspec.convert(given, MqttOptions), layout), layout)
     try:
-        connector.connect()
-        yield Source(connector, layout)
+        source.connector.connect()
+        yield source
     finally:
-        connector.close()
+        source.connector.close()
 
 
 def framing(data: bytes | bytearray) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -269,6 +270,55 @@ def test_without_a_connection_nothing_is_written(plant: Plant) -> None:
 # -- the connection ----------------------------------------------------------------------------------------------------
 
 
+def test_a_reload_keeps_messages_and_changes_the_subscriptions(plant: Plant) -> None:
+    device = plant.device
+    device.publish("line/a", "1")
+    device.publish("line/new", "7", retain=True)
+    device.publish("line/status", '{"a": "online", "b": "offline"}', retain=True)
+    tags = {name: ("INT", f"line/{name}") for name in ("a", "b", "gone")}
+    try:
+        with connected(plant.address, tags, client_id="shmio-reload") as source:
+            device.publish("line/a", "3")
+            source.until(lambda: source.code("a") == 0)
+            at_ns = source.source_ns("a")
+            tags = {"new": ("INT", "line/new"), "a": tags["a"], "both": ("LREAL", "line/a")}
+            wills = [{"topic": "line/status $.a", "match": "a"}, {"topic": "line/status $.b", "match": "both"}]
+            source.reload(tags, will=wills)
+            assert source.connector.describe().count("shmio-reload") == 1
+            source.until(lambda: source.code("a") == 0)  # after the first message about its device
+            assert (source.value("a"), source.source_ns("a")) == (3, at_ns)
+            source.until(lambda: source.code("new") == 0)
+            assert source.value("new") == 7
+            source.until(lambda: source.code("both") == statuses.BAD_NO_COMMUNICATION)
+            assert source.code("a") == 0
+            source.reload(tags, will=[*wills, {"topic": "line/status $.a", "match": "new"}])  # nothing is subscribed
+            source.read()
+            assert [source.code(path) for path in tags][:2] == [0, 0]
+            assert source.code("both") == statuses.BAD_NO_COMMUNICATION
+            device.publish("line/gone", "5")  # nobody subscribes to this topic any more
+            device.publish("line/a", "4")
+            source.until(lambda: source.value("a") == 4)
+    finally:
+        device.clear("line/new", "line/status")
+
+
+def test_no_message_is_lost_by_reloads(plant: Plant) -> None:
+    tags = {"count": ("DINT", "line/count"), "other": ("INT", "line/other")}
+    with connected(plant.address, tags, timeout=10_000) as source, ThreadPoolExecutor(1) as pool:
+        flood = pool.submit(plant.device.ask, "flood", "line/count", 5000)
+        last, turn = 0, 0
+        while not flood.done():
+            turn += 1
+            source.reload({"count": tags["count"]} if turn % 2 else tags)
+            source.read()
+            found = source.value("count")
+            assert isinstance(found, int)
+            assert found >= last
+            last = found
+        source.until(lambda: source.value("count") == 5000)
+        assert turn > 2
+
+
 def test_a_client_that_takes_over_is_named(plant: Plant) -> None:
     with connected(plant.address, TAGS, client_id="twin") as source:
         source.read()
@@ -294,5 +344,9 @@ def test_a_broker_that_knows_only_mqtt_3() -> None:
             source.until(lambda: source.value("pos") == 3.0)
             assert "MQTT 3.1.1" in source.connector.describe()
             assert source.code("fixed") == statuses.BAD_USER_ACCESS_DENIED  # alone
+            source.reload({"other": ("INT", "fixed/other"), "fixed": ("INT", "fixed/number"), "pos": TAGS["pos"]})
+            source.read()
+            assert source.value("pos") == 3.0
+            assert source.code("fixed") == source.code("other") == statuses.BAD_USER_ACCESS_DENIED
         with pytest.raises(ConnectorError, match="version"), connected(address, TAGS, version="5"):
             pass

@@ -187,6 +187,32 @@ def test_no_question_is_asked_if_that_is_not_wanted(plant: Plant, edge: Edge) ->
         assert edge.peer.ask("heard") == []
 
 
+def test_a_reload_keeps_what_is_known_of_nodes_and_asks_for_a_birth_if_metrics_were_added(
+    plant: Plant, edge: Edge
+) -> None:
+    first = {path: TAGS[path] for path in ("axis/count", "axis/pos", "axis/on")}
+    with connected(plant.address, first) as source:
+        born(source, edge)
+        source.reload({path: TAGS[path] for path in ("axis/on", "axis/pos")})
+        source.read()
+        assert [source.value("axis/on"), source.value("axis/pos"), source.code("axis/pos")] == [True, 1.5, 0]
+        edge.send("DDATA", "robot", {"alias": 11, "type": "Int16", "value": 300})  # a metric that was removed
+        edge.send("DDATA", "robot", {"alias": 10, "type": "Double", "value": 2.5})
+        source.until(lambda: source.value("axis/pos") == 2.5)
+        source.reload(TAGS)
+        edge.send("DDATA", "other", {"name": "n", "type": "Int16", "value": 5})  # of a device whose birth was missed
+        edge.send("DDATA", "robot", {"alias": 10, "type": "Double", "value": 3.5}, {"alias": 11})
+        source.until(lambda: source.value("axis/pos") == 3.5)
+        kept = {"axis/pos", "axis/on"}
+        assert {path for path in TAGS if source.code(path) == 0} == kept
+        assert source.code("axis/count") == statuses.BAD_WAITING_FOR_INITIAL_DATA
+        born(source, edge)
+        source.until(lambda: source.code("node/cpu") == 0 and source.code("axis/name") == 0)
+        assert source.code("axis/gone") == statuses.BAD_NOT_FOUND
+        edge.send("DDATA", "robot", {"alias": 11, "type": "Int16", "value": 9})
+        source.until(lambda: source.value("axis/count") == 9)
+
+
 def test_a_node_of_shmio_itself_is_read(plant: Plant) -> None:
     """The connector reads the values that shmio's own bridge publishes."""
     kinds: dict[str, tuple[str, Any]] = {

@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+import msgspec
+
 from shmio.connectors.base import Connector
 from shmio.connectors.ros.rosbridge import RosbridgeConnector, RosbridgeOptions
 from shmio.layout.model import Layout
@@ -34,6 +36,17 @@ class Source:
         self.connector, self.layout = connector, layout
         self._area = StatusArea(layout)
         self.image = b""
+
+    def reload(self, tags: Mapping[str, tuple[str, str] | dict[str, Any]], **options: Any) -> None:
+        """Let a connector with other tags, and with some other options, take over the connection."""
+        before, self.layout = self.connector, layout_of(tags)
+        given = msgspec.structs.asdict(before._options) | options  # type: ignore[attr-defined]
+        self.connector = type(before)(msgspec.convert(given, before.Options), self.layout)
+        self._area = StatusArea(self.layout)
+        try:
+            assert self.connector.take_over(before)
+        finally:
+            before.close()
 
     def read(self) -> None:
         self.image = self.connector.read()
@@ -69,9 +82,9 @@ class Source:
 @contextmanager
 def connected(url: str, tags: Mapping[str, tuple[str, str] | dict[str, Any]], **options: Any) -> Iterator[Source]:
     layout = layout_of(tags)
-    connector = RosbridgeConnector(RosbridgeOptions(url=url, **{"timeout": 1000} | options), layout)
+    source = Source(RosbridgeConnector(RosbridgeOptions(url=url, **{"timeout": 1000} | options), layout), layout)
     try:
-        connector.connect()
-        yield Source(connector, layout)
+        source.connector.connect()
+        yield source
     finally:
-        connector.close()
+        source.connector.close()

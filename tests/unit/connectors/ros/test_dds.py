@@ -47,12 +47,12 @@ def connected(peer: Peer, tags: dict[str, Any] | None = None, **options: Any) ->
     layout = layout_of(tags or tags_of(peer))
     latched = [f"/{peer.prefix}/mode"] if tags is None else []
     keys: dict[str, Any] = {"domain": DOMAIN, "timeout": 5000, "latched": latched} | options
-    connector = Ros2Connector(Ros2Options(**keys), layout)
+    source = Source(Ros2Connector(Ros2Options(**keys), layout), layout)
     try:
-        connector.connect()
-        yield Source(connector, layout)
+        source.connector.connect()
+        yield source
     finally:
-        connector.close()
+        source.connector.close()
 
 
 def seen(source: Source, peer: Peer, names: list[str], positions: list[float], sec: int = 0) -> None:
@@ -198,3 +198,35 @@ def test_what_is_wrong_is_said_before_anything_starts() -> None:
     with pytest.raises(ConnectorError, match="interface"):
         connector.connect()
     connector.close()
+
+
+def test_a_reload_changes_readers_and_writers(peer: Peer) -> None:
+    tags = tags_of(peer)
+    peer.ask("mode", "auto")
+    with connected(peer, {"j1": tags["j1"], "spare": tags["spare"]}, max_age=0) as source:
+        seen(source, peer, ["j2", "j1"], [2.5, 1.5], 1_700_000_000)
+        present = peer.ask("participants")
+        latched = [f"/{peer.prefix}/mode"]
+        source.reload({name: tags[name] for name in ("j2", "mode")}, latched=latched)
+        source.read()
+        assert (source.value("j2"), source.source_ns("j2")) == (2.5, 1_700_000_000_000_000_007)
+        source.until(lambda: source.code("mode") == 0)  # it was stored by its publisher
+        assert source.value("mode") == "auto"
+        spare = ("ARRAY[0..1] OF INT", peer.address("spare", "std_msgs/Int16MultiArray data"))
+        source.reload({"mode": tags["mode"], "spare": spare}, latched=latched, reliability="reliable")
+        source.reload({"mode": tags["mode"], "spare": tags["spare"]}, latched=latched, reliability="reliable")
+        source.until(lambda: source.write(spare=[3, 4]) == [""])
+        assert (source.value("mode"), peer.ask("commanded")) == ("auto", [3, 4])
+        assert peer.ask("participants") == present
+        unknown = {"other": ("STRING[20]", peer.address("nowhere", "std_msgs/String data"))}
+        with pytest.raises(ConnectorError, match="no publisher or subscriber"):
+            source.reload(unknown, latched=[], timeout=300)
+
+
+def test_a_reload_may_give_a_topic_another_type(peer: Peer) -> None:
+    wrong = {"mode": ("INT", peer.address("mode", "std_msgs/Int16 data")), "j1": tags_of(peer)["j1"]}
+    with connected(peer, wrong, max_age=0) as source:
+        peer.ask("mode", "auto")
+        source.reload({"mode": tags_of(peer)["mode"], "j1": tags_of(peer)["j1"]}, latched=[f"/{peer.prefix}/mode"])
+        source.until(lambda: source.code("mode") == 0)
+        assert source.value("mode") == "auto"

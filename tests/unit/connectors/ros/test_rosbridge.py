@@ -234,3 +234,25 @@ def test_what_is_wrong_is_said_before_anything_starts(tag: Any, options: dict[st
 def test_a_wrong_url(url: str) -> None:
     with pytest.raises(ValueError, match="url: expected"):
         RosbridgeOptions(url=url)
+
+
+def test_a_reload_keeps_last_messages_and_changes_what_is_subscribed_and_advertised(bridge: Bridge) -> None:
+    bridge.ask("publish", "/mode", {"data": "auto"})
+    mode: dict[str, Any] = {"type": "STRING[20]", "address": "/mode std_msgs/String data"}
+    with connected(bridge.url, {"mode": mode | {"writable": True}, **JOINTS}, max_age=0) as source:
+        bridge.ask("publish", "/joint_states", joint_state(["j1", "j2"], [1.5, 2.5], sec=1_700_000_000))
+        source.until(lambda: source.code("j2") == 0)
+        source.reload({"j2": JOINTS["j2"], "mode": mode, **TWIST})
+        source.read()
+        assert (source.value("j2"), source.value("mode")) == (2.5, "auto")
+        assert source.source_ns("j2") == 1_700_000_000_000_000_007
+        assert source.code("vx") == statuses.BAD_WAITING_FOR_INITIAL_DATA
+        assert source.write(vx=0.5, wz=0.25) == ["", ""]
+        assert sorted(bridge.ask("subscribed")) == ["/cmd_vel", "/joint_states", "/mode"]
+        assert bridge.ask("advertised") == ["/cmd_vel"]
+        source.reload({"mode": mode | {"writable": True}}, throttle_ms=1)
+        assert source.write(mode="hand") == [""]
+        source.read()
+        assert source.value("mode") == "hand"
+        assert (bridge.ask("subscribed"), bridge.ask("advertised")) == (["/mode"], ["/mode"])
+        assert bridge.ask("clients") == 1
