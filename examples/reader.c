@@ -21,7 +21,7 @@
 #include <unistd.h>
 #include "clock.h"
 
-enum { ABI = 1, LAYOUT = 1, FRAMES = 2, RETIRED = 1, ENTRY = 128, RING_HEADER = 128, RAW = 320, LOOK_NS = 200000000 };
+enum { ABI = 2, LAYOUT = 1, FRAMES = 2, RETIRED = 1, ENTRY = 128, RING_HEADER = 128, RAW = 320, LOOK_NS = 200000000 };
 
 static const uint8_t *base; /* the mapping, read-only */
 static uint64_t size;

@@ -17,7 +17,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from shmio import logs, realtime
 from shmio.audit import trail
 from shmio.audit.file import AuditSettings
 from shmio.errors import ConfigError, LayoutError, SegmentError, ShmioError
-from shmio.segment import Activity, Report, Segment
+from shmio.segment import Activity, Block, Report, Segment
 
 BEAT_S = 0.2
 ROLE_WAIT_S = 10.0
@@ -46,6 +46,7 @@ class Worker:
         self.stopping = threading.Event()
         self._on_stop: Callable[[], object] | None = None
         self._on_reread: Callable[[], object] | None = None
+        self._read_blocks: set[Block] = set()  # the blocks with a reader at the last call of report_readers()
         self._rereads = False  # True once SIGHUP has come, perhaps before on_reread()
         self.log = self._set_up_log(Path(spec["log_file"]), spec.get("log_format", "text"))
         self.segment = Segment.open(spec["instance"], writable=True)
@@ -104,6 +105,23 @@ class Worker:
         if self._report != old:
             self.slot.report = self._report
         self.slot.beat()
+
+    def report_readers(self, readers: Iterable[tuple[Block, int]]) -> None:
+        """Report how far this process is behind with reading frames.
+
+        Args:
+            readers: For each reader, its block and the number of the last frame that it has read.
+                The slowest reader of each block counts.
+
+        """
+        slowest: dict[Block, int] = {}
+        for block, last in readers:
+            slowest[block] = min(last, slowest.get(block, last))
+        for block in self._read_blocks - slowest.keys():
+            block.report_reader(self.slot, None)
+        for block, last in slowest.items():
+            block.report_reader(self.slot, last)
+        self._read_blocks = set(slowest)
 
     def on_stop(self, call: Callable[[], object]) -> None:
         """Call ``call`` in another thread when a stop is requested.

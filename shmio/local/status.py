@@ -5,16 +5,20 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
 import msgspec
 
 from shmio.errors import NotRunningError, SegmentError
 from shmio.model.clock import Clock
 from shmio.model.values import Quality
+from shmio.segment.block import Block
 from shmio.segment.header import State as InstanceState
 from shmio.segment.processes import Phase, ProcessSlot
 from shmio.segment.segment import Segment, running_instances
 
+READERS: Final = frozenset({"grpc", "mqtt", "opcua", "web", "recorder", "alerts"})
+"""Kinds of the processes that can read the frames of sources."""
 SILENT_S = 5.0
 """After this time in s without a heartbeat, a supervisor is reported as not responding."""
 
@@ -32,11 +36,24 @@ class ProcessStatus(msgspec.Struct, kw_only=True):
     counters: dict[str, int]
 
 
+class ReaderStatus(msgspec.Struct):
+    """How far a process that reads a source's frames is behind.
+
+    ``frames`` is the number of complete frames that it has not read. ``lag_s`` is the time since the
+    oldest of them was published.
+    """
+
+    process: str
+    frames: int
+    lag_s: float
+
+
 class SourceStatus(ProcessStatus, kw_only=True):
     """Status of a source: its process, and the newest frame of its block.
 
     ``cycle`` is null before the first frame. ``real_time`` is true if the source does not use the
-    instance clock, so steps do not move it.
+    instance clock, so steps do not move it. ``readers`` are the processes of the instance that read
+    the source's frames, the slowest first.
     """
 
     quality: str
@@ -45,6 +62,7 @@ class SourceStatus(ProcessStatus, kw_only=True):
     rate_hz: float
     overruns: int
     real_time: bool
+    readers: list[ReaderStatus] = []
 
 
 class SupervisorStatus(msgspec.Struct):
@@ -128,9 +146,9 @@ def status_of(segment: Segment, remedy: str, asking: str = "") -> InstanceStatus
     supervised = segment.supervised
     pid, state = segment.supervisor
     now_ns = time.monotonic_ns()
-    processes = [
-        _process(segment, slot, slot.alive() or slot.kind == asking, supervised, now_ns) for slot in segment.processes
-    ]
+    alive = [slot for slot in segment.processes if slot.alive() or slot.kind == asking]
+    readers = [slot for slot in alive if slot.kind in READERS]
+    processes = [_process(segment, slot, slot in alive, supervised, now_ns, readers) for slot in segment.processes]
     status = InstanceStatus(
         instance=segment.instance,
         mode=segment.header.mode,
@@ -209,7 +227,7 @@ def assess(running: Sequence[bool], qualities: Sequence[Quality | None], note: s
 
 
 def _process(
-    segment: Segment, slot: ProcessSlot, alive: bool, supervised: bool, now_ns: int
+    segment: Segment, slot: ProcessSlot, alive: bool, supervised: bool, now_ns: int, readers: Sequence[ProcessSlot]
 ) -> SourceStatus | ProcessStatus:
     state, report = slot.supervised, slot.report
     phase, note = state.phase, state.note
@@ -249,7 +267,15 @@ def _process(
         rate_hz=counters.get("rate_mhz", 0) / 1000 if current and quality is not Quality.BAD else 0.0,
         overruns=counters.get("overruns", 0),
         real_time=not block.attributes.stepped,
+        readers=_reader_statuses(block, readers),
     )
+
+
+def _reader_statuses(block: Block, slots: Sequence[ProcessSlot]) -> list[ReaderStatus]:
+    """Return the status of the processes that read a block, the slowest first."""
+    lags = [(slot, lag) for slot in slots if (lag := block.reader_lag(slot)) is not None]
+    found = [ReaderStatus(slot.name, lag.frames, round(lag.behind_ns / 1e9, 3)) for slot, lag in lags]
+    return sorted(found, key=lambda reader: (-reader.lag_s, -reader.frames))
 
 
 def _seconds(duration_ns: int) -> float:

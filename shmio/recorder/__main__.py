@@ -98,6 +98,7 @@ def _report(worker: Worker, series: RotatingRecorder | TriggeredRecorder, proble
     counters = series.counters
     numbers = (counters.frames, counters.events, counters.missed, series.written)
     worker.report(numbers, note=problem or _note(series))
+    worker.report_readers((follower.block, follower.last) for follower in series.tap.followers)
 
 
 def _note(series: RotatingRecorder | TriggeredRecorder) -> str:

@@ -102,6 +102,11 @@ class BlockFollower:
         self._frames = _Stream("frames", block.cursor(after=place.frame), place.log_ns, reason)
         self._events = _Stream("events", block.events.cursor(after=place.event), place.log_ns, reason)
 
+    @property
+    def last(self) -> int:
+        """Number of the last frame that was read or counted as missed."""
+        return self._frames.cursor.last
+
     def take(self, limit: int) -> Iterator[BlockEntry]:
         """Yield the entries that were published so far, at most about ``limit`` entries."""
         retired = self.block.retired  # before the read, so that the last entries are read, too

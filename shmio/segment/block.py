@@ -22,6 +22,7 @@ from shmio.model.values import Provenance, Quality
 from shmio.segment._atomics import REASON_SIZE, Ring
 from shmio.segment.events import Event, EventKind, Record, decode_event
 from shmio.segment.header import cut
+from shmio.segment.reader_lag import ReportedPosition
 
 if TYPE_CHECKING:
     from shmio.layout.model import Layout
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from shmio.segment.injection_list import DeclaredCell, InjectionListCell
     from shmio.segment.model_channel import ModelChannel
     from shmio.segment.playhead import Playhead
+    from shmio.segment.processes import ProcessSlot
+    from shmio.segment.reader_lag import ReaderLag, ReaderTable
 
 
 class Frame(NamedTuple):
@@ -266,6 +269,7 @@ class Block:
         commands: CommandQueues,
         injections: InjectionListCell,
         declared: DeclaredCell,
+        readers: ReaderTable,
         attributes: Attributes,
         retired: Callable[[], bool],
         section: int,
@@ -284,6 +288,7 @@ class Block:
         """The existing injections of the source."""
         self.declared = declared
         """The injections that the configuration declares for the source."""
+        self._readers = readers
         self.attributes = attributes
         self.clock = clock
         self.model_channel = model_channel
@@ -372,6 +377,27 @@ class Block:
         """Return a copy of the frame with this number; None if it is not in the ring."""
         fields = self.ring.read(number)
         return None if fields is None else decode_frame(fields)
+
+    def reader_lag(self, slot: ProcessSlot) -> ReaderLag | None:
+        """Return how far a process's slowest reader is behind; None if the process does not read the block."""
+        return self._readers.read(slot.index, slot.report.pid, self.ring.head())
+
+    def report_reader(self, slot: ProcessSlot, last: int | None) -> None:
+        """Report how far this process's slowest reader is behind. Only the process in ``slot`` may call this.
+
+        Args:
+            slot: The slot of this process.
+            last: Number of the last frame that the reader has read; None: the process no longer reads
+                the block.
+        """
+        if last is None:
+            self._readers.write(slot.index, ReportedPosition(0, 0, 0, 0, 0))
+            return
+        frames, behind_ns, at_ns = max(0, self.ring.head() - last), 0, time.monotonic_ns()
+        if frames:
+            oldest = self.cursor(after=last).poll()  # or the oldest that is left, if that frame is overwritten
+            behind_ns = 0 if oldest is None else max(0, self.now_ns() - oldest.publish_ns)
+        self._readers.write(slot.index, ReportedPosition(os.getpid(), frames, last, behind_ns, at_ns))
 
     def cursor(self, *, after: int | None = None) -> Cursor[Frame]:
         """Return a cursor that starts after frame ``after`` (default: the newest one)."""

@@ -15,11 +15,11 @@ from shmio.segment import _atomics
 from shmio.version import __version__
 
 MAGIC: Final = int.from_bytes(b"SHMIOSEG", "little")
-ABI_VERSION: Final = 1
+ABI_VERSION: Final = 2
 HEADER_SIZE: Final = 4096
 SECTION_SIZE: Final = 128
-SLOT_SIZE: Final = 1024
-MAX_SECTIONS: Final = 2048
+SLOT_SIZE: Final = 1088
+MAX_SECTIONS: Final = 4096
 MAX_PROCESSES: Final = 256
 
 # Offsets of the fields that change during the segment's life.
@@ -66,6 +66,7 @@ class SectionKind(IntEnum):
     DECLARED = 8
     LINK = 9
     PLAYHEAD = 10
+    READERS = 11
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,19 +30,21 @@ _SUPERVISED_AT: Final = 128
 _SUPERVISED: Final = struct.Struct("<IIq352s")
 _HEARTBEAT_AT: Final = 512
 _REPORT_AT: Final = 520
-_REPORT: Final = struct.Struct("<IIq8Q408s")
+MOST_COUNTERS: Final = 16
+"""Maximum number of counters of a worker."""
+_REPORT: Final = struct.Struct(f"<IIq{MOST_COUNTERS}Q408s")
 
 COUNTERS: Final[Mapping[str, tuple[str, ...]]] = {
     "source": ("polls", "overruns", "failures", "connects", "round_trip_us", "rate_mhz"),
     "emulator": ("cycles", "overruns"),
-    "grpc": ("streams", "messages", "dropped", "published", "refused", "bytes"),
-    "mqtt": ("messages", "commands", "refused", "waiting", "backlog", "dropped", "connects", "missed"),
-    "opcua": ("sessions", "items", "writes", "refused", "bytes"),
+    "grpc": ("streams", "messages", "dropped", "published", "refused", "bytes", "waiting_bytes"),
+    "mqtt": ("messages", "commands", "refused", "waiting", "backlog", "dropped", "connects", "missed", "bytes"),
+    "opcua": ("sessions", "items", "writes", "refused", "bytes", "messages"),
     "recorder": ("frames", "events", "missed", "bytes"),
-    "web": ("requests", "refused", "connections", "pages", "messages", "bytes"),
+    "web": ("requests", "refused", "connections", "pages", "messages", "bytes", "answer_bytes"),
     "alerts": ("active", "notices", "suppressed", "waiting", "failed", "missed"),
 }
-"""Names of a worker's counters, at most 8, by kind of process, in the order of :attr:`Report.counters`."""
+"""Names of a worker's counters by kind of process, in the order of :attr:`Report.counters`."""
 
 
 EXTERNAL_SLOTS: Final = 4
@@ -177,7 +179,7 @@ class ProcessSlot:
 
     @report.setter
     def report(self, value: Report) -> None:
-        counters = (*value.counters, *(0,) * (8 - len(value.counters)))
+        counters = (*value.counters, *(0,) * (MOST_COUNTERS - len(value.counters)))
         data = _REPORT.pack(value.pid, value.activity, value.started_ns, *counters, cut(value.note, 407))
         _atomics.cell_write(self._memory, self._offset + _REPORT_AT, data)
 

@@ -36,6 +36,7 @@ from shmio.segment.injection_list import CELL_SIZE, declared_cell, injection_lis
 from shmio.segment.model_channel import ModelChannel
 from shmio.segment.playhead import PLAYHEAD_SIZE, Playhead
 from shmio.segment.processes import EXTERNAL_SLOTS, SUPERVISOR_LOCK, ProcessSpec, ProcessTable, supervisor_beat
+from shmio.segment.reader_lag import TABLE_SIZE, ReaderTable
 from shmio.segment.shm import SharedObject
 from shmio.version import __version__
 
@@ -50,7 +51,7 @@ def _align(size: int, to: int) -> int:
 
 _DAMAGED = "; the segment is damaged: restart the instance"
 _RING_SECONDS = 8
-_SECTIONS_PER_BLOCK = 8  # at most: one of every kind
+_SECTIONS_PER_BLOCK = 9  # at most: one of every kind
 _SPARE_SECTIONS = 40 * _SECTIONS_PER_BLOCK
 _OWN_SECTIONS = 1  # sections of no block: the clock page
 _SPARE_PROCESSES = 16 + EXTERNAL_SLOTS
@@ -130,6 +131,7 @@ class BlockSpec:
             (SectionKind.SOURCE, len(attributes), attributes),
             (SectionKind.INJECTIONS, CELL_SIZE, b""),
             (SectionKind.DECLARED, CELL_SIZE, bytes(8) + self.declared),
+            (SectionKind.READERS, TABLE_SIZE, b""),
             *([(SectionKind.LINK, *model_channel.section(linked, self.slot_bytes))] if self.attributes.remote else []),
             *([(SectionKind.PLAYHEAD, PLAYHEAD_SIZE, b"")] if self.attributes.replay else []),
         ]
@@ -184,6 +186,7 @@ def read_block(
         queues = CommandQueues(memory, *part(SectionKind.COMMANDS))
         injections = injection_list_cell(memory, *part(SectionKind.INJECTIONS))
         declared = declared_cell(memory, *part(SectionKind.DECLARED))
+        readers = ReaderTable(memory, *part(SectionKind.READERS))
         lock_byte = head.process_capacity + _FIRST_LINK + layout_at
         channel = ModelChannel(shared, memory, *part(SectionKind.LINK), lock_byte) if attributes.remote else None
         playhead = (
@@ -208,7 +211,7 @@ def read_block(
         return found
 
     return Block(
-        described.name, layout, frames, events, queues, injections, declared, attributes,
+        described.name, layout, frames, events, queues, injections, declared, readers, attributes,
         lambda: header.retired(memory, head, layout_at), layout_at, clock, channel, playhead,
     )  # fmt: skip
 

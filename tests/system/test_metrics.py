@@ -60,8 +60,9 @@ def query(api: str, expression: str) -> list[Any]:
 
 
 def test_a_cell_is_monitored(make_cell: Callable[..., Cell], tmp_path: Path) -> None:
-    with reserved_port() as target, reserved_port() as server, reserved_port() as broker:
+    with reserved_port() as target, reserved_port() as server, reserved_port() as broker, reserved_port() as opcua:
         section = f'[recorder]\n[mqtt]\nlisten = "{broker}"\nbroker = "mosquitto"\n[metrics]\nlisten = "{target}"\n'
+        section += f'[opcua]\nlisten = "{opcua}"\n'
         cell = make_cell(config=CONFIG.replace("timeout = 1000", 'timeout = 1000\nwritable = ["Outputs"]') + section)
         cell.up()
         cell.output("shmio", "set", "Outputs/0", "3")
@@ -91,6 +92,24 @@ def test_a_cell_is_monitored(make_cell: Callable[..., Cell], tmp_path: Path) -> 
                 assert query(api, text), text
             assert query(api, "shmio_source_quality")[0]["value"][1] == "2"
             until(lambda: query(api, "shmio_grpc_sent_bytes_total > 0") != [], "the bytes of the answer")
+            until(lambda: query(api, "shmio_mqtt_sent_bytes_total > 0") != [], "the bytes of the bridge")
+
+            def lag(process: str) -> float:
+                found = query(api, f'shmio_reader_lag_seconds{{source="cell",process="{process}"}}')
+                return float(found[0]["value"][1])
+
+            assert {lag(process) < 1 for process in ("recorder", "mqtt", "grpc", "opcua")} == {True}
+            recorder = cell.processes()["recorder"]["pid"]
+            os.kill(recorder, signal.SIGSTOP)
+            try:
+                until(lambda: lag("recorder") > 2, "a recorder that reads nothing")
+                (source,) = [one for one in cell.status()["processes"] if one["name"] == "cell"]
+                assert source["readers"][0]["process"] == "recorder"
+                assert source["readers"][0]["frames"] > 50
+                assert "recorder is" in cell.output("shmio-supervisor", "status")
+            finally:
+                os.kill(recorder, signal.SIGCONT)
+            until(lambda: lag("recorder") < 1, "a recorder that has caught up")
 
             def alerts() -> set[str]:
                 return {one["labels"]["alertname"] for one in json.loads(get(f"{api}/alerts"))["data"]["alerts"]}

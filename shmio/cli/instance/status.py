@@ -27,6 +27,8 @@ from shmio.segment import Segment, instances
 _HEADINGS = ("NAME", "KIND", "STATE", "PID", "RESTARTS", "UPTIME", "")
 _LIST_HEADINGS = ("NAME", "STATE", "FILE", "LISTENS ON")
 WHERE_S = 2.0
+LATE_S = 1.0
+"""A reader that is at least this time in s behind is shown beside its source."""
 
 
 def status(arguments: argparse.Namespace) -> int:
@@ -87,6 +89,8 @@ def _row(process: ProcessStatus) -> tuple[str, ...]:
             rate = f"{process.rate_hz:.1f}" if process.rate_hz else "-"
             overruns = f"{process.overruns} overrun{'s' * (process.overruns != 1)}"
             details.append(f"cycle {process.cycle}, {rate} Hz, {overruns}")
+        if process.readers and (slowest := process.readers[0]).lag_s >= LATE_S:
+            details.append(f"{slowest.process} is {slowest.frames} frames ({slowest.lag_s:.1f} s) behind")
     if process.note and not _said(process):
         details.append(process.note)
     if process.kind == "mqtt" and (missed := process.counters.get("missed")):

@@ -97,6 +97,7 @@ class Alerts:
         note = f"active: {', '.join(active)}" if active else ""
         problem = "; ".join(filter(None, (dispatcher.problem, self._writer.problem)))
         self._worker.report(counters, note=shorten("; ".join(filter(None, (problem, note))), MAX_NOTE))
+        self._worker.report_readers(monitor.readers)
 
     def close(self) -> None:
         """End all actions, and write the state."""

@@ -94,6 +94,11 @@ class Monitor:
         """Number of frames that were overwritten or skipped before they could be evaluated."""
         return self._missed + sum(follower.missed for follower in self._followers.values())
 
+    @property
+    def readers(self) -> Iterator[tuple[Block, int]]:
+        """The blocks that the monitor follows, each with the number of the last frame read."""
+        return ((follower.block, follower.last) for follower in self._followers.values())
+
     def run_once(self) -> tuple[list[tuple[WatchedAlert, Notice]], bool]:
         """Evaluate new frames and states. Return the new notices, and whether more frames are waiting."""
         clock = self._segment.clock.read()  # before the frames, so that they include all of a finished step

@@ -103,7 +103,9 @@ async def _serve(worker: Worker) -> None:
         services.stepper.timeline.update()
         streams, dropped, published, refused = services.counters
         messages = feeds.messages + services.updates
-        worker.report((streams, messages, dropped, published, refused, server.calls.sent_bytes))
+        sent = server.calls.sent_bytes
+        worker.report((streams, messages, dropped, published, refused, sent, services.waiting_bytes))
+        worker.report_readers((*feeds.readers, *services.readers))
         try:
             await asyncio.wait_for(stopping.wait(), BEAT_S)
         except TimeoutError:

@@ -46,6 +46,7 @@ def _run_bridge(worker: Worker) -> None:
         if time.monotonic() - reported_s >= BEAT_S:
             reported_s = time.monotonic()
             worker.report(bridge.counters, note=bridge.problem)
+            worker.report_readers(bridge.readers)
     bridge.close()
     worker.report(bridge.counters, note="")
     log.info("%d messages", bridge.outbox.sent)

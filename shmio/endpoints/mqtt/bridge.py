@@ -35,7 +35,7 @@ from shmio.endpoints.mqtt.steps import StepDelivery
 from shmio.endpoints.mqtt.topic_guard import MOST_WAITING, TopicGuard
 from shmio.endpoints.mqtt.topics import BridgeStatusChannel, Channel, ClearedTopic, Message, TopicRules, status
 from shmio.layout.topic import shorten
-from shmio.segment import ProcessSlot, Quality, Segment
+from shmio.segment import Block, ProcessSlot, Quality, Segment
 from shmio.segment.doorbell import TURN_NS, Relay
 
 OFFLINE: Final = b"offline"
@@ -144,8 +144,18 @@ class Bridge:
         own = (
             outbox.sent, commands.received, refused, outbox.waiting, outbox.backlog, outbox.dropped,
             self.connection.connects, self._missed + sum(feed.missed for feed in self._feeds.values()),
+            self.connection.sent_bytes + self.command_connection.connection.sent_bytes,
         )  # fmt: skip
         return own if self._sparkplug is None else tuple(map(sum, zip(own, self._sparkplug.counters, strict=True)))
+
+    @property
+    def readers(self) -> Iterator[tuple[Block, int]]:
+        """The blocks that the bridge reads now, each with the number of the last frame read."""
+        for feed in self._feeds.values():
+            if not feed.step_driven:
+                yield feed.block, feed.follower.last
+        if self._sparkplug is not None:
+            yield from self._sparkplug.readers
 
     @property
     def problem(self) -> str:

@@ -52,6 +52,7 @@ async def _serve(worker: Worker) -> None:
     while not stopping.is_set():
         endpoint.follow_reloads()
         worker.report(endpoint.counters)
+        worker.report_readers(endpoint.readers)
         try:
             await asyncio.wait_for(stopping.wait(), BEAT_S)
         except TimeoutError:

@@ -174,13 +174,14 @@ class Processor(UaProcessor):
 
 
 class _CountedTransport:
-    """A connection's transport that counts the bytes written to it."""
+    """A connection's transport that counts the messages and bytes written to it."""
 
     def __init__(self, transport: asyncio.BaseTransport, counters: Any) -> None:
         self._transport: Any = transport
         self._counters = counters
 
     def write(self, data: bytes) -> None:
+        self._counters.sent_messages += 1
         self._counters.sent_bytes += len(data)
         self._transport.write(data)
 

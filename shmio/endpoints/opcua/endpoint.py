@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Container
+from collections.abc import Container, Iterator
 from functools import partial
 
 from shmio.config import OpcUa
@@ -12,7 +12,7 @@ from shmio.endpoints.opcua.feed import Feed
 from shmio.endpoints.opcua.methods import Stepping, add_injections, add_step
 from shmio.endpoints.opcua.nodes import SourceNode
 from shmio.endpoints.opcua.server import Server, bound_decoding
-from shmio.segment import ProcessSlot, Segment
+from shmio.segment import Block, ProcessSlot, Segment
 from shmio.segment.doorbell import Relay
 
 log = logging.getLogger("shmio.opcua")
@@ -55,7 +55,15 @@ class Endpoint:
         """The counters, in the order in which the process table names them."""
         shared = self.server.iserver
         counted = shared.counters
-        return shared.sessions, shared.subscriptions.items, counted.writes, counted.refused, counted.sent_bytes
+        return (
+            shared.sessions, shared.subscriptions.items, counted.writes, counted.refused, counted.sent_bytes,
+            counted.sent_messages,
+        )  # fmt: skip
+
+    @property
+    def readers(self) -> Iterator[tuple[Block, int]]:
+        """The blocks that the endpoint reads, each with the number of the last frame read."""
+        return ((source.feed.block, source.feed.follower.last) for source in self.sources.values())
 
     def poll(self) -> None:
         """Read all new frames of all sources."""

@@ -59,12 +59,13 @@ log = logging.getLogger("shmio.opcua")
 
 @dataclass
 class Counters:
-    """Counts the writes of clients, refused requests, and the bytes that clients were sent."""
+    """Counts the writes of clients, refused requests, and what clients were sent."""
 
     writes: int = 0
     refused: int = 0
+    sent_messages: int = 0
     sent_bytes: int = 0
-    """Number of bytes that were written to the connections."""
+    """Numbers of messages and bytes that were written to the connections."""
 
 
 class InternalServer(LibraryInternalServer):

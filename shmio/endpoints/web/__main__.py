@@ -55,7 +55,7 @@ async def _serve(worker: Worker) -> None:
     stopping = asyncio.Event()
     worker.on_stop(lambda: loop.call_soon_threadsafe(stopping.set))
     measurements = Measurements(worker.segment)
-    page = cell = None
+    page = cell = served = None
     if isinstance(config, Web):
         cell = attach(worker.segment.instance, writable=True)
         sessions = Sessions(read_tokens(msgspec.convert(given, list[Token])), config.roles or ())
@@ -80,7 +80,9 @@ async def _serve(worker: Worker) -> None:
     while not stopping.is_set():
         counters = server.counters
         sent = (0, 0, 0) if page is None else page.counters
-        worker.report((counters.requests, counters.refused, counters.connections, *sent))
+        worker.report((counters.requests, counters.refused, counters.connections, *sent, counters.answer_bytes))
+        if served is not None:
+            worker.report_readers(served.feeds.readers)
         try:
             await asyncio.wait_for(stopping.wait(), BEAT_S)
         except TimeoutError:

@@ -65,6 +65,7 @@ _COUNTERS: Final[Mapping[str, Mapping[str, _Named]]] = {
         "published": _Named("shmio_grpc_published", "Values that clients wrote or injected."),
         "refused": _Named("shmio_grpc_refused", "Calls that were refused."),
         "bytes": _Named("shmio_grpc_sent_bytes", "Bytes of the messages that were sent to clients."),
+        "waiting_bytes": _Named("shmio_grpc_waiting_bytes", "Bytes of the messages that wait for clients.", gauge=True),
     },
     "mqtt": {
         "messages": _Named("shmio_mqtt_messages", "Messages that were published."),
@@ -75,6 +76,7 @@ _COUNTERS: Final[Mapping[str, Mapping[str, _Named]]] = {
         "dropped": _Named("shmio_mqtt_dropped", "Changes that the full backlog dropped."),
         "connects": _Named("shmio_mqtt_connects", "Connections that were made to the broker."),
         "missed": _Named("shmio_mqtt_missed_frames", "Frames that the bridge was too slow to read."),
+        "bytes": _Named("shmio_mqtt_sent_bytes", "Bytes of the topics and payloads of published messages."),
     },
     "opcua": {
         "sessions": _Named("shmio_opcua_sessions", "Sessions that are open.", gauge=True),
@@ -82,6 +84,7 @@ _COUNTERS: Final[Mapping[str, Mapping[str, _Named]]] = {
         "writes": _Named("shmio_opcua_writes", "Values that clients wrote."),
         "refused": _Named("shmio_opcua_refused", "Writes and calls that were refused."),
         "bytes": _Named("shmio_opcua_sent_bytes", "Bytes that were written to the connections of clients."),
+        "messages": _Named("shmio_opcua_messages", "Messages that were written to the connections of clients."),
     },
     "recorder": {
         "frames": _Named("shmio_recorder_frames", "Frames that were recorded."),
@@ -96,6 +99,7 @@ _COUNTERS: Final[Mapping[str, Mapping[str, _Named]]] = {
         "pages": _Named("shmio_web_pages", "Pages that are open.", gauge=True),
         "messages": _Named("shmio_web_messages", "Messages that were sent to pages."),
         "bytes": _Named("shmio_web_sent_bytes", "Bytes of the messages that were sent to pages."),
+        "answer_bytes": _Named("shmio_web_answer_bytes", "Bytes of the answers to requests, without headers."),
     },
     "alerts": {
         "active": _Named("shmio_alerts_active", "Alerts that are active.", gauge=True),
@@ -183,7 +187,9 @@ class InstanceCollector(Collector):
         )
         yield CounterMetricFamily("shmio_clock_steps", "Steps of virtual time that are done.", value=clock.done)
         yield from self._processes(status.processes)
-        yield from _sources([one for one in status.processes if isinstance(one, SourceStatus)])
+        sources = [one for one in status.processes if isinstance(one, SourceStatus)]
+        yield from _sources(sources)
+        yield from _readers(sources)
         yield from self._frames()
         yield from self._timing()
         yield from self._disks()
@@ -361,6 +367,18 @@ def _sources(sources: Sequence[SourceStatus]) -> Iterator[Metric]:
         quality.add_metric([one.name], Quality[one.quality.upper()])
         rate.add_metric([one.name], one.rate_hz)
     yield from (quality, rate)
+
+
+def _readers(sources: Sequence[SourceStatus]) -> Iterator[Metric]:
+    labels = ["source", "process"]
+    behind = "by the slowest reader of this process."
+    frames = GaugeMetricFamily("shmio_reader_lag_frames", f"Frames of the source not yet read {behind}", labels=labels)
+    lag = GaugeMetricFamily("shmio_reader_lag_seconds", f"Age of the oldest frame not yet read {behind}", labels=labels)
+    for one in sources:
+        for reader in one.readers:
+            frames.add_metric([one.name, reader.process], reader.frames)
+            lag.add_metric([one.name, reader.process], reader.lag_s)
+    yield from (frames, lag)
 
 
 def _numbers(path: str, dims: Sequence[tuple[int, int]], value: Value) -> Iterator[tuple[str, float]]:

@@ -48,11 +48,13 @@ _HEADERS: Final = (
 
 @dataclass
 class Counters:
-    """Counts the requests and refusals so far, and the open connections."""
+    """Counts the requests, refusals and bytes of answers so far, and the open connections."""
 
     requests: int = 0
     refused: int = 0
     connections: int = 0
+    answer_bytes: int = 0
+    """Number of bytes of the bodies of answers to HTTP requests."""
 
 
 class _Protocol(H11Protocol):
@@ -153,6 +155,8 @@ class _Guarded:
                 message["headers"] = [
                     *message["headers"], *((name, value) for name, value in _HEADERS if name not in given)
                 ]  # fmt: skip
+            elif message["type"] == "http.response.body":
+                self._counters.answer_bytes += len(message.get("body", b""))
             await send(message)
 
         async def refuse(status: int, text: bytes) -> None:

@@ -239,6 +239,11 @@ class Feeds:
             self._task = asyncio.get_running_loop().create_task(self._send())
         return feed
 
+    @property
+    def readers(self) -> Iterator[tuple[Block, int]]:
+        """The blocks that pages plot, each with the number of the last frame that was sent."""
+        return ((feed.block, feed.last) for feed in self._feeds.values() if feed.followers)
+
     def leave(self, feed: Feed, follower: Follower) -> None:
         """Remove a follower from a feed."""
         feed.followers.discard(follower)

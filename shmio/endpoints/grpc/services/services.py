@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 import grpc
@@ -18,7 +18,7 @@ from shmio.endpoints.grpc.streams.outbox import OpenStreams, Outboxes
 from shmio.endpoints.grpc.time.stepper import Stepper
 from shmio.endpoints.grpc.topics import Topics
 from shmio.endpoints.grpc.wakeups import WakeUps
-from shmio.segment import ProcessSlot, Segment
+from shmio.segment import Block, ProcessSlot, Segment
 
 
 class Services:
@@ -83,6 +83,11 @@ class Services:
         The feeds count the messages of the other services.
         """
         return self._shmio_v1.subscribe_calls.updates
+
+    @property
+    def readers(self) -> Iterator[tuple[Block, int]]:
+        """The blocks that clients read frame by frame, each with the number of the last frame sent."""
+        return self._shmio_v1.subscribe_calls.readers
 
     @property
     def waiting_bytes(self) -> int:

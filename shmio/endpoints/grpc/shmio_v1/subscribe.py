@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Collection
+from collections.abc import AsyncIterator, Callable, Collection, Iterator
 from functools import partial
 from typing import Any, Final, Protocol
 
@@ -31,7 +31,7 @@ from shmio.endpoints.grpc.time.timeline import PATIENCE_S, Timeline
 from shmio.endpoints.grpc.wakeups import Callback, WakeUps
 from shmio.errors import EndpointError, PathError, SegmentError, ShmioError, ValueRangeError
 from shmio.local.time_control import Step
-from shmio.segment import Event, Frame, FrameFollower
+from shmio.segment import Block, Event, Frame, FrameFollower
 from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_STREAMS: Final = 256
@@ -249,6 +249,16 @@ class SubscribeCall:
         self._wake = asyncio.Event()
         self._clock = asyncio.get_running_loop().time
 
+    @property
+    def readers(self) -> Iterator[tuple[Block, int]]:
+        """The blocks whose frames are all sent, each with the number of the last frame sent.
+
+        Without those whose frames wait for a step.
+        """
+        for updates in self._blocks.values():
+            if isinstance(updates, EveryFrame) and self._may_send(updates):
+                yield updates.view.block, updates.follower.last
+
     async def open(self) -> bytes:
         """Start following all blocks, and return the tables.
 
@@ -458,6 +468,11 @@ class SubscribeCalls:
     def updates(self) -> int:
         """Number of updates sent by Subscribe calls since the start."""
         return self._ended_updates + sum(subscription.updates for subscription in self._open)
+
+    @property
+    def readers(self) -> Iterator[tuple[Block, int]]:
+        """The blocks that clients read frame by frame, each with the number of the last frame sent."""
+        return (reader for subscription in self._open for reader in subscription.readers)
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
         """Return the handler of the call, by name. The handler yields serialised messages."""

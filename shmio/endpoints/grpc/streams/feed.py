@@ -169,6 +169,11 @@ class Feed:
         return (self._reader.alive or self.block.retired) and self.commands.alive
 
     @property
+    def last(self) -> int:
+        """Number of the last frame that the feed has read."""
+        return self._follower.last
+
+    @property
     def over(self) -> bool:
         """True if the feed has ended, and has no listeners and no commands in flight."""
         return not (self._reader.alive or self._channels) and self.commands.over
@@ -445,6 +450,11 @@ class Feeds(Mapping[str, Feed]):
     def messages(self) -> int:
         """Number of messages encoded since the start."""
         return self._ended_messages + sum(feed.messages for feed in (*self._feeds.values(), *self._ended))
+
+    @property
+    def readers(self) -> Iterator[tuple[Block, int]]:
+        """The blocks of the feeds, each with the number of the last frame read."""
+        return ((feed.block, feed.last) for feed in self._feeds.values())
 
     @property
     def alive(self) -> bool:

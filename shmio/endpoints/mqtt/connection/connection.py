@@ -195,6 +195,8 @@ class BrokerConnection:
         """Called with the unacknowledged messages when the connection is lost."""
         self.problems = ConnectionProblems()
         self.connects = 0
+        self.sent_bytes = 0
+        """Number of bytes of the topics and payloads that were sent."""
         self.subscribed = False
         """True if the broker has answered the last subscription."""
         self._policy, self._selector, self._wake, self._will, self._most = policy, selector, wake, will, most
@@ -406,6 +408,7 @@ class BrokerConnection:
             return
         qos, retain = message.qos and limits.qos, message.retain and limits.retain
         info = client.publish(message.topic, message.payload, qos, retain, properties if self.mqtt5 else None)
+        self.sent_bytes += len(message.topic.encode()) + len(message.payload)
         if qos:
             self._in_flight[info.mid] = message
         else:

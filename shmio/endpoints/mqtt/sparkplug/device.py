@@ -82,6 +82,11 @@ class Device:
         return self._follower.missed
 
     @property
+    def last(self) -> int:
+        """Number of the last frame that the device has read."""
+        return self._follower.last
+
+    @property
     def behind(self) -> int:
         """Number of frames that the device has not read yet."""
         return self._follower.behind

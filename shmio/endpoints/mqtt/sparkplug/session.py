@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import selectors
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 import msgspec
@@ -30,7 +30,7 @@ from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.glob import Glob
 from shmio.layout.model import Register
 from shmio.layout.topic import shorten
-from shmio.segment import DONE, EventKind, Segment
+from shmio.segment import DONE, Block, EventKind, Segment
 
 SAMPLE_BYTES: Final = 96
 """Approximate memory that a sample needs in addition to its value, in bytes."""
@@ -164,7 +164,15 @@ class Session:
         refused, connects = self._refused + self.connection.problems.refused, self.connection.connects
         missed = self._missed + sum(device.missed for device in self._devices.values())
         kept = self._backlog
-        return self._sent, self._received, refused, waiting, kept.count, kept.dropped, connects, missed
+        return (
+            self._sent, self._received, refused, waiting, kept.count, kept.dropped, connects, missed,
+            self.connection.sent_bytes,
+        )  # fmt: skip
+
+    @property
+    def readers(self) -> Iterator[tuple[Block, int]]:
+        """The blocks that the session reads, each with the number of the last frame read."""
+        return ((device.block, device.last) for device in self._devices.values())
 
     @property
     def problem(self) -> str:

@@ -7,11 +7,13 @@ import { LogTab } from "./log.js";
 /** @typedef {import("./main.js").Context} Context */
 
 const PROCESS = ["Process", "Kind", "State", "pid", "Restarts", "CPU %", "Memory", "Running for", "Note", ""];
-const SOURCE = ["Source", "Quality", "Registers", "Period ms", "Rate Hz", "Overruns", "Round trip ms", "Age", "Disconnected in 1, 10, 30 min", "Connected in 1, 10, 30 min"];
+const SOURCE = ["Source", "Quality", "Registers", "Period ms", "Rate Hz", "Overruns", "Round trip ms", "Age", "Slowest reader", "Disconnected in 1, 10, 30 min", "Connected in 1, 10, 30 min"];
 const CLIENT = ["Endpoint", "Connections", "Clients"];
 /** Kinds of processes in words. @type {Record<string, string>} */
 const KINDS = { source: "source", emulator: "emulator", grpc: "gRPC", mqtt: "MQTT", opcua: "OPC UA", web: "web page", recorder: "recorder", alerts: "alerts" };
 const LOG_LINES = 50;
+/** A reader that is this many seconds behind is marked. */
+const LATE_S = 1;
 const ALERT = ["Alert", "Severity", "Text", "Reason", "Active for"];
 /** The class of each severity. @type {Record<string, string>} */
 const SEVERITY = { warning: "uncertain", critical: "bad" };
@@ -68,6 +70,7 @@ export class OverviewTab {
         one.overruns,
         [fixed(one.round_trip_ms, 2), "number"],
         [one.age_s === null ? "" : duration(one.age_s), "number"],
+        slowest(one.readers),
         [one.lost.join(", "), "number"],
         [one.recovered.join(", "), "number"],
       ]),
@@ -140,6 +143,15 @@ export class OverviewTab {
 /** @param {any} process @returns {string} What the process has counted. */
 function counters(process) {
   return Object.entries(process.counters).map(([name, value]) => `${name.replaceAll("_", " ")}: ${value}`).join("\n");
+}
+
+/**
+ * @param {{ process: string, frames: number, lag_s: number }[]} readers The processes that read a source, the slowest first.
+ * @returns {[string, string, string]} The slowest one, its class, and a tooltip with all of them.
+ */
+function slowest(readers) {
+  const texts = readers.map(({ process, frames, lag_s }) => `${process}: ${frames} frames, ${duration(lag_s)}`);
+  return [texts[0] ?? "none", readers.length > 0 && readers[0].lag_s >= LATE_S ? "uncertain" : "", texts.join("\n")];
 }
 
 /** A table whose rows are named by their first cell. */
