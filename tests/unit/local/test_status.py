@@ -97,8 +97,8 @@ def test_running_instance(cell: Cell, instance: str) -> None:
     assert (source.quality, source.reason, source.cycle) == ("good", "", 5)
     assert (source.rate_hz, source.overruns, source.real_time) == (49.9, 3, True)
     assert "rate_mhz" not in source.counters
-    counters = {"streams": 7, "messages": 3, "dropped": 0, "published": 1, "refused": 250, "bytes": 49_900, "waiting_bytes": 0}
-    assert grpc.counters == counters
+    counters = {"streams": 7, "messages": 3, "dropped": 0, "published": 1, "refused": 250, "bytes": 49_900}
+    assert grpc.counters == {**counters, "waiting_bytes": 0}
     assert type(grpc) is ProcessStatus, "only a source has a quality"
 
 
