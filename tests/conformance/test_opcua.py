@@ -25,8 +25,11 @@ MANY = 1100
 """More than the nodes of a request and of a subscription."""
 
 
-def layout() -> Layout:
-    tags: dict[str, object] = {"counted": {"type": f"ARRAY[1..{WORDS}] OF UDINT", "address": "ns=2;s=counted"}}
+def layout(*, changed: bool = False) -> Layout:
+    tags: dict[str, object] = {"added": {"type": "UINT", "address": "ns=2;s=added"}} if changed else {}
+    tags["counted"] = {"type": f"ARRAY[1..{WORDS}] OF UDINT", "address": "ns=2;s=counted"}
+    if changed:
+        return place_tags("device", tags).with_statuses()
     tags |= {f"spare/{place}": {"type": "BYTE", "address": f"ns=2;s=spare{place}"} for place in range(SPARE)}
     tags["fixed"] = {"type": "UINT", "address": "/Objects/2:Device/2:fixed"}
     return place_tags("device", tags).with_statuses()
@@ -35,15 +38,20 @@ def layout() -> Layout:
 class OpcUaRig:
     """The server behind a proxy."""
 
-    def __init__(self, proxy: FaultProxy, mode: Literal["subscribe", "poll"]) -> None:
+    def __init__(self, proxy: FaultProxy, mode: Literal["subscribe", "poll"], *, changed: bool = False) -> None:
         self.proxy = proxy
-        self.layout = layout()
+        self.layout = layout(changed=changed)
         self._mode = mode
         by_path = {register.path: register for register in self.layout.registers}
         self._counted = codec(by_path["counted"], "little")
+        if changed:
+            return
         self.spare = by_path["spare/0"].offset
         self.flags = self.spare
         self.refused = Write(by_path["fixed"].offset, 0, b"\1\0")
+
+    def changed(self) -> OpcUaRig:
+        return OpcUaRig(self.proxy, self._mode, changed=True)
 
     def connector(self) -> Connector:
         options = OpcUaOptions(
@@ -63,6 +71,7 @@ class OpcUaRig:
 def device() -> Iterator[Device]:
     with Device() as device:
         device.ask("add", "counted", "UInt32", [0] * WORDS)
+        device.ask("add", "added", "UInt16", 9)
         device.ask("add", "fixed", "UInt16", 7, False)
         for place in range(SPARE):
             device.ask("add", f"spare{place}", "Byte", 0)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import importlib.util
+import itertools
 import logging
 import threading
 import time
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Coroutine, Iterator, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -122,6 +123,7 @@ class OpcUaConnector(Connector):
     can_write = True
     register_quality = True
     reads_optimized = True
+    register_options = frozenset({"nodes"})
     path_options: ClassVar[tuple[str, ...]] = ("certificate", "key", "trusted", "password_file")
 
     def __init__(self, options: OpcUaOptions, layout: Layout) -> None:
@@ -193,13 +195,7 @@ class OpcUaConnector(Connector):
 
         """
         self.close()
-        if self._image is None:
-            raise ConnectorError("the layout has no status area")
-        with self._lock:
-            self._latest.clear()
-            for index in range(len(self._layout.registers)):
-                self._image.fail(index, BAD_WAITING_FOR_INITIAL_DATA)
-        self._reported.clear()
+        self._forget()
         link = self._link = _Link(self._options, self._credentials, self._nodes, self._deliver)
         link.start()
         try:
@@ -210,6 +206,27 @@ class OpcUaConnector(Connector):
         except ConnectorError:
             self.close()
             raise
+
+    def take_over(self, other: OpcUaConnector) -> bool:
+        """Take over the sessions, and the newest values of the nodes that both connectors have."""
+        link = other._link
+        if link is None:
+            return False
+        self._link, other._link = link, None
+        link.check()
+        self._forget()
+        link.call(lambda: link.change(self._nodes, self._deliver))
+        return True
+
+    def _forget(self) -> None:
+        """Let all registers wait for their first values."""
+        if self._image is None:
+            raise ConnectorError("the layout has no status area")
+        with self._lock:
+            self._latest.clear()
+            for index in range(len(self._layout.registers)):
+                self._image.fail(index, BAD_WAITING_FOR_INITIAL_DATA)
+        self._reported.clear()
 
     def read(self) -> bytes:
         """Return the image of the newest values. In mode ``poll``, first read all nodes.
@@ -531,6 +548,7 @@ class _Link(threading.Thread):
         super().__init__(name="opcua", daemon=True)
         self._options, self._credentials, self._deliver = options, credentials, deliver
         self._nodes = nodes
+        self._handles = itertools.count()
         self._loop = asyncio.new_event_loop()
         self._stopping = asyncio.Event()
         self._closed = False
@@ -644,15 +662,9 @@ class _Link(threading.Thread):
             self._loop.close()
 
     async def _main(self) -> None:
-        from shmio.connectors.opcua.session import Item, Session  # noqa: PLC0415  a library that only sources need
-
         options = self._options
-        self.items = [
-            Item(index, one.address, one.deadband, index // options.session_items, is_structure=one.is_structure)
-            for index, one in enumerate(self._nodes)
-        ]
-        parts = [self.items[at : at + options.session_items] for at in range(0, len(self.items), options.session_items)]
-        sessions = [Session(options, self._credentials, part, self._deliver) for part in parts]
+        self.items = [self._item(index, node) for index, node in enumerate(self._nodes)]
+        sessions = self._new_sessions(self.items, 0)
         stopping = asyncio.create_task(self._stopping.wait())
         try:
             opening = asyncio.gather(*(one.open() for one in sessions))
@@ -661,14 +673,11 @@ class _Link(threading.Thread):
                 opening.cancel()
             await opening
             self.sessions = sessions
-            lost = [one.failure for one in sessions]
-            await self._first_values(sessions, lost)
-            if not self.opened.done():
+            self._watch(sessions)
+            await self._first_values()
+            if self._failure is None and not self.opened.done():
                 self.opened.set_result(None)
-            await asyncio.wait((*lost, stopping), return_when=asyncio.FIRST_COMPLETED)
-            for one in lost:
-                if one.done():
-                    self._lose(one.result())
+            await stopping
         except ConnectorError as error:
             self._lose(error)
         except asyncio.CancelledError:
@@ -676,20 +685,106 @@ class _Link(threading.Thread):
         finally:
             stopping.cancel()
             healthy = self._failure is None
-            await asyncio.gather(*(one.close(polite=healthy) for one in sessions), return_exceptions=True)
+            opened = [*sessions, *(one for one in self.sessions if one not in sessions)]
+            await asyncio.gather(*(one.close(polite=healthy) for one in opened), return_exceptions=True)
             rest = [one for one in asyncio.all_tasks() if one is not asyncio.current_task()]
             for task in rest:
                 task.cancel()
             await asyncio.gather(*rest, return_exceptions=True)
 
-    async def _first_values(self, sessions: Sequence[Session], lost: Sequence[asyncio.Future[Any]]) -> None:
+    def _item(self, index: int, node: _Node) -> Item:
+        from shmio.connectors.opcua.session import Item  # noqa: PLC0415  a library that only sources need
+
+        return Item(index, next(self._handles), node.address, node.deadband, is_structure=node.is_structure)
+
+    def _new_sessions(self, items: Sequence[Item], first: int) -> list[Session]:
+        """Return new sessions for items; the first has the number ``first``. They are not open."""
+        from shmio.connectors.opcua.session import Session  # noqa: PLC0415
+
+        most = self._options.session_items
+        sessions: list[Session] = []
+        for at in range(0, len(items), most):
+            part = items[at : at + most]
+            for item in part:
+                item.session = first + len(sessions)
+            sessions.append(Session(self._options, self._credentials, part, self._deliver))
+        return sessions
+
+    def _watch(self, sessions: Iterable[Session]) -> None:
+        """Notice when one of these sessions, which are open, is lost."""
+        for one in sessions:
+            one.failure.add_done_callback(self._session_lost)
+
+    def _session_lost(self, failure: asyncio.Future[ConnectorError]) -> None:
+        if not failure.cancelled():
+            self._lose(failure.result())
+            self._stopping.set()
+
+    async def change(self, nodes: Sequence[_Node], deliver: Callable[[list[tuple[Item, Sample]]], None]) -> None:
+        """Read other nodes, and deliver their samples to another object, which first gets the newest ones.
+
+        Nodes that stay the same keep their monitored items and their sessions. A session without any
+        nodes is closed, unless it is the only one. The definitions of structures are read again.
+        """
+        await asyncio.gather(*(one.learn_again() for one in self.sessions))
+        left: dict[tuple[Any, ...], list[Item]] = {}
+        for item in self.items:
+            left.setdefault((item.address, item.deadband, item.is_structure), []).append(item)
+        self._nodes, self._deliver = nodes, deliver
+        kept: list[list[Item]] = [[] for _ in self.sessions]
+        new: list[Item] = []
+        items: list[Item] = []
+        for index, node in enumerate(nodes):
+            if same := left.get((node.address, node.deadband, node.is_structure)):
+                item = same.pop()
+                item.index = index
+                kept[item.session].append(item)
+            else:
+                item = self._item(index, node)
+                new.append(item)
+            items.append(item)
+        parts: list[list[Item]] = []
+        at = 0
+        for number, own in enumerate(kept):
+            room = max(0, self._options.session_items - len(own))
+            parts.append(new[at : at + room])
+            for item in parts[-1]:
+                item.session = number
+            at += len(parts[-1])
+        gone = [one.switch(own, part, deliver) for one, own, part in zip(self.sessions, kept, parts, strict=True)]
+        self.items = items
+        for item in (item for own in kept for item in own):
+            seen = [item.seen] if item.last is item.seen else [item.last, item.seen]
+            deliver([(item, sample) for sample in seen if sample is not None])
+        present = self.sessions
+        more = self._new_sessions(new[at:], len(present))
+        self.sessions = [*present, *more]
+        await asyncio.gather(
+            *(one.follow(those, part) for one, those, part in zip(present, gone, parts, strict=True)),
+            *(one.open() for one in more),
+        )
+        self._watch(more)
+        await self._close_empty()
+
+    async def _close_empty(self) -> None:
+        """Close the sessions without nodes, but not the last session."""
+        empty = [one for one in self.sessions if not one.items]
+        if len(empty) == len(self.sessions):
+            empty = empty[1:]
+        self.sessions = [one for one in self.sessions if one not in empty]
+        for number, one in enumerate(self.sessions):
+            for item in one.items:
+                item.session = number
+        await asyncio.gather(*(one.close(polite=True) for one in empty))
+
+    async def _first_values(self) -> None:
         """Read all nodes in mode ``poll``; else wait, at most for the time-out, for their first values."""
         if self._options.mode == "poll":
             await self._guarded(self.poll)
             return
         end_s = self._loop.time() + self._options.timeout / 1000
-        while any(one.waiting for one in sessions) and self._loop.time() < end_s and not self._stopping.is_set():
-            if any(one.done() for one in lost):
+        while any(one.waiting for one in self.sessions) and self._loop.time() < end_s:
+            if self._stopping.is_set():
                 return
             await asyncio.sleep(0.005)
 

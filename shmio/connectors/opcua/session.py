@@ -82,10 +82,13 @@ class Item:
     """A node that the source reads, and its state."""
 
     index: int
+    """Index of the node in the source's layout, which a reload may change."""
+    handle: int
+    """The client's number of the monitored item, which no other item has during the connection."""
     address: Address
     deadband: float
     """Dead-band in the numbers of the node, before scaling; 0 if there is none."""
-    session: int
+    session: int = 0
     """Index of the session that reads the node."""
     node: Any = None
     """The node id; None if the server has not resolved the address yet."""
@@ -143,8 +146,9 @@ class Session:
             deliver: Called with new samples. The sample of a failed item has no value.
 
         """
-        self._options, self._credentials, self._items, self._deliver = options, credentials, items, deliver
-        self._by_index = {item.index: item for item in items}
+        self._options, self._credentials, self._deliver_to = options, credentials, deliver
+        self._items = [*items]
+        self._by_handle = {item.handle: item for item in items}
         self._timeout_s = options.timeout / 1000
         self._client: Any = None
         self._protocol: Any = None
@@ -157,6 +161,7 @@ class Session:
         self._wanted = 0
         self._acknowledge: list[Any] = []
         self._tasks: list[asyncio.Task[None]] = []
+        self._retrying: asyncio.Task[None] | None = None
         self._per_read = self._per_write = self._per_path = self._per_items = MAX_PER_CALL
         self._answered_ns = time.monotonic_ns()
         self.failure = asyncio.get_running_loop().create_future()
@@ -208,7 +213,8 @@ class Session:
             await self._subscribe([item for item in self._items if item.node is not None])
         self._report_failed(self._items)
         self._answered_ns = time.monotonic_ns()
-        self._tasks += [asyncio.create_task(one()) for one in (self._probe, self._watch, self._retry)]
+        self._tasks += [asyncio.create_task(one()) for one in (self._probe, self._watch)]
+        self._retrying = asyncio.create_task(self._retry())
 
     def _new_client(self) -> Any:
         client = Client(self._options.full_url, timeout=self._timeout_s)
@@ -294,9 +300,10 @@ class Session:
 
     async def close(self, *, polite: bool) -> None:
         """Close the connection. If ``polite``, first send CloseSession to the server."""
-        for task in self._tasks:
+        tasks = [*self._tasks, *([self._retrying] if self._retrying is not None else [])]
+        for task in tasks:
             task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await asyncio.gather(*tasks, return_exceptions=True)
         if self._client is None:
             return
         low = self._client.uaclient
@@ -696,7 +703,7 @@ class Session:
         if filters and item.deadband:
             chosen = ua.DataChangeFilter(ua.DataChangeTrigger.StatusValue, 1, item.deadband)
         wanted = ua.MonitoringParameters(
-            item.index, float(self._options.sampling_ms), chosen, self._options.queue, True
+            item.handle, float(self._options.sampling_ms), chosen, self._options.queue, True
         )
         return ua.MonitoredItemCreateRequest(
             ua.ReadValueId(item.node, ua.AttributeIds.Value), ua.MonitoringMode.Reporting, wanted
@@ -749,8 +756,8 @@ class Session:
         one.sequence = found.sequence
         self._acknowledge.append(ua.SubscriptionAcknowledgement(one.number, found.sequence))
         taken: list[tuple[Item, Sample]] = []
-        for index, sample in found.values:
-            item = self._by_index.get(index)
+        for handle, sample in found.values:
+            item = self._by_handle.get(handle)
             if item is None or item.subscription is not one:
                 continue
             if item.settles_ns and self._is_from_before(item, sample):
@@ -767,6 +774,67 @@ class Session:
         if sample.source_ns and item.written_ns:
             return sample.source_ns < item.written_ns
         return item.last is not None and sample.value != item.last.value
+
+    # -- other nodes ---------------------------------------------------------------------------------------------------
+
+    @property
+    def items(self) -> Sequence[Item]:
+        """The nodes that the session reads."""
+        return self._items
+
+    def switch(self, kept: Sequence[Item], new: Sequence[Item], deliver: Deliver) -> list[Item]:
+        """Read other nodes from now on: those in ``kept``, which it reads now, and those in ``new``.
+
+        Call :meth:`follow` next. No sample of another node is delivered any more, and no sample is
+        delivered to the previous function.
+
+        Returns:
+            The nodes that the session no longer reads.
+
+        """
+        if self._retrying is not None:
+            self._retrying.cancel()  # it may be about to subscribe to nodes that are no longer read
+        present = self._items
+        self._items, self._deliver_to = [*kept, *new], deliver
+        self._by_handle = {item.handle: item for item in self._items}
+        return [item for item in present if item.handle not in self._by_handle]
+
+    async def follow(self, gone: Sequence[Item], new: Sequence[Item]) -> None:
+        """End the subscriptions to the nodes that are no longer read, and resolve and subscribe to the new ones."""
+        for one in [*self._subscriptions.values()]:
+            await self._unsubscribe(one, [item for item in gone if item.subscription is one])
+        await self._resolve(new)
+        await self._learn(new)
+        if self._options.mode == "subscribe":
+            await self._subscribe_into_room([item for item in new if item.node is not None])
+            for one in [*self._subscriptions.values()]:
+                if not one.items and len(self._subscriptions) > 1:
+                    await self._drop(one)
+        self._report_failed(new)
+        self._retrying = asyncio.create_task(self._retry())
+
+    async def learn_again(self) -> None:
+        """Ask again for the definitions of all structures. They may have changed."""
+        await self._learn(self._items)
+
+    async def _unsubscribe(self, subscription: Subscription, items: Sequence[Item]) -> None:
+        """Delete monitored items of a subscription."""
+        for at in range(0, len(items), self._per_items):
+            part = items[at : at + self._per_items]
+            request = ua.DeleteMonitoredItemsRequest()
+            request.Parameters = ua.DeleteMonitoredItemsParameters(
+                subscription.number, [item.monitored for item in part]
+            )
+            await self._response(ua.DeleteMonitoredItemsResponse, request)
+            for item in part:
+                item.subscription = None
+        left = {*items}
+        subscription.items = [item for item in subscription.items if item not in left]
+
+    def _deliver(self, samples: list[tuple[Item, Sample]]) -> None:
+        """Deliver samples, but not those of nodes that are no longer read."""
+        if wanted := [one for one in samples if self._by_handle.get(one[0].handle) is one[0]]:
+            self._deliver_to(wanted)
 
     # -- supervision ---------------------------------------------------------------------------------------------------
 
@@ -862,20 +930,22 @@ class Session:
         known = [item for item, one in zip(items, there, strict=True) if one.code & 0xFFFF0000 not in _AGAIN]
         for item in known:
             if item.subscription is not None:
-                request = ua.DeleteMonitoredItemsRequest()
-                request.Parameters = ua.DeleteMonitoredItemsParameters(item.subscription.number, [item.monitored])
-                await self._response(ua.DeleteMonitoredItemsResponse, request)
-                item.subscription.items.remove(item)
-                item.subscription = None
+                await self._unsubscribe(item.subscription, [item])
             item.code = BAD_WAITING_FOR_INITIAL_DATA
+        await self._subscribe_into_room(known)
+        self._report_failed(known)
+
+    async def _subscribe_into_room(self, items: Sequence[Item]) -> None:
+        """Monitor items in the present subscriptions, as far as these have room, and in new ones."""
         at = 0
+        beyond: list[Item] = []
         for one in [*self._subscriptions.values()]:
             room = max(0, self._options.max_items - len(one.items))
-            if part := known[at : at + room]:
+            if part := items[at : at + room]:
                 await self._fill(one, part)
+                beyond += [item for item in part if item.subscription is None and item.code == _BAD_TOO_MANY_ITEMS]
             at += room
-        await self._subscribe(known[at:])
-        self._report_failed(known)
+        await self._subscribe([*beyond, *items[at:]])
 
     def _report_failed(self, items: Iterable[Item]) -> None:
         """Deliver the status codes of items that cannot be read, but not of monitored items, which get samples."""

@@ -32,14 +32,27 @@ class Source:
     """A connector with a tag table; its address is ``ns=2;s=PATH`` unless a tag has one."""
 
     def __init__(self, url: str, tags: Mapping[str, Any], **options: Any) -> None:
+        keys = {"timeout": 1000, "publishing_ms": 10, "sampling_ms": 5} | options
+        self._options = OpcUaOptions(url=url, **keys)
+        self._make(tags)
+
+    def _make(self, tags: Mapping[str, Any]) -> None:
         given = {
             path: {"address": f"ns=2;s={path}", **(tag if isinstance(tag, dict) else {"type": tag})}
             for path, tag in tags.items()
         }
         self.layout = place_tags("device", given).with_statuses()
         self._area = StatusArea(self.layout)
-        keys = {"timeout": 1000, "publishing_ms": 10, "sampling_ms": 5} | options
-        self.connector = OpcUaConnector(OpcUaOptions(url=url, **keys), self.layout)
+        self.connector = OpcUaConnector(self._options, self.layout)
+
+    def reload(self, tags: Mapping[str, Any]) -> None:
+        """Let a connector with other tags take over the connection."""
+        before = self.connector
+        self._make(tags)
+        try:
+            assert self.connector.take_over(before)
+        finally:
+            before.close()
 
     def value(self, path: str, image: bytes | None = None) -> Value:
         register = self.layout.registers[self.layout.by_path[path]]

@@ -83,6 +83,19 @@ class Device:
         of_type = self.types[data_type].nodeid
         await self.node("Device").add_variable(ua.NodeId(name, 2), f"2:{name}", variant, None, of_type)
 
+    async def rename(self, data_type: str, member: str, name: str) -> None:
+        """Give a member of a structure another name, in its definition alone."""
+        node = self.types[data_type]
+        found = await node.read_attribute(ua.AttributeIds.DataTypeDefinition)
+        for one in found.Value.Value.Fields:
+            one.Name = name if one.Name == member else one.Name
+        await node.write_attribute(ua.AttributeIds.DataTypeDefinition, ua.DataValue(found.Value))
+
+    async def monitored(self) -> list[int]:
+        """Return the number of monitored items of each subscription."""
+        subscriptions = self.server.iserver.subscription_service.subscriptions.values()
+        return sorted(len(one.monitored_item_srv._monitored_items) for one in subscriptions)
+
     async def set(self, name: str, kind: str, value: Any, code: int = 0, source_s: float = 0) -> None:
         data = ua.DataValue(_variant(kind, value), ua.StatusCode(code))
         if source_s:

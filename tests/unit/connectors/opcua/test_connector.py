@@ -209,6 +209,51 @@ def test_many_nodes_have_several_subscriptions_and_sessions(device: Device) -> N
     until(lambda: device.ask("clients") == 0, "the end of the sessions")
 
 
+@MODES
+def test_a_reload_keeps_values_sessions_and_monitored_items(device: Device, mode: str) -> None:
+    def tags(*numbers: int) -> dict[str, Any]:
+        return {f"n{number}": {"type": "INT", "address": f"ns=2;s={mode}{number}"} for number in numbers}
+
+    for number in range(12):
+        device.ask("add", f"{mode}{number}", "Int16", number)
+    device.ask("set", f"{mode}2", "Int16", 2, 0, 1_700_000_000)
+    with connected(device.url, tags(*range(7)), mode=mode, max_items=2, session_items=3) as source:
+        until(lambda: all(source.status(path).code == GOOD for path in tags(*range(7))), "all values")
+        assert device.ask("clients") == 3
+        many = [11, 2, 10, 6, 9, 8, 7, 5, 4, 3, 0]
+        source.reload(tags(*many))
+        image = source.connector.read()
+        assert [source.value(f"n{number}", image) for number in (0, 2, 5, 6)] == [0, 2, 5, 6]
+        assert source.status("n2", image).source_ns == 1_700_000_000_000_000_000
+        until(lambda: all(source.status(path).code == GOOD for path in tags(*many)), "the new values")
+        assert [source.value(f"n{number}") for number in many] == many
+        for number in many:
+            assert source.write(f"n{number}", 50 + number) == ""
+        assert [device.ask("get", f"{mode}{number}") for number in many] == [50 + number for number in many]
+        assert (device.ask("clients"), sum(device.ask("monitored"))) == (4, 11 * (mode == "subscribe"))
+        source.reload(tags(2, 99))
+        image = source.connector.read()
+        assert source.value("n2", image) == 52
+        assert source.status("n99", image).code & 0xFFFF0000 == BAD_NODE_ID_UNKNOWN
+        assert (device.ask("clients"), sum(device.ask("monitored"))) == (1, mode == "subscribe")
+        source.reload(tags(5))  # no node is the same
+        until(lambda: source.status("n5").code == GOOD and source.value("n5") == 55, "the value")
+        device.ask("set", f"{mode}5", "Int16", 7)
+        until(lambda: source.value("n5") == 7, "a change")
+        assert (device.ask("clients"), sum(device.ask("monitored"))) == (1, mode == "subscribe")
+    until(lambda: device.ask("clients") == 0, "the end of the sessions")
+
+
+def test_a_session_lost_after_a_reload_is_noticed(device: Device) -> None:
+    tags = {f"n{number}": {"type": "INT", "address": "ns=2;s=mode"} for number in range(2)}
+    with connected(device.url, tags, session_items=2) as source:
+        source.reload(tags | {"n2": tags["n0"], "n3": tags["n0"]})
+        until(lambda: source.status("n3").code == GOOD, "the value in the new session")
+        device.ask("expire")
+        with pytest.raises(ConnectorError):
+            until(lambda: not source.connector.read(), "the end")
+
+
 def test_the_servers_state_is_a_doubt(device: Device) -> None:
     with connected(device.url, {"mode": "INT"}, timeout=100) as source:
         assert source.connector.doubt == ""

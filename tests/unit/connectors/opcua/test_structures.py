@@ -137,6 +137,28 @@ def test_a_structure_that_comes_later_is_read(server: Device, monkeypatch: pytes
         until(lambda: source.status("open").code == GOOD and source.value("open") is True, "the structure")
 
 
+@MODES
+def test_a_reload_changes_members_and_reads_definitions_again(
+    server: Device, mode: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    server.ask("define", f"Tank{mode}", [("Level", "Int32", ""), ("Limit", "Int32", "")])
+    server.ask("structure", f"tank{mode}", f"Tank{mode}", {"Level": 5, "Limit": 9})
+    level, limit, high = (
+        {"type": "DINT", "address": f"ns=2;s=tank{mode}#{member}"} for member in ("Level", "Limit", "High")
+    )
+    with connected(server.url, {"level": level}, mode=mode) as source:
+        assert source.value("level") == 5
+        source.reload({"limit": limit, "level": level, "count": TABLE["count"]})
+        image = source.connector.read()
+        assert (source.value("limit", image), source.value("level", image)) == (9, 5)
+        until(lambda: source.status("count").code == GOOD, "the new structure")
+        server.ask("rename", f"Tank{mode}", "Limit", "High")  # the encoding stays the same
+        source.reload({"high": high, "level": level})
+        image = source.connector.read()
+        assert (source.value("high", image), source.value("level", image)) == (9, 5)
+    assert not caplog.records
+
+
 def test_a_union_has_one_member(server: Device) -> None:
     server.ask("structure", "either", "Either", {"Text": "now"})
     tags = {
