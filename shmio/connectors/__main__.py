@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 SWITCH_S = 0.0005  # with Python's default of 5 ms, other threads would delay the poll thread too long
 LAST_WORDS_S = 4.0  # less than the supervisor's grace period
 REPLAY_TIMEOUT_S = 1.0
+ATTEMPT_S = 15.0  # less than the time for which the supervisor waits until the process runs again
 HANG_MARGIN_S = 30.0  # added to the time-out, because asyncio's look-up of a host name has no time-out
 
 
@@ -56,10 +57,11 @@ def run(worker: Worker) -> None:
         woken.clear()
         running.report(worker, rate)
         if isinstance(running.part.loop, SourceLoop) and (config := worker.revised()) is not None:
-            part = _replaced(running, running.part.loop, worker, config, woken)
+            part = _replaced(running, running.part.loop, worker, config, woken, rate)
             if part is None:
                 return
             running = _Running(part)
+            running.await_attempt(worker, rate)
             worker.running()
     running.stop()
 
@@ -88,19 +90,28 @@ class _Running:
         busy_s = _busy_s(loop.counters.busy_since_ns)
         if busy_s > self.part.timeout_s + HANG_MARGIN_S:
             return  # without a heartbeat, so that the supervisor replaces the process
-        counters = loop.counters
         note = f"a cycle takes longer than {self.part.timeout_s:g} s" if busy_s > self.part.timeout_s else loop.note
-        worker.report(
-            (
-                counters.polls,
-                counters.overruns,
-                counters.failures,
-                counters.connects,
-                counters.round_trip_us,
-                rate.update_mhz(counters.polls),
-            ),
-            note=note,
+        worker.report(self.counters(rate), note=note)
+
+    def counters(self, rate: _Rate) -> tuple[int, ...]:
+        """Return the counters for the process table."""
+        counters = self.part.loop.counters
+        return (
+            counters.polls,
+            counters.overruns,
+            counters.failures,
+            counters.connects,
+            counters.round_trip_us,
+            rate.update_mhz(counters.polls),
         )
+
+    def await_attempt(self, worker: Worker, rate: _Rate) -> None:
+        """Wait until the loop has taken over the connection, or has connected or failed, at most ``ATTEMPT_S``."""
+        attempted = self.part.loop.attempted if isinstance(self.part.loop, SourceLoop) else threading.Event()
+        deadline_s = time.monotonic() + ATTEMPT_S
+        while not attempted.wait(BEAT_S) and time.monotonic() < deadline_s and not worker.stopping.is_set():
+            self.report(worker, rate)
+        self.report(worker, rate)
 
     def stop(self, meanwhile: Callable[[], None] = lambda: None) -> bool:
         """Stop the loop, and call ``meanwhile`` repeatedly while it ends; return whether it has ended."""
@@ -114,7 +125,7 @@ class _Running:
 
 
 def _replaced(
-    running: _Running, loop: SourceLoop, worker: Worker, config: dict[str, Any], woken: threading.Event
+    running: _Running, loop: SourceLoop, worker: Worker, config: dict[str, Any], woken: threading.Event, rate: _Rate
 ) -> _LoopHandle | None:
     """Stop a loop, wait until the supervisor has changed the segment, and return the next loop.
 
@@ -129,7 +140,7 @@ def _replaced(
     loop.keep()
     if not running.stop(worker.report):
         raise ConnectorError("the device did not answer in time for the reload; the process starts again")
-    worker.report(activity=Activity.PAUSED)
+    worker.report(counters=running.counters(rate), note=loop.unkept, activity=Activity.PAUSED)
     while not (block.retired or worker.slot.digest != digest):
         if worker.stopping.is_set():
             break

@@ -240,6 +240,10 @@ class SourceLoop:
         self._offered = None if predecessor is None else predecessor.kept
         self.kept: Connector | None = None
         """After the end of the loop, the connector with its open connection, if :meth:`keep` was called."""
+        self.unkept = ""
+        """After the end of the loop, why the connection was not kept although :meth:`keep` was called."""
+        self.attempted = threading.Event()
+        """Set when the first attempt to take over a connection, or to connect, has ended."""
         self._keep = False
         self._writer = writer
         self._schedule = schedule
@@ -297,6 +301,7 @@ class SourceLoop:
             self._writer.cycle = max(self._writer.cycle, self._schedule.at(self._clock.now_ns()))
             self._disconnected(self._writer.cycle, "the source was stopped")
             self._writer.event(Record(EventKind.STOPPED))
+            self.attempted.set()
 
     def poll(self, cycle: int) -> bool:
         """Run one cycle: connect if necessary, write, request an image, publish images.
@@ -395,6 +400,7 @@ class SourceLoop:
             self.counters.connects += 1
         self._connected_ns = self._clock.now_ns()
         self._accepting = False
+        self.attempted.set()
 
     def _taken_over(self) -> bool:
         """Take over the connection that the predecessor has kept, if any; return whether this succeeded."""
@@ -409,6 +415,7 @@ class SourceLoop:
     def _settled(self) -> bool:
         """Wait until nothing is in flight; return whether this succeeded and the connection is open."""
         if self._connected_ns is None:
+            self.unkept = "the device was not connected"
             return False
         try:
             self._drain()
@@ -417,14 +424,19 @@ class SourceLoop:
                 self._call(lambda: self.commands.confirm(lambda: self._connector.confirm(until_ns)))
         except ConnectorError as error:
             log.warning("the connection cannot be kept: %s", error)
+            self.unkept = str(error)
             return False
-        return not self._in_flight and not self.commands.unconfirmed
+        if self._in_flight or self.commands.unconfirmed:
+            self.unkept = f"the device did not confirm its {'reads' if self._in_flight else 'writes'} in time"
+            return False
+        return True
 
     def _call(self, hook: Callable[[], _Result]) -> _Result:
         return self.counters.watch(self._clock.now_ns, hook)
 
     def _fail(self, cycle: int, reason: str) -> bool:
         self.counters.failures += 1
+        self.attempted.set()
         self._connected_ns = None
         self._in_flight.clear()
         self._confirm_last()

@@ -11,7 +11,7 @@ import msgspec
 from shmio.config import Declaration
 from shmio.config.masking import is_secret, mask_value
 from shmio.plan.processes import Plan
-from shmio.segment import Block, BlockSpec, Segment
+from shmio.segment import Block, BlockSpec, Quality, Segment
 from shmio.supervisor.fleet import Fleet, digest
 
 
@@ -135,11 +135,21 @@ def preview(plan: Plan, running: Plan, epoch: int, fleet: Fleet, segment: Segmen
         "stop": list(changes.stopped),
         "start": list(changes.started),
         "restart": [f"{name}: {'; '.join(_reasons(name, plan, running, fleet))}" for name in changes.replaced],
-        "change": [f"{name}: {'; '.join(_reasons(name, plan, running, fleet))}" for name in changes.changed],
+        "change": [
+            f"{name}: {'; '.join([*_reasons(name, plan, running, fleet), *_unconnected(segment.blocks[name])])}"
+            for name in changes.changed
+        ],
         "injections": list(_changed_injections(plan, running)),
         "reread": [name for name in changes.kept if fleet.named(name).rereads(jobs[name])],
         "keep": list(changes.kept),
     }
+
+
+def _unconnected(block: Block) -> Iterator[str]:
+    """Yield why a source has no connection that it could keep."""
+    frame = block.latest()
+    if frame is not None and frame.quality is Quality.BAD:
+        yield f"but it is not connected now: {frame.reason}"
 
 
 def _reasons(name: str, plan: Plan, running: Plan, fleet: Fleet) -> list[str]:

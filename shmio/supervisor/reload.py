@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Final
 
 from shmio.control import Answer
@@ -41,6 +41,8 @@ class _Followers:
         self._fleet = fleet
         self._jobs = {job.name: job for job in jobs}
         self._pids: dict[str, int] = {}
+        self._before: dict[str, tuple[str, tuple[int, ...]]] = {}
+        """By name, why a source has not kept its connection, and its attempts to connect before the change."""
         self.failed: dict[str, str] = {}
         """Why the other sources are restarted, by name."""
         self._deadline_s = time.monotonic() + PAUSE_S
@@ -85,7 +87,26 @@ class _Followers:
         """Let the remaining sources continue, after the segment has been changed."""
         self._deadline_s = time.monotonic() + FOLLOW_S
         for name in self._pids:
+            self._before[name] = self._fleet.named(name).slot.report.note, self._attempts(name)
             self._fleet.follow(self._fleet.named(name), self._jobs[name])
+
+    def _attempts(self, name: str) -> tuple[int, ...]:
+        """Return how often a source has connected, and how often it has failed."""
+        counters = self._fleet.named(name).slot.counters
+        return counters["connects"], counters["failures"]
+
+    def outcome(self) -> Iterator[str]:
+        """Yield a line for each source that was not restarted."""
+        for name in self._pids:
+            why, before = self._before[name]
+            after = self._attempts(name)
+            if after == before:
+                yield f"{name}: changed, and keeps its connection"
+            elif after[0] > before[0]:
+                yield f"{name}: changed, and connected again: {why or 'its connection was lost during the change'}"
+            else:
+                note = self._fleet.named(name).slot.report.note
+                yield f"{name}: changed, but not connected: {note or why or 'its connection was lost'}"
 
     def running(self) -> bool:
         """Return whether all remaining sources run again. Restart those that have ended or take too long."""
@@ -189,7 +210,7 @@ class InstanceChange:
         """Return two lists of lines: what was done, and which problems there are."""
         done = [*(f"{name}: stopped" for name in self.changes.stopped), *self._injections]
         done += [f"{name}: the supervisor asked it to reload its tokens and roles" for name in self._signalled]
-        done += [f"{name}: changed, and keeps its connection" for name in self._followers.names]
+        done += self._followers.outcome()
         problems = []
         for job in self._coming:
             managed = self._fleet.named(job.name)

@@ -155,8 +155,20 @@ def test_a_device_that_is_away_does_not_delay_the_reload(plant: Plant) -> None:
     plant.proxy.refuse()
     until(lambda: plant.cell.processes()["pumps"]["quality"] == "bad", "bad quality")
     plant.table(LEVEL)
-    assert plant.reload()[0] == SAME
+    assert "not connected now: " in plant.reload("--dry-run")[0]
+    assert plant.reload()[0].startswith("pumps: changed, but not connected: ")
     plant.proxy.admit()
+    assert plant.value("pumps/Level") == 7
+    assert plant.pid == pid
+
+
+def test_a_connection_that_cannot_be_kept_is_reported(plant: Plant) -> None:
+    """The device accepts connections, but does not answer."""
+    pid = plant.pid
+    plant.proxy.freeze()
+    plant.table(LEVEL)
+    assert plant.reload()[0].startswith("pumps: changed, and connected again: ")
+    plant.proxy.thaw()
     assert plant.value("pumps/Level") == 7
     assert plant.pid == pid
 
