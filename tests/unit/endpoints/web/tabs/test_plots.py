@@ -3,6 +3,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import socket
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from typing import Any
 import pytest
 from websockets.sync.connection import Connection
 
-from shmio.endpoints.web import signals
+from shmio.endpoints.web import page, signals
 from shmio.endpoints.web.tabs import plots
 from shmio.recorder.file_output import Output, create
 from shmio.recorder.instance_follower import FROM_THE_FIRST, InstanceFollower
@@ -164,12 +165,13 @@ def test_long_past_comes_at_equal_distances(segment: Segment, monkeypatch: pytes
         assert len({later - earlier for earlier, later in pairwise(found)}) == 1
 
 
-def test_page_that_stalls_gets_the_newest_data(segment: Segment) -> None:
-    """A page that does not read for 100 batches of 180 kB gets a few of them, a gap, and the newest."""
-    bursts, frames = 100, 100
+def test_page_that_stalls_gets_the_newest_data(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A page that does not read for 20 batches of 180 kB gets a few of them, a gap, and the newest."""
+    monkeypatch.setattr(page, "MAX_BATCHES", 4)
+    bursts, frames = 20, 100
     paths = [f"cell/long/{number}" for number in range(1, 201)]
     writer = segment.writer("cell")
-    with pages(segment) as server, server.open(max_queue=1) as stalled, server.open() as other:
+    with pages(segment) as server, server.open(max_queue=1, sock=small(server)) as stalled, server.open() as other:
         for browser in (stalled, other):
             follow(server, browser, *paths)
         for burst in range(bursts):
@@ -186,6 +188,14 @@ def test_page_that_stalls_gets_the_newest_data(segment: Segment) -> None:
                 break
         assert received < frames * bursts / 2
         assert gaps > 1  # the first is the beginning
+
+
+def small(server: Pages) -> socket.socket:
+    """Return a connection to the server whose client's kernel buffers less than a batch."""
+    connection = socket.socket()
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 14)
+    connection.connect(("127.0.0.1", server.port))
+    return connection
 
 
 def test_empty_list_ends_the_course(segment: Segment) -> None:
