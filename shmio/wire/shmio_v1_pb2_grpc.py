@@ -182,7 +182,7 @@ class ShmioServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def Inject(self, request_iterator, context):
-        """Lays an injection until the stream ends. The endpoint sends the original values, the client sends injected ones.
+        """Creates an injection until the stream ends. The endpoint sends the original values, the client sends injected ones.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -197,7 +197,7 @@ class ShmioServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def Declare(self, request, context):
-        """Lays declared injections, which their sources run, all or none; then sends their events.
+        """Creates declared injections, which their sources run, all or none; then sends their events.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -211,14 +211,14 @@ class ShmioServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def Lift(self, request, context):
-        """Lifts one injection, whoever laid it.
+        """Lifts one injection, whichever program created it.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def LiftAll(self, request, context):
-        """Lifts all injections, whoever laid them, for an emergency.
+        """Lifts all injections, whichever program created them, for an emergency.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -99,7 +99,7 @@ class SimlogAPIServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def Inject(self, request, context):
-        """Lays a shadow topic over another topic, and streams the values of the other.
+        """Creates a shadow topic over another topic, and streams the values of the other.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -102,7 +102,7 @@ class SimlogAPIServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def Inject(self, request, context):
-        """Lays a shadow over a topic.
+        """Creates a shadow over a topic.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
