@@ -1,6 +1,6 @@
 """The C extension; everything else is in pyproject.toml.
 
-``SHMIO_SANITIZE=address,undefined`` builds it under sanitizers (see .ci/run).
+``SHMIO_SANITIZE=address,undefined`` builds it under sanitizers (see .ci/checks).
 """
 
 import os
