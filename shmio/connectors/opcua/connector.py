@@ -23,7 +23,7 @@ from shmio.connectors.base import Connector, Lost, WriteLostError
 from shmio.connectors.browsing import Browsed, Wanted
 from shmio.connectors.opcua.decode import Sample
 from shmio.connectors.opcua.options import Credentials, OpcUaOptions
-from shmio.connectors.opcua.structures import AbsentError, find, read_value
+from shmio.connectors.opcua.structures import AbsentError, ChangedValue, find, read_value
 from shmio.connectors.opcua.values import MismatchError, ValueConverter
 from shmio.connectors.register_image import RegisterImage
 from shmio.connectors.request_count import CycleRequests, Requests, counted
@@ -55,10 +55,6 @@ CLOSE_S: Final = 0.5
 MAX_REPORTED: Final = 20
 """Maximum number of faulty registers that the log names per connection."""
 
-_WRITES_WHOLE: Final = (
-    "a member of a structure cannot be written: OPC UA writes only whole structures, which would undo what others "
-    "write to their members at the same time"
-)
 _NO_DEADBAND: Final = "a member of a structure has no dead-band: the server sends each change of the structure"
 
 _Result = TypeVar("_Result")
@@ -85,6 +81,45 @@ class _NodeWrite(NamedTuple):
     elements: str | None
     sample: Sample
 
+    @property
+    def writes(self) -> tuple[int, ...]:
+        """The indices of the writes that this step belongs to."""
+        return (self.write,)
+
+
+class _MemberWrite(NamedTuple):
+    """A new value for a register that is a member of a structure, or for some of its elements."""
+
+    write: int
+    """Index of the write that this belongs to."""
+    register: int
+    """Index of the register."""
+    value: Any
+    """The value; a flat list of the new elements if ``size`` is not 0."""
+    first: int = 0
+    size: int = 0
+    """Number of new elements, from ``first`` on; 0 if the whole value is new."""
+
+    def repeats(self, other: _MemberWrite) -> bool:
+        """Return whether this write changes again what the other one has changed."""
+        if self.register != other.register:
+            return False
+        apart = self.first + self.size <= other.first or other.first + other.size <= self.first
+        return not (self.size and other.size and apart)
+
+
+@dataclass
+class _StructureWrite:
+    """A write to members of one structure: the node is read, changed and written as a whole."""
+
+    item: Item
+    members: list[_MemberWrite]
+
+    @property
+    def writes(self) -> tuple[int, ...]:
+        """The indices of the writes that this step belongs to."""
+        return tuple(one.write for one in self.members)
+
 
 @dataclass
 class _Sending:
@@ -93,7 +128,7 @@ class _Sending:
     outcomes: list[str | Lost]
     deadline_ns: int
     """When to stop waiting for answers, ns of CLOCK_MONOTONIC."""
-    steps: list[_NodeWrite] = field(default_factory=list)
+    steps: list[_NodeWrite | _StructureWrite] = field(default_factory=list)
     begun: int = 0
     """Number of the steps that may have been sent."""
     confirmed: int = 0
@@ -106,13 +141,13 @@ class _Sending:
         A write that was sent but not answered is UNKNOWN: the server may have carried it out.
         """
         outcomes = [*self.outcomes]
-        for step in self.steps[self.confirmed : self.begun]:
-            if outcomes[step.write] == "":
-                outcomes[step.write] = Lost.UNKNOWN
-        done = {step.write for step in self.steps[: self.begun]}
-        for step in self.steps[self.begun :]:
-            if outcomes[step.write] == "":
-                outcomes[step.write] = Lost.UNKNOWN if step.write in done else Lost.UNSENT
+        for number in (one for step in self.steps[self.confirmed : self.begun] for one in step.writes):
+            if outcomes[number] == "":
+                outcomes[number] = Lost.UNKNOWN
+        done = {number for step in self.steps[: self.begun] for number in step.writes}
+        for number in (one for step in self.steps[self.begun :] for one in step.writes):
+            if outcomes[number] == "":
+                outcomes[number] = Lost.UNKNOWN if number in done else Lost.UNSENT
         return WriteLostError(reason, outcomes)
 
 
@@ -335,11 +370,24 @@ class OpcUaConnector(Connector):
         if link is None or not link.ready:
             raise WriteLostError(f"not connected to {self._options.peer}", [Lost.UNSENT] * len(writes))
         sending = self._sending = _Sending([""] * len(writes), time.monotonic_ns() + round(self.timeout_s * 1e9))
+        structures: dict[int, _StructureWrite] = {}
         for number, write in enumerate(writes):
             try:
-                sending.steps += self._steps(link, number, write)
+                steps = list(self._steps(link, number, write))
             except ValueError as error:
                 sending.outcomes[number] = str(error)
+                continue
+            for step in steps:
+                if isinstance(step, _NodeWrite):
+                    sending.steps.append(step)
+                    continue
+                item = link.items[self._node_of[step.register]]
+                there = structures.get(item.index)
+                if there is not None and not any(step.repeats(one) for one in there.members):
+                    there.members.append(step)
+                else:  # both values of a pulse are written
+                    structures[item.index] = _StructureWrite(item, [step])
+                    sending.steps.append(structures[item.index])
         try:
             sending.future = link.begin(lambda: self._carry_out(link, sending))
         except ConnectorError as error:
@@ -370,11 +418,14 @@ class OpcUaConnector(Connector):
         """Send the write requests, and read the nodes back. This runs in the thread of the sessions."""
         outcomes = sending.outcomes
         for step in sending.steps:
-            if step.elements is not None and not await link.has_ranges(step):
+            if isinstance(step, _NodeWrite) and step.elements is not None and not await link.has_ranges(step):
                 path = self._path(step)
                 outcomes[step.write] = f"{path}: the server does not write single elements: write the whole array"
-        sending.steps = [step for step in sending.steps if outcomes[step.write] == ""]
+        sending.steps = [step for step in sending.steps if any(outcomes[number] == "" for number in step.writes)]
         for batch in _batches(sending.steps, link.per_write):
+            if isinstance(batch, _StructureWrite):
+                await self._write_structure(link, sending, batch)
+                continue
             sending.begun += len(batch)
             codes = await link.write(batch)
             sending.confirmed += len(batch)
@@ -385,11 +436,51 @@ class OpcUaConnector(Connector):
         if sending.steps:
             await link.read_back(list({step.item.index: step.item for step in sending.steps}.values()))
 
+    async def _write_structure(self, link: _Link, sending: _Sending, step: _StructureWrite) -> None:
+        """Read a structure, change members of it, and write it. A write that is impossible changes nothing."""
+        outcomes, registers = sending.outcomes, self._layout.registers
+        there = await link.present(step.item)
+        refused = True
+        while refused:  # a write of several members may be refused because of the last one
+            members = [one for one in step.members if outcomes[one.write] == ""]
+            changed: ChangedValue | None = None
+            refused = False
+            for one in members:
+                try:
+                    if quality_of(there.code) is Quality.BAD:
+                        raise ValueError(f"the server reports {describe(there.code)}")
+                    changed = changed or ChangedValue(step.item.structures, there)
+                    self._change(changed, one)
+                except ValueError as error:
+                    outcomes[one.write] = outcomes[one.write] or f"{registers[one.register].path}: {error}"
+                    refused = True
+        sending.begun += 1
+        if changed is not None and members:
+            (code,) = await link.write([_NodeWrite(members[0].write, step.item, None, changed.sample)])
+            if quality_of(code) is Quality.BAD:
+                for one in members:
+                    path = registers[one.register].path
+                    outcomes[one.write] = f"{path}: the server refuses the structure: {describe(code)}"
+        sending.confirmed += 1
+
+    def _change(self, changed: ChangedValue, one: _MemberWrite) -> None:
+        """Change a member of a structure. Raise ValueError if that is impossible."""
+        member, converter = self._members[one.register], self._converters[one.register]
+        now = changed.find(member)
+        if not one.size:
+            changed.set(member, converter.sample(one.value, now))
+            return
+        part = converter.elements(one.value, now)
+        if now.dims is None or one.first + one.size > len(now.value):
+            raise ValueError("it has no such elements at present")
+        values = [*now.value[: one.first], *part.value, *now.value[one.first + one.size :]]
+        changed.set(member, now._replace(value=values))
+
     def _path(self, step: _NodeWrite) -> str:
         """Return the path of the register that a step writes."""
         return self._layout.registers[self._nodes[step.item.index].registers[0]].path
 
-    def _steps(self, link: _Link, number: int, write: Write) -> Iterator[_NodeWrite]:
+    def _steps(self, link: _Link, number: int, write: Write) -> Iterator[_NodeWrite | _MemberWrite]:
         """Yield the node writes that carry out a write of bytes. Raise ValueError if that is impossible."""
         layout, found = self._layout, False
         covered, image = bytearray(layout.size), bytearray(layout.size)
@@ -404,18 +495,22 @@ class OpcUaConnector(Connector):
                 continue
             found = True
             item = link.items[self._node_of[index]]
-            if item.is_structure:
-                raise ValueError(f"{register.path}: {_WRITES_WHOLE}")
             if item.node is None:
                 raise ValueError(f"{register.path}: the server does not know its node")
             value = codec(register, layout.byte_order).decode(image)
             like, converter = self._latest.get(index), self._converters[index]
             try:
                 if share == wanted:
-                    yield _NodeWrite(number, item, None, converter.sample(value, like))
+                    if item.is_structure:
+                        yield _MemberWrite(number, index, value)
+                    else:
+                        yield _NodeWrite(number, item, None, converter.sample(value, like))
                     continue
                 first, count = _elements(register, share)
                 flat: Any = value
+                if item.is_structure:
+                    yield _MemberWrite(number, index, flat[first : first + count], first, count)
+                    continue
                 sample = converter.elements(flat[first : first + count], like)
             except ValueError as error:
                 raise ValueError(f"{register.path}: {error}") from None
@@ -445,8 +540,8 @@ def _nodes(options: OpcUaOptions, layout: Layout) -> tuple[list[_Node], list[Mem
     for index, register in enumerate(layout.registers):
         try:
             address, member = _address(options, layout, register)
-            if member and (register.deadband or register.writable):
-                raise ValueError(_WRITES_WHOLE if register.writable else _NO_DEADBAND)
+            if member and register.deadband:
+                raise ValueError(_NO_DEADBAND)
         except ValueError as error:
             raise ConfigError(f"layout: {register.path}: {error}") from None
         members.append(member)
@@ -522,10 +617,16 @@ def _elements(register: Register, share: bytes) -> tuple[int, int]:
     return chosen[0], len(chosen)
 
 
-def _batches(steps: Sequence[_NodeWrite], most: int) -> Iterator[list[_NodeWrite]]:
+def _batches(steps: Sequence[_NodeWrite | _StructureWrite], most: int) -> Iterator[list[_NodeWrite] | _StructureWrite]:
     """Group steps into requests, in their order. A request is for one session, and writes no node twice."""
     batch: list[_NodeWrite] = []
     for step in steps:
+        if isinstance(step, _StructureWrite):
+            if batch:
+                yield batch
+            batch = []
+            yield step
+            continue
         full = len(batch) >= most or any(one.item is step.item for one in batch)
         if batch and (full or batch[0].item.session != step.item.session):
             yield batch
@@ -809,6 +910,10 @@ class _Link(threading.Thread):
         """Write a batch whose nodes belong to one session; return the status codes."""
         session = self.sessions[batch[0].item.session]
         return await session.write([(step.item, step.elements, step.sample) for step in batch])
+
+    async def present(self, item: Item) -> Sample:
+        """Read the present value of a node."""
+        return await self.sessions[item.session].present(item)
 
     async def has_ranges(self, step: _NodeWrite) -> bool:
         """Return whether the server supports the index range of a write."""

@@ -1,4 +1,4 @@
-"""Reads values from the answers of a server: read responses and publish responses.
+"""Reads values from the answers of a server, read responses and publish responses, and encodes single values.
 
 The library's own decoding builds an object for each field, which is too slow for thousands of values
 a cycle, and sets no limit to the memory that a short message can demand. This decoder reads only what
@@ -380,6 +380,23 @@ class Reader:
         if kind == 0:
             return None
         raise MalformedError
+
+
+def encoded(kind: int, value: Any) -> bytes:
+    """Encode a value of a built-in type, as :meth:`Reader.value` returns it.
+
+    Raises:
+        ValueError: Values of this type cannot be encoded.
+
+    """
+    if kind in _STRUCTS:
+        return _STRUCTS[kind].pack(value)
+    if kind == DATE_TIME:
+        return _TIME.pack(value // 100 + _EPOCH)
+    if kind in (STRING, LOCALIZED_TEXT, BYTE_STRING):
+        data = value if kind == BYTE_STRING else value.encode()
+        return (b"\2" if kind == LOCALIZED_TEXT else b"") + _INT.pack(len(data)) + data
+    raise ValueError(f"a {NAMES[kind]} in a structure cannot be written")
 
 
 def size_of(kind: int) -> int:

@@ -551,6 +551,11 @@ class Session:
                 item.settles_ns, item.written_ns = now_ns + round(self._settle_s(item) * 1e9), sample.source_ns
         self._deliver(list(zip(items, found, strict=True)))
 
+    async def present(self, item: Item) -> Sample:
+        """Read the present value of a node."""
+        (found,) = await self._samples([item.node])
+        return found
+
     async def has_ranges(self, item: Item, elements: str, count: int) -> bool:
         """Return whether the server can read single elements of an array.
 

@@ -1,4 +1,4 @@
-"""Reads structures by the server's definitions of their data types (OPC 10000-6, section 5.2.7).
+"""Reads and changes structures by the server's definitions of their data types (OPC 10000-6, section 5.2.7).
 
 Both the definition and the structure come from the server, so either may be wrong. If the bytes of a
 structure do not have exactly the length that its definition demands, none of its members has a value.
@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping
+import struct
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
@@ -235,6 +236,12 @@ def read_value(structures: Mapping[NodeKey, Structure], sample: Sample) -> Membe
         AbsentError: The value is null.
 
     """
+    return _read_value(structures, sample, _Reading)
+
+
+def _read_value(
+    structures: Mapping[NodeKey, Structure], sample: Sample, reading_of: Callable[[bytes, int], _Reading]
+) -> Members | Elements:
     if sample.kind != ua.EXTENSION:
         raise MismatchError(f"the node is {_named(sample)}, and no structure")
     values: list[Extension] = sample.value if sample.dims is not None else [sample.value]
@@ -247,7 +254,7 @@ def read_value(structures: Mapping[NodeKey, Structure], sample: Sample) -> Membe
         structure = structures.get(encoding)
         if structure is None:
             raise MismatchError("the server does not define the node's structure")
-        reading = _Reading(one.body, left)
+        reading = reading_of(one.body, left)
         found.append(_read(structure, reading))
         left = reading.values_left
     return found[0] if sample.dims is None else Elements(found, sample.dims)
@@ -261,6 +268,14 @@ def find(found: Found, member: Member) -> Sample:
         MismatchError: The data type has no such member, or ``member`` names a structure.
 
     """
+    found = _walk(found, member)
+    if not isinstance(found, Sample):
+        raise MismatchError(f"it is {_named(found)}: give the address of a member")
+    return found
+
+
+def _walk(found: Found, member: Member) -> Found:
+    """Return what ``member`` names in a value, also if that is a structure. Raise the errors of :func:`find`."""
     for place, step in enumerate(member):
         here = member_text(member[:place])[1:] or "the value"
         if isinstance(step, str):
@@ -275,20 +290,132 @@ def find(found: Found, member: Member) -> Sample:
         elif isinstance(found, Members) or found.dims is None or len(found.dims) != len(step):
             raise MismatchError(f"{here} is {_named(found)}, which has no element [{','.join(map(str, step))}]")
         else:
-            index = 0
-            for one, size in zip(step, found.dims, strict=True):
-                if one >= size:
-                    raise AbsentError("it has no such element at present")
-                index = index * size + one
+            index = _index(step, found.dims)
             element = found.values[index] if isinstance(found, Elements) else found.value[index]
             if isinstance(element, Members):
                 found = element
             else:
                 assert isinstance(found, Sample)  # noqa: S101 - for the type checker
                 found = found._replace(value=element, dims=None)
-    if not isinstance(found, Sample):
-        raise MismatchError(f"it is {_named(found)}: give the address of a member")
     return found
+
+
+def _index(step: Sequence[int], dims: Sequence[int]) -> int:
+    """Return the place of an element in the flat list of an array. Raise AbsentError if it has no such element."""
+    index = 0
+    for one, size in zip(step, dims, strict=True):
+        if one >= size:
+            raise AbsentError("it has no such element at present")
+        index = index * size + one
+    return index
+
+
+class ChangedValue:
+    """The value of a node that is a structure, or an array of structures, with new values of some members.
+
+    The bytes of all other members stay as the server sent them.
+    """
+
+    def __init__(self, structures: Mapping[NodeKey, Structure], sample: Sample) -> None:
+        """Read a value.
+
+        Raises:
+            MismatchError: As :func:`read_value`.
+            AbsentError: As :func:`read_value`.
+
+        """
+        self._sample = sample
+        self._readings: list[_Locating] = []
+        self._new: dict[int, Sample] = {}
+        """By ``id`` of the sample of a changed member, its new sample."""
+        self._found = _read_value(structures, sample, self._locating)
+
+    def _locating(self, body: bytes, values: int) -> _Reading:
+        self._readings.append(_Locating(body, values))
+        return self._readings[-1]
+
+    def find(self, member: Member) -> Sample:
+        """Return the present or new value of a member. Raise the errors of :func:`find`."""
+        owner, index = self._leaf(member)
+        now = self._new.get(id(owner), owner)
+        return now if index is None else now._replace(value=now.value[index], dims=None)
+
+    def set(self, member: Member, new: Sample) -> None:
+        """Change a member.
+
+        Raises:
+            ValueError: The member cannot be written.
+
+        """
+        owner, index = self._leaf(member)
+        if index is not None:
+            now = self._new.get(id(owner), owner)
+            new = now._replace(value=[*now.value[:index], new.value, *now.value[index + 1 :]])
+        where = next(one.places[id(owner)] for one in self._readings if id(owner) in one.places)
+        _encode(where.field, new)  # raises ValueError
+        self._new[id(owner)] = new
+
+    def _leaf(self, member: Member) -> tuple[Sample, int | None]:
+        """Return the sample that was read for a member, or for the array whose element ``member`` is, and its index."""
+        if member and not isinstance(member[-1], str):
+            owner = _walk(self._found, member[:-1])
+            if isinstance(owner, Sample) and owner.dims is not None and len(owner.dims) == len(member[-1]):
+                return owner, _index(member[-1], owner.dims)
+        return find(self._found, member), None
+
+    @property
+    def sample(self) -> Sample:
+        """The value with all changes."""
+        given: list[Extension] = self._sample.value if self._sample.dims is not None else [self._sample.value]
+        made = []
+        for one, reading in zip(given, self._readings, strict=True):
+            body, at = bytearray(), 0
+            for key, where in reading.places.items():  # in the order of the bytes
+                if (new := self._new.get(key)) is not None:
+                    body += one.body[at : where.start] + _encode(where.field, new)
+                    at = where.end
+            made.append(one._replace(body=bytes(body + one.body[at:])))
+        return self._sample._replace(value=made if self._sample.dims is not None else made[0])
+
+
+class _Place(NamedTuple):
+    """Where the bytes of a member are."""
+
+    start: int
+    end: int
+    field: Field
+
+
+class _Locating(_Reading):
+    """Reads the body of a structure, and notes where its members are."""
+
+    def __init__(self, data: bytes, values: int) -> None:
+        super().__init__(data, values)
+        self.places: dict[int, _Place] = {}
+        """The places of members that are no structures, by the ``id`` of their samples."""
+
+    def field(self, one: Field, depth: int) -> Found:
+        start = self._at
+        found = super().field(one, depth)
+        if isinstance(found, Sample):
+            self.places[id(found)] = _Place(start, self._at, one)
+        return found
+
+
+def _encode(one: Field, sample: Sample) -> bytes:
+    """Encode the value of a member. Raise ValueError if its type cannot be written."""
+    values = sample.value if sample.dims is not None else [sample.value]
+    data = b"".join(ua.encoded(sample.kind, value) for value in values)
+    dims = sample.dims or ()
+    if one.kind == ua.VARIANT:
+        flags = 0x80 * bool(dims) | 0x40 * (len(dims) > 1)
+        sizes = struct.pack(f"<{1 + len(dims)}i", len(dims), *dims) if len(dims) > 1 else b""
+        return bytes([sample.kind | flags]) + (struct.pack("<i", len(values)) if dims else b"") + data + sizes
+    if sample.kind != one.kind or len(dims) != one.rank:
+        raise ValueError(f"a {ua.NAMES[one.kind]} in a structure cannot be written")
+    if one.rank == 1:
+        return struct.pack("<i", len(values)) + data
+    return (struct.pack(f"<{1 + one.rank}i", one.rank, *dims) if one.rank else b"") + data
 
 
 class Listed(NamedTuple):

@@ -61,6 +61,14 @@ class Source:
     def status(self, path: str, image: bytes | None = None) -> RegisterStatus:
         return self._area.get(self.connector.read() if image is None else image, self.layout.by_path[path])
 
+    def write_all(self, values: Mapping[str, Value]) -> list[str]:
+        """Write several registers in one command; return the outcome of each."""
+        writes = []
+        for path, value in values.items():
+            register = self.layout.registers[self.layout.by_path[path]]
+            writes += encode(register, value, self.layout.byte_order)
+        return write(self.connector, writes)
+
     def write(self, path: str, value: Value) -> str:
         register = self.layout.registers[self.layout.by_path[path]]
         outcomes = write(self.connector, encode(register, value, self.layout.byte_order))

@@ -24,6 +24,7 @@ PASSWORD = "secret password"
 CREATE, CREATE_ALL = MonitoredItemService._create_data_change_monitored_item, InternalSession.create_monitored_items
 PROCESS = UaProcessor._process_message
 BROWSE, READ, SUBSCRIBE = InternalSession.browse, InternalSession.read, InternalSession.create_subscription
+WRITE = InternalSession.write
 
 
 class Accounts:
@@ -35,6 +36,8 @@ class Accounts:
 
 class Device:
     """The nodes and what happens to them."""
+
+    written = 0
 
     def __init__(self, server: Server) -> None:
         self.server = server
@@ -90,6 +93,20 @@ class Device:
         for one in found.Value.Value.Fields:
             one.Name = name if one.Name == member else one.Name
         await node.write_attribute(ua.AttributeIds.DataTypeDefinition, ua.DataValue(found.Value))
+
+    async def allow(self, name: str, writable: bool = True) -> None:
+        """Let clients write a variable, or not."""
+        await self.node(name).set_writable(writable)
+
+    async def writes(self) -> int:
+        """Return how many values clients have written or tried to write."""
+
+        async def counted(session: Any, asked: Any) -> Any:
+            Device.written += len(asked.NodesToWrite) if session.external else 0
+            return await WRITE(session, asked)
+
+        InternalSession.write = counted
+        return Device.written
 
     async def monitored(self) -> list[int]:
         """Return the number of monitored items of each subscription."""

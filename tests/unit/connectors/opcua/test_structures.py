@@ -16,7 +16,8 @@ from shmio.errors import ConfigError
 from shmio.layout.compiler import Source as File
 from shmio.layout.compiler import compile_sources
 from shmio.layout.tags import place_tags
-from shmio.layout.values.codec import codec
+from shmio.layout.values.codec import Value, codec
+from shmio.layout.values.write import encode
 from shmio.model.statuses import (
     BAD_DECODING_ERROR,
     BAD_NO_DATA,
@@ -25,6 +26,7 @@ from shmio.model.statuses import (
     GOOD,
     status_area,
 )
+from shmio.testing.write_conformance import write
 from tests.unit.connectors.opcua.device import Device
 from tests.unit.connectors.opcua.harness import connected, until
 from tests.unit.connectors.opcua.node_server import NodeServer
@@ -86,7 +88,6 @@ def test_members_are_registers(server: Device, mode: str) -> None:
             image = source.connector.read()
             assert (source.value("hint", image), source.status("hint", image).code) == (0.5, GOOD)
             assert source.status("second", image).code == BAD_NO_DATA, "the array has become shorter"
-            assert "cannot be written" in source.write("count", 5)
         finally:
             server.ask("structure", "pump", "Pump", VALUE)
 
@@ -159,6 +160,49 @@ def test_a_reload_changes_members_and_reads_definitions_again(
     assert not caplog.records
 
 
+@MODES
+def test_members_are_written_with_the_rest_of_their_structure(server: Device, mode: str) -> None:
+    tags = TABLE | {
+        "first": {"type": "LREAL", "address": "ns=2;s=pump#Axes[0].Position"},
+        "x": {"type": "STRING[8]", "address": "ns=2;s=axes#[0].Name"},
+        "y": {"type": "LREAL", "address": "ns=2;s=axes#[1].Position"},
+    }
+    for node in ("pump", "axes"):
+        server.ask("allow", node)
+    with connected(server.url, tags, mode=mode, timeout=4000) as source:
+        before = source.connector.read()
+        writes = server.ask("writes")
+        values: dict[str, Value] = {"count": 77, "force": 5, "second": 9.25}
+        assert source.write_all(values) == [""] * 3
+        assert server.ask("writes") == writes + 1, "one write for all members"
+        image = source.connector.read()  # the members that were not written are as before
+        expected = {path: source.value(path, before) for path in VALUES} | values | {"forces": [7, 8, 5]}
+        assert {path: source.value(path, image) for path in VALUES} == expected
+        assert source.write("forces", [1, 2, 3]) == ""
+        assert source.write("name", "longer than before") == ""
+        assert source.value("name") == "longer than before"
+        assert source.write("position", -30) == ""  # it is scaled by 10
+        element = source.layout.element(source.layout.registers[source.layout.by_path["forces"]], (2,))
+        assert write(source.connector, encode(element, 40, source.layout.byte_order)) == [""]
+        image = source.connector.read()
+        assert (source.value("forces", image), source.value("position", image)) == ([1, 40, 3], -30)
+        outcomes = source.write_all({"hint": 1.0, "homed": False, "first": 7.5})
+        assert "no such member at present" in outcomes[0]
+        assert outcomes[1:] == ["", ""]
+        assert source.value("homed") is False
+        assert source.write_all({"x": "new", "y": -1.5}) == ["", ""]
+        assert [source.value("x"), source.value("y")] == ["new", -1.5]
+        twice = [encode(source.layout.registers[source.layout.by_path["count"]], one, "little")[0] for one in (1, 2)]
+        writes = server.ask("writes")
+        assert write(source.connector, twice) == ["", ""]
+        assert (server.ask("writes"), source.value("count")) == (writes + 2, 2)  # both values of a pulse
+        server.ask("allow", "axes", False)
+        (refusal,) = source.write_all({"x": "no"})
+        assert "x: the server refuses the structure: Bad" in refusal
+        assert source.value("x") == "new"
+    server.ask("structure", "pump", "Pump", VALUE)
+
+
 def test_a_union_has_one_member(server: Device) -> None:
     server.ask("structure", "either", "Either", {"Text": "now"})
     tags = {
@@ -175,7 +219,6 @@ def test_a_union_has_one_member(server: Device) -> None:
 @pytest.mark.parametrize(
     ("tag", "words"),
     [
-        ({"address": "ns=2;s=a#B", "writable": True}, "a member of a structure cannot be written"),
         ({"address": "ns=2;s=a#B", "deadband": 1}, "no dead-band"),
         ({"address": "ns=2;s=a#B..C"}, "the way to the member is wrong at '..C'"),
         ({"address": "ns=2;s=a#"}, "## for a # of the identifier"),
