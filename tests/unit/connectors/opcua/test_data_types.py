@@ -18,9 +18,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmio.connectors.opcua import decode
-from shmio.connectors.opcua.data_types import MAX_TYPES, DataTypes
+from shmio.connectors.opcua.data_types import MAX_TYPES, DataTypes, Structures
 from shmio.connectors.opcua.decode import Extension, MalformedError, Sample
-from shmio.connectors.opcua.structures import AbsentError, Members, find, members_of, read_definition, read_value
+from shmio.connectors.opcua.structures import (
+    AbsentError,
+    ChangedValue,
+    Members,
+    find,
+    members_of,
+    read_definition,
+    read_value,
+)
 from shmio.connectors.opcua.values import MismatchError
 
 ENCODED = b"\1\2\1\0"
@@ -63,11 +71,18 @@ class Server:
         return [ua.NodeId(number, 0 if number < 100 else 2) if number else None for number in found]
 
 
-def read(definitions: dict[int, bytes], body: bytes, parents: dict[int, int] | None = None) -> Any:
-    server = Server(definitions, body, parents)
-    types = DataTypes(server)
+def learned(definitions: dict[int, bytes], body: bytes, parents: dict[int, int] | None = None) -> Structures:
+    types = DataTypes(Server(definitions, body, parents))
     asyncio.run(types.learn([ua.NodeId(101, 2)]))
-    return read_value(types.structures, Sample(decode.EXTENSION, Extension(ENCODED, body), None, 0, 0))
+    return types.structures
+
+
+def value_of(body: bytes) -> Sample:
+    return Sample(decode.EXTENSION, Extension(ENCODED, body), None, 0, 0)
+
+
+def read(definitions: dict[int, bytes], body: bytes, parents: dict[int, int] | None = None) -> Any:
+    return read_value(learned(definitions, body, parents), value_of(body))
 
 
 def numbers(*kinds: int) -> Fields:
@@ -193,6 +208,45 @@ def test_damaged_values_are_values_or_refused(at: int, noise: bytes) -> None:
         for one in itertools.islice(members_of(read(TYPES, BODY[:at] + noise + BODY[at + len(noise) :])), 1000):
             if not one.refused and one.sample.value is not None:
                 find(read(TYPES, BODY[:at] + noise + BODY[at + len(noise) :]), one.member)
+
+
+def test_a_member_is_changed_without_the_other_bytes() -> None:
+    types = learned(TYPES, BODY)
+    for member, old, new in (
+        (("n",), struct.pack("<Ii", 3, -3), struct.pack("<Ii", 3, 8)),
+        (("many", (1,), "m1"), ELEMENT * 2, ELEMENT + ELEMENT[:1] + struct.pack("<d", 8) + ELEMENT[9:]),
+        (("v",), b"\x06\7\0\0\0", b"\x06\x08\0\0\0"),
+        (("u", "m0"), struct.pack("<Ii", 1, 9), struct.pack("<Ii", 1, 8)),
+    ):
+        changed = ChangedValue(types, value_of(BODY))
+        changed.set(member, changed.find(member)._replace(value=8))
+        assert changed.sample == value_of(BODY.replace(old, new))
+        assert changed.find(member).value == 8
+    changed = ChangedValue(types, value_of(BODY))
+    changed.set(("o",), Sample(decode.STRING, "longer", None, 0, 0))
+    changed.set(("v",), Sample(decode.INT16, [1, 2], (2,), 0, 0))
+    whole = b"\2\0\0\0ab", b"\6\0\0\0longer"
+    assert changed.sample.value.body == BODY.replace(*whole).replace(b"\x06\7\0\0\0", b"\x84\2\0\0\0\1\0\2\0")
+    for member, words in ((("many", (1,), "m4"), "NodeId"), (("u", "m1"), "no such member"), (("many",), "address")):
+        with pytest.raises(ValueError, match=words):
+            changed.set(member, Sample(decode.STRING, "x", None, 0, 0))
+
+
+@given(st.integers(0, len(BODY) - 1), st.binary(min_size=1, max_size=8))
+def test_a_member_of_a_damaged_value_is_changed_alone_or_refused(at: int, noise: bytes) -> None:
+    types, value = learned(TYPES, BODY), value_of(BODY[:at] + noise + BODY[at + len(noise) :])
+
+    def members(sample: Sample) -> dict[str, str]:
+        found = itertools.islice(members_of(read_value(types, sample)), 100)
+        return {repr(one.member): repr(one.sample) for one in found}
+
+    with suppress(MismatchError):
+        before = members(value)
+        for one in itertools.islice(members_of(read_value(types, value)), 20):
+            changed = ChangedValue(types, value)
+            with suppress(ValueError):
+                changed.set(one.member, changed.find(one.member))
+                assert members(changed.sample) == before
 
 
 @given(st.sampled_from([101, 102, 103]), st.integers(0, 400), st.binary(min_size=1, max_size=8))

@@ -278,3 +278,13 @@ def test_an_independent_server(tmp_path: Path) -> None:
                 assert (values["PLC/pump/Mode"], values["PLC/pump/Hint"], values["PLC/pump/On"]) == (1, 0.5, True)
                 assert (values["PLC/pumps/1/Spare"], values["PLC/pumps/1/Bytes"]) == (-7, [1, 2, 3])
                 assert values["PLC/either/Text"] == "now"
+                new: dict[str, Value] = {
+                    "PLC/pump/Mode": 0, "PLC/pump/Axes/1/Name": f"by {mode}", "PLC/pump/Bytes": [4, 5, 6],
+                    "PLC/pump/Axes/0/Settling": 0.25, "PLC/pumps/1/Spare": 8, "PLC/either/Text": "now",
+                }  # fmt: skip
+                outcomes = source.write_all({**new, "PLC/either/Whole": 1})
+                assert outcomes[:-1] == [""] * len(new)
+                assert "no such member at present" in outcomes[-1]
+                image = source.connector.read()
+                assert {path: source.value(path, image) for path in tags} == values | new
+                assert not any(source.write_all({path: values[path] for path in new}))
