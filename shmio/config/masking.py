@@ -2,7 +2,9 @@
 
 shmio's own keys name files with secrets, or have hashes of secrets. A key of another package's
 connector may have the secret itself. Therefore the name of a key decides whether its value is masked.
-In doubt, it is masked.
+Secrets are also masked in the values of other keys: in URLs, after options of commands such as
+``--password``, after ``Bearer``, and where a text has the form of a well-known kind of token. In
+doubt, a value is masked.
 """
 
 from __future__ import annotations
@@ -27,6 +29,18 @@ _KEY_FILES: Final = re.compile(r"""["']?[^"']*\.(?:pem|key|der|crt|p8)["']?""", 
 """Matches a path. It is not masked if its key has the name ``key``, as in shmio's own sections."""
 _WORD: Final = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 _USER: Final = re.compile(r"(?<=://)[^\s/\"']*(?=@)")
+_SHAPES: Final = re.compile(
+    r"(?<![A-Za-z0-9_-])(?:gh[oprsu]_[A-Za-z0-9]{16,}|github_pat_\w{16,}|glpat-[\w-]{16,}|xox[a-z]-[\w-]{10,}"
+    r"|sk-[\w-]{16,}|A[KS]IA[0-9A-Z]{16}|eyJ[\w-]{8,}\.[\w-]{8,}(?:\.[\w-]*)?)"
+)
+"""Matches tokens of GitHub, GitLab, Slack and others, and JSON web tokens."""
+_WEB_URL: Final = re.compile(r"(?<![A-Za-z])(?:https?|wss?)://[^\s\"']+", re.IGNORECASE)
+_URL_PARTS: Final = re.compile(r"(?<=/)[^/?#]+")
+_UUID: Final = re.compile(r"[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}", re.IGNORECASE)
+_RUN: Final = re.compile(r"[A-Za-z0-9]{16,}")
+_OPTION: Final = re.compile(r"(?<![\w-])--?([A-Za-z][\w-]*)\s+(?=[^\s-])")
+_WHOLE_OPTION: Final = re.compile(r"--?([A-Za-z][\w-]*)")
+_SCHEME: Final = re.compile(r"(?<![\w-])(?:Bearer|Basic)\s+(?=[\w.~+/=-]{8})", re.IGNORECASE)
 _ASSIGNED: Final = re.compile(r"(?<![A-Za-z0-9_-])([A-Za-z0-9_-]++)[\"']?\s*+(?:=(?!=)|:(?!//))\s*(?=\S)")
 _EQUATED: Final = re.compile(r"(?<![A-Za-z0-9_-])([A-Za-z0-9_-]++)[\"']?\s*+=(?!=)\s*(?=\S)")
 _MIN_QUOTED: Final = 4
@@ -43,7 +57,7 @@ def is_secret(key: str) -> bool:
     may then check the value.
     """
     folded = key.lower()
-    if folded in _NO_SECRETS or folded.endswith(_PATH_SUFFIXES):
+    if folded in _NO_SECRETS or folded.replace("-", "_").endswith(_PATH_SUFFIXES):
         return False
     joined = re.sub(r"[^a-z0-9]", "", folded)
     words = {word.lower() for word in _WORD.findall(key)}
@@ -65,25 +79,49 @@ def mask_value(key: str, value: Any) -> Any:
             return MASK if value else value
         return {name: mask_value(name, item) for name, item in value.items()}
     if isinstance(value, list | tuple):
-        return [mask_value(key, item) for item in value]
+        items = list(value)
+        hidden = [False, *(is_secret_option(item) for item in items[:-1])]
+        return [
+            MASK if secret and isinstance(item, str) else mask_value(key, item)
+            for item, secret in zip(items, hidden, strict=True)
+        ]
     if is_secret(key) and not _is_key_file(key, str(value)):
         return MASK
     return mask_line(value) if isinstance(value, str) else value
 
 
 def mask_line(line: str, assigned: re.Pattern[str] = _ASSIGNED) -> str:
-    """Return a line in which the user information of URLs, and all that follows a secret key, is masked.
+    """Return a line in which secrets are masked: parts of URLs, tokens, and all that follows a secret key or option.
 
     Args:
         line: The line.
         assigned: Matches a key and the sign that separates it from its value.
 
     """
-    line = _USER.sub(MASK, line)
-    for match in assigned.finditer(line):
-        if is_secret(match[1]) and not _is_key_file(match[1], line[match.end() :].strip()):
-            return line[: match.end()] + MASK
+    line = _SHAPES.sub(MASK, _USER.sub(MASK, line))
+    line = _WEB_URL.sub(lambda url: _URL_PARTS.sub(_mask_url_part, url[0]), line)
+    for pattern in (assigned, _OPTION):
+        for match in pattern.finditer(line):
+            if is_secret(match[1]) and not _is_key_file(match[1], line[match.end() :].strip()):
+                line = line[: match.end()] + MASK
+                break
+    if (scheme := _SCHEME.search(line)) is not None:
+        line = line[: scheme.end()] + MASK
     return line
+
+
+def _mask_url_part(part: re.Match[str]) -> str:
+    """Mask a part of a URL's path that has a UUID, or at least 16 letters and digits in a row, as in webhooks."""
+    runs = _RUN.findall(part[0])
+    if _UUID.search(part[0]) or any(not run.isalpha() and not run.isdigit() for run in runs):
+        return MASK
+    return part[0]
+
+
+def is_secret_option(item: Any) -> bool:
+    """Return whether an item of a list is an option of a command, such as ``--password``, which the secret follows."""
+    match = _WHOLE_OPTION.fullmatch(item) if isinstance(item, str) else None
+    return match is not None and is_secret(match[1])
 
 
 @dataclass(frozen=True)
@@ -135,6 +173,8 @@ class _Masker:
         self._table_hidden = False
         self._header = False
         self._start = True
+        self._option = False
+        """True after an option of a command, such as ``"--password"``, in a list. The secret follows it."""
         self.secrets: set[str] = set()
         """The secret values found so far."""
 
@@ -147,6 +187,10 @@ class _Masker:
             elif piece[0] == "#":
                 if (shown := mask_line(piece)) != piece:
                     yield match.start(), match.end(), shown
+            elif self._option and self._depth and piece[0] in "\"'":
+                self._option = False
+                self.secrets.add(piece.strip("\"'"))
+                yield match.start(), match.end(), self._covered(piece)
             elif self._hidden is not None and self._is_value(match) and not self._shows_path(piece):
                 self.secrets.add(piece.strip("\"'"))
                 self._awaited = False
@@ -165,6 +209,7 @@ class _Masker:
 
     def _follow(self, piece: str) -> None:
         first = piece[0]
+        self._option = (self._option and first == ",") or (self._depth > 0 and is_secret_option(piece.strip("\"'")))
         if self._start and first == "[":
             self._header, self._start, self._parts = True, False, []
             self._hidden, self._awaited = None, False

@@ -22,8 +22,8 @@ from shmio.endpoints.web.metrics import Exposition, InstanceCollector
 from shmio.endpoints.web.page import Page, Tab
 from shmio.endpoints.web.served import Served
 from shmio.endpoints.web.sessions import COOKIE, MAX_AGE_S, Sessions, User
-from shmio.endpoints.web.uploads import MAX_BYTES, MAX_HEAD_BYTES, compile_uploads
-from shmio.errors import ShmioError
+from shmio.endpoints.web.uploads import MAX_BYTES, Uploads
+from shmio.errors import EndpointError, ShmioError
 from shmio.segment import Segment
 
 STATIC: Final = Path(__file__).parent / "static"
@@ -32,8 +32,6 @@ MAX_PAGES: Final = 64
 MAX_SILENT: Final = 256
 """Maximum number of WebSockets without a call. If there are more, the oldest is closed."""
 MAX_LOGIN_BYTES: Final = 4096
-MAX_DROPPED: Final = 2
-"""Maximum number of simultaneous requests with files that users have dropped on a page."""
 _TYPES: Final = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
 _POLICY: Final = {
     "content-security-policy": (
@@ -104,7 +102,7 @@ class PageApp:
         self._pages: set[Page] = set()
         self._silent: dict[Page, None] = {}
         """The pages without a call, the oldest first."""
-        self._dropping = 0
+        self._uploads = Uploads()
         self._files = {
             f"/{file.relative_to(STATIC)}": (file.read_bytes(), _TYPES[file.suffix])
             for file in STATIC.rglob("*")
@@ -197,18 +195,17 @@ class PageApp:
         """Return the registers in files that the user has dropped on the page. The files are not stored."""
         if "read" not in self._user(request).roles:
             return JSONResponse({"error": "this needs the role read: sign in"}, 403)
-        if self._dropping >= MAX_DROPPED:
-            return JSONResponse({"error": "other files are being read: try again"}, 429)
-        self._dropping += 1
         try:
-            body = await _body(request, MAX_BYTES + MAX_HEAD_BYTES)
+            body = await self._uploads.receive(request.stream())
             if body is None:
                 return JSONResponse({"error": f"these files have more than {MAX_BYTES >> 20} MB"}, 413)
-            return Response(await compile_uploads(body), media_type="application/json")
+            return Response(await self._uploads.compile(body), media_type="application/json")
+        except ClientDisconnect:
+            return Response(status_code=400)  # nobody reads it
+        except EndpointError as error:
+            return JSONResponse({"error": str(error)}, 429)
         except ShmioError as error:
             return JSONResponse({"error": str(error)}, 422)
-        finally:
-            self._dropping -= 1
 
     def _describe(self, user: User) -> dict[str, object]:
         return {

@@ -10,7 +10,7 @@ import asyncio
 import resource
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import AsyncIterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import PurePath
 from typing import Annotated, Any, Final
@@ -18,7 +18,7 @@ from typing import Annotated, Any, Final
 import msgspec
 from msgspec import Meta
 
-from shmio.errors import CommandError, LayoutError
+from shmio.errors import CommandError, EndpointError, LayoutError
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.importing.found import Found, ImportingError
 from shmio.layout.importing.importer import import_tags
@@ -30,6 +30,12 @@ MAX_BYTES: Final = 8 << 20
 """Maximum size of all files together, in bytes."""
 MAX_HEAD_BYTES: Final = 64 << 10
 """Maximum size of the line with the names, in bytes."""
+MAX_RECEIVING: Final = 8
+"""Maximum number of uploads that are received at the same time. A newer one ends the oldest."""
+MAX_COMPILING: Final = 2
+"""Maximum number of uploads that are compiled at the same time. Others wait."""
+WAIT_S: Final = 10
+"""Maximum time in s for which an upload waits for others to be compiled."""
 MAX_FILES: Final = 100
 MAX_ROWS: Final = 100_000
 """Maximum number of registers that are shown."""
@@ -53,6 +59,57 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 
     name: _Name
     size: _Bytes
+
+
+class Uploads:
+    """Receives and compiles uploads. Slow clients do not block others. Use it in the event loop's thread only."""
+
+    def __init__(self) -> None:
+        self._receiving: dict[int, bytearray] = {}
+        """The uploads that are being received, the oldest first."""
+        self._number = 0
+        self._compiling = asyncio.Semaphore(MAX_COMPILING)
+
+    async def receive(self, parts: AsyncIterable[bytes]) -> bytes | None:
+        """Return a whole upload; None if it is too large.
+
+        Raises:
+            EndpointError: Too many newer uploads came meanwhile.
+
+        """
+        self._number += 1
+        number, body = self._number, bytearray()
+        self._receiving[number] = body
+        if len(self._receiving) > MAX_RECEIVING:
+            self._receiving.pop(next(iter(self._receiving))).clear()  # its client may take long to notice
+        try:
+            async for part in parts:
+                if number not in self._receiving:
+                    raise EndpointError("too many files are being received: try again")
+                body += part
+                if len(body) > MAX_BYTES + MAX_HEAD_BYTES:
+                    return None
+            return bytes(body)
+        finally:
+            self._receiving.pop(number, None)
+
+    async def compile(self, body: bytes) -> bytes:
+        """Compile an upload: :func:`compile_uploads`. Wait until few enough others are being compiled.
+
+        Raises:
+            CommandError: Compiling took too much time or memory.
+            EndpointError: Others took too long.
+
+        """
+        try:
+            async with asyncio.timeout(WAIT_S):
+                await self._compiling.acquire()
+        except TimeoutError:
+            raise EndpointError("other files are being read: try again") from None
+        try:
+            return await compile_uploads(body)
+        finally:
+            self._compiling.release()
 
 
 async def compile_uploads(body: bytes) -> bytes:

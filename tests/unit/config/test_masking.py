@@ -31,6 +31,14 @@ SECRET = "hunter2-hunter2"
         f'command = "run --password={SECRET}"',
         f'[[alert]]\nwebhook = "https://hooks.example/{SECRET}"',
         f'command = ["curl", "-H", "Authorization: Bearer {SECRET}"]',
+        f'command = ["mosquitto_pub", "--password", "{SECRET}", "-t", "alarm"]',
+        f'command = [\n"mail",\n"--api-key",  # of the provider\n"{SECRET}"]',
+        f'command = "notify --token {SECRET}"',
+        f'headers = ["Bearer {SECRET}"]',
+        f'url = "https://host/hook?channel=7&access_token={SECRET}"',
+        f'url = "https://hooks.example/services/T0123/{SECRET}aB3dE6gH9"',
+        f'url = "https://host/x" # Basic {SECRET}',
+        f'text = "ghp_0123456789abcdefABCD {SECRET[:0]}" # password: {SECRET}',
         f"# password = {SECRET}",
         f'listen = ["a"] # the token: "{SECRET}"',
         f'text = """\npassword = "{SECRET}"\n"""',
@@ -64,6 +72,10 @@ def test_secret_is_masked(text: str) -> None:
         '[[injection]]\nwhen = "cell/token == 3"\n',
         'writable = ["Outputs", "Robot_*/*"]\nperiod_ms = 20.5\n',
         '[[source]]\nurl = "opc.tcp://10.0.0.1:4840"\n',
+        '[[source]]\nurl = "http://10.0.0.1:5000/machines/DMG-Mori-NLX2500-line-3/sample"\n',
+        'command = ["logger", "-p", "user.err", "--tag", "shmio"]\n',
+        'command = ["mosquitto_pub", "--password-file", "mqtt.secret"]\n',
+        "# the bearer is at the door, and a basic rule holds\n",
     ],
 )
 def test_other_text_is_shown(text: str) -> None:
@@ -100,3 +112,24 @@ def test_values_are_masked_by_their_keys() -> None:
 @given(st.text(alphabet="\"'#[]{}=.,:\n\\ abpassword0-"))
 def test_any_text_keeps_its_lines(text: str) -> None:
     assert mask(text).text.count("\n") == text.count("\n")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "ghp_0123456789abcdefABCDEFGH",
+        "xoxb-12345-67890-abcdef",
+        "AKIA0123456789ABCDEF",
+        "eyJhbGciOiJIUzI1NiJ9.eyJzdWIiOiIxMjM0In0.c2lnbmF0dXJl",
+        "https://discord.example/api/webhooks/1234/a1B2c3D4e5F6g7H8i9J0k1",
+    ],
+)
+def test_tokens_are_known_by_their_form(text: str) -> None:
+    shown = mask(f'anything = "{text}"\n').text
+    assert MASK in shown
+    assert text.rpartition("/")[2] not in shown
+    assert mask_value("anything", [text])[0] == shown.split('"')[1]
+
+
+def test_parsed_value_after_an_option_is_masked() -> None:
+    assert mask_value("command", ["x", "--password", SECRET, "y"]) == ["x", "--password", MASK, "y"]

@@ -100,7 +100,7 @@ export class Lanes {
 
   /** @param {string[]} paths @param {number} index @returns {Lane} */
   makeLane(paths, index) {
-    const canvas = element("canvas", { tabindex: 0, role: "img", "aria-label": `SignalHistory of ${paths.join(", ")}` });
+    const canvas = element("canvas", { tabindex: 0, role: "img", "aria-label": `Plot of ${paths.join(", ")}` });
     const legend = element("ul", { class: "legend" }, ...paths.map((path) => this.makeEntry(path)));
     const root = element("section", { class: "lane" }, legend, canvas);
     root.addEventListener("drop", (event) => {

@@ -3,15 +3,17 @@ from __future__ import annotations
 import asyncio
 import json
 import socket
+from collections.abc import AsyncIterator
+from contextlib import ExitStack
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmio.endpoints.web import app, uploads
+from shmio.endpoints.web import uploads
 from shmio.endpoints.web.uploads import compile_uploads, describe
-from shmio.errors import CommandError
+from shmio.errors import CommandError, EndpointError
 from shmio.segment import Segment
 from tests.unit.endpoints.web.test_page import SECRETS, pages
 
@@ -111,29 +113,67 @@ def test_page_gets_the_registers_of_its_files(segment: Segment) -> None:
         assert server.request("POST", "/layout", too_large)[0] == 413
 
 
-def test_users_without_a_role_and_foreign_pages_drop_nothing(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_users_without_a_role_and_foreign_pages_drop_nothing(segment: Segment) -> None:
     with pages(segment, SECRETS, roles=()) as server:
         assert server.request("POST", "/layout", request(press_db=BLOCK))[0] == 403
     with pages(segment) as server:
         assert server.request("POST", "/layout", b"", Origin="http://evil.example")[0] == 403
-        monkeypatch.setattr(app, "MAX_DROPPED", 0)
-        assert server.request("POST", "/layout", request(press_db=BLOCK))[0] == 429
 
 
-def test_page_upload_that_ends_early_leaves_room_for_others(
-    segment: Segment, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setattr(app, "MAX_DROPPED", 1)
-    with pages(segment) as server:
-        with socket.create_connection(("127.0.0.1", server.port)) as client:
+def test_slow_page_uploads_do_not_block_others(segment: Segment, caplog: pytest.LogCaptureFixture) -> None:
+    with pages(segment) as server, ExitStack() as slow:
+        for _ in range(2 * uploads.MAX_RECEIVING):
+            client = slow.enter_context(socket.create_connection(("127.0.0.1", server.port)))
             client.sendall(b"POST /layout HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 100\r\n\r\nabc")
-            status = 200
-            while status != 429:  # until the server has the beginning
-                status = server.request("POST", "/layout", b"[]\n")[0]
-        while status == 429:
-            status = server.request("POST", "/layout", b"[]\n")[0]
-        assert status == 200
+        assert server.request("POST", "/layout", request(press_db=BLOCK))[0] == 200
     assert not caplog.records
+
+
+def test_a_newer_upload_ends_the_oldest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(uploads, "MAX_RECEIVING", 1)
+
+    async def run() -> None:
+        some = uploads.Uploads()
+        more = asyncio.Event()
+
+        async def slow() -> AsyncIterator[bytes]:
+            yield b"a"
+            await more.wait()
+            yield b"b"
+
+        async def fast() -> AsyncIterator[bytes]:
+            yield b"whole"
+
+        old = asyncio.create_task(some.receive(slow()))
+        await asyncio.sleep(0)
+        assert await some.receive(fast()) == b"whole"
+        more.set()
+        with pytest.raises(EndpointError, match="try again"):
+            await old
+
+    asyncio.run(run())
+
+
+def test_an_upload_waits_for_others_to_be_compiled_but_not_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def run() -> None:
+        some, done = uploads.Uploads(), asyncio.Event()
+
+        async def long(_: bytes) -> bytes:
+            await done.wait()
+            return b"done"
+
+        monkeypatch.setattr(uploads, "compile_uploads", long)
+        first = [asyncio.create_task(some.compile(b"")) for _ in range(uploads.MAX_COMPILING)]
+        await asyncio.sleep(0)
+        with monkeypatch.context() as impatient:
+            impatient.setattr(uploads, "WAIT_S", 0)
+            with pytest.raises(EndpointError, match="try again"):
+                await some.compile(b"")
+        waiting = asyncio.create_task(some.compile(b""))
+        done.set()
+        assert await asyncio.gather(*first, waiting) == [b"done"] * (uploads.MAX_COMPILING + 1)
+
+    asyncio.run(run())
 
 
 def test_page_is_told_if_files_take_too_long(monkeypatch: pytest.MonkeyPatch) -> None:
