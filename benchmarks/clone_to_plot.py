@@ -81,7 +81,7 @@ def demo(folder: Path, environment: dict[str, str], command: str) -> Iterator[st
 
 
 def _address(lines: SimpleQueue[str | None]) -> str:
-    seen = []
+    seen: list[str] = []
     deadline_s = time.monotonic() + LIMIT_S
     while True:
         try:

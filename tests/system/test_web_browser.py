@@ -511,3 +511,79 @@ def test_page_says_that_the_instance_has_stopped(cell: Cell, page: Any) -> None:
     cell.up()
     expect(page.get_by_role("alert")).to_be_hidden()
     expect(page.locator("#state")).to_have_text("running")
+
+
+class Fingers:
+    """Touches an element, by the protocol of Chromium's developer tools. Points are shares of its width and height."""
+
+    def __init__(self, page: Any, selector: str) -> None:
+        self._session = page.context.new_cdp_session(page)
+        self._box = page.locator(selector).first.bounding_box()
+
+    def _send(self, kind: str, points: list[tuple[float, float]]) -> None:
+        box = self._box
+        touches = [
+            {"x": box["x"] + x * box["width"], "y": box["y"] + y * box["height"], "id": number}
+            for number, (x, y) in enumerate(points)
+        ]
+        self._session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": touches})
+
+    def tap(self, x: float, y: float) -> None:
+        self._send("touchStart", [(x, y)])
+        self._send("touchEnd", [])
+
+    def move(self, *ways: tuple[tuple[float, float], tuple[float, float]]) -> None:
+        """Move each finger from one point to another."""
+        for step in range(9):
+            points = [
+                (old[0] + step / 8 * (new[0] - old[0]), old[1] + step / 8 * (new[1] - old[1])) for old, new in ways
+            ]
+            self._send("touchMove" if step else "touchStart", points)
+        self._send("touchEnd", [])
+
+
+@pytest.mark.parametrize("scene", [SCENE])
+def test_fingers_move_plots_and_the_cell(cell: Cell, address: str, page: Any) -> None:  # noqa: ARG001  the cell runs
+    tablet = page.context.browser.new_context(has_touch=True, viewport={"width": 1024, "height": 768}).new_page()
+    tablet.set_default_timeout(PATIENCE_MS)
+    tablet.goto(f"http://{address}/")
+    tablet.get_by_role("tab", name="Plots").tap()
+    search = tablet.get_by_label("Add a register")
+    search.fill(AXIS)
+    search.press("Enter")
+    expect(tablet.locator(f'.legend li[data-path="{AXIS}"] output')).not_to_have_text("no value")
+    fingers = Fingers(tablet, ".lane canvas")
+    fingers.move(((0.4, 0.5), (0.6, 0.5)))
+    expect(tablet.get_by_role("button", name="Live")).to_be_visible()
+
+    def measured_s() -> float:
+        """Tap on two points; return the time between them."""
+        for x in (0.3, 0.8):
+            fingers.tap(x, 0.5)
+        times = tablet.get_by_text("Δt")
+        return float(times.inner_text().split("Δt ")[1].split()[0])
+
+    before_s = measured_s()
+    assert 2 < before_s < 8
+    fingers.move(((0.45, 0.5), (0.3, 0.5)), ((0.55, 0.5), (0.8, 0.5)))
+    assert measured_s() < before_s / 2
+    fingers.move(((0.3, 0.5), (0.5, 0.5)), ((0.7, 0.5), (0.5, 0.5)))
+    keep(tablet, "touch")
+
+    tablet.get_by_role("tab", name="3D").tap()
+    tablet.get_by_role("button", name="Front").tap()
+
+    def green() -> int:
+        picture = tablet.locator(".scene-picture canvas").screenshot()
+        found: dict[str, int] = tablet.evaluate(COUNT_PIXELS, base64.b64encode(picture).decode())
+        return found["green"]
+
+    until(lambda: green() > 0, "the picture")
+    front = green()
+    fingers = Fingers(tablet, ".scene-picture canvas")
+    fingers.move(((0.4, 0.5), (0.45, 0.5)), ((0.6, 0.5), (0.55, 0.5)))
+    until(lambda: green() < front / 2, "two fingers make it smaller")
+    small = green()
+    fingers.move(((0.3, 0.5), (0.6, 0.5)))
+    until(lambda: green() < small, "one finger turns it")
+    tablet.context.close()

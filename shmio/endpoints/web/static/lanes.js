@@ -26,6 +26,7 @@ const REDRAW_MS = 40;
 const LEAST_S = 0.001;
 const MOST_S = 30 * 86_400;
 const NEAR_PX = 6;
+const LEAST_PINCH_PX = 30; // between two fingers
 
 export class Lanes {
   /** @param {Data} data */
@@ -101,7 +102,7 @@ export class Lanes {
   /** @param {string[]} paths @param {number} index @returns {Lane} */
   makeLane(paths, index) {
     const canvas = element("canvas", { tabindex: 0, role: "img", "aria-label": `Plot of ${paths.join(", ")}` });
-    const legend = element("ul", { class: "legend" }, ...paths.map((path) => this.makeEntry(path)));
+    const legend = element("ul", { class: "legend" }, ...paths.map((path) => this.makeEntry(path, index, paths.length > 1)));
     const root = element("section", { class: "lane" }, legend, canvas);
     root.addEventListener("drop", (event) => {
       const path = event.dataTransfer?.getData("text/plain") ?? "";
@@ -114,8 +115,8 @@ export class Lanes {
     return { paths, canvas, legend, root };
   }
 
-  /** @param {string} path */
-  makeEntry(path) {
+  /** @param {string} path @param {number} index Index of its lane. @param {boolean} joined Whether the lane has others. */
+  makeEntry(path, index, joined) {
     const swatch = element("span", { class: "swatch" });
     swatch.style.background = this.color(path);
     const entry = element(
@@ -124,6 +125,8 @@ export class Lanes {
       swatch,
       element("span", { class: "name" }, path),
       element("output", { class: "value" }),
+      index > 0 ? element("button", { type: "button", "aria-label": `Join ${path} with the plot above`, title: "Join with the plot above", click: () => this.move(path, index - 1) }, "↑") : null,
+      joined ? element("button", { type: "button", "aria-label": `Plot ${path} alone`, title: "Give it a plot of its own", click: () => this.move(path, -1) }, "↓") : null,
       element("button", { type: "button", "aria-label": `Remove ${path}`, click: () => this.remove(path) }, "×"),
     );
     entry.addEventListener("dragstart", (event) => event.dataTransfer?.setData("text/plain", path));
@@ -141,35 +144,61 @@ export class Lanes {
     return `hsl(${Math.round(210 + 137.5 * number) % 360} 70% 50%)`;
   }
 
-  /** @param {HTMLCanvasElement} canvas */
+  /**
+   * Let the user move the plots: drag or swipe to move, wheel or two fingers to zoom, click or tap to set the mark.
+   *
+   * @param {HTMLCanvasElement} canvas
+   */
   listen(canvas) {
-    const timeAt = (/** @type {MouseEvent} */ event) => {
+    const timeAt = (/** @type {number} */ x) => {
       const box = canvas.getBoundingClientRect();
-      return this.from + ((event.clientX - box.left - LEFT_PX) / (box.width - LEFT_PX)) * (this.to - this.from);
+      return this.from + ((x - box.left - LEFT_PX) / (box.width - LEFT_PX)) * (this.to - this.from);
     };
+    /** @type {Map<number, number>} The horizontal position of each pressed pointer. */
+    const pressed = new Map();
     /** @type {{ time: number, moved: boolean } | null} */
     let drag = null;
+    /** @type {number | null} Where a finger tapped last: a finger cannot point without pressing. */
+    let tapped = null;
     canvas.addEventListener("pointerdown", (event) => {
-      drag = { time: timeAt(event), moved: false };
+      pressed.set(event.pointerId, event.clientX);
+      drag = { time: timeAt(event.clientX), moved: pressed.size > 1 };
+      this.cursor = drag.time;
       canvas.setPointerCapture(event.pointerId);
     });
     canvas.addEventListener("pointermove", (event) => {
-      const time = timeAt(event);
-      if (drag !== null && Math.abs(time - drag.time) > 0.005 * (this.to - this.from)) {
+      const time = timeAt(event.clientX);
+      const before = pressed.get(event.pointerId);
+      const other = [...pressed].find(([id]) => id !== event.pointerId)?.[1];
+      if (before !== undefined) pressed.set(event.pointerId, event.clientX);
+      if (before !== undefined && other !== undefined) {
+        const [old, fresh] = [before, event.clientX].map((x) => Math.max(LEAST_PINCH_PX, Math.abs(x - other)));
+        if (old !== fresh) this.zoom(old / fresh, timeAt(other));
+        return;
+      }
+      if (drag !== null && (drag.moved || Math.abs(time - drag.time) > 0.005 * (this.to - this.from))) {
         drag.moved = true;
         this.pause(true);
         this.shift(drag.time - time);
       }
-      this.cursor = timeAt(event);
+      this.cursor = timeAt(event.clientX);
       this.request();
     });
-    canvas.addEventListener("pointerup", () => {
-      if (drag !== null && !drag.moved) this.mark = this.mark === null ? this.cursor : null;
-      drag = null;
+    canvas.addEventListener("pointerup", (event) => {
+      if (drag !== null && !drag.moved) {
+        const place = event.pointerType === "touch" ? tapped : this.cursor;
+        this.mark = this.mark === null ? place : null;
+        tapped = this.cursor;
+      }
+    });
+    canvas.addEventListener("lostpointercapture", (event) => {
+      pressed.delete(event.pointerId);
+      const [rest] = pressed.values();
+      drag = rest === undefined ? null : { time: timeAt(rest), moved: true };
       this.request();
     });
-    canvas.addEventListener("pointerleave", () => {
-      if (drag !== null) return;
+    canvas.addEventListener("pointerleave", (event) => {
+      if (drag !== null || event.pointerType === "touch") return;
       this.cursor = null;
       this.request();
     });
@@ -177,7 +206,7 @@ export class Lanes {
       "wheel",
       (event) => {
         event.preventDefault();
-        this.zoom(event.deltaY > 0 ? 1.25 : 0.8, timeAt(event));
+        this.zoom(event.deltaY > 0 ? 1.25 : 0.8, timeAt(event.clientX));
       },
       { passive: false },
     );

@@ -115,12 +115,12 @@ async function askToken() {
 function enter(found) {
   showUser(found);
   connection.close();
+  shown?.close();
+  shown = null; // the next connection shows the tab with the new roles
   if (context.may("read")) {
     connection.connect();
     return;
   }
-  shown?.close();
-  shown = null;
   byId("offline").hidden = true;
   replace(byId("main"), element("p", {}, "Sign in to see this cell."));
 }

@@ -69,7 +69,7 @@ export class SceneTab {
         look("Top", -90, 89),
         look("Front", -90, 8),
         look("Right", 0, 8),
-        element("span", { class: "dim" }, "Drag to turn, Shift and drag to move, wheel to zoom"),
+        element("span", { class: "dim" }, "Drag to turn, Shift and drag to move, wheel to zoom; two fingers move and zoom"),
       ),
       element("div", { class: "scene-body" }, element("div", { class: "scene-picture" }, this.canvas, this.over, this.problem), element("div", { class: "scene-list" }, this.reasons, this.list)),
     );
