@@ -543,7 +543,7 @@ class Fingers:
 
 
 @pytest.mark.parametrize("scene", [SCENE])
-def test_fingers_move_plots_and_the_cell(cell: Cell, address: str, page: Any) -> None:  # noqa: ARG001  the cell runs
+def test_fingers_move_plots_and_the_cell(address: str, page: Any) -> None:
     tablet = page.context.browser.new_context(has_touch=True, viewport={"width": 1024, "height": 768}).new_page()
     tablet.set_default_timeout(PATIENCE_MS)
     tablet.goto(f"http://{address}/")
