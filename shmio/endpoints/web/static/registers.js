@@ -1,6 +1,7 @@
 // The registers tab: a virtual table of the tree of all registers. The server sends only the visible rows.
 
 import { element, notify, replace, setText } from "./dom.js";
+import { duration } from "./format.js";
 import { plot } from "./plots.js";
 import { VirtualRows } from "./virtual.js";
 
@@ -9,7 +10,7 @@ import { VirtualRows } from "./virtual.js";
  * @typedef {{ path: string, name: string, depth: number, expandable: boolean, type?: string, unit?: string, comment?: string,
  *   writable?: boolean, overridden?: boolean }} Row
  */
-/** @typedef {[string | null, string, string, string, number | null]} Value Text, quality, reason, provenance, source time. */
+/** @typedef {[string | null, string, string, string, number | null]} Value Text, quality, reason, provenance, age in s when it was sent. */
 
 const FILTER_DELAY_MS = 200;
 
@@ -26,6 +27,8 @@ export class RegistersTab {
     this.rows = [];
     /** @type {Record<string, Value>} */
     this.values = {};
+    this.valuesMs = 0;
+    this.timer = setInterval(() => this.fill(), 1000); // ages grow while no values come
     this.asked = 0;
     this.answered = 0;
     this.selected = "";
@@ -49,7 +52,7 @@ export class RegistersTab {
     this.view.addEventListener("keydown", (event) => this.key(event));
     this.detail = element("form", { class: "detail", "aria-label": "Register" });
     this.detail.addEventListener("submit", (event) => event.preventDefault());
-    const heads = ["Register", "Value", "Quality", "Origin", "Type", "Comment"].map((text) => element("span", { role: "columnheader" }, text));
+    const heads = ["Register", "Value", "Quality", "Origin", "Age", "Type", "Comment"].map((text) => element("span", { role: "columnheader" }, text));
     this.root = element(
       "div",
       { class: "registers" },
@@ -63,6 +66,7 @@ export class RegistersTab {
 
   close() {
     this.stop();
+    clearInterval(this.timer);
     this.virtual.close();
     this.context.connection.call("registers.rows", { first: 0, count: 0 }).catch(() => {});
   }
@@ -111,7 +115,7 @@ export class RegistersTab {
     const mark = row.expandable ? (open ? "▾ " : "▸ ") : "";
     const name = element("span", { role: "gridcell", class: "name", title: row.path }, mark + row.name);
     name.style.paddingLeft = `${row.depth * 1.2}rem`;
-    const cells = ["value", "quality", "origin"].map((kind) => element("span", { role: "gridcell", class: kind }));
+    const cells = ["value", "quality", "origin", "age"].map((kind) => element("span", { role: "gridcell", class: kind }));
     const made = element(
       "div",
       { class: "tree-row", role: "row", "data-path": row.path, click: () => this.choose(row), "aria-level": row.depth + 1 },
@@ -132,22 +136,25 @@ export class RegistersTab {
   /** @param {Record<string, Value>} values */
   show(values) {
     this.values = values;
+    this.valuesMs = performance.now();
     this.fill();
   }
 
   /** Write the values into the rows. */
   fill() {
+    const passedS = (performance.now() - this.valuesMs) / 1000;
     this.rows.forEach((row, index) => {
       const value = this.values[row.path];
       const cells = this.body.children[index]?.children;
       if (value === undefined || cells === undefined) return;
-      const [text, quality, reason, origin] = value;
+      const [text, quality, reason, origin, age] = value;
       setText(cells[1], text === null ? "no value" : `${text}${row.unit ? ` ${row.unit}` : ""}`);
       setText(cells[2], reason ? `${quality}: ${reason}` : quality);
       cells[2].className = `quality ${quality}`;
       cells[2].setAttribute("title", reason);
       setText(cells[3], origin);
       cells[3].className = `origin ${origin}`;
+      setText(cells[4], age === null ? "" : duration(age + passedS));
       if (row.path === this.selected && this.present) setText(this.present, `${text ?? "no value"} (${quality}, ${origin})`);
     });
   }

@@ -201,19 +201,21 @@ class Registers(Tab):
         blocks = self.page.served.segment.blocks
         frames = {source: block.latest() for source, block in blocks.items()}
         values: dict[str, list[Any]] = {}
+        ages: dict[str, float | None] = {}
         for path, register in self._visible:
             source = path.partition("/")[0]
             if source in blocks:
-                values[path] = _value(reading(blocks[source], register, frames[source]))
+                found = reading(blocks[source], register, frames[source])
+                values[path], ages[path] = [*_value(found), found.source_time], found.age_s
         if values != self._sent:
             self._sent = values
-            self.page.push("registers", values)
+            self.page.push("registers", {path: [*shown[:-1], ages[path]] for path, shown in values.items()})
 
 
 def _value(found: Reading) -> list[Any]:
-    """Return what a row shows: the value as text, quality, reason, provenance and source time."""
+    """Return what a row shows besides the age: the value as text, quality, reason and provenance."""
     text = None if found.value is None else _text(found)
-    return [text, str(found.quality), found.reason, found.provenance, found.source_time]
+    return [text, str(found.quality), found.reason, found.provenance]
 
 
 def _text(found: Reading) -> str:

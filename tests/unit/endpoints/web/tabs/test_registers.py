@@ -37,6 +37,7 @@ def test_visible_rows_come_with_their_values(segment: Segment) -> None:
         while (found := values(browser, "cell/axis/position"))[1] != "uncertain":
             pass
         assert found[:4] == ["1.5", "uncertain", "a test", "live"]
+        assert 0 <= found[4] < 60
 
 
 def test_all_sources_are_expanded_at_first(segment: Segment) -> None:
