@@ -8,6 +8,9 @@ In the row with silent WebSockets, 500 others are opened beside the page, and ag
 ``paint``: in headless Chromium, from a frame's publication to the end of the browser frame in which the plot with it
 was drawn. ``fps``: how often the plots were drawn in a second. Chromium draws on the same cores, without a GPU.
 
+Then a source with 100,000 registers: the time until Chromium first paints the page, from a click on the tab of the
+registers until the values of the first rows are there, and from a text in the search until its first row is there.
+
 The last table is of clients of gRPC and MQTT that follow one register of the same source: the time from the frame's
 publication to the client, alone, beside 500 silent WebSockets, and beside ten pages with 20 signals. The situations
 take turns, and all parties are separate processes.
@@ -18,10 +21,13 @@ from __future__ import annotations
 import asyncio
 import json
 import shutil
+import statistics
 import struct
+import tempfile
 import time
 from collections.abc import AsyncIterator, Sequence
 from contextlib import ExitStack, asynccontextmanager, suppress
+from pathlib import Path
 from typing import NamedTuple
 
 from common import HERE, Child, begin, quantiles, table
@@ -182,6 +188,49 @@ def paint(running: Instance, address: str, signals: int, duration_s: float) -> l
     ]  # fmt: skip
 
 
+def tree(rounds: int) -> list[list[str]]:
+    """Return the rows of the table of a tree with 100,000 registers."""
+    from playwright.sync_api import sync_playwright  # noqa: PLC0415  it need not be installed
+
+    steps = ("first paint", "registers are opened", "a search is answered")
+    found: dict[str, list[float]] = {step: [] for step in steps}
+    with ExitStack() as stack:
+        address = stack.enter_context(reserved_port())
+        tags = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "tags.toml"
+        paths = (
+            f"line{line:02}/unit{unit:02}/value{value:02}"
+            for line in range(100)
+            for unit in range(50)
+            for value in range(20)
+        )
+        tags.write_text("[registers]\n" + "".join(f'"{path}" = {{ type = "REAL" }}\n' for path in paths))
+        source = f'[[source]]\nname = "big"\nconnector = "memory"\ntags = "{tags}"\nperiod_ms = 200\n'
+        stack.enter_context(instance(PERIOD_MS, more=f'{source}[web]\nlisten = "{address}"\n'))
+        driver = stack.enter_context(sync_playwright())
+        browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        for _ in range(rounds):
+            page = browser.new_context(viewport={"width": 1280, "height": 800}).new_page()
+            page.goto(f"http://{address}/")
+            page.wait_for_selector("#sources tbody td:nth-child(2)")
+            found["first paint"].append(
+                page.evaluate("performance.getEntriesByName('first-contentful-paint')[0].startTime")
+            )
+            begun_s = time.monotonic()
+            page.get_by_role("tab", name="Registers").click()
+            page.wait_for_function("document.querySelector('.tree-row .value')?.textContent")
+            found["registers are opened"].append(1000 * (time.monotonic() - begun_s))
+            begun_s = time.monotonic()
+            page.get_by_label("Search").fill("line99/unit49/value19")
+            page.wait_for_selector('.tree-row[data-path="big/line99/unit49/value19"]')
+            found["a search is answered"].append(1000 * (time.monotonic() - begun_s))
+            page.context.close()
+        browser.close()
+    return [
+        [step, f"{min(times):.0f}", f"{statistics.median(times):.0f}", f"{max(times):.0f}"]
+        for step, times in found.items()
+    ]
+
+
 def beside(running: Instance, web: Address, broker: Address, load: Sequence[object], duration_s: float) -> Beside:
     """Return the latencies of a gRPC client and an MQTT client, and the overruns, beside a load of the web page."""
     slot = running.segment.processes.find("cell")
@@ -263,6 +312,7 @@ def main() -> None:
             painted = [paint(running, str(address), signals, 2.0 if quick else PAINT_S) for signals in (20, 200)]
     if painted:
         table(["", "web, % of a core", "paint, ms", "p99", "fps", "overruns", "others, % of a core"], painted)
+        table(["100,000 registers, ms", "least", "median", "most"], tree(1 if quick else 5))
     neighbours(quick=quick)
 
 
