@@ -95,6 +95,30 @@ def test_staleness_is_sent(soon_stale: Segment, mode: Any) -> None:
     serve(soon_stale, test)
 
 
+def test_a_client_that_reads_every_frame_is_a_reader(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        served.publish(image(1.0))
+        latest, every = subscribe(served, "cell"), subscribe(served, "cell", mode=EVERY)
+        for stream in (latest, every):
+            await stream.update()
+        assert [(block.source, last) for block, last in served.service.readers] == [("cell", 1)]
+        for _ in range(5):  # without a turn of the event loop, so that nothing is sent
+            served.publish(image(2.0))
+        assert [last for _, last in served.service.readers] == [1]
+        while (await every.update()).frame < 6:
+            pass
+        assert [last for _, last in served.service.readers] == [6]
+        every.call.cancel()
+
+        async def gone() -> bool:
+            await asyncio.sleep(0)
+            return not list(served.service.readers)
+
+        await served.until(gone)
+
+    serve(segment, test)
+
+
 def test_a_stream_that_is_behind_catches_up_in_slices(segment: Segment) -> None:
     """Other tasks run between the slices, even if the updates are small."""
 
