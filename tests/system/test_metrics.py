@@ -121,3 +121,49 @@ def test_a_cell_is_monitored(make_cell: Callable[..., Cell], tmp_path: Path) -> 
                 until(lambda: "ShmioSourceBad" in alerts(), "the alert")
             finally:
                 os.kill(plc, signal.SIGCONT)
+
+
+SERIES = {
+    "ShmioUnreachable": {'up{job="shmio"}': "0x20"},
+    "ShmioSourceBad": {'shmio_source_quality{source="cell"}': "0x20"},
+    "ShmioSourceStale": {'shmio_source_age_seconds{source="cell"}': "11x20", "shmio_clock_virtual": "0x20"},
+    "ShmioProcessDown": {'shmio_process_running{process="grpc"}': "0x20"},
+    "ShmioProcessProblem": {'shmio_process_problem{process="mqtt"}': "1x20"},
+    "ShmioProcessRestarts": {'shmio_process_restarts_total{process="cell"}': "0+1x20"},
+    "ShmioOverruns": {
+        'shmio_source_overruns_total{source="cell"}': "0+30x20",
+        'shmio_source_polls_total{source="cell"}': "0+2000x20",
+    },
+    "ShmioReaderLags": {'shmio_reader_lag_seconds{source="cell",process="recorder"}': "3x20"},
+    "ShmioRecorderMisses": {"shmio_recorder_missed_total": "0+1x20"},
+    "ShmioClientsMiss": {"shmio_grpc_dropped_total": "0+1x20"},
+    "ShmioDiskFull": {
+        'shmio_disk_free_bytes{folder="recordings"}': "4x20",
+        'shmio_disk_size_bytes{folder="recordings"}': "100x20",
+    },
+}
+"""Series in which each alert of the packaged rules is active after 10 minutes, with a value every 30 s."""
+
+
+def test_each_alert_rule_fires_on_its_series_alone(tmp_path: Path) -> None:
+    rules = (PACKAGING / "alerts.yml").read_text()
+    assert sorted(SERIES) == sorted(line.split()[-1] for line in rules.splitlines() if "- alert:" in line)
+    tests = [
+        {
+            "interval": "30s",
+            "input_series": [{"series": name, "values": values} for name, values in series.items()],
+            "promql_expr_test": [
+                {
+                    "expr": 'count by (alertname) (ALERTS{alertstate="firing"})',
+                    "eval_time": "10m",
+                    "exp_samples": [{"labels": f'{{alertname="{alert}"}}', "value": 1}],
+                }
+            ],
+        }
+        for alert, series in SERIES.items()
+    ]
+    (tmp_path / "test.yml").write_text(json.dumps({"rule_files": [str(PACKAGING / "alerts.yml")], "tests": tests}))
+    done = subprocess.run(
+        ["promtool", "test", "rules", tmp_path / "test.yml"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
