@@ -16,7 +16,7 @@ typedef struct {
     PyObject_HEAD
     Py_buffer buffer;
     ring_view ring;
-    uint8_t *scratch; /* room for one effective image: Python gets bytes only if a frame has one */
+    uint8_t *scratch; /* for an effective image, which becomes a bytes object only if the frame has one */
     uint32_t incarnation;
 } Ring;
 
@@ -77,7 +77,7 @@ static PyObject *Ring_begin(Ring *self, PyObject *args)
     a32 *stored = &ring_head(&self->ring)->incarnation;
     unsigned int incarnation = 0;
     if (!PyArg_ParseTuple(args, "|I", &incarnation) || !Ring_writable(self)) return NULL;
-    /* Only the writer changes this word; readers have the incarnation of each frame in the frame. */
+    /* Only the writer changes this word. Readers find the incarnation of a frame in the frame. */
     if (!incarnation) incarnation = atomic_load_explicit(stored, memory_order_relaxed) + 1;
     self->incarnation = incarnation;
     atomic_store_explicit(stored, incarnation, memory_order_relaxed);
@@ -132,8 +132,8 @@ static PyObject *Ring_head(Ring *self, PyObject *unused)
     return PyLong_FromUnsignedLongLong(atomic_load_explicit(&ring_head(&self->ring)->head, memory_order_acquire));
 }
 
-/* (frame, cycle, publish_ns, clock_ns, source_ns, incarnation, quality, provenance, event, delay_us, reason, raw,
- * effective) */
+/* Returns a frame as a tuple: (frame, cycle, publish_ns, clock_ns, source_ns, incarnation, quality, provenance,
+ * event, delay_us, reason, raw, effective). None if the ring does not have it. */
 static PyObject *Ring_copy(Ring *self, bool latest, uint64_t frame)
 {
     slot_info info;
@@ -528,6 +528,7 @@ typedef struct {
     uint32_t index; /* number to report; entries with the same index are adjacent */
 } scan_entry;
 
+/* Returns whether the bytes of an entry differ. `dirty` says which chunks of the image differ. */
 static bool entry_changed(const scan_entry *entry, const uint8_t *old, const uint8_t *new, const uint8_t *dirty)
 {
     uint32_t last = (entry->offset + entry->size - 1) / CHUNK;

@@ -1,9 +1,9 @@
-/* A queue of byte records in shared memory: one producer and one consumer, of which neither ever waits.
+/* A queue of byte records in shared memory, for one producer and one consumer. Neither ever waits.
  *
- * Pure C11 like ring.h. Writers send commands to a source through such queues, one for each writer and
- * block; docs/reference/segment-format.md describes the bytes. Accesses to the data are not atomic. Only
- * head and tail order them: the bytes between tail and head belong to the consumer, all others to the
- * producer.
+ * Pure C11 like ring.h. Writers send commands to a source through such queues. Each pair of writer and
+ * block has one. docs/reference/segment-format.md describes the bytes. Accesses to the data are not
+ * atomic; head and tail order them. The bytes between tail and head belong to the consumer, all others
+ * to the producer.
  */
 #ifndef SHMIO_QUEUE_H
 #define SHMIO_QUEUE_H
@@ -14,16 +14,16 @@
 #define RECORD_HEADER_SIZE 8u /* u32 bytes of the record, u32 zero */
 
 typedef struct {
-    a64 head; /* bytes ever added; in the producer's cache line */
+    a64 head; /* total bytes added; in the producer's cache line */
     uint64_t reserved0[7];
-    a64 tail; /* bytes ever removed; in the consumer's cache line */
+    a64 tail; /* total bytes removed; in the consumer's cache line */
     uint64_t reserved1[7];
 } queue_header;
 _Static_assert(sizeof(queue_header) == QUEUE_HEADER_SIZE, "queue header");
 
 enum queue_result { QUEUE_EMPTY = 0, QUEUE_RECORD = 1, QUEUE_BROKEN = 2 };
 
-/* Copy bytes and wrap at `capacity`, a power of two. */
+/* Copies bytes into the queue, and wraps at `capacity`, a power of two. */
 static inline void queue_copy_in(uint8_t *data, uint64_t capacity, uint64_t at, const uint8_t *from, uint64_t size)
 {
     uint64_t start = at & (capacity - 1), first = size < capacity - start ? size : capacity - start;
@@ -31,6 +31,7 @@ static inline void queue_copy_in(uint8_t *data, uint64_t capacity, uint64_t at, 
     memcpy(data, from + first, size - first);
 }
 
+/* Copies bytes out of the queue, and wraps at `capacity`. */
 static inline void queue_copy_out(uint8_t *to, const uint8_t *data, uint64_t capacity, uint64_t at, uint64_t size)
 {
     uint64_t start = at & (capacity - 1), first = size < capacity - start ? size : capacity - start;
@@ -38,15 +39,15 @@ static inline void queue_copy_out(uint8_t *to, const uint8_t *data, uint64_t cap
     memcpy(to + first, data, size - first);
 }
 
-/* Adds a record; false if there is no room. The consumer cannot see an incomplete record, so a producer
- * that dies leaves no part of one. */
+/* Adds a record. Returns false if the queue has no room. The consumer never sees an incomplete record,
+ * even if the producer dies. */
 static inline bool queue_push(uint8_t *queue, uint64_t capacity, const uint8_t *record, uint32_t size)
 {
     queue_header *header = (queue_header *)(void *)queue;
     uint8_t *data = queue + QUEUE_HEADER_SIZE;
     uint64_t needed = RECORD_HEADER_SIZE + align8(size);
-    uint64_t head = atomic_load_explicit(&header->head, memory_order_relaxed); /* only we write it */
-    /* Pairs with the release store in queue_drop: records that the consumer has removed may now be overwritten. */
+    uint64_t head = atomic_load_explicit(&header->head, memory_order_relaxed); /* only the producer writes it */
+    /* Pairs with the release store in queue_drop: the producer may overwrite records that the consumer has removed. */
     uint64_t used = head - atomic_load_explicit(&header->tail, memory_order_acquire);
     if (used > capacity || needed > capacity - used) return false;
     uint32_t words[2] = {size, 0};
@@ -57,11 +58,12 @@ static inline bool queue_push(uint8_t *queue, uint64_t capacity, const uint8_t *
     return true;
 }
 
-/* Returns the size of the oldest record. BROKEN: head, tail and size are inconsistent, which shmio never writes. */
+/* Finds the size of the oldest record. Returns BROKEN if head, tail and size are inconsistent, which shmio
+ * never writes. */
 static inline enum queue_result queue_peek(const uint8_t *queue, uint64_t capacity, uint32_t *size)
 {
     const queue_header *header = (const queue_header *)(const void *)queue;
-    uint64_t tail = atomic_load_explicit(&header->tail, memory_order_relaxed); /* only we write it */
+    uint64_t tail = atomic_load_explicit(&header->tail, memory_order_relaxed); /* only the consumer writes it */
     uint64_t used = atomic_load_explicit(&header->head, memory_order_acquire) - tail;
     if (used == 0) return QUEUE_EMPTY;
     uint32_t words[2];
@@ -72,13 +74,13 @@ static inline enum queue_result queue_peek(const uint8_t *queue, uint64_t capaci
     return QUEUE_RECORD;
 }
 
-/* Removes the record that queue_peek saw. */
+/* Copies out and removes the record that queue_peek has found. */
 static inline void queue_drop(uint8_t *queue, uint64_t capacity, uint8_t *record, uint32_t size)
 {
     queue_header *header = (queue_header *)(void *)queue;
     uint64_t tail = atomic_load_explicit(&header->tail, memory_order_relaxed);
     queue_copy_out(record, queue + QUEUE_HEADER_SIZE, capacity, tail + RECORD_HEADER_SIZE, size);
-    /* Pairs with the acquire load in queue_push: the record has been copied out. */
+    /* Pairs with the acquire load in queue_push: a producer that sees this tail may overwrite the record. */
     atomic_store_explicit(&header->tail, tail + RECORD_HEADER_SIZE + align8(size), memory_order_release);
 }
 

@@ -1,4 +1,4 @@
-/* The shared-memory mechanisms of shmio: frame ring, cell, doorbell.
+/* Frame ring, cell and doorbell: the mechanisms that processes share in memory.
  *
  * Pure C11, no Python: _atomics.c wraps it, and tests/native/ runs it under the sanitizers.
  * docs/reference/segment-format.md describes the bytes; this file is their reference implementation.
@@ -114,7 +114,7 @@ static inline const char *ring_open(ring_view *ring, uint8_t *base, uint64_t siz
     return NULL;
 }
 
-/* Copy to and from shared memory in relaxed 64-bit words. Only the private side may end within a word. */
+/* Copies to shared memory in relaxed 64-bit words. The private data may end within a word. */
 static inline void words_store(uint8_t *shared, const uint8_t *data, size_t size)
 {
     a64 *words = (a64 *)(void *)shared;
@@ -131,6 +131,7 @@ static inline void words_store(uint8_t *shared, const uint8_t *data, size_t size
     }
 }
 
+/* Copies from shared memory in relaxed 64-bit words. The private data may end within a word. */
 static inline void words_load(uint8_t *data, const uint8_t *shared, size_t size)
 {
     const a64 *words = (const a64 *)(const void *)shared;
@@ -145,10 +146,11 @@ static inline void words_load(uint8_t *data, const uint8_t *shared, size_t size)
     }
 }
 
-/* Wakes all that wait on this word. With a read-only mapping they cannot register, so it always wakes. */
+/* Wakes all threads that wait on this word. Readers with a read-only mapping cannot register, so the
+ * system call is always made. */
 static inline void doorbell_ring(a32 *word)
 {
-    /* release: a waiter that sees the new value sees everything written before it. */
+    /* Release: a thread that sees the new value sees everything that was written before it. */
     atomic_fetch_add_explicit(word, 1, memory_order_release);
     syscall(SYS_futex, word, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0);
 }
@@ -169,19 +171,19 @@ static inline uint64_t ring_publish(const ring_view *ring, slot_info info, const
                                     const uint8_t *effective)
 {
     ring_header *header = ring_head(ring);
-    uint64_t frame = atomic_load_explicit(&header->head, memory_order_relaxed) + 1; /* only we write it */
+    uint64_t frame = atomic_load_explicit(&header->head, memory_order_relaxed) + 1; /* only the writer changes it */
     uint8_t *base = ring_slot(ring, frame);
     slot_header *slot = (slot_header *)(void *)base;
 
     atomic_store_explicit(&slot->sequence, 2 * frame + 1, memory_order_relaxed);
-    /* Pairs with the acquire fence in ring_read: a reader that saw any word below also sees the odd sequence. */
+    /* Pairs with the acquire fence in ring_read: a reader that sees any word below also sees the odd sequence. */
     atomic_thread_fence(memory_order_release);
     info.flags = (uint16_t)(effective ? info.flags | FLAG_EFFECTIVE : info.flags & ~FLAG_EFFECTIVE);
     words_store((uint8_t *)slot->words, (const uint8_t *)&info, sizeof info);
     if (info.reason_size) words_store(base + SLOT_HEADER_SIZE, reason, info.reason_size);
     words_store(base + RAW_OFFSET, raw, ring->frame_size);
     if (effective) words_store(base + ring->effective_offset, effective, ring->frame_size);
-    /* Pairs with the acquire load of the sequence in ring_read: a reader that sees it even sees the whole frame. */
+    /* Pairs with the acquire load of the sequence in ring_read: a reader that sees the even number sees the whole frame. */
     atomic_store_explicit(&slot->sequence, 2 * frame + 2, memory_order_release);
     /* Pairs with the acquire load of head in every reader: the slots of all frames up to head were complete. */
     atomic_store_explicit(&header->head, frame, memory_order_release);
@@ -209,8 +211,8 @@ static inline bool ring_read(const ring_view *ring, uint64_t frame, slot_info *i
     return atomic_load_explicit(&slot->sequence, memory_order_relaxed) == whole;
 }
 
-/* Copies the newest frame and returns its number. Returns 0 if there is none yet, or if the writer overtook
- * each of READ_ATTEMPTS reads. */
+/* Copies the newest frame and returns its number. Returns 0 if the ring has no frame yet, or if the writer
+ * has overtaken each of READ_ATTEMPTS reads. */
 static inline uint64_t ring_latest(const ring_view *ring, slot_info *info, uint8_t *reason, uint8_t *raw, uint8_t *effective)
 {
     for (int attempt = 0; attempt < READ_ATTEMPTS; attempt++) {
@@ -220,7 +222,7 @@ static inline uint64_t ring_latest(const ring_view *ring, slot_info *info, uint8
     return 0;
 }
 
-/* A cell: a sequence word, then bytes. It has one writer, and readers copy all of the bytes or none. */
+/* Writes a cell: a sequence word, then bytes. A cell has one writer. Readers copy all of its bytes or none. */
 static inline void cell_write(uint8_t *cell, const uint8_t *data, size_t size)
 {
     a64 *sequence = (a64 *)(void *)cell;
@@ -231,6 +233,7 @@ static inline void cell_write(uint8_t *cell, const uint8_t *data, size_t size)
     atomic_store_explicit(sequence, odd + 1, memory_order_release); /* pairs with the first load in cell_read */
 }
 
+/* Copies a cell. Returns false if it was being written at each of READ_ATTEMPTS attempts. */
 static inline bool cell_read(const uint8_t *cell, uint8_t *data, size_t size)
 {
     const a64 *sequence = (const a64 *)(const void *)cell;
