@@ -236,6 +236,12 @@ def test_benchmark_of_reading_mqtt() -> None:
     assert len(re.findall(r"^(?:shmio|paho) +[1-9]\d* +\d+\.\d+", found, re.MULTILINE)) == 2, found
 
 
+def test_benchmark_of_reading_mtconnect() -> None:
+    found = printed("mtconnect_read")
+    assert re.search(r"^shmio +[1-9]\d* +\d+\.\d+$", found, re.MULTILINE), found
+    assert re.search(r"^urllib, ElementTree +[1-9]\d* +\d+\.\d+ +\d+\.\d+ +\d+\.\d+$", found, re.MULTILINE), found
+
+
 def test_benchmark_of_reading_ros() -> None:
     pytest.importorskip("cyclonedds")
     found = printed("ros_read")
