@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import lru_cache
 from typing import Final, NamedTuple
 from xml.parsers import expat
 
@@ -237,14 +238,21 @@ def to_ns(text: str) -> int:
     match = _TIME.fullmatch(text)
     if match is None:
         return 0
-    zone = match[3] if match[3] not in (None, "Z") else "+00:00"
-    try:
-        moment = datetime.fromisoformat(f"{match[1]}{zone}").astimezone(UTC)
-    except (ValueError, OverflowError):
+    seconds = _seconds(match[1], match[3] if match[3] not in (None, "Z") else "+00:00")
+    if seconds is None:
         return 0
-    since = moment - datetime(1970, 1, 1, tzinfo=UTC)
-    found = (since.days * 86_400 + since.seconds) * 1_000_000_000 + int((match[2] or "0").ljust(9, "0"))
+    found = seconds * 1_000_000_000 + int((match[2] or "0").ljust(9, "0"))
     return found if 0 < found < 1 << 63 else 0
+
+
+@lru_cache(maxsize=1000)  # the observations of a document are of few seconds
+def _seconds(moment: str, zone: str) -> int | None:
+    """Return whole seconds since 1970 UTC; None if the text is not a moment."""
+    try:
+        since = datetime.fromisoformat(f"{moment}{zone}").astimezone(UTC) - datetime(1970, 1, 1, tzinfo=UTC)
+    except (ValueError, OverflowError):
+        return None
+    return since.days * 86_400 + since.seconds
 
 
 def _whole(text: str, name: str) -> int:
