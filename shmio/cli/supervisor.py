@@ -99,11 +99,16 @@ def _parser() -> argparse.ArgumentParser:
     audit.add_argument("--action", metavar="ACTION", help="only this action, such as write or restart")
     add_json(audit, "print one JSON object per line")
     init = verb("init", "write a configuration: the A50 example, or one for the files given", file)
-    init.usage = f"{PROGRAM} init [-h] [-c FILE] [--emulated] [--block NAME] [plc.ini] [FILE.db [FILE.udt ...]]"
+    init.usage = (
+        f"{PROGRAM} init [-h] [-c FILE] [--demo | --emulated] [--block NAME] [plc.ini] [FILE.db [FILE.udt ...]]"
+    )
     init.epilog = (
         "A device without source files of data blocks has a tag table, which a [[source]] names as its layout: "
         "shmio-layout import converts the tag list of another tool, shmio-supervisor browse asks an OPC UA server or "
         "an MQTT broker, and docs/how-to/use-a-tag-list.md says how to write one."
+    )
+    init.add_argument(
+        "--demo", action="store_true", help="the A50 example with its emulated PLC; the same as without files"
     )
     init.add_argument("--emulated", action="store_true", help="with an emulated PLC in place of the real one")
     init.add_argument("--block", metavar="NAME", help="only this data block (default: a source for each)")

@@ -11,8 +11,9 @@ import os
 import re
 import sys
 import unicodedata
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from importlib import resources
 from itertools import chain, count, islice
 from pathlib import Path
@@ -21,6 +22,8 @@ from typing import Final, NamedTuple
 from shmio.cli.target import config_file, option_for
 from shmio.config import Address
 from shmio.config.read import RESERVED_SOURCES, SECTION_PROCESSES, read_properties, read_tables
+from shmio.config.web import check_library
+from shmio.endpoints.mqtt.broker.program import check_installed
 from shmio.errors import ConfigError, LayoutError
 from shmio.layout.compiler import Program
 from shmio.layout.model import Layout
@@ -63,17 +66,22 @@ def init(arguments: argparse.Namespace) -> int:
     file = config_file(arguments)
     _refuse_present(file)
     text, missing = None, dict[Path, list[str]]()
+    left_out: list[str] = []
+    if arguments.files and arguments.demo:
+        raise ConfigError("--demo writes the A50 example: give no files with it")
     if arguments.files:
         text, missing, warnings = new_config(file, arguments.files, arguments.block, emulated=arguments.emulated)
         for line in warnings:
             print(printable(line), file=sys.stderr)
     elif arguments.block:
         raise ConfigError("--block chooses a data block of the files that are given, and there are none")
-    written = _example(file) if text is None else {file: text}
+    written = {file: text} if text is not None else _example(file, left_out)
     other = vacant_name(EXAMPLE_NAME, file) if text is None else EXAMPLE_NAME  # before this instance takes the name
     _write(written)
     for path in written:
         print(printable(f"wrote {path}"))
+    for line in left_out:
+        print(line)
     if other != EXAMPLE_NAME:
         print(
             f"an instance or a configuration nearby is called {EXAMPLE_NAME}, too: to run both, call this one {other}"
@@ -87,11 +95,36 @@ def init(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _example(file: Path) -> dict[Path, str]:
-    """Return the files of the A50 cell with its emulated controller, by path."""
+def _example(file: Path, left_out: list[str]) -> dict[Path, str]:
+    """Return the files of the A50 cell with its emulated controller, by path.
+
+    A section whose programs are not installed becomes a comment; its remedy is added to ``left_out``.
+    """
     folder = resources.files("shmio.cli") / "a50"
     config, *others = ((folder / name).read_text(encoding="utf-8") for name in EXAMPLE)
+    checks: dict[str, Callable[[], None]] = {"mqtt": check_installed, "web": partial(check_library, "web")}
+    for section, check in checks.items():
+        try:
+            check()
+        except ConfigError as error:
+            config = comment_out(config, section)
+            left_out.append(f"[{section}] is a comment for now: {error}")
     return {file: config} | {file.parent / name: text for name, text in zip(EXAMPLE[1:], others, strict=True)}
+
+
+def comment_out(config: str, section: str) -> str:
+    """Return a configuration whose ``[section]`` and ``[[section.*]]`` tables are comments.
+
+    Args:
+        config: Text of a configuration with an empty line before each table.
+        section: Name of the section.
+
+    """
+    tables = config.split("\n\n")
+    for index, table in enumerate(tables):
+        if table.lstrip("[").startswith((f"{section}]", f"{section}.")):
+            tables[index] = "\n".join(f"# {line}" for line in table.splitlines())
+    return "\n\n".join(tables) + ("" if tables[-1].endswith("\n") or not config.endswith("\n") else "\n")
 
 
 def _refuse_present(path: Path) -> None:

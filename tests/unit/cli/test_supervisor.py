@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import re
@@ -17,6 +18,7 @@ from shmio import control
 from shmio.cli import target
 from shmio.cli.supervisor import main
 from shmio.config import load
+from shmio.endpoints.mqtt.broker import program
 from shmio.layout.model import Layout, Register
 from shmio.local import status
 from shmio.plan.prepare import prepare
@@ -61,15 +63,37 @@ def example(capsys: pytest.CaptureFixture[str]) -> Edit:
     return edit
 
 
-def test_init_writes_the_example_of_the_repository(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["init"]) == 0
-    assert capsys.readouterr().out.splitlines()[:3] == [
-        f"wrote {name}" for name in ("supervisor.toml", "db201.db", "scene.toml")
-    ]
-    for name in ("db201.db", "scene.toml"):
+@pytest.mark.parametrize("options", [[], ["--demo"]])
+def test_init_writes_the_example_of_the_repository(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["init", *options]) == 0
+    names = ["supervisor.toml", "db201.db", "scene.toml"]
+    assert capsys.readouterr().out.splitlines()[:3] == [f"wrote {name}" for name in names]
+    for name in names:
         assert Path(name).read_bytes() == (ROOT / name).read_bytes()
-    without_page, page = Path("supervisor.toml").read_text().split("# [web]")  # its libraries may be missing
-    assert f"{without_page}[web]{page}".replace("\n# ", "\n") == (ROOT / "supervisor.toml").read_text()
+
+
+def test_sections_of_the_example_whose_programs_are_missing_are_comments(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("SHMIO_MOSQUITTO", "")
+    found = importlib.util.find_spec
+    missing = {"amqtt", "uvicorn"}
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in missing else found(name))
+    monkeypatch.setattr(program, "find_spec", importlib.util.find_spec)
+    assert main(["init", "--demo"]) == 0
+    broker, page = capsys.readouterr().out.splitlines()[3:5]
+    assert "shmio[broker]" in broker
+    assert "shmio[web]" in page
+    config = load(Path("supervisor.toml"))
+    assert (config.mqtt, config.web, config.instance.name) == (None, None, "a50")
+    uncommented = re.sub("^# (?!The A50)", "", Path("supervisor.toml").read_text(), flags=re.MULTILINE)
+    assert uncommented == (ROOT / "supervisor.toml").read_text()
+
+
+def test_demo_takes_no_files(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["init", "--demo", "cell.db"]) == 1
+    assert "no files" in capsys.readouterr().err
+    assert not Path("supervisor.toml").exists()
 
 
 def test_init_names_tag_tables(capsys: pytest.CaptureFixture[str]) -> None:
@@ -728,7 +752,7 @@ def test_a_block_is_chosen_by_its_number_or_name(example: Edit, key: str, capsys
 
 def test_help_lists_the_arguments_of_init_and_the_modes(capsys: pytest.CaptureFixture[str]) -> None:
     for verb, said in (
-        ("init", "init [-h] [-c FILE] [--emulated] [--block NAME] [plc.ini] [FILE.db [FILE.udt ...]]"),
+        ("init", "init [-h] [-c FILE] [--demo | --emulated] [--block NAME] [plc.ini] [FILE.db [FILE.udt ...]]"),
         ("up", "replay: play a recording in place of the sources"),
     ):
         with pytest.raises(SystemExit):

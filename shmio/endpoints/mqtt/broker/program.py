@@ -60,9 +60,19 @@ def choose_broker(settings: Mqtt) -> str | None:
             'it listens only on loopback, and everybody may do everything (one [[mqtt.account]], roles = ["read", '
             '"write"], no name)'
         )
-    if find_spec("amqtt") is None:
-        raise ConfigError(NEITHER)
+    check_installed()
     return None
+
+
+def check_installed() -> None:
+    """Check that this machine has a broker.
+
+    Raises:
+        ConfigError: Neither mosquitto nor aMQTT is installed.
+
+    """
+    if find_mosquitto() is None and find_spec("amqtt") is None:
+        raise ConfigError(NEITHER)
 
 
 def _only_mosquitto(settings: Mqtt) -> Iterator[str]:
