@@ -6,6 +6,8 @@ Programs on the same host start with :func:`attach`, others with :func:`connect`
 
 from __future__ import annotations
 
+import importlib
+
 from shmio.version import __version__
 
 TYPE_CHECKING = False  # importing typing takes 10 ms, in which Ctrl-C prints a traceback
@@ -17,25 +19,25 @@ if TYPE_CHECKING:
     from shmio.model.cell import Cell
     from shmio.recording.dump import open_dump
 
+_MODULES = {
+    "Cell": "shmio.model.cell",
+    "attach": "shmio.local.attach",
+    "connect": "shmio.client",
+    "open_dump": "shmio.recording.dump",
+}
+"""The module of each public name."""
+
 __all__ = ["Cell", "__version__", "attach", "connect", "open_dump"]
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name at its first use, because most processes of an instance need none."""
-    if name == "attach":
-        from shmio.local.attach import attach  # noqa: PLC0415
-
-        return attach
-    if name == "connect":
-        from shmio.client import connect  # noqa: PLC0415
-
-        return connect
-    if name == "Cell":
-        from shmio.model.cell import Cell  # noqa: PLC0415
-
-        return Cell
-    if name == "open_dump":
-        from shmio.recording.dump import open_dump  # noqa: PLC0415
-
-        return open_dump
-    raise AttributeError(f"module 'shmio' has no attribute {name!r}")
+    module = _MODULES.get(name)
+    if module is None:
+        raise AttributeError(f"module 'shmio' has no attribute {name!r}")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except ModuleNotFoundError as error:
+        if error.name is None or not module.startswith(error.name):
+            raise
+        raise ImportError(f"shmio.{name} is not part of shmio-client: it needs pip install shmio, on Linux") from None

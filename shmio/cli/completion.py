@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Final
 
 from shmio.errors import ShmioError
-from shmio.recording.libraries import library
+from shmio.libraries import library
 
 PROGRAMS: Final = ("shmio", "shmio-supervisor", "shmio-dump", "shmio-layout", "shmio-campaign")
 SHELLS: Final = ("bash", "zsh", "fish")

@@ -14,10 +14,9 @@ from shmio.layout.model import Layout, Register
 from shmio.layout.topic import look_up, parse_topic
 from shmio.layout.values.codec import Value
 from shmio.layout.values.typed import read_value
-from shmio.local.writer import MIN_PERIODS, TIMEOUT_S
 from shmio.logs import printable
 from shmio.model.cell import Cell
-from shmio.model.values import Outcome, OutcomeKind
+from shmio.model.values import WRITE_MIN_PERIODS, WRITE_TIMEOUT_S, Outcome, OutcomeKind
 
 MATCHES = 3
 """Number of matching registers that the error about a pattern names."""
@@ -34,7 +33,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "--timeout",
         type=seconds,
         metavar="S",
-        help=f"give up if no cycle begins to write in this time in s (default {TIMEOUT_S:g}, or {MIN_PERIODS} cycles)",
+        help="give up if no cycle begins to write in this time in s "
+        f"(default {WRITE_TIMEOUT_S:g}, or {WRITE_MIN_PERIODS} cycles)",
     )
     parser.add_argument("pairs", nargs="+", action=Pairs, metavar="PATH VALUE", help="register or array element")
 

@@ -9,11 +9,9 @@ import sys
 import msgspec
 
 from shmio.cli.common import at_least, dumps, stop_on_signals
-from shmio.cli.instance.status import clock_line
 from shmio.errors import CommandError, ValueRangeError
-from shmio.local.status import clock_status
-from shmio.local.time_control import MAX_RATE, MAX_STEP_NS, MIN_STEP_NS, check_step
 from shmio.model.cell import Cell
+from shmio.model.clock import MAX_RATE, MAX_STEP_NS, MIN_STEP_NS, ClockMode, ClockStatus, check_step, clock_status
 
 LOOK_S = 0.2
 
@@ -65,6 +63,20 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
     clock = clock_status(cell.clock())
     print(dumps(msgspec.to_builtins(clock)) if options.json else clock_line(clock, options.dt_ms))
     return 0
+
+
+def clock_line(clock: ClockStatus, dt_ms: float | None = None) -> str:
+    """Return the state of the clock as text.
+
+    ``dt_ms`` is the length of the steps that were just made; None for the clock's step size.
+    """
+    if clock.mode == str(ClockMode.WALL):
+        return f"real time {clock.time_s:.3f} s"
+    size = f"{clock.step_size_ms:g} ms"
+    step = f"{clock.step}, steps of {size}" if dt_ms is None else f"{clock.step} of {dt_ms:g} ms, step size {size}"
+    how = f", playing at {clock.rate:g} times real time" if clock.playing else ""
+    note = f"; {clock.note}" if clock.note else ""
+    return f"virtual time {clock.time_s:.3f} s, step {step}{how}{note}"
 
 
 def _ask(cell: Cell) -> None:

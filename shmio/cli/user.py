@@ -7,17 +7,16 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
 from shmio.cli import completion, inject, read, replay, step
 from shmio.cli import set as set_verb
 from shmio.cli.common import add_json, complete, ended_by_interrupt, run
-from shmio.cli.target import target
 from shmio.config.address import UNIX, Address
 from shmio.errors import ConfigError, UnknownClientError
 from shmio.layout.spelling import may_be_tia_spelling, topic_path
-from shmio.local.attach import Attachment
 from shmio.model.cell import Cell
 from shmio.version import __version__
 
@@ -94,6 +93,14 @@ def _opened(arguments: argparse.Namespace, *, writable: bool) -> Iterator[Cell]:
 
     """
     if arguments.host is None:
+        if find_spec("shmio.local") is None:  # the distribution shmio-client
+            raise ConfigError(
+                "name the instance with --host HOST:PORT: shmio-client reaches instances only by gRPC (on Linux, "
+                "pip install shmio also reads the shared memory of this host)"
+            )
+        from shmio.cli.target import target  # noqa: PLC0415  not part of shmio-client
+        from shmio.local.attach import Attachment  # noqa: PLC0415
+
         with Attachment(target(arguments).open(writable=writable)) as attachment:
             yield attachment
         return

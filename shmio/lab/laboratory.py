@@ -24,7 +24,8 @@ from shmio.connectors.poll_loop import Schedule
 from shmio.errors import ConfigError, TimeError
 from shmio.judging.source import Rows
 from shmio.local.attach import Attachment
-from shmio.local.time_control import Coordinator, Step, check_step
+from shmio.local.time_control import Coordinator, Step
+from shmio.model.clock import check_step
 from shmio.plan.prepare import prepare
 from shmio.plan.processes import Job, Plan
 from shmio.recorder.recorder import AttachedFiles, ConfigFiles

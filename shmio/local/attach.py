@@ -38,9 +38,9 @@ from shmio.local.injection import Campaign, ObservedWrite, Shadow, as_given, by_
 from shmio.local.reading import View, reading
 from shmio.local.replays import Replays
 from shmio.local.subscription import Following, Subscription
-from shmio.local.time_control import Coordinator, Timekeeper, check_step
+from shmio.local.time_control import Coordinator, Timekeeper
 from shmio.local.writer import SourceWriter
-from shmio.model.clock import Clock
+from shmio.model.clock import Clock, check_step
 from shmio.model.injection import Injection, Lifted, Running
 from shmio.model.values import Outcome, Quality, Reading
 from shmio.segment.block import Block, Cursor, Entry, Frame, Layouts

@@ -10,7 +10,7 @@ from typing import Final
 import msgspec
 
 from shmio.errors import NotRunningError, SegmentError
-from shmio.model.clock import Clock
+from shmio.model.clock import ClockStatus, clock_status
 from shmio.model.values import Quality
 from shmio.segment.block import Block
 from shmio.segment.header import State as InstanceState
@@ -70,22 +70,6 @@ class SupervisorStatus(msgspec.Struct):
 
     pid: int
     uptime_s: float
-
-
-class ClockStatus(msgspec.Struct):
-    """Status of the instance's clock. ``mode`` is wall or virtual; ``step`` is the last finished step.
-
-    ``note`` says which processes a step waits for, why the last step failed, or on which sources it
-    had no effect. Before the first step, it says how to return to real time.
-    """
-
-    mode: str
-    time_s: float
-    step: int
-    step_size_ms: float
-    playing: bool
-    rate: float
-    note: str
 
 
 class InstanceStatus(msgspec.Struct):
@@ -170,14 +154,6 @@ def status_of(segment: Segment, remedy: str, asking: str = "") -> InstanceStatus
             status.state, status.note = str(InstanceState.DEGRADED), silence
     status.processes = processes
     return status
-
-
-def clock_status(state: Clock) -> ClockStatus:
-    """Convert the state of the clock page to the units of a status."""
-    return ClockStatus(
-        str(state.mode), state.present_ns / 1e9, state.done, state.step_size_ns / 1e6, state.playing, state.rate,
-        state.note,
-    )  # fmt: skip
 
 
 def supervisor_silence(segment: Segment) -> str | None:

@@ -12,18 +12,15 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from shmio.errors import SegmentError, ShmioError, TimeError, ValueRangeError
-from shmio.model.clock import Clock, ClockMode
+from shmio.model.clock import MAX_RATE, Clock, ClockMode, check_step
 from shmio.model.values import Quality
 from shmio.segment.block import Block
 from shmio.segment.clock import time_lock
 from shmio.segment.processes import ProcessSlot
 from shmio.segment.segment import Segment
 
-MIN_STEP_NS: Final = 1_000
-MAX_STEP_NS: Final = 3_600_000_000_000
 _TURN_NS: Final = 100_000_000
 """Interval in ns at which a wait for the owner of time checks whether that process has died."""
-MAX_RATE: Final = 1000.0
 _DISPATCHERS: Final = frozenset({"alerts", "emulator", "grpc", "mqtt", "recorder"})
 """Kinds of processes that act when a step is done. Steps may wait until these have delivered the step."""
 _PATIENCE_S: Final = 2.0
@@ -494,12 +491,6 @@ class Timekeeper:
             now_ns = time.monotonic_ns()
             due_ns = max(due_ns + round(step.dt_ns / rate), now_ns - _LATE_NS)
             self._paused.wait(max(0, due_ns - now_ns) / 1e9)
-
-
-def check_step(dt_ns: float) -> None:
-    """Raise ValueRangeError if a step may not have this length."""
-    if not MIN_STEP_NS <= dt_ns <= MAX_STEP_NS:
-        raise ValueRangeError(f"the length of a step must be from 0.001 ms to 3600000 ms (1 h), not {dt_ns / 1e6:g} ms")
 
 
 def _step_answer(block: Block, number: int) -> str | None:

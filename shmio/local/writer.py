@@ -18,7 +18,7 @@ from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.model import Register
 from shmio.layout.topic import find
 from shmio.layout.values.write import Write, apply, bits_of, cover, encode, merge
-from shmio.model.values import Outcome, OutcomeKind
+from shmio.model.values import WRITE_MIN_PERIODS, WRITE_TIMEOUT_S, Outcome, OutcomeKind
 from shmio.segment.commands import (
     EMPTY,
     MAX_NAME_BYTES,
@@ -35,9 +35,6 @@ from shmio.segment.events import Event, EventKind
 if TYPE_CHECKING:
     from shmio.segment.block import Block, Cursor
 
-TIMEOUT_S: Final = 2.0
-MIN_PERIODS: Final = 3
-"""A command may wait for this number of cycles by default, or for TIMEOUT_S if that is longer."""
 _MODELS: Final = frozenset({"simulation", "remote"})  # connectors with registers that only a model writes
 PATIENCE_S: Final = 1.0
 """Time in s after a command's deadline in which the device's answer may still arrive."""
@@ -158,7 +155,7 @@ class SourceWriter:
     @property
     def timeout_s(self) -> float:
         """Default time that a command may wait for the source, in s."""
-        return max(TIMEOUT_S, MIN_PERIODS * self.block.period_ns / 1e9)
+        return max(WRITE_TIMEOUT_S, WRITE_MIN_PERIODS * self.block.period_ns / 1e9)
 
     @cached_property
     def _writable(self) -> bytes:

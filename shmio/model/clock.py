@@ -5,8 +5,16 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Final, NamedTuple
 
+import msgspec
+
+from shmio.errors import ValueRangeError
+
 STEP_SIZE_NS: Final = 50_000_000
 """Default length of a step, in ns."""
+MIN_STEP_NS: Final = 1_000
+MAX_STEP_NS: Final = 3_600_000_000_000
+MAX_RATE: Final = 1000.0
+"""Maximum speed of playing, relative to real time."""
 
 
 class ClockMode(IntEnum):
@@ -75,3 +83,33 @@ class Clock(NamedTuple):
     def lead(self, period_ns: int) -> int:
         """Return the number to add to ``clock // period`` to get the cycle in wall time."""
         return self.step - self.resumed_ns // period_ns
+
+
+class ClockStatus(msgspec.Struct):
+    """Status of the instance's clock. ``mode`` is wall or virtual; ``step`` is the last finished step.
+
+    ``note`` says which processes a step waits for, why the last step failed, or on which sources it
+    had no effect. Before the first step, it says how to return to real time.
+    """
+
+    mode: str
+    time_s: float
+    step: int
+    step_size_ms: float
+    playing: bool
+    rate: float
+    note: str
+
+
+def clock_status(state: Clock) -> ClockStatus:
+    """Convert the state of the clock page to the units of a status."""
+    return ClockStatus(
+        str(state.mode), state.present_ns / 1e9, state.done, state.step_size_ns / 1e6, state.playing, state.rate,
+        state.note,
+    )  # fmt: skip
+
+
+def check_step(dt_ns: float) -> None:
+    """Raise ValueRangeError if a step may not have this length."""
+    if not MIN_STEP_NS <= dt_ns <= MAX_STEP_NS:
+        raise ValueRangeError(f"the length of a step must be from 0.001 ms to 3600000 ms (1 h), not {dt_ns / 1e6:g} ms")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from shmio.layout.model import Register
@@ -80,6 +80,11 @@ class Reading:
     def path(self) -> str:
         """Path of the register, including its source."""
         return f"{self.source}/{self.register.path}"
+
+
+WRITE_TIMEOUT_S: Final = 2.0
+WRITE_MIN_PERIODS: Final = 3
+"""A write may wait for this number of cycles by default, or for WRITE_TIMEOUT_S if that is longer."""
 
 
 class OutcomeKind(StrEnum):

@@ -15,8 +15,8 @@ import numpy.typing as npt
 from shmio.errors import RecordingError
 from shmio.layout.model import ByteOrder, Layout, Register
 from shmio.layout.values.frame_codec import FrameCodec
+from shmio.libraries import ANALYSIS, library
 from shmio.model.statuses import status_registers
-from shmio.recording.libraries import ANALYSIS, library
 from shmio.recording.reading.batch import HEAD, Batch
 from shmio.recording.reading.part import DumpBlock
 

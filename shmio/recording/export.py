@@ -18,9 +18,9 @@ import numpy.typing as npt
 from mcap.writer import Writer
 
 from shmio.layout.model import Register
+from shmio.libraries import ANALYSIS, library
 from shmio.recording.columns import Collector, Columns, flat, heading
 from shmio.recording.dump import Chosen, Dump
-from shmio.recording.libraries import ANALYSIS, library
 from shmio.recording.reading.part import MAX_NS, DumpBlock
 from shmio.recording.rewriting import new_file
 from shmio.recording.times import iso

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 import msgspec
 
 from shmio import control
+from shmio.cli.step import clock_line
 from shmio.cli.target import config_option, target
 from shmio.errors import ControlError, NotRunningError, SegmentError
 from shmio.local.status import (
-    ClockStatus,
     InstanceStatus,
     ProcessStatus,
     SourceStatus,
@@ -21,7 +21,6 @@ from shmio.local.status import (
     supervisor_silence,
 )
 from shmio.logs import printable
-from shmio.model.clock import ClockMode
 from shmio.segment import Segment, instances
 
 _HEADINGS = ("NAME", "KIND", "STATE", "PID", "RESTARTS", "UPTIME", "")
@@ -65,20 +64,6 @@ def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]) - 1)]
     padded = ([*(cell.ljust(width) for cell, width in zip(row, widths, strict=False)), row[-1]] for row in rows)
     return ["  ".join(cells).rstrip() for cells in padded]
-
-
-def clock_line(clock: ClockStatus, dt_ms: float | None = None) -> str:
-    """Return the state of the clock as text.
-
-    ``dt_ms`` is the length of the steps that were just made; None for the clock's step size.
-    """
-    if clock.mode == str(ClockMode.WALL):
-        return f"real time {clock.time_s:.3f} s"
-    size = f"{clock.step_size_ms:g} ms"
-    step = f"{clock.step}, steps of {size}" if dt_ms is None else f"{clock.step} of {dt_ms:g} ms, step size {size}"
-    how = f", playing at {clock.rate:g} times real time" if clock.playing else ""
-    note = f"; {clock.note}" if clock.note else ""
-    return f"virtual time {clock.time_s:.3f} s, step {step}{how}{note}"
 
 
 def _row(process: ProcessStatus) -> tuple[str, ...]:

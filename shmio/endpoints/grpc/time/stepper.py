@@ -16,7 +16,8 @@ from shmio.endpoints.grpc.streams.outbox import OpenStreams, Outboxes
 from shmio.endpoints.grpc.time.timeline import Timeline, TimeStatus
 from shmio.endpoints.grpc.wakeups import WakeUp, WakeUps
 from shmio.errors import ShmioError, TimeError
-from shmio.local.time_control import Coordinator, Step, StepWait, check_step
+from shmio.local.time_control import Coordinator, Step, StepWait
+from shmio.model.clock import check_step
 from shmio.segment import ProcessSlot, Segment
 from shmio.segment.clock import ClockPage
 
