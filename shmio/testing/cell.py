@@ -13,12 +13,11 @@ from typing import Any
 
 import msgspec
 
-from shmio import realtime
 from shmio.config import Address
 from shmio.errors import ConfigError
-from shmio.local.status import read_status
 
-BIN = Path(sys.executable).parent
+BIN = Path(os.environ.get("SHMIO_BIN", Path(sys.executable).parent))
+"""Folder with shmio's commands."""
 PATIENCE_S = 120.0
 
 CONFIG = """
@@ -92,6 +91,8 @@ class Cell:
 
     def status(self) -> dict[str, Any]:
         """Return what ``shmio-supervisor status --json`` prints. This starts no process."""
+        from shmio.local.status import read_status  # noqa: PLC0415  not part of shmio-client
+
         status: dict[str, Any] = msgspec.to_builtins(read_status(self.instance, ""))
         return status
 
@@ -129,6 +130,8 @@ def kill(pid: int, sign: signal.Signals = signal.SIGKILL) -> None:
 
 def may_be_realtime() -> bool:
     """Return whether this user may have a real-time priority."""
+    from shmio import realtime  # noqa: PLC0415  not part of shmio-client
+
     try:
         realtime.check(1)
     except ConfigError:

@@ -65,8 +65,8 @@ def started(folder: Path, instance: str) -> Iterator[Cell]:
 @pytest.fixture(scope="module")
 def running(tmp_path_factory: pytest.TempPathFactory, shared_instance: str) -> Iterator[Cell]:
     with started(tmp_path_factory.mktemp("cell"), shared_instance) as running:
-        with shmio.attach(shared_instance) as attached:
-            until(lambda: attached.get(AT)[0].quality is Quality.GOOD, "good values")
+        with remote(running) as connected:
+            until(lambda: connected.get(AT)[0].quality is Quality.GOOD, "good values")
         yield running
 
 
@@ -205,7 +205,7 @@ def test_injections_are_reported_as_events(cell: shmio.Cell) -> None:
 
 
 def test_events_name_the_writer(cell: shmio.Cell, running: Cell) -> None:
-    with cell.events("cell") as events, shmio.attach(running.instance, writable=True) as other:
+    with cell.events("cell") as events, remote(running) as other:
         other.note("gripper changed")
         noted = until_kind(events, "noted")
         assert (noted.text, noted.by.startswith("program "), noted.paths) == ("gripper changed", True, ())
@@ -353,7 +353,7 @@ def test_time_is_stepped_played_and_released(cell: shmio.Cell) -> None:
 
 
 def test_step_is_refused_while_another_program_plays_time(cell: shmio.Cell, running: Cell) -> None:
-    with shmio.attach(running.instance, writable=True) as other:
+    with remote(running) as other:
         other.play()
         with pytest.raises(TimeError, match="play"):
             cell.step()
