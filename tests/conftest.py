@@ -63,6 +63,7 @@ START_PROCESSES = (
     "tests/unit/cli/test_completion.py",
     "tests/unit/cli/test_supervisor.py::test_up_detach_reports_faults",
     "tests/unit/client/test_generated.py",
+    "tests/unit/test_client_distribution.py::test_each_module",
     "tests/unit/endpoints/alerts/test_command.py",
     "tests/unit/endpoints/mqtt/broker/",
     "tests/unit/endpoints/web/test_uploads.py",

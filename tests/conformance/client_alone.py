@@ -1,4 +1,4 @@
-"""A pytest plugin: the conformance tests of remote cells with the distribution shmio-client alone (scripts/test-client).
+"""A pytest plugin for scripts/test-client: remote cells conform with the distribution shmio-client alone.
 
 It refuses imports of what the client's users need not have: shmio's other packages, their libraries,
 and modules of the standard library that exist on Linux only.
