@@ -16,7 +16,8 @@
     │   ├── AlreadyRunningError  the instance already has a supervisor
     │   └── FormatError          this version cannot read the segment's format
     ├── CommandError       a command cannot be sent to its source, or was not carried out
-    │   └── TimeError            the instance's clock cannot be moved, or a step failed
+    │   ├── TimeError            the instance's clock cannot be moved, or a step failed
+    │   └── SnapshotError        a snapshot cannot be saved or restored
     ├── QualityError       the quality of the value is bad
     ├── ConnectorError     the device did not answer as it should
     ├── ModelError         a simulation model is declared wrongly, or its code failed
@@ -131,6 +132,10 @@ class TimeError(CommandError):
 
     The message names that program, or the process that failed, and the reason.
     """
+
+
+class SnapshotError(CommandError):
+    """A snapshot cannot be saved or restored; the message names what prevents it."""
 
 
 class QualityError(ShmioError):

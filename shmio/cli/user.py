@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
-from shmio.cli import completion, inject, read, replay, step
+from shmio.cli import completion, inject, read, replay, snapshot, step
 from shmio.cli import set as set_verb
 from shmio.cli.common import add_json, complete, ended_by_interrupt, run
 from shmio.config.address import UNIX, Address
@@ -53,6 +53,9 @@ VERBS = {
         "Step the instance's time: after the first step only steps move it, until it is released.",
         step.arguments,
         step.execute,
+    ),
+    "snapshot": Verb(
+        "Save the state of an instance in virtual time, and restore it.", snapshot.arguments, snapshot.execute
     ),
     "replay": Verb(
         "Show how recordings play, and control them: pause, play, seek, and more.", replay.arguments, replay.execute

@@ -24,6 +24,7 @@ from shmio.errors import (
 from shmio.messages import value_to_wire
 from shmio.model.clock import Clock, ClockMode
 from shmio.model.replay import ReplayChanges, ReplayStatus
+from shmio.model.snapshot import SnapshotInfo
 from shmio.model.values import Outcome, OutcomeKind
 from shmio.wire import shmio_v1_pb2 as wire
 
@@ -33,6 +34,8 @@ WRITE_PATIENCE_S: Final = 30.0
 """Time in s to add to the time-out of a write, because a source may have long cycles."""
 _SEARCH_PATIENCE_S: Final = 600.0
 """Time-out of a search in a recording, in s."""
+SNAPSHOT_S: Final = 100.0
+"""Time-out in s of a call that saves or restores a snapshot; the instance itself gives up earlier."""
 OPTIONS: Final = [
     ("grpc.max_receive_message_length", 64 << 20),
     ("grpc.keepalive_time_ms", 20_000),
@@ -305,6 +308,14 @@ def replay_status(found: Any) -> list[ReplayStatus]:
         )
         for one in found.sources
     ]  # fmt: skip
+
+
+def snapshot(found: Any) -> SnapshotInfo:
+    """Convert a snapshot of the wire."""
+    return SnapshotInfo(
+        found.name, found.instance, found.saved_s, found.time_ns, found.step, found.size_bytes, dict(found.left_out),
+        found.problem,
+    )  # fmt: skip
 
 
 def replay_patience_s(changes: ReplayChanges) -> float | None:

@@ -50,6 +50,7 @@ class Instance(Section):
 
     name: Name
     log_dir: Text = "logs"
+    snapshot_dir: Text = "snapshots"
     log_format: LogFormat = "text"
     audit: bool = True
     audit_mb: Annotated[float, Meta(ge=0.01, le=65536)] = 10.0
@@ -498,3 +499,8 @@ class Config(Section):
     def log_dir(self) -> Path:
         """Folder of the log files."""
         return self.path(self.instance.log_dir)
+
+    @property
+    def snapshot_dir(self) -> Path:
+        """Folder of the snapshots."""
+        return self.path(self.instance.snapshot_dir)

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from shmio import worker
@@ -17,6 +18,7 @@ from shmio.connectors.injections import blocks_of, owner_of
 from shmio.connectors.models.stepped import PageClock, SteppedLoop, connected_inputs
 from shmio.connectors.poll_loop import Schedule, SourceLoop, WallClock
 from shmio.errors import ConfigError, ConnectorError
+from shmio.local.state_requests import StateRequests
 from shmio.segment import Activity, Segment
 from shmio.worker import BEAT_S, Worker
 
@@ -189,6 +191,10 @@ def _loop_of(worker: Worker, predecessor: SourceLoop | None = None) -> _LoopHand
         source, writer, schedule, page_clock, writable,
         allow_nonfinite=allow, inputs=inputs, owner_of=owners, blocks=blocks, crash=worker.slot.supervised.note,
     )  # fmt: skip
+
+    stepped.state_requests = StateRequests(
+        segment.clock, worker.slot.index, worker.name, Path(worker.config["snapshots"]), stepped
+    )
 
     def stop() -> None:
         page_clock.stop()

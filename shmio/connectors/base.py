@@ -7,7 +7,7 @@ recording. A loop calls the methods of each: ``poll_loop``, ``models.stepped`` o
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from typing import Any, ClassVar
 
@@ -15,7 +15,7 @@ import msgspec
 
 from shmio.connectors.browsing import Browsed, Wanted
 from shmio.connectors.request_count import CycleRequests
-from shmio.errors import ConfigError, ConnectorError
+from shmio.errors import ConfigError, ConnectorError, SnapshotError
 from shmio.layout.model import Layout
 from shmio.layout.values.codec import Value
 from shmio.layout.values.write import Write
@@ -364,6 +364,24 @@ class Computed(ABC):
 
     def close(self) -> None:  # noqa: B027  most hold nothing
         """Release all resources of the source. The loop calls this last."""
+
+    def save(self) -> bytes:
+        """Return the source's state beside its last image, for a snapshot. Called between two steps.
+
+        Raises:
+            SnapshotError: The source cannot save its state; the message says why.
+
+        """
+        raise SnapshotError("its connector does not support snapshots")
+
+    def prepare_restore(self, data: bytes) -> Callable[[], None]:  # noqa: ARG002
+        """Check the state of a snapshot, and return the function that restores it.
+
+        Raises:
+            SnapshotError: The state is damaged, or does not fit the source.
+
+        """
+        raise SnapshotError("its connector does not support snapshots")
 
     @abstractmethod
     def write(self, writes: Sequence[Write]) -> list[str]:

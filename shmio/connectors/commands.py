@@ -389,6 +389,11 @@ class CommandProcessor:
             self._accept(command, layer)
 
     @property
+    def injections(self) -> InjectionProcessor:
+        """The injections of the source."""
+        return self._injections
+
+    @property
     def waiting(self) -> bool:
         """True if items wait for :meth:`carry_out`."""
         return bool(self._items)

@@ -31,6 +31,7 @@ from shmio.connectors.injection_layers import (
     declared,
     shadow,
 )
+from shmio.connectors.injection_state import LayerState, check_configured, make_layer, save_layer
 from shmio.connectors.output import Image, LayerPublisher, Output, in_parts, layer_event, lost, pieces
 from shmio.errors import ConfigError, SegmentError
 from shmio.injection import Program, compile_program
@@ -237,6 +238,21 @@ class DeclaredInjections:
         """Update the list of declared layers after layers were added or lifted."""
         with self._output.lock:
             self._settle()
+
+    def compiled(self, saved: Sequence[LayerState]) -> list[Layer]:
+        """Return the injections of a snapshot.
+
+        Raises:
+            SnapshotError: They are damaged, or do not fit the configuration.
+
+        """
+        layers = [make_layer(one, self._own.layout.size, self._program) for one in saved]
+        check_configured(layers, {declaration.name: declaration for declaration in self._own.declared.read()})
+        return layers
+
+    def restored(self) -> None:
+        """Continue with the injections of a snapshot. The caller holds the output's ``lock``."""
+        self._settle()
 
     def _settle(self) -> None:
         self._layers = [layer for layer in self._publisher.injections.layers if isinstance(layer, DeclaredLayer)]
@@ -460,6 +476,57 @@ class InjectionProcessor:
         self._publisher.lift(lambda other: other is layer, "lifted", command)
         self.declared.settle()
         return ""
+
+    def save(self) -> list[LayerState]:
+        """Return the state of all injections, the innermost first. The caller holds the output's ``lock``."""
+        return [save_layer(layer) for layer in self.injections.layers]
+
+    def prepare_restore(self, saved: Sequence[LayerState], now: CycleImage, base: bytes) -> Callable[[], list[Record]]:
+        """Check the state of a snapshot, and return the function that restores it.
+
+        The caller of that function holds the output's ``lock``, and then publishes an image and the
+        returned events. An injection without ``keep`` whose client does not run any more is kept.
+
+        Args:
+            saved: The state of all injections.
+            now: The image at which conditions were evaluated last.
+            base: The image to which injections are applied.
+
+        Raises:
+            SnapshotError: The state is damaged, or does not fit the configuration.
+
+        """
+        layers = self.declared.compiled(saved)
+
+        def restore() -> list[Record]:
+            before = {layer.id: layer for layer in self.injections.layers}
+            for layer in layers:
+                layer.keep = layer.keep or self._owner_of(layer.owner.writer) != layer.owner
+            self.injections.now = now
+            self._publisher.replace(layers, base)
+            self.declared.restored()
+            return list(self._changes(before, {layer.id: layer for layer in layers}))
+
+        return restore
+
+    def _changes(self, before: Mapping[int, Layer], after: Mapping[int, Layer]) -> Iterator[Record]:
+        """Yield the events about the injections that a snapshot ends, creates, or makes active or inactive."""
+        reason = "a snapshot was restored"
+        for layer in before.values():
+            if isinstance(layer, DeclaredLayer):
+                yield from lost(layer, reason)
+            if layer.id not in after:
+                yield layer_event(EventKind.LIFTED, layer, reason)
+        for layer in after.values():
+            known = before.get(layer.id)
+            if not isinstance(layer, DeclaredLayer):
+                if known is None:
+                    yield from self._publisher.created(layer, layer_event(EventKind.INJECTED, layer, layer.name))
+                continue
+            if known is None:
+                yield from _injected_events(layer, None)
+            if layer.active != (known is not None and known.active):
+                yield _activation_event(layer)
 
     def follow_changes(self) -> None:
         """Apply changes of the configuration; in intervals of ``LOOK_NS``, check owners and conditions.

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Final, NamedTuple
 
 import msgspec
@@ -138,6 +138,17 @@ class Output:
                 self._pending += self.advance(image)
             self._publish(image.at)
 
+    @property
+    def last(self) -> Image | None:
+        """The image published last, or by the source's previous process; None if there is none."""
+        return self._last
+
+    def replace(self, image: Image, records: Iterable[Record]) -> None:
+        """Publish an image in place of everything before it, then ``records``. The caller holds ``lock``."""
+        self._last = image
+        self._pending = list(records)
+        self._publish()
+
     def resume(self, image: Image) -> None:
         """Continue from an image that the source's previous process has published."""
         with self.lock:
@@ -153,10 +164,10 @@ class Output:
         if self._now_ns() >= self._next_ns:
             self._publish()
 
-    def flush(self) -> None:
-        """Publish the waiting changes, if their time has come."""
+    def flush(self, *, now: bool = False) -> None:
+        """Publish the waiting changes, if their time has come or ``now`` is set."""
         with self.lock:
-            if self._changed and self._now_ns() >= self._next_ns:
+            if self._changed and (now or self._now_ns() >= self._next_ns):
                 self._publish()
 
     def _publish(self, at: Stamp | None = None) -> None:
@@ -236,6 +247,21 @@ class LayerPublisher:
         """Remove the layers that ``which`` selects, and publish the reason."""
         with self.output.lock:
             self.output.show(self.removed(which, reason, command))
+
+    def replace(self, layers: Sequence[Layer], base: bytes) -> None:
+        """Replace all layers. The caller holds the output's ``lock``, and then publishes the image ``base``.
+
+        Raises:
+            ValueError: The list would be too long.
+
+        """
+        self._shown.clear()
+        self._computed.clear()
+        self._ranges = {layer.id: ranges_of(layer.cover.tobytes()) for layer in layers}
+        self.injections.layers = list(layers)
+        self.publish()
+        for _ in self.computed(base):
+            pass  # the clients of outer layers have got these values already
 
     def removed(self, which: Callable[[Layer], bool], reason: str, command: Command | None = None) -> list[Record]:
         """Remove the layers that ``which`` selects, and return the events about this.

@@ -6,7 +6,8 @@ import os
 import selectors
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ExitStack
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from shmio import worker
 from shmio.config import Address
@@ -14,12 +15,17 @@ from shmio.emulators.device import Device, Served
 from shmio.emulators.kinds import create
 from shmio.emulators.ports import reserved_port
 from shmio.emulators.programs import UserCode
+from shmio.emulators.state import DeviceKeeper
 from shmio.emulators.stepping import InstanceTime
 from shmio.errors import ShmioError
 from shmio.layout.document import load_layout
+from shmio.local.state_requests import StateRequests
 from shmio.logs import fields
 from shmio.segment.doorbell import Relay
 from shmio.worker import BEAT_S, Worker
+
+if TYPE_CHECKING:
+    from shmio.emulators.faults import FaultControl
 
 
 def run(worker: Worker) -> None:
@@ -46,7 +52,7 @@ def run(worker: Worker) -> None:
         else:
             device = _started(worker, listen, cleanup)
         if config["clock"] == "instance":
-            _follow_clock(worker, device, selector, cleanup)
+            _follow_clock(worker, device, selector, cleanup, faults)
         worker.log.info("playing %s", program, extra=fields(address=listen))
         worker.running()
         worker.on_stop(lambda: os.eventfd_write(stop, 1))
@@ -61,16 +67,28 @@ def run(worker: Worker) -> None:
             worker.report((cycle.cycles, cycle.overruns))
 
 
-def _follow_clock(worker: Worker, device: Device, selector: selectors.BaseSelector, cleanup: ExitStack) -> None:
-    """Let the device's program follow the instance's clock."""
+def _follow_clock(
+    worker: Worker,
+    device: Device,
+    selector: selectors.BaseSelector,
+    cleanup: ExitStack,
+    faults: FaultControl | None,
+) -> None:
+    """Let the device's program follow the instance's clock, and take part in snapshots."""
     page, slot = worker.segment.clock, worker.slot.index
     relay = Relay(page.slot_bell(slot), "emulator-steps")
     cleanup.callback(relay.join)
     time = InstanceTime(page, slot, device.cycle, worker.report)
     cleanup.callback(time.close)
+    config = worker.config
+    keeper = DeviceKeeper(
+        device, time, config["kind"], config["program"], lambda: faults is not None and faults.disturbs
+    )
+    requests = StateRequests(page, slot, worker.name, Path(config["snapshots"]), keeper)
 
     def follow() -> None:
         relay.acknowledge()
+        requests.serve()
         time.follow()
 
     selector.register(relay.descriptor, selectors.EVENT_READ, follow)

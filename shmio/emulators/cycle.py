@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 
 class Cycle:
@@ -86,6 +87,21 @@ class Cycle:
                         self._scan(0)
             except Exception as error:  # noqa: BLE001 - the process reports defects of the program
                 self.failure = error
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Run no cycle while the ``with`` block runs."""
+        with self._turn:
+            yield
+
+    @property
+    def position(self) -> tuple[int, int]:
+        """Number of the last cycle, and the time since then in ns. Set it while the program is frozen."""
+        return self._number, self._owed_ns
+
+    @position.setter
+    def position(self, position: tuple[int, int]) -> None:
+        self._number, self._owed_ns = position
 
     def _scan(self, skipped: int) -> None:
         self._number += skipped + 1

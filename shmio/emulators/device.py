@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
@@ -27,6 +27,21 @@ class Device(Protocol):
 
     def start(self) -> None:
         """Listen, and run the program. Raise EndpointError if the address is not available."""
+
+    def save(self) -> bytes:
+        """Return the state of the memory and the program, for a snapshot. Call it between two cycles.
+
+        Raises:
+            SnapshotError: The state cannot be saved.
+            ModelError: The program's code failed.
+        """
+
+    def prepare_restore(self, data: bytes) -> Callable[[], None]:
+        """Check a state, and return the function that restores it.
+
+        Raises:
+            SnapshotError: The state is damaged, or does not fit the device.
+        """
 
     def stop(self) -> None:
         """Stop listening, and stop the program; return when all threads have ended."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Self
 
+import msgspec
 from snap7.server import CPUState
 
 from shmio.config.address import Address
@@ -13,7 +14,7 @@ from shmio.emulators.areas import AREAS, Place, TableMemory, is_table, place_nam
 from shmio.emulators.cycle import Cycle
 from shmio.emulators.programs import BUILT_IN, Idle, UserCode, program
 from shmio.emulators.s7 import S7Server, ServerOptions
-from shmio.errors import ConfigError
+from shmio.errors import ConfigError, SnapshotError
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
 from shmio.layout.s7.address import Area
@@ -94,6 +95,47 @@ class Emulator:
         """Stop the server and the program; return when all threads have ended."""
         self._server.stop()
         self.cycle.stop()
+
+    def save(self) -> bytes:
+        """Return the state of the memory and the program, for a snapshot.
+
+        Raises:
+            SnapshotError: The CPU is not in RUN, or the program cannot save its state.
+            ModelError: The program's code failed.
+
+        """
+        if self._server.cpu_state != CPUState.RUN:
+            raise SnapshotError("its CPU is not in RUN: start it first")
+        with self._server.lock:
+            memory = [bytes(area) for area in self._memory.values()]
+            return msgspec.msgpack.encode((bytes(self._frame), memory, self._program.save()))
+
+    def prepare_restore(self, data: bytes) -> Callable[[], None]:
+        """Check a state, and return the function that restores it.
+
+        Raises:
+            SnapshotError: The state is damaged, or does not fit the controller.
+
+        """
+        if self._server.cpu_state != CPUState.RUN:
+            raise SnapshotError("its CPU is not in RUN: start it first")
+        try:
+            frame, memory, program_state = msgspec.msgpack.decode(data, type=tuple[bytes, list[bytes], bytes])
+        except msgspec.MsgspecError as error:
+            raise SnapshotError(f"its state is damaged: {error}") from None
+        areas = list(self._memory.values())
+        if len(frame) != len(self._frame) or list(map(len, memory)) != list(map(len, areas)):
+            raise SnapshotError("its memory has other areas")
+        restore_program = self._program.prepare_restore(program_state)
+
+        def restore() -> None:
+            with self._server.lock:
+                restore_program()
+                self._frame[:] = frame
+                for area, content in zip(areas, memory, strict=True):
+                    area[:] = content
+
+        return restore
 
     def __enter__(self) -> Self:
         self.start()

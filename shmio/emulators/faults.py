@@ -48,6 +48,7 @@ class FaultControl:
         """
         self._head, framing = _LENGTHS[kind]
         self._worker = worker
+        self._disturbs = False
         path = emulator_socket_path(worker.segment.header.control, worker.name)
         if len(path.encode()) > MAX_PATH_BYTES:
             raise ControlError(
@@ -59,6 +60,11 @@ class FaultControl:
             self._control = ControlServer(path, selector, self._handle, self._deny, Disturb)
             cleanup.callback(self._control.close)
             self._cleanup = cleanup.pop_all()
+
+    @property
+    def disturbs(self) -> bool:
+        """True while a command disturbs the answers."""
+        return self._disturbs
 
     def expire(self) -> None:
         """Disconnect clients that have not sent a command in time."""
@@ -81,6 +87,7 @@ class FaultControl:
 
     def _disturb(self, request: Disturb) -> None:
         proxy = self._proxy
+        self._disturbs = request.answers != "ok"
         proxy.pass_all()
         proxy.delay(0.0, request.delay_ms / 1000 if request.answers == "delay" else 0.0)
         if request.answers == "corrupt":

@@ -9,16 +9,18 @@ from __future__ import annotations
 import logging
 import struct
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import msgspec
 
 from shmio.config.address import Address
 from shmio.emulators.cycle import Cycle
 from shmio.emulators.device import Served
 from shmio.emulators.loop_thread import LoopThread
 from shmio.emulators.programs import BUILT_IN, Idle, UserCode, program
-from shmio.errors import ConfigError, EndpointError, ValueRangeError
+from shmio.errors import ConfigError, EndpointError, SnapshotError, ValueRangeError
 from shmio.layout.addresses.modbus import MAX_ADDRESS, Order, Table, WordCodec, parse
 from shmio.layout.addresses.modbus import Address as Place
 from shmio.layout.image import initial_frame
@@ -38,6 +40,9 @@ _TABLES: Final = _READS | {5: Table.COIL, 15: Table.COIL} | dict.fromkeys((6, 16
 
 Words = dict[tuple[int, Table], list[int]]
 """The entries of each unit's tables: bits as 0 and 1, and words."""
+
+
+_State = tuple[bytes, bool, list[list[Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)]]], bytes]
 
 
 class _Place:
@@ -181,6 +186,33 @@ class ModbusEmulator:
         if self._server is not None:
             self._loop.run(self._server.shutdown)
         self._loop.stop()
+
+    def save(self) -> bytes:
+        """Return the state of the tables and the program, for a snapshot."""
+        with self._lock:
+            words = list(self._words.values())
+            return msgspec.msgpack.encode((bytes(self._frame), self._store.written, words, self._program.save()))
+
+    def prepare_restore(self, data: bytes) -> Callable[[], None]:
+        """Check a state, and return the function that restores it."""
+        try:
+            frame, written, words, program_state = msgspec.msgpack.decode(data, type=_State)
+        except msgspec.MsgspecError as error:
+            raise SnapshotError(f"its state is damaged: {error}") from None
+        tables = list(self._words.values())
+        if len(frame) != len(self._frame) or list(map(len, words)) != list(map(len, tables)):
+            raise SnapshotError("its tables have other sizes")
+        restore_program = self._program.prepare_restore(program_state)
+
+        def restore() -> None:
+            with self._lock:
+                restore_program()
+                self._frame[:] = frame
+                self._store.written = written
+                for table, entries in zip(tables, words, strict=True):
+                    table[:] = entries
+
+        return restore
 
     async def _serve(self) -> None:
         from pymodbus.server import ModbusTcpServer  # noqa: PLC0415  it needs the extra

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any, Final
@@ -13,7 +13,7 @@ from shmio.emulators.cycle import Cycle
 from shmio.emulators.device import Served
 from shmio.emulators.loop_thread import LoopThread
 from shmio.emulators.programs import BUILT_IN, Idle, UserCode, program
-from shmio.errors import ConfigError, EndpointError, ValueRangeError
+from shmio.errors import ConfigError, EndpointError, SnapshotError, ValueRangeError
 from shmio.layout.addresses import siemens
 from shmio.layout.addresses.opcua import BrowsePath, NodeAddress, parse
 from shmio.layout.image import initial_frame
@@ -138,6 +138,14 @@ class OpcUaEmulator:
         if self._server is not None:
             self._loop.run(self._server.stop)
         self._loop.stop()
+
+    def save(self) -> bytes:
+        """Raise SnapshotError, because the server's nodes cannot be saved."""
+        raise SnapshotError("the emulator of OPC UA servers does not support snapshots")
+
+    def prepare_restore(self, data: bytes) -> Callable[[], None]:  # noqa: ARG002
+        """Raise SnapshotError, because the server's nodes cannot be restored."""
+        raise SnapshotError("the emulator of OPC UA servers does not support snapshots")
 
     async def _serve(self) -> None:
         from asyncua import Server, ua  # noqa: PLC0415  it needs the extra

@@ -11,12 +11,31 @@ import msgspec
 import numpy as np
 
 from shmio.config.faults import meant
-from shmio.errors import ConfigError, ModelError
+from shmio.errors import ConfigError, ModelError, SnapshotError
 from shmio.layout.model import NUMBERS, Layout
 from shmio.layout.values.codec import Value, codec
 from shmio.simulation import ModelRunner
 from shmio.simulation.a50 import A50Cell
 from shmio.simulation.loading import load
+
+
+class Stateless:
+    """Base class of programs whose registers depend only on the time and the memory."""
+
+    def save(self) -> bytes:
+        """Return no state."""
+        return b""
+
+    def prepare_restore(self, data: bytes) -> Callable[[], None]:
+        """Check that there is no state; there is nothing to restore.
+
+        Raises:
+            SnapshotError: There is a state.
+
+        """
+        if data:
+            raise SnapshotError("the snapshot is of another program")
+        return lambda: None
 
 
 class A50:
@@ -40,13 +59,21 @@ class A50:
         self._runner.resume(bytes(frame))  # clients may have written any register, also outputs
         frame[:] = self._runner.step(round(time_s * 1e9), self.period_ms * 1_000_000)
 
+    def save(self) -> bytes:
+        """Return the model's state."""
+        return self._runner.save()
+
+    def prepare_restore(self, data: bytes) -> Callable[[], None]:
+        """Check a state, and return the function that restores it."""
+        return self._runner.prepare_restore(data)
+
 
 # Word i of generation g is g + i * STRIDE modulo 2**64. STRIDE is odd, so that all words of a block
 # differ; and for longer than any test runs, no word occurs at its place again.
 _STRIDE = 0x9E37_79B9_7F4A_7C15
 
 
-class Counter:
+class Counter(Stateless):
     """Fills the block with big-endian 64-bit words, computed from the cycle number and the word's place.
 
     If fewer than eight bytes remain at the end, they contain the first bytes of a word.
@@ -88,7 +115,7 @@ def _word(generation: int, place: int) -> bytes:
     return ((generation + place * _STRIDE) & 0xFFFF_FFFF_FFFF_FFFF).to_bytes(8, "big")
 
 
-class Wave:
+class Wave(Stateless):
     """Moves all registers that commands cannot write: numbers swing from 0 to 100, and bits blink.
 
     Each register has its own phase. The program does not change texts, times, or registers that a tag
@@ -117,7 +144,7 @@ class Wave:
             own.encode_into(value, frame)
 
 
-class Idle:
+class Idle(Stateless):
     """Changes no register: a controller in RUN without a user program."""
 
     period_ms = 100
@@ -167,6 +194,24 @@ class UserProgram:
         frame[:] = self._runner.step(time_ns, time_ns - self._time_ns)
         self._time_ns = time_ns
 
+    def save(self) -> bytes:
+        """Return the time of the last scan, and the state of the user's program."""
+        return msgspec.msgpack.encode((self._time_ns, self._runner.save()))
+
+    def prepare_restore(self, data: bytes) -> Callable[[], None]:
+        """Check a state, and return the function that restores it."""
+        try:
+            time_ns, own = msgspec.msgpack.decode(data, type=tuple[int, bytes])
+        except msgspec.MsgspecError as error:
+            raise SnapshotError(f"the state of the program is damaged: {error}") from None
+        restore_own = self._runner.prepare_restore(own)
+
+        def restore() -> None:
+            restore_own()
+            self._time_ns = time_ns
+
+        return restore
+
 
 class Program(Protocol):
     """A controller's user program, with the plant it controls."""
@@ -180,6 +225,23 @@ class Program(Protocol):
 
         Registers that the program does not set keep what clients wrote; the program may read them.
         ``frame`` keeps its length.
+        """
+
+    def save(self) -> bytes:
+        """Return the state beside the memory, for a snapshot.
+
+        Raises:
+            SnapshotError: The program cannot save its state.
+            ModelError: The program's code failed.
+
+        """
+
+    def prepare_restore(self, data: bytes) -> Callable[[], None]:
+        """Check a state, and return the function that restores it.
+
+        Raises:
+            SnapshotError: The state is damaged, or is that of another program.
+
         """
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Final
 
 from shmio.emulators.cycle import Cycle
+from shmio.errors import SnapshotError
 from shmio.segment.clock import ClockPage
 
 _PART_NS: Final = 1_000_000_000
@@ -53,11 +54,28 @@ class InstanceTime:
             first = bool(state.dt_ns) and not state.stepping
             self._time_ns = state.present_ns - first * state.dt_ns
             self._step = state.step - (first or state.stepping)
-        if not state.stepping and state.step > self._step:
+        if not state.stepping and state.step > self._step and state.dt_ns:  # 0: a snapshot is being restored
             self._advance(state.time_ns - self._time_ns)
             self._time_ns, self._step = state.time_ns, state.step
             if self._cycle.failure is None:  # else the process ends
                 self._page.deliver(self._slot, state.step)
+
+    @property
+    def place(self) -> tuple[int, int]:
+        """The step and the instance time in ns up to which scans have run.
+
+        Raises:
+            SnapshotError: Time is real.
+
+        """
+        if self._time_ns is None:
+            raise SnapshotError("its program has not stopped yet")
+        return self._step, self._time_ns
+
+    def jump(self, step: int, time_ns: int) -> None:
+        """Continue from the step and time of a snapshot, and report that step as delivered."""
+        self._step, self._time_ns = step, time_ns
+        self._page.deliver(self._slot, step)
 
     def close(self) -> None:
         """Stop following the clock, so that later steps do not wait for this process."""

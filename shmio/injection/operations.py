@@ -207,6 +207,15 @@ class OperationContext(NamedTuple):
     time_ns: int
 
 
+class StoredImage(NamedTuple):
+    """An image that an operation holds, with its cycle and instance time. ``role`` says what for."""
+
+    role: int
+    cycle: int
+    time_ns: int
+    image: bytes
+
+
 class Operation(ABC):
     """Base class of operations. Each object belongs to one injection, and has its state."""
 
@@ -229,6 +238,17 @@ class Operation(ABC):
 
     def resume(self, image: Bytes) -> None:  # noqa: B027
         """Restore the state from the last image that the source's previous process published."""
+
+    def save(self) -> list[StoredImage]:
+        """Return all images that the operation holds, for a snapshot."""
+        return []
+
+    def restore(self, images: Sequence[StoredImage]) -> None:  # noqa: B027  most operations have no state
+        """Hold the images that :meth:`save` has returned, and no others."""
+
+
+def _bits(image: bytes) -> Bytes:
+    return np.frombuffer(image, np.uint8).copy()
 
 
 class Fixed(Operation):
@@ -357,6 +377,14 @@ class Freeze(Operation):
         """Freeze the values that the previous process of the source published last."""
         self._held = image.copy()
 
+    def save(self) -> list[StoredImage]:
+        """Return the frozen values."""
+        return [] if self._held is None else [StoredImage(0, 0, 0, self._held.tobytes())]
+
+    def restore(self, images: Sequence[StoredImage]) -> None:
+        """Freeze the values of a snapshot."""
+        self._held = next((_bits(one.image) for one in images), None)
+
     def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: ARG002, D102
         if self._held is None:
             self._held = image.copy()
@@ -383,6 +411,17 @@ class Drop(Operation):
     def resume(self, image: Bytes) -> None:
         """Restore the values that readers saw last."""
         self._held = image.copy()
+
+    def save(self) -> list[StoredImage]:
+        """Return the values that readers see if the next cycle is dropped, and those of this cycle."""
+        held = [] if self._held is None else [StoredImage(0, 0, 0, self._held.tobytes())]
+        passing = [] if self._passing is None else [StoredImage(1, self._passing[0], 0, self._passing[1].tobytes())]
+        return held + passing
+
+    def restore(self, images: Sequence[StoredImage]) -> None:
+        """Restore the values of a snapshot."""
+        self._held = next((_bits(one.image) for one in images if not one.role), None)
+        self._passing = next(((one.cycle, _bits(one.image)) for one in images if one.role), None)
 
     def passed(self, image: Bytes, at: OperationContext) -> None:
         """Record the values of a cycle that is not dropped."""
@@ -424,6 +463,14 @@ class Delay(Operation):
     def begin(self) -> None:
         """Forget all stored images."""
         self._line.clear()
+
+    def save(self) -> list[StoredImage]:
+        """Return all stored images, the oldest first."""
+        return [StoredImage(0, cycle, time_ns, image.tobytes()) for cycle, time_ns, image in self._line]
+
+    def restore(self, images: Sequence[StoredImage]) -> None:
+        """Store the images of a snapshot."""
+        self._line = deque((one.cycle, one.time_ns, _bits(one.image)) for one in images)
 
     def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: D102
         if self._line and self._line[-1][0] == at.cycle:

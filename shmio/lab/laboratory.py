@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, Self, cast
@@ -21,9 +21,10 @@ from shmio.connectors.base import Computed
 from shmio.connectors.injections import blocks_of, owner_of
 from shmio.connectors.models.stepped import SteppedLoop, connected_inputs
 from shmio.connectors.poll_loop import Schedule
-from shmio.errors import ConfigError, TimeError
+from shmio.errors import ConfigError, ShmioError, TimeError
 from shmio.judging.source import Rows
 from shmio.local.attach import Attachment
+from shmio.local.snapshots import Refusals
 from shmio.local.time_control import Coordinator, Step
 from shmio.model.clock import check_step
 from shmio.plan.prepare import prepare
@@ -154,7 +155,7 @@ class Laboratory:
 
         """
         segment = segment or self.open()
-        return Attachment(segment, _LabCoordinator(self, segment))
+        return Attachment(segment, _LabCoordinator(self, segment), _LabStates(self), lambda: self.plan.snapshot_dir)
 
     def prepare(self, plan: RunPlan, seen: Callable[[Mapping[str, Rows]], None] = lambda _rows: None) -> LiveRun:
         """Return a run of a campaign, which has not begun.
@@ -269,3 +270,40 @@ class _LabCoordinator(Coordinator):
             if problem:
                 raise TimeError(f"step {step.number}: {problem}")
             return step
+
+    def announce(self) -> None:
+        """Do nothing, because no other process follows time."""
+
+
+class _LabStates:
+    """The states of a laboratory's sources, for snapshots."""
+
+    def __init__(self, lab: Laboratory) -> None:
+        self._lab = lab
+
+    def names(self) -> tuple[list[str], Refusals]:
+        """Return the sources; all take part."""
+        return list(self._lab.loops), {}
+
+    def save(self, name: str, names: list[str], work: Path) -> tuple[dict[str, bytes], Refusals]:  # noqa: ARG002
+        """Return the states of the sources."""
+        states: dict[str, bytes] = {}
+        return states, self._each(names, lambda one, loop: states.update({one: loop.save(name)}))
+
+    def check(self, name: str, states: Mapping[str, bytes], work: Path) -> Refusals:  # noqa: ARG002
+        """Check the states."""
+        return self._each(states, lambda one, loop: loop.check(states[one]))
+
+    def restore(self, name: str, states: Mapping[str, bytes], work: Path) -> Refusals:  # noqa: ARG002
+        """Restore the states."""
+        return self._each(states, lambda one, loop: loop.restore(states[one], name))
+
+    def _each(self, names: Iterable[str], call: Callable[[str, SteppedLoop], object]) -> Refusals:
+        refusals: Refusals = {}
+        with self._lab.moving:
+            for one in names:
+                try:
+                    call(one, self._lab.loops[one])
+                except ShmioError as error:
+                    refusals[one] = str(error)
+        return refusals

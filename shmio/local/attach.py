@@ -19,7 +19,7 @@ import sys
 import threading
 import time
 import weakref
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -37,11 +37,13 @@ from shmio.local.events import Events
 from shmio.local.injection import Campaign, ObservedWrite, Shadow, as_given, by_path, lift_all, written
 from shmio.local.reading import View, reading
 from shmio.local.replays import Replays
+from shmio.local.snapshots import Snapshots, States
 from shmio.local.subscription import Following, Subscription
 from shmio.local.time_control import Coordinator, Timekeeper
 from shmio.local.writer import SourceWriter
 from shmio.model.clock import Clock, check_step
 from shmio.model.injection import Injection, Lifted, Running
+from shmio.model.snapshot import SnapshotInfo
 from shmio.model.values import Outcome, Quality, Reading
 from shmio.segment.block import Block, Cursor, Entry, Frame, Layouts
 from shmio.segment.commands import Direction
@@ -59,9 +61,16 @@ class Attachment:
     Use it as a context manager, or call :meth:`close`. :func:`attach` creates it.
     """
 
-    def __init__(self, segment: Segment, coordinator: Coordinator | None = None) -> None:
+    def __init__(
+        self,
+        segment: Segment,
+        coordinator: Coordinator | None = None,
+        states: States | None = None,
+        snapshot_folder: Callable[[], Path] | None = None,
+    ) -> None:
         self._segment = segment
         self._time = Timekeeper(segment, coordinator)
+        self._snapshots = Snapshots(segment, self._time, states, snapshot_folder)
         self.replay = Replays(segment)
         """The instance's replays. Call it as ``replay`` of :class:`shmio.Cell`, or use its methods.
 
@@ -553,6 +562,47 @@ class Attachment:
         """
         self._time.release()
         return self.clock
+
+    def save_snapshot(self, name: str, *, partial: bool = False) -> SnapshotInfo:
+        """Save the state of the instance, whose time must be virtual: see :class:`shmio.Cell`.
+
+        The attachment must be ``writable``.
+
+        Raises:
+            SnapshotError: The state of a process cannot be saved, or the file cannot be written.
+            TimeError: Time is real, or another program owns it.
+        """
+        return self._snapshots.save(name, partial=partial)
+
+    def restore_snapshot(self, name: str) -> SnapshotInfo:
+        """Restore a snapshot; time may go back: see :class:`shmio.Cell`.
+
+        The attachment must be ``writable``.
+
+        Raises:
+            SnapshotError: There is no such snapshot, or it does not fit the instance; nothing has
+                been changed. Or a process could not restore its state; then its data are bad.
+            TimeError: Time is real, or another program owns it.
+        """
+        return self._snapshots.restore(name)
+
+    def snapshots(self) -> list[SnapshotInfo]:
+        """Return the instance's snapshots, the oldest first.
+
+        Raises:
+            SnapshotError: The folder of the snapshots cannot be read.
+        """
+        self._segment.require_running()
+        return self._snapshots.all()
+
+    def delete_snapshot(self, name: str) -> None:
+        """Delete a snapshot.
+
+        Raises:
+            SnapshotError: There is no such snapshot, or it cannot be deleted.
+        """
+        self._segment.require_running()
+        self._snapshots.delete(name)
 
     def _source_writer(self, block: Block) -> SourceWriter:
         """Return the writer for a block.

@@ -6,8 +6,8 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable, Generator, Sequence
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -101,6 +101,11 @@ class Coordinator:
         self._lock = threading.RLock()
         self._lock_byte = time_lock(segment.header)
         self._owns = False
+
+    @property
+    def owns(self) -> bool:
+        """True if this program owns time."""
+        return self._owns
 
     def read(self) -> Clock:
         """Read the clock page."""
@@ -254,6 +259,36 @@ class Coordinator:
             raise TimeError(f"step {step.number}: {problem}")
         return step
 
+    def jump(self, state: Clock) -> None:
+        """Set the step, the time and the step size to those of a snapshot. This program must own time."""
+        with self._lock:
+            self._segment.clock.write(
+                self.read()._replace(
+                    step=state.step, done=state.done, time_ns=state.time_ns, dt_ns=0, step_size_ns=state.step_size_ns,
+                    stepping=False, playing=False, note="",
+                ),
+                ring=False,
+            )  # fmt: skip
+
+    def announce(self) -> None:
+        """Wait until all processes that deliver steps have noticed that time has jumped.
+
+        Raises:
+            TimeError: A process did not notice it within the hard time-out.
+        """
+        with self._lock:
+            number = self.read().done
+            self._segment.clock.bell.ring()
+            waiting = self._await_delivery(number, jumped=True)
+            while True:
+                try:
+                    _, seen, rest_ns = next(waiting)
+                except StopIteration as over:
+                    if over.value:
+                        raise TimeError(str(over.value)) from None
+                    return
+                self._segment.clock.delivered_bell.wait(seen, rest_ns)
+
     def close(self) -> None:
         """Give up the ownership of time. Time stays stopped until another program takes it over."""
         with self._lock:
@@ -353,16 +388,17 @@ class Coordinator:
             yield StepWait(block, seen, (self._hard_ns if warned else min(self._soft_ns, self._hard_ns)) - passed_ns)
         return "; ".join(problems)
 
-    def _await_delivery(self, number: int) -> Generator[StepWait, None, str]:
+    def _await_delivery(self, number: int, *, jumped: bool = False) -> Generator[StepWait, None, str]:
         """Wait until other processes have delivered a step.
 
+        With ``jumped``, time may have gone back, so that a later step may have been delivered.
         Return a text about the processes that have not delivered it; empty: all have.
         """
         clock, begun_ns = self._segment.clock, time.monotonic_ns()
         rung = warned = False
         while True:
             seen = clock.delivered_bell.value()
-            waiting = [slot for slot in self._segment.processes if self._owes(slot, number)]
+            waiting = [slot for slot in self._segment.processes if self._owes(slot, number, jumped=jumped)]
             if not rung:
                 rung = True
                 self._ring([slot.name for slot in waiting])
@@ -378,12 +414,13 @@ class Coordinator:
             # With a time limit, because a process that dies rings no doorbell.
             yield StepWait(None, seen, min(self._soft_ns, self._hard_ns - passed_ns))
 
-    def _owes(self, slot: ProcessSlot, number: int) -> bool:
+    def _owes(self, slot: ProcessSlot, number: int, *, jumped: bool) -> bool:
         """Return whether another living process still has to deliver this step."""
         if slot.kind not in _DISPATCHERS:
             return False
         last = self._segment.clock.delivered(slot.index)
-        return last is not None and last < number and slot.alive()  # alive() is False for this process's own slot
+        owes = last is not None and (last != number if jumped else last < number)
+        return owes and slot.alive()  # alive() is False for this process's own slot
 
     def _owner(self, pid: int) -> str:
         """Return name and pid of the owner of time, for a message."""
@@ -422,6 +459,25 @@ class Timekeeper:
             raise TimeError("time is playing: pause it before you step it")
         self._take_over()
         return self._coordinator.step(dt_ns)
+
+    @contextmanager
+    def still(self) -> Iterator[Coordinator]:
+        """Own time while the ``with`` block runs, and yield the coordinator. No step is made meanwhile.
+
+        Raises:
+            TimeError: Another program owns time, time is being played, or time is real.
+        """
+        self._segment.require_running()
+        if self._player is not None:
+            raise TimeError("time is playing: pause it first")
+        check_virtual(self._segment.clock.read())
+        owned = self._coordinator.owns
+        self._take_over()
+        try:
+            yield self._coordinator
+        finally:
+            if not owned:
+                self._coordinator.close()
 
     def play(self, rate: float = 1.0, dt_ns: int | None = None) -> None:
         """Start to step in a thread, ``rate`` times as fast as real time.
@@ -491,6 +547,12 @@ class Timekeeper:
             now_ns = time.monotonic_ns()
             due_ns = max(due_ns + round(step.dt_ns / rate), now_ns - _LATE_NS)
             self._paused.wait(max(0, due_ns - now_ns) / 1e9)
+
+
+def check_virtual(clock: Clock) -> None:
+    """Raise TimeError if time is real, so that no snapshot can be saved or restored."""
+    if not clock.virtual:
+        raise TimeError("time is real, but snapshots need virtual time: shmio step --pause stops time")
 
 
 def _step_answer(block: Block, number: int) -> str | None:

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from shmio.model.event import Event
     from shmio.model.injection import Declared, Injection, InjectionEvent, Lifted
     from shmio.model.replay import ReplayChanges, ReplayStatus
+    from shmio.model.snapshot import SnapshotInfo
     from shmio.model.values import Outcome, Provenance, Quality, Reading
 
 
@@ -346,6 +347,44 @@ class Cell(Closable, Protocol):
 
         Raises:
             TimeError: Another program owns time, or time was virtual from the instance's start.
+        """
+
+    def save_snapshot(self, name: str, *, partial: bool = False) -> SnapshotInfo:
+        """Save the state of the instance to a file of this name, in the instance's folder.
+
+        The state is the clock, the models, the images, the injections, and the emulators that
+        follow the instance's clock. A snapshot of the same name is replaced.
+
+        Args:
+            name: Name of the snapshot: letters, digits, ``_``, ``-`` and ``.``.
+            partial: Whether to save the rest if the state of some processes cannot be saved. The
+                result names them.
+
+        Raises:
+            SnapshotError: The state of a process cannot be saved, or the file cannot be written.
+            TimeError: Time is real, or another program owns it.
+        """
+
+    def restore_snapshot(self, name: str) -> SnapshotInfo:
+        """Restore a snapshot of this instance, or of one with the same configuration.
+
+        Time continues from the snapshot's; it may go back. The result names what is not in the
+        snapshot, and therefore stays as it is.
+
+        Raises:
+            SnapshotError: There is no such snapshot, or it does not fit the instance; nothing has
+                been changed. Or a process could not restore its state; then its data are bad.
+            TimeError: Time is real, or another program owns it.
+        """
+
+    def snapshots(self) -> list[SnapshotInfo]:
+        """Return the instance's snapshots, the oldest first."""
+
+    def delete_snapshot(self, name: str) -> None:
+        """Delete a snapshot.
+
+        Raises:
+            SnapshotError: There is no such snapshot, or it cannot be deleted.
         """
 
     def replay(self, **changes: Unpack[ReplayChanges]) -> list[ReplayStatus]:

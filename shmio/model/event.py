@@ -47,6 +47,10 @@ class EventKind(StrEnum):
     """A declared injection is no longer active."""
     NOTED = "noted"
     """A program added a note."""
+    SAVED = "saved"
+    """The state of the source was saved in the snapshot of this name."""
+    RESTORED = "restored"
+    """The state of the snapshot of this name was restored; time may have gone back."""
     REMOVED = "removed"
     """A reload has removed the source; no more events follow."""
     OTHER = "other"
@@ -71,7 +75,7 @@ class Event:
         clock_ns: The instance's clock, in ns.
         utc_ns: UTC time, in ns.
         quality: Quality after the event.
-        text: A reason, the note, or the name of the injection, depending on the kind.
+        text: A reason, the note, or the name of the injection or snapshot, depending on the kind.
         injection: Number of the injection that the event is about; 0: none.
         command: Number of the command that the event is about, chosen by its writer; 0: none.
         by: The client that caused the event: ``grpc``, ``mqtt``, or a program such as ``program

@@ -173,6 +173,8 @@ class Plan:
     log_format: str = "text"
     audit: AuditSettings | None = None
     """The audit log, to which the processes write who did what; None if there is none."""
+    snapshot_dir: Path = Path("snapshots")
+    """Folder of the snapshots."""
 
     @property
     def processes(self) -> list[ProcessSpec]:
@@ -257,8 +259,11 @@ def make_plan(
             more["layouts"].append(layout.to_json().decode())
             more["options"].append(dict(options))
         more["folder"] = str(config.path(emulator.folder))
+        more["snapshots"] = str(config.snapshot_dir)
         sections.append((emulator.name, "emulator", msgspec.to_builtins(emulator) | more))
-    sections += [(source.name, "source", msgspec.to_builtins(source)) for source in config.source]
+    for source in config.source:
+        keys: dict[str, Any] = {"snapshots": str(config.snapshot_dir)} if source.name in computed else {}
+        sections.append((source.name, "source", msgspec.to_builtins(source) | keys))
     if config.grpc and mode != "log":
         place = {"group": config.instance.group, "config_file": str(config_file.resolve())}
         sections.append(("grpc", "grpc", msgspec.to_builtins(config.grpc) | place))
@@ -288,6 +293,7 @@ def make_plan(
         group=config.instance.group,
         config_file=config_file.resolve(),
         log_dir=log_dir,
+        snapshot_dir=config.snapshot_dir,
         log_format=log_format,
         audit=audit,
         blocks=blocks,

@@ -28,6 +28,7 @@ class Program(Model):
     period_ms: ClassVar[float] = 10.0
     """Time between two scans on an emulated controller, in ms."""
 
+    state_modules = ("shmio.plc.blocks",)
     _now_ns: int = 0
 
     def __init_subclass__(cls, **keywords: object) -> None:

@@ -323,7 +323,7 @@ class InstanceFollower:
         self.followers = [follower for follower in self.followers if not follower.done]
         self._watching = [follower for follower in self._watching if not follower.done]
         entries.sort(key=lambda entry: entry.log_ns)  # stable: entries of a block stay in order
-        if state.virtual and state.done > self.done and not more:
+        if state.virtual and state.done != self.done and not more:
             entries += self._step(state)
         now_s = time.monotonic()
         if now_s - self._watched_s >= TURN_S:

@@ -1,8 +1,9 @@
 """The clock page: the instance's time, the requested step, and the steps that processes delivered.
 
 docs/reference/segment-format.md describes its bytes. Only the owner of time writes the instance's
-time and the requested step. Each process writes the number of the step that it has delivered. The
-page has a doorbell for each process, which wakes the process when it must act on a change.
+time, the requested step and a request to save or restore state. Each process writes the number of
+the step that it has delivered, and of the request that it has answered. The page has a doorbell for
+each process, which wakes the process when it must act on a change.
 
 When a program releases time (``Coordinator.release``), real time continues from the last virtual
 time, and cycles continue from the number of the last step. So neither ever decreases. The page has
@@ -22,7 +23,8 @@ import math
 import struct
 import time
 from collections.abc import Callable
-from typing import Final
+from enum import IntEnum
+from typing import Final, NamedTuple
 
 from shmio.errors import SegmentError
 from shmio.model.clock import Clock, ClockMode
@@ -46,6 +48,37 @@ _NOTE_SIZE: Final = 167
 _PLAYING: Final = 1
 _STEPPING: Final = 2
 _ATTEMPTS: Final = 4
+_INVALID: Final = "the clock page is invalid: restart the instance: shmio-supervisor down, up"
+
+
+_REQUEST: Final = struct.Struct("<QI4x32s64s")
+_REQUEST_COPY: Final = 128
+
+
+class StateAction(IntEnum):
+    """What processes are asked to do with their state."""
+
+    NONE = 0
+    SAVE = 1
+    CHECK = 2
+    """Check the state of a snapshot, without a change."""
+    RESTORE = 3
+
+
+class StateRequest(NamedTuple):
+    """A request of the owner of time to all processes that take part in snapshots.
+
+    ``folder`` is the name of the folder with their states, inside the instance's snapshot folder.
+    ``name`` is the snapshot's name.
+    """
+
+    number: int = 0
+    action: StateAction = StateAction.NONE
+    folder: str = ""
+    name: str = ""
+
+
+_ACTIONS: Final = frozenset(StateAction)
 
 
 class DoubleBuffer:
@@ -105,6 +138,9 @@ class ClockPage:
         self._memory = memory
         self._offset = offset
         self._state = _cell(memory, offset)
+        at = self._answers_at = offset + _TABLE_AT + slots * _ENTRY.size
+        self._request = DoubleBuffer(memory, (at, at + _REQUEST_COPY), _INVALID)
+        self._answers_at += 2 * _REQUEST_COPY
         self._owned = owned
         self._last = b"", Clock()  # the last state read
         self._started_ns, self._started_utc_ns = head.started_ns, head.started_utc_ns
@@ -223,6 +259,33 @@ class ClockPage:
         _atomics.store64(self._memory, self._entry(index), 0)
         self.delivered_bell.ring()
 
+    def state_request(self) -> StateRequest:
+        """Return the last request to save or restore state.
+
+        Raises:
+            SegmentError: The page is corrupt.
+        """
+        number, action, folder, name = _REQUEST.unpack(self._request.read(_REQUEST.size))
+        known = action if action in _ACTIONS else StateAction.NONE
+        return StateRequest(number, StateAction(known), text(folder), text(name))
+
+    def request_state(self, request: StateRequest) -> None:
+        """Ask processes to save or restore their state. Only the owner of time may call this.
+
+        The caller then rings the doorbells of these processes.
+        """
+        folder, name = request.folder.encode(), request.name.encode()
+        self._request.write(_REQUEST.pack(request.number, request.action, folder, name))
+
+    def state_answer(self, index: int) -> int:
+        """Return the number of the last request that the process in a slot has answered; 0: none."""
+        return _atomics.load64(self._memory, self._answers_at + 8 * index)
+
+    def answer_state(self, index: int, number: int) -> None:
+        """Record that the process in a slot has answered a request. Only that process may call this."""
+        _atomics.store64(self._memory, self._answers_at + 8 * index, number)
+        self.delivered_bell.ring()
+
     def _entry(self, index: int) -> int:
         return self._offset + _TABLE_AT + index * _ENTRY.size
 
@@ -234,7 +297,7 @@ def time_lock(head: Header) -> int:
 
 def page_size(slots: int) -> int:
     """Return the size of the section in bytes for a process table with this many slots."""
-    return _TABLE_AT + slots * _ENTRY.size
+    return _TABLE_AT + slots * (_ENTRY.size + 8) + 2 * _REQUEST_COPY
 
 
 def _word(memory: memoryview, offset: int) -> int:
@@ -243,8 +306,7 @@ def _word(memory: memoryview, offset: int) -> int:
 
 def _cell(memory: memoryview, offset: int) -> DoubleBuffer:
     first, second = _COPIES_AT
-    complaint = "the clock page is invalid: restart the instance: shmio-supervisor down, up"
-    return DoubleBuffer(memory, (offset + first, offset + second), complaint)
+    return DoubleBuffer(memory, (offset + first, offset + second), _INVALID)
 
 
 def _pack(state: Clock) -> bytes:

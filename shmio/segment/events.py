@@ -70,6 +70,10 @@ class EventKind(IntEnum):
     """A declared injection is no longer active."""
     NOTED = 17
     """A client added a note, which is the event's text. The event ends the client's command."""
+    SAVED = 18
+    """The state of the source was saved in a snapshot, whose name is the event's text."""
+    RESTORED = 19
+    """The state of a snapshot was restored. Time may have gone back. The next frame shows this state."""
 
     def __str__(self) -> str:
         return self.name.lower()

@@ -68,6 +68,17 @@ class Images:
             raise LayoutError(f"the image has {len(image)} bytes, but the block has {len(self.shown)}")
         self.shown[:] = self.commanded[:] = image
 
+    def restore(self, commanded: bytes, shown: bytes) -> None:
+        """Set both images.
+
+        Raises:
+            LayoutError: An image has the wrong size.
+
+        """
+        if {len(commanded), len(shown)} != {len(self.shown)}:
+            raise LayoutError(f"an image has {len(shown)} bytes, but the block has {len(self.shown)}")
+        self.commanded[:], self.shown[:] = commanded, shown
+
     def with_given(self, image: bytes | bytearray) -> bytes:
         """Return the image, but with the commanded values where the model computes nothing."""
         if self._all_computed:

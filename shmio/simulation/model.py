@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
@@ -12,7 +13,7 @@ from typing import Any, ClassVar, Final, Protocol, Self, final
 
 import numpy as np
 
-from shmio.errors import LayoutError, ModelError, ShmioError
+from shmio.errors import LayoutError, ModelError, ShmioError, SnapshotError
 from shmio.layout.model import NUMBERS, Layout
 from shmio.layout.simlog_structures import members
 from shmio.layout.tags import parse_type, place_tags
@@ -20,7 +21,9 @@ from shmio.layout.topic import canonical_path, shorten
 from shmio.logs import printable
 from shmio.simulation.images import Ends, Port
 
-_OWN: Final = frozenset({"declarations", "random", "start", "step"})
+_OWN: Final = frozenset({"declarations", "random", "restore_state", "save_state", "start", "step"})
+_NOT_STATE: Final = frozenset({"_ends", "_ports", "random"})
+"""Attributes that ``ModelRunner`` saves itself, or creates."""
 
 
 # -- declarations --------------------------------------------------------------------------------------------
@@ -229,6 +232,12 @@ class Model(ABC):
     reference: ClassVar[str] = ""
     """The model's name in messages: ``package.module:Class``, or the name of the file of an FMU."""
 
+    state_modules: ClassVar[tuple[str, ...]] = ()
+    """Further modules whose classes the model's attributes may have in a snapshot.
+
+    Those of the model's class and its base classes are always allowed.
+    """
+
     random: np.random.Generator
     """The model's only source of randomness, seeded with the ``seed`` of its source."""
 
@@ -287,6 +296,13 @@ class Model(ABC):
         self._ends = ends
         self.random = np.random.default_rng(seed)
 
+    @classmethod
+    def code_files(cls) -> list[Path]:
+        """Return the files of the model's own code. A snapshot is restored only if they are the same."""
+        own = (base.__module__ for base in cls.__mro__ if not base.__module__.startswith(("shmio.", "abc", "builtins")))
+        files = (getattr(sys.modules.get(name), "__file__", None) for name in dict.fromkeys(own))
+        return [Path(file) for file in files if file]
+
     def start(self) -> None:  # noqa: B027  not every model needs it
         """Prepare the model. ``ModelRunner`` calls this method once, before the first step.
 
@@ -303,6 +319,27 @@ class Model(ABC):
             dt_s: The length of the step, in s.
 
         """
+
+    def save_state(self) -> object:
+        """Return the model's state for a snapshot: by default, a dict of all its attributes.
+
+        The registers and ``random`` are saved anyway. The state consists of numbers, texts, bytes,
+        lists, tuples, dicts, sets, numpy arrays, and objects of classes of the model's modules.
+        Override both this method and :meth:`restore_state` if the model has other attributes.
+        """
+        return {name: value for name, value in vars(self).items() if name not in _NOT_STATE}
+
+    def restore_state(self, state: Any) -> None:
+        """Continue from a state that :meth:`save_state` has returned, perhaps in another process.
+
+        :meth:`start` has been called before; registers and ``random`` are restored already.
+        """
+        if not isinstance(state, dict) or not all(isinstance(name, str) for name in state) or _NOT_STATE & state.keys():
+            raise SnapshotError("the state is not that of a model with the default save_state()")
+        own = vars(self)
+        for name in own.keys() - _NOT_STATE:
+            del own[name]
+        own.update(state)
 
     def _close(self) -> None:  # noqa: B027  the garbage collector suffices for most models
         """Release what :meth:`start` has acquired. ``ModelRunner`` calls this after the last step."""

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
+import secrets
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import lru_cache
 from types import MappingProxyType
 from typing import Any, Final, Protocol
 
-from shmio.errors import ConfigError, LayoutError, ModelError, PathError, ValueRangeError
+import msgspec
+import numpy as np
+
+from shmio.errors import ConfigError, LayoutError, ModelError, PathError, SnapshotError, ValueRangeError
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import find
@@ -25,6 +31,7 @@ from shmio.simulation.model import (
     layout_of,
     place_declarations,
 )
+from shmio.simulation.state import decode_state, encode_state
 
 NOTHING: Final[Mapping[str, object]] = MappingProxyType({})
 
@@ -60,6 +67,7 @@ class ModelRunner:
 
         """
         self.name = model.reference
+        self._version = _version(model)  # now, because the files may change
         self.layout = layout_of(model) if layout is None else layout
         found = {declaration: self._find(model, declaration) for declaration in declared(model, Input, Output, InOut)}
         outputs = [r for declaration in found if isinstance(declaration, Output) for r in found[declaration].values()]
@@ -181,18 +189,70 @@ class ModelRunner:
         except LayoutError as error:
             raise LayoutError(f"model {self.name}: {error}") from None
 
+    def save(self) -> bytes:
+        """Return the state of the model and both images, for a snapshot.
+
+        Raises:
+            SnapshotError: The model's state cannot be saved. The message names the reason.
+            ModelError: The model's code failed.
+
+        """
+        self.begin()
+        states: list[bytes] = []
+        self._run(lambda: states.append(self._encoded(self._model.save_state())))
+        images = self._images
+        saved = _Saved(
+            self.name, self._version, bytes(images.commanded), bytes(images.shown),
+            encode_state(self._model.random, None, ()), states[0],
+        )  # fmt: skip
+        return msgspec.msgpack.encode(saved)
+
+    def prepare_restore(self, data: bytes) -> Callable[[], None]:
+        """Check the state of a snapshot, and return the function that restores it.
+
+        Raises:
+            SnapshotError: The state is damaged, or is that of another model or another version of
+                it.
+
+        """
+        try:
+            saved = msgspec.msgpack.decode(data, type=_Saved)
+        except msgspec.MsgspecError as error:
+            raise SnapshotError(f"model {self.name}: the state is damaged: {error}") from None
+        if saved.model != self.name:
+            raise SnapshotError(f"the snapshot has the state of model {saved.model}, but the model is {self.name}")
+        if saved.version != self._version:
+            raise SnapshotError(f"model {self.name}: its code has changed since the snapshot was saved")
+        if {len(saved.commanded), len(saved.shown)} != {len(self._images.shown)}:
+            raise SnapshotError(f"model {self.name}: the snapshot has images of another size")
+        generator = decode_state(saved.random, None, ())
+        if not isinstance(generator, np.random.Generator):
+            raise SnapshotError(f"model {self.name}: the state is damaged: it has no random generator")
+        state = decode_state(saved.state, self._model, _modules(self._model))
+
+        def restore() -> None:
+            self.begin()
+            self._images.restore(saved.commanded, saved.shown)
+            self._model.random = generator
+            self._run(lambda: self._model.restore_state(state))
+
+        return restore
+
+    def _encoded(self, state: object) -> bytes:
+        return encode_state(state, self._model, _modules(self._model))
+
     def close(self) -> None:
         """Release what the model holds, such as the library of an FMU. The model cannot step any more."""
         self._model._close()
 
-    def _run(self, call: Callable[..., None], *arguments: float, instead: bytes | None = None) -> None:
+    def _run(self, call: Callable[..., object], *arguments: float, instead: bytes | None = None) -> None:
         """Call the model's code. If it fails, restore the shown image."""
         before = self.image if instead is None else instead
         try:
             call(*arguments)
-        except ModelError as error:  # its message already says what has failed, and where
+        except (ModelError, SnapshotError) as error:  # its message already says what has failed, and where
             self._images.shown[:] = before
-            raise ModelError(f"model {self.name}: {error}") from error
+            raise type(error)(f"model {self.name}: {error}") from error
         except (Exception, SystemExit) as error:
             self._images.shown[:] = before
             raise ModelError(f"model {self.name}: {explain(error, self._model.__module__)}") from error
@@ -244,6 +304,38 @@ def _parameters(model: type[Model], given: Mapping[str, object]) -> dict[str, Po
         except ValueRangeError as error:
             raise ConfigError(f"parameters.{error}") from None
     return ports
+
+
+class _Saved(msgspec.Struct, array_like=True, forbid_unknown_fields=True):
+    """The state of a model in a snapshot. ``version`` is the digest of the model's code."""
+
+    model: str
+    version: str
+    commanded: bytes
+    shown: bytes
+    random: bytes
+    state: bytes
+
+
+def _modules(model: Model) -> frozenset[str]:
+    """Return the names of the modules whose classes a model's state may have."""
+    own = {base.__module__ for base in type(model).__mro__} - {"abc", "builtins"}
+    return frozenset(own | set(model.state_modules))
+
+
+@lru_cache(maxsize=256)
+def _version(model: type[Model]) -> str:
+    """Return the SHA-256 of the files of a model's code; of the FMU's file for an FMU.
+
+    If a file cannot be read, the version is unique.
+    """
+    digest = hashlib.sha256()
+    for file in model.code_files():
+        try:
+            digest.update(hashlib.sha256(file.read_bytes()).digest())
+        except OSError:
+            return secrets.token_hex(32)
+    return digest.hexdigest()
 
 
 def _kind(register: Register) -> str:

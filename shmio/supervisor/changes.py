@@ -84,6 +84,7 @@ def refusal(plan: Plan, running: Plan) -> str | None:
         "instance.group": (running.group, plan.group),
         "instance.clock": (_clock(running), _clock(plan)),
         "instance.log_dir": (running.log_dir, plan.log_dir),
+        "instance.snapshot_dir": (running.snapshot_dir, plan.snapshot_dir),
         "instance.log_format": (running.log_format, plan.log_format),
         **{f"instance.{key}": (_audit(running, key), _audit(plan, key)) for key in AUDIT_KEYS},
     }

@@ -21,6 +21,7 @@ from shmio.audit import trail
 from shmio.audit.trail import MAX_NAMED, Acting, Actor, uid_actor
 from shmio.model.clock import Clock
 from shmio.segment import Block, Event, EventKind, Segment
+from shmio.segment.clock import StateAction
 from shmio.segment.commands import pid_of, worst
 from shmio.segment.events import ENDS, EVENT_DATA_SIZE
 from shmio.segment.processes import WRITERS
@@ -272,6 +273,9 @@ class BlockCommands:
             trail.record("replay", what, "requested", who=self._programs.actor(pid))
 
 
+_SNAPSHOTS: Final = {StateAction.SAVE: "save snapshot", StateAction.RESTORE: "restore snapshot"}
+
+
 class TimeChanges:
     """Writes to the audit log which programs move the instance's time. Use it from one thread."""
 
@@ -279,17 +283,27 @@ class TimeChanges:
         self._clock = segment.clock
         self._programs = programs
         self._before = self._clock.last_written()
+        self._asked = self._clock.state_request().number
 
     def turn(self) -> None:
-        """Write entries for all changes since the last turn. All steps of a turn share one entry."""
-        before, now = self._before, self._clock.last_written()
-        if now == before:
+        """Write entries for all changes since the last turn.
+
+        All steps of a turn share one entry. If several snapshots are saved or restored in a turn,
+        the last has an entry.
+        """
+        asked, before, now = self._clock.state_request(), self._before, self._clock.last_written()
+        snapshot, self._asked = asked.number != self._asked and asked.action in _SNAPSHOTS, asked.number
+        if now == before and not snapshot:
             return
         self._before = now
         pid = now.owner or before.owner
         if not pid or self._programs.is_own(pid):
             return
         who = self._programs.actor(pid)
+        if snapshot:
+            trail.record(_SNAPSHOTS[asked.action], {"snapshot": asked.name}, "requested", who=who)
+            if asked.action is StateAction.RESTORE:
+                before = now
         for action, what in _changes(before, now):
             count = now.step - before.step if action == "step" else 1
             trail.record(action, what, "done", who=who, count=count)

@@ -200,7 +200,13 @@ class Supervisor:
         else:
             plan, read_ns = self._reloader.plan, self._reloader.read_ns
             listen = {job.name: found for job in plan.jobs if (found := job.listening[:MAX_ADDRESSES])}
-            answer.ok(config=str(plan.config_file), read_ns=read_ns, log_dir=str(plan.log_dir), listen=listen)
+            answer.ok(
+                config=str(plan.config_file),
+                read_ns=read_ns,
+                log_dir=str(plan.log_dir),
+                snapshot_dir=str(plan.snapshot_dir),
+                listen=listen,
+            )
 
     def _audit(self, request: Request, peer: Peer) -> Callable[[str], None]:
         """Write a client's request to the audit log; return a function that writes its outcome."""

@@ -419,6 +419,8 @@ class Event(_message.Message):
         KIND_ACTIVATED: _ClassVar[Event.Kind]
         KIND_DEACTIVATED: _ClassVar[Event.Kind]
         KIND_NOTED: _ClassVar[Event.Kind]
+        KIND_SAVED: _ClassVar[Event.Kind]
+        KIND_RESTORED: _ClassVar[Event.Kind]
         KIND_REMOVED: _ClassVar[Event.Kind]
     KIND_UNSPECIFIED: Event.Kind
     KIND_STARTED: Event.Kind
@@ -438,6 +440,8 @@ class Event(_message.Message):
     KIND_ACTIVATED: Event.Kind
     KIND_DEACTIVATED: Event.Kind
     KIND_NOTED: Event.Kind
+    KIND_SAVED: Event.Kind
+    KIND_RESTORED: Event.Kind
     KIND_REMOVED: Event.Kind
     SOURCE_FIELD_NUMBER: _ClassVar[int]
     KIND_FIELD_NUMBER: _ClassVar[int]
@@ -1137,3 +1141,64 @@ class Playing(_message.Message):
     over: bool
     until_s: float
     def __init__(self, source: _Optional[str] = ..., time_s: _Optional[float] = ..., position_s: _Optional[float] = ..., length_s: _Optional[float] = ..., speed: _Optional[float] = ..., paused: bool = ..., loop: bool = ..., over: bool = ..., until_s: _Optional[float] = ...) -> None: ...
+
+class SaveSnapshotRequest(_message.Message):
+    __slots__ = ("name", "partial")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    PARTIAL_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    partial: bool
+    def __init__(self, name: _Optional[str] = ..., partial: bool = ...) -> None: ...
+
+class RestoreSnapshotRequest(_message.Message):
+    __slots__ = ("name",)
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    def __init__(self, name: _Optional[str] = ...) -> None: ...
+
+class ListSnapshotsRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class ListSnapshotsResponse(_message.Message):
+    __slots__ = ("snapshots",)
+    SNAPSHOTS_FIELD_NUMBER: _ClassVar[int]
+    snapshots: _containers.RepeatedCompositeFieldContainer[Snapshot]
+    def __init__(self, snapshots: _Optional[_Iterable[_Union[Snapshot, _Mapping]]] = ...) -> None: ...
+
+class DeleteSnapshotRequest(_message.Message):
+    __slots__ = ("name",)
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    def __init__(self, name: _Optional[str] = ...) -> None: ...
+
+class DeleteSnapshotResponse(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class Snapshot(_message.Message):
+    __slots__ = ("name", "instance", "saved_s", "time_ns", "step", "size_bytes", "left_out", "problem")
+    class LeftOutEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: str
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    INSTANCE_FIELD_NUMBER: _ClassVar[int]
+    SAVED_S_FIELD_NUMBER: _ClassVar[int]
+    TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    SIZE_BYTES_FIELD_NUMBER: _ClassVar[int]
+    LEFT_OUT_FIELD_NUMBER: _ClassVar[int]
+    PROBLEM_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    instance: str
+    saved_s: float
+    time_ns: int
+    step: int
+    size_bytes: int
+    left_out: _containers.ScalarMap[str, str]
+    problem: str
+    def __init__(self, name: _Optional[str] = ..., instance: _Optional[str] = ..., saved_s: _Optional[float] = ..., time_ns: _Optional[int] = ..., step: _Optional[int] = ..., size_bytes: _Optional[int] = ..., left_out: _Optional[_Mapping[str, str]] = ..., problem: _Optional[str] = ...) -> None: ...

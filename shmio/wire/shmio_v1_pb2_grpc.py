@@ -134,6 +134,26 @@ class ShmioStub(object):
                 request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.ReplayRequest.SerializeToString,
                 response_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.ReplayResponse.FromString,
                 _registered_method=True)
+        self.SaveSnapshot = channel.unary_unary(
+                '/shmio.v1.Shmio/SaveSnapshot',
+                request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.SaveSnapshotRequest.SerializeToString,
+                response_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.Snapshot.FromString,
+                _registered_method=True)
+        self.RestoreSnapshot = channel.unary_unary(
+                '/shmio.v1.Shmio/RestoreSnapshot',
+                request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.RestoreSnapshotRequest.SerializeToString,
+                response_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.Snapshot.FromString,
+                _registered_method=True)
+        self.ListSnapshots = channel.unary_unary(
+                '/shmio.v1.Shmio/ListSnapshots',
+                request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.ListSnapshotsRequest.SerializeToString,
+                response_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.ListSnapshotsResponse.FromString,
+                _registered_method=True)
+        self.DeleteSnapshot = channel.unary_unary(
+                '/shmio.v1.Shmio/DeleteSnapshot',
+                request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.DeleteSnapshotRequest.SerializeToString,
+                response_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.DeleteSnapshotResponse.FromString,
+                _registered_method=True)
 
 
 class ShmioServicer(object):
@@ -281,6 +301,34 @@ class ShmioServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def SaveSnapshot(self, request, context):
+        """Saves the state of the instance, whose time must be virtual, to a file in the instance's folder.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def RestoreSnapshot(self, request, context):
+        """Restores a saved state. Time may go back.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def ListSnapshots(self, request, context):
+        """Returns all snapshots, the oldest first.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def DeleteSnapshot(self, request, context):
+        """Deletes a snapshot.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_ShmioServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -383,6 +431,26 @@ def add_ShmioServicer_to_server(servicer, server):
                     servicer.Replay,
                     request_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.ReplayRequest.FromString,
                     response_serializer=shmio_dot_wire_dot_shmio__v1__pb2.ReplayResponse.SerializeToString,
+            ),
+            'SaveSnapshot': grpc.unary_unary_rpc_method_handler(
+                    servicer.SaveSnapshot,
+                    request_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.SaveSnapshotRequest.FromString,
+                    response_serializer=shmio_dot_wire_dot_shmio__v1__pb2.Snapshot.SerializeToString,
+            ),
+            'RestoreSnapshot': grpc.unary_unary_rpc_method_handler(
+                    servicer.RestoreSnapshot,
+                    request_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.RestoreSnapshotRequest.FromString,
+                    response_serializer=shmio_dot_wire_dot_shmio__v1__pb2.Snapshot.SerializeToString,
+            ),
+            'ListSnapshots': grpc.unary_unary_rpc_method_handler(
+                    servicer.ListSnapshots,
+                    request_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.ListSnapshotsRequest.FromString,
+                    response_serializer=shmio_dot_wire_dot_shmio__v1__pb2.ListSnapshotsResponse.SerializeToString,
+            ),
+            'DeleteSnapshot': grpc.unary_unary_rpc_method_handler(
+                    servicer.DeleteSnapshot,
+                    request_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.DeleteSnapshotRequest.FromString,
+                    response_serializer=shmio_dot_wire_dot_shmio__v1__pb2.DeleteSnapshotResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -925,6 +993,114 @@ class Shmio(object):
             '/shmio.v1.Shmio/Replay',
             shmio_dot_wire_dot_shmio__v1__pb2.ReplayRequest.SerializeToString,
             shmio_dot_wire_dot_shmio__v1__pb2.ReplayResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def SaveSnapshot(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/shmio.v1.Shmio/SaveSnapshot',
+            shmio_dot_wire_dot_shmio__v1__pb2.SaveSnapshotRequest.SerializeToString,
+            shmio_dot_wire_dot_shmio__v1__pb2.Snapshot.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def RestoreSnapshot(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/shmio.v1.Shmio/RestoreSnapshot',
+            shmio_dot_wire_dot_shmio__v1__pb2.RestoreSnapshotRequest.SerializeToString,
+            shmio_dot_wire_dot_shmio__v1__pb2.Snapshot.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ListSnapshots(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/shmio.v1.Shmio/ListSnapshots',
+            shmio_dot_wire_dot_shmio__v1__pb2.ListSnapshotsRequest.SerializeToString,
+            shmio_dot_wire_dot_shmio__v1__pb2.ListSnapshotsResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def DeleteSnapshot(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/shmio.v1.Shmio/DeleteSnapshot',
+            shmio_dot_wire_dot_shmio__v1__pb2.DeleteSnapshotRequest.SerializeToString,
+            shmio_dot_wire_dot_shmio__v1__pb2.DeleteSnapshotResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -170,3 +170,35 @@ fmi2Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind kind, fmi2
     *value = ((Tank *)c)->ended;
     return fmi2OK;
 }
+
+fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *state) {
+    *state = malloc(sizeof(Tank));
+    memcpy(*state, c, sizeof(Tank));
+    return fmi2OK;
+}
+fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate state) {
+    Tank *tank = c;
+    const fmi2CallbackFunctions *callbacks = tank->callbacks;
+    memcpy(tank, state, sizeof *tank);
+    tank->callbacks = callbacks;
+    return fmi2OK;
+}
+fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *state) {
+    free(*state);
+    *state = NULL;
+    return fmi2OK;
+}
+fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate state, size_t *size) {
+    *size = sizeof(Tank);
+    return fmi2OK;
+}
+fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate state, fmi2Byte bytes[], size_t size) {
+    memcpy(bytes, state, size);
+    return fmi2OK;
+}
+fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte bytes[], size_t size, fmi2FMUstate *state) {
+    if (size != sizeof(Tank)) return fmi2Error;
+    *state = malloc(size);
+    memcpy(*state, bytes, size);
+    return fmi2OK;
+}

@@ -19,11 +19,21 @@ from shmio.client.sync.injection import Campaign, Shadow
 from shmio.client.sync.transport import CLOSED, Channel, Duplex, Step, Stream, outputs_of, sleep
 from shmio.client.table import InjectResponse, ReadResponse, SimulateResponse, SubscribeResponse
 from shmio.client.update import Snapshot, Tables, Update
-from shmio.errors import CommandError, ConflictError, PathError, RemoteError, ShmioError, TimeError, ValueRangeError
+from shmio.errors import (
+    CommandError,
+    ConflictError,
+    PathError,
+    RemoteError,
+    ShmioError,
+    SnapshotError,
+    TimeError,
+    ValueRangeError,
+)
 from shmio.layout.glob import choose
 from shmio.model.clock import Clock
 from shmio.model.injection import Injection, Lifted
 from shmio.model.replay import ReplayChanges, ReplayStatus
+from shmio.model.snapshot import SnapshotInfo
 from shmio.model.values import Outcome, Reading
 from shmio.wire import shmio_v1_pb2 as wire
 from shmio.wire.shmio_v1_pb2_grpc import ShmioStub
@@ -439,6 +449,40 @@ class Client:
         """
         found = self._call(self._stub.Replay, calls.replay_request(changes), calls.replay_patience_s(changes))
         return calls.replay_status(found)
+
+    def save_snapshot(self, name: str, *, partial: bool = False) -> SnapshotInfo:
+        """Save the state of the instance, whose time must be virtual: see :class:`shmio.Cell`.
+
+        Raises:
+            SnapshotError: The snapshot cannot be saved; the message says why.
+        """
+        return self._snapshot(self._stub.SaveSnapshot, wire.SaveSnapshotRequest(name=name, partial=partial))
+
+    def restore_snapshot(self, name: str) -> SnapshotInfo:
+        """Restore a snapshot; time may go back: see :class:`shmio.Cell`.
+
+        Raises:
+            SnapshotError: The snapshot cannot be restored; the message says why.
+        """
+        return self._snapshot(self._stub.RestoreSnapshot, wire.RestoreSnapshotRequest(name=name))
+
+    def snapshots(self) -> list[SnapshotInfo]:
+        """Return the instance's snapshots, the oldest first."""
+        found = self._call(self._stub.ListSnapshots, wire.ListSnapshotsRequest())
+        return [calls.snapshot(one) for one in found.snapshots]
+
+    def delete_snapshot(self, name: str) -> None:
+        """Delete a snapshot. Raise SnapshotError if there is none, or it cannot be deleted."""
+        try:
+            self._call(self._stub.DeleteSnapshot, wire.DeleteSnapshotRequest(name=name))
+        except CommandError as error:
+            raise SnapshotError(str(error)) from None
+
+    def _snapshot(self, method: Callable[..., Any], request: Any) -> SnapshotInfo:
+        try:
+            return calls.snapshot(self._call(method, request, calls.SNAPSHOT_S))
+        except CommandError as error:
+            raise SnapshotError(str(error)) from None
 
     def _move(self, method: Callable[..., Any], request: Any, timeout_s: float | None = None) -> Clock:
         """Call a method that controls time. Raise TimeError if the endpoint refuses, or a step failed."""

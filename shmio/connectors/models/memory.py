@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import msgspec
 
 from shmio.connectors.base import Computed
+from shmio.errors import SnapshotError
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
 from shmio.layout.values.write import Write, apply
@@ -35,6 +36,16 @@ class Memory(Computed):
     def begin(self) -> bytes:
         """Return the image of all registers."""
         return bytes(self._image)
+
+    def save(self) -> bytes:
+        """Return the image."""
+        return bytes(self._image)
+
+    def prepare_restore(self, data: bytes) -> Callable[[], None]:
+        """Check an image, and return the function that restores it."""
+        if len(data) != len(self._image):
+            raise SnapshotError("its image has another size")
+        return lambda: self.resume(data)
 
     def write(self, writes: Sequence[Write]) -> list[str]:
         """Store the values; every write succeeds."""

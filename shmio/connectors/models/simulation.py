@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any
 
 import msgspec
@@ -75,6 +75,14 @@ class Simulation(Computed):
     def begin(self) -> bytes:
         """Start the model, and return its first image."""
         return self._runner.begin()
+
+    def save(self) -> bytes:
+        """Return the model's state."""
+        return self._runner.save()
+
+    def prepare_restore(self, data: bytes) -> Callable[[], None]:
+        """Check the model's state, and return the function that restores it."""
+        return self._runner.prepare_restore(data)
 
     def write(self, writes: Sequence[Write]) -> list[str]:
         """Store values of registers; writes to outputs are refused."""

@@ -13,6 +13,7 @@ from typing import Final, Protocol
 from shmio.connectors.base import Computed
 from shmio.connectors.commands import CommandProcessor
 from shmio.connectors.injections import Blocks, OwnerOf, newest
+from shmio.connectors.models.state import PreparedSource, save_source
 from shmio.connectors.output import Image, Output
 from shmio.connectors.poll_loop import Counters, QualityLog, Schedule
 from shmio.errors import PathError, SegmentError, ShmioError
@@ -20,6 +21,7 @@ from shmio.layout.topic import Topic, find, parse_topic
 from shmio.layout.values.codec import RegisterCodec, Value
 from shmio.layout.values.write import Write
 from shmio.local.reading import holds_none, status_of
+from shmio.local.state_requests import StateRequests
 from shmio.model.clock import Clock
 from shmio.model.statuses import trusted_codec
 from shmio.segment import Block, BlockWriter, EventKind, Frame, Provenance, Quality, Record, Segment
@@ -224,6 +226,8 @@ class SteppedLoop:
         self._time_ns: int | None = None  # instance time of the image computed last
         self._published = False
         self.counters = Counters()
+        self.state_requests: StateRequests | None = None
+        """Requests to save and restore the state; None: there are none."""
 
     @property
     def note(self) -> str:
@@ -331,6 +335,8 @@ class SteppedLoop:
         elif not state.stepping:
             self._handled = self._writer.cycle = state.step
             self._writer.at_ns = self._page.monotonic_ns(state.time_ns)
+            if self.state_requests is not None:
+                self.state_requests.serve()
             if self._source.has_changed():
                 self._show(state.step)
         wait_ns = None
@@ -350,6 +356,50 @@ class SteppedLoop:
         """Carry out the waiting commands. Call this between two steps."""
         if self.commands.waiting:
             self._carry_out()
+
+    # ---- snapshots ---------------------------------------------------------------------------------------------------
+
+    def save(self, name: str) -> bytes:
+        """Return the source's state for the snapshot ``name``. Call this between two steps.
+
+        Raises:
+            SnapshotError: The state cannot be saved.
+            ShmioError: The source's own code failed.
+
+        """
+        self.write_now()
+        return save_source(
+            self._source, self._output, self.commands, name, step=self._handled, computed_ns=self._time_ns
+        )
+
+    def check(self, data: bytes) -> None:
+        """Check whether a state can be restored, without a change.
+
+        Raises:
+            SnapshotError: The state is damaged, or does not fit the source.
+
+        """
+        PreparedSource(self._source, self._output, self.commands, data)
+
+    def restore(self, data: bytes, name: str) -> None:
+        """Restore a state of the snapshot ``name``, and publish it. If this fails, publish a bad frame.
+
+        Raises:
+            SnapshotError: The state is damaged, or does not fit the source.
+            ShmioError: The source's own code failed.
+
+        """
+        prepared = PreparedSource(self._source, self._output, self.commands, data)
+        saved = prepared.saved
+        self._handled = self._writer.cycle = saved.step
+        self._writer.at_ns = self._page.monotonic_ns(saved.time_ns)
+        self._time_ns = saved.computed_ns
+        try:
+            prepared.restore(self._writer, name)
+        except ShmioError as error:
+            self._fail(saved.step, f"the snapshot {name} was not restored: {error}")
+            raise
+        self._quality_log.update(prepared.quality, saved.reason, saved.step)
 
     # ---- wall time and virtual time ------------------------------------------------------------------------------
 

@@ -61,7 +61,7 @@ class StepDelivery:
             for feed in released:
                 feed.step_driven = False
         self._virtual = now.virtual
-        if self._delivering is None and now.virtual and now.done > self.done:
+        if self._delivering is None and now.virtual and now.done != self.done:  # a snapshot may set time back
             self._begin(now, feeds)
         if self._delivering is not None and self._over(self._delivering):
             self.done, self._delivering = self._delivering.number, None

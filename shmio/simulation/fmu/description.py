@@ -79,6 +79,8 @@ class Description(NamedTuple):
     returns_early: bool
     start_s: float
     """The FMU's time at its start."""
+    lacks: tuple[str, ...]
+    """The capabilities that a snapshot needs and the FMU lacks."""
 
 
 def describe(archive: Archive) -> Description:
@@ -107,6 +109,11 @@ def describe(archive: Archive) -> Description:
         cosimulation.canHandleVariableCommunicationStepSize,
         cosimulation.mightReturnEarlyFromDoStep,
         _number(experiment.startTime, 0.0) if experiment is not None else 0.0,
+        tuple(
+            name[:-5] + ("state" if version == 2 else "State")
+            for name in ("canGetAndSetFMUstate", "canSerializeFMUstate")
+            if not getattr(cosimulation, name)
+        ),
     )
 
 

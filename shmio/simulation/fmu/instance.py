@@ -119,6 +119,32 @@ class Instance:
         for group in groups:
             group.show()
 
+    def save(self) -> bytes:
+        """Return the FMU's state as bytes."""
+        with self._calling():
+            get, free, to_bytes, _, _ = self._state_calls()
+            state = get()
+            try:
+                return bytes(to_bytes(state))
+            finally:
+                free(state)
+
+    def restore(self, data: bytes) -> None:
+        """Give the FMU a state that :meth:`save` has returned."""
+        with self._calling():
+            _, free, _, from_bytes, put = self._state_calls()
+            state = from_bytes(data)
+            try:
+                put(state)
+            finally:
+                free(state)
+
+    def _state_calls(self) -> tuple[Callable[..., Any], ...]:
+        fmu = self._fmu
+        if self.version == 2:
+            return (fmu.getFMUstate, fmu.freeFMUstate, fmu.serializeFMUstate, fmu.deSerializeFMUstate, fmu.setFMUstate)
+        return (fmu.getFMUState, fmu.freeFMUState, fmu.serializeFMUState, fmu.deserializeFMUState, fmu.setFMUState)
+
     def do_step(self, now_s: float, size_s: float) -> float | None:
         """Let the FMU make one step.
 
@@ -262,6 +288,10 @@ class Group:
     def get(self, component: object) -> None:
         """Read the values of the FMU."""
         self._get(component, *self._arguments)
+
+    def forget(self) -> None:
+        """Give the FMU all values at the next call of :meth:`set_changed`."""
+        self._given, self._given_bytes = [], []
 
     def show(self) -> None:
         """Write the values that were read to the ports.

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
-from shmio.errors import ModelError, ShmioError
+import msgspec
+
+from shmio.errors import ModelError, ShmioError, SnapshotError
 from shmio.simulation.fmu.archive import Archive, Extracted
 from shmio.simulation.fmu.description import Description, describe
 from shmio.simulation.fmu.instance import FmuError, Group, Instance
@@ -41,6 +43,11 @@ def load_fmu(file: Path) -> type[FmuModel]:
     except ModelError as error:
         raise ModelError(f"{file}: {error}") from None
     return FmuModel.with_declarations(file.name, description.declarations, archive=archive, description=description)
+
+
+class _SavedFmu(msgspec.Struct, forbid_unknown_fields=True):
+    fmu: bytes
+    times: tuple[int | None, int, int, float]
 
 
 class FmuModel(Model):
@@ -100,6 +107,38 @@ class FmuModel(Model):
             raise self._fail(error) from None
         except ShmioError as error:
             raise ModelError(str(error)) from None
+
+    @classmethod
+    def code_files(cls) -> list[Path]:
+        """Return the FMU's file."""
+        return [cls.archive.path]
+
+    def save_state(self) -> object:
+        """Return the FMU's own state, and the times."""
+        if self._failure or self._instance is None:
+            raise SnapshotError(self._failure or "the FMU has not started")
+        if self.description.lacks:
+            raise SnapshotError(f"the FMU cannot save its state: it lacks {' and '.join(self.description.lacks)}")
+        times = (self._begun_ns, self._done_ns, self._fixed_ns, self._now_s)
+        return {"fmu": self._instance.save(), "times": times}
+
+    def restore_state(self, state: Any) -> None:
+        """Give the FMU its own state."""
+        if self._failure or self._instance is None:
+            raise SnapshotError(self._failure or "the FMU has not started")
+        if self.description.lacks:
+            raise SnapshotError(f"the FMU cannot restore a state: it lacks {' and '.join(self.description.lacks)}")
+        try:
+            saved = msgspec.convert(state, _SavedFmu)
+        except msgspec.ValidationError as error:
+            raise SnapshotError(f"the state of the FMU is damaged: {error}") from None
+        try:
+            self._instance.restore(saved.fmu)
+        except FmuError as error:
+            raise self._fail(error) from None
+        self._begun_ns, self._done_ns, self._fixed_ns, self._now_s = saved.times
+        for group in self._inputs:
+            group.forget()
 
     def _advance_evenly(self, instance: Instance, passed_ns: int, dt_ns: int) -> None:
         """Make steps of equal length up to a time since the FMU's start.

@@ -36,10 +36,10 @@ _SERVICES: Final[Mapping[str, Mapping[str, str]]] = {
         INJECT: "Inject",
     },
     "shmio.v1.Shmio": {
-        READ: "GetLayouts GetStatus Read Subscribe Events ListInjections WatchClock",
+        READ: "GetLayouts GetStatus Read Subscribe Events ListInjections WatchClock ListSnapshots",
         WRITE: "Write Simulate",
         INJECT: "Inject Declare Lift LiftAll",
-        CONTROL: "Step Steps SetStepSize Play Pause Release Replay",
+        CONTROL: "Step Steps SetStepSize Play Pause Release Replay SaveSnapshot RestoreSnapshot DeleteSnapshot",
     },
     "com.ttsnetwork.simulator3.SimServerAPI": {
         READ: "subscribe",

@@ -15,6 +15,7 @@ from shmio.endpoints.grpc.shmio_v1.injections import InjectionCalls
 from shmio.endpoints.grpc.shmio_v1.replay import ReplayCalls
 from shmio.endpoints.grpc.shmio_v1.selection import Selections
 from shmio.endpoints.grpc.shmio_v1.simulate import SimulateCalls
+from shmio.endpoints.grpc.shmio_v1.snapshots import SnapshotCalls
 from shmio.endpoints.grpc.shmio_v1.subscribe import SubscribeCalls
 from shmio.endpoints.grpc.shmio_v1.tables import AGE_NS, ORIGINALS, Selection, View, describe, stale_fields
 from shmio.endpoints.grpc.shmio_v1.write import WriteCalls
@@ -73,6 +74,7 @@ class ShmioV1:
             self._simulate_calls,
             TimeCalls(segment, stepper),
             ReplayCalls(segment),
+            SnapshotCalls(segment, stepper),
         )
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:

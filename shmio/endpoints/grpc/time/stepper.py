@@ -16,7 +16,7 @@ from shmio.endpoints.grpc.streams.outbox import OpenStreams, Outboxes
 from shmio.endpoints.grpc.time.timeline import Timeline, TimeStatus
 from shmio.endpoints.grpc.wakeups import WakeUp, WakeUps
 from shmio.errors import ShmioError, TimeError
-from shmio.local.time_control import Coordinator, Step, StepWait
+from shmio.local.time_control import Coordinator, Step, StepWait, check_virtual
 from shmio.model.clock import check_step
 from shmio.segment import ProcessSlot, Segment
 from shmio.segment.clock import ClockPage
@@ -322,6 +322,15 @@ class Stepper:
             attempt.end("done")
         return status
 
+    async def while_still(self, work: Callable[[Coordinator], _Result]) -> _Result:
+        """Call ``work`` in a thread, while this process controls time and makes no step.
+
+        Raises:
+            TimeError: Time is real or is playing, or another program controls it.
+
+        """
+        return await self._do(self._while_still(work))
+
     async def stop(self) -> None:
         """Stop moving time. If this process was playing, the next one resumes playing."""
         if self._rest is not None:
@@ -406,6 +415,13 @@ class Stepper:
             if not self._player.on:
                 self._own(False)
                 self._coordinator.close()
+
+    async def _while_still(self, work: Callable[[Coordinator], _Result]) -> _Result:
+        if self._player.on:
+            raise TimeError("time is playing: pause it first")
+        check_virtual(self._segment.clock.read())
+        async with self._moved():
+            return await asyncio.to_thread(work, self._coordinator)
 
     # ---- playing ---------------------------------------------------------------------------------------------------
 

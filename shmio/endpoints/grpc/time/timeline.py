@@ -347,6 +347,8 @@ class Timeline:
             self._delivery.begin(_before(state))
         elif self.virtual_time.on and not state.virtual and not self._delivery.busy:  # if busy, at the next call
             self._end(state)
+        if state.virtual and state.done < self.virtual_time.moment.number and not self.steered:
+            self.virtual_time.moment = Moment(state.done - 1, state.present_ns)  # a snapshot has set time back
         if state.virtual and state.done > self.virtual_time.moment.number and not self.steered:
             step = Step(state.done, state.present_ns, state.dt_ns)
             if self._awaited or self._delivery.busy:

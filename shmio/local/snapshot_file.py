@@ -1,0 +1,217 @@
+"""The files of snapshots.
+
+A file has a header of 56 bytes (little-endian): the magic ``SHMIOSNP``, u32 version 1, u32 size of
+the description, u64 size of the states, SHA-256 of both together. The description is JSON, the
+states are one MessagePack map: bytes by the name of the process. A file is complete before it gets
+its name, and replaces an older file of that name.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import re
+import secrets
+import shutil
+import struct
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from shmio.errors import SnapshotError
+from shmio.local.state_requests import WORK, read_bounded, write_new
+from shmio.model.snapshot import SnapshotInfo
+
+SUFFIX: Final = ".snapshot"
+VERSION: Final = 1
+MAX_FILE_BYTES: Final = 512 << 20
+MAX_HEAD_BYTES: Final = 1 << 20
+MAX_LISTED: Final = 10_000
+_MAGIC: Final = b"SHMIOSNP"
+_HEADER: Final = struct.Struct("<8sIIQ32s")
+_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")
+_STATES: Final = msgspec.msgpack.Decoder(dict[str, bytes])
+
+
+class SnapshotHead(msgspec.Struct, forbid_unknown_fields=True):
+    """The description of a snapshot. ``sources`` has the digest of each source's layout."""
+
+    instance: str
+    saved_s: float
+    step: int
+    done: int
+    time_ns: int
+    step_size_ns: int
+    sources: dict[str, str]
+    left_out: dict[str, str]
+
+
+def check_name(name: str) -> None:
+    """Raise SnapshotError if a snapshot cannot have this name."""
+    if not _NAME.fullmatch(name):
+        raise SnapshotError(f"{name!r:.80} cannot be a snapshot's name: use up to 63 letters, digits, '_', '-' and '.'")
+
+
+def file_of(folder: Path, name: str) -> Path:
+    """Return the file of a snapshot; raise SnapshotError if the name is invalid."""
+    check_name(name)
+    return folder / f"{name}{SUFFIX}"
+
+
+@contextmanager
+def work_folder(folder: Path) -> Iterator[Path]:
+    """Create a folder for the states, inside the folder of snapshots, and remove it at the end.
+
+    Also remove those of programs that were killed.
+
+    Raises:
+        SnapshotError: The folder cannot be created.
+    """
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        _tidy(folder)
+        work = folder / f".work-{secrets.token_hex(8)}"
+        work.mkdir(mode=0o700)
+        lock = os.open(work, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError as error:
+        raise SnapshotError(f"{folder}: {error.strerror}") from None
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield work
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+        os.close(lock)
+
+
+def _tidy(folder: Path) -> None:
+    for work in folder.iterdir():
+        if not WORK.fullmatch(work.name):
+            continue
+        with suppress(OSError):
+            lock = os.open(work, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(work)
+            finally:
+                os.close(lock)
+
+
+def write_snapshot(file: Path, work: Path, head: SnapshotHead, states: Mapping[str, bytes]) -> SnapshotInfo:
+    """Write a snapshot. If this fails, an older file of this name stays.
+
+    Raises:
+        SnapshotError: The states are too large, or the file cannot be written.
+    """
+    description, body = msgspec.json.encode(head), msgspec.msgpack.encode(dict(states))
+    size = _HEADER.size + len(description) + len(body)
+    if size > MAX_FILE_BYTES or len(description) > MAX_HEAD_BYTES:
+        raise SnapshotError(f"the snapshot would have {size} bytes, more than {MAX_FILE_BYTES}")
+    digest = hashlib.sha256(description + body).digest()
+    header = _HEADER.pack(_MAGIC, VERSION, len(description), len(body), digest)
+    new = work / file.name
+    try:
+        write_new(new, header, description, body, sync=True)
+        new.rename(file)
+        _sync_folder(file.parent)
+    except OSError as error:
+        raise SnapshotError(f"{file}: {error.strerror}; the snapshot was not saved") from None
+    return _info(file, head, size)
+
+
+def read_snapshot(file: Path) -> tuple[SnapshotInfo, SnapshotHead, dict[str, bytes]]:
+    """Read a snapshot.
+
+    Raises:
+        SnapshotError: There is no such snapshot, it is damaged, or another version has written it.
+    """
+    try:
+        data = memoryview(read_bounded(file, MAX_FILE_BYTES))
+    except OSError as error:
+        raise _unreadable(file, error) from None
+    head_size, body_size, digest = _sizes(file, bytes(data[: _HEADER.size]))
+    if len(data) != _HEADER.size + head_size + body_size or hashlib.sha256(data[_HEADER.size :]).digest() != digest:
+        raise SnapshotError(f"{file} is damaged: its checksum is wrong")
+    head = _head(file, bytes(data[_HEADER.size : _HEADER.size + head_size]))
+    try:
+        states = _STATES.decode(data[_HEADER.size + head_size :])
+    except msgspec.MsgspecError as error:
+        raise SnapshotError(f"{file} is invalid: {error}") from None
+    return _info(file, head, len(data)), head, states
+
+
+def list_snapshots(folder: Path) -> list[SnapshotInfo]:
+    """Return the snapshots of a folder, the oldest first. A damaged description is reported, not raised.
+
+    Raises:
+        SnapshotError: The folder cannot be read.
+    """
+    try:
+        files = sorted(folder.glob(f"*{SUFFIX}"))[:MAX_LISTED]
+    except OSError as error:
+        raise SnapshotError(f"{folder}: {error.strerror}") from None
+    return sorted(map(_listed, (file for file in files if _NAME.fullmatch(file.stem))), key=lambda one: one.saved_s)
+
+
+def delete_snapshot(file: Path) -> None:
+    """Delete a snapshot. Raise SnapshotError if there is none, or it cannot be deleted."""
+    try:
+        file.unlink()
+    except OSError as error:
+        raise _unreadable(file, error) from None
+
+
+def _listed(file: Path) -> SnapshotInfo:
+    try:
+        with file.open("rb") as stream:
+            head_size, body_size, _ = _sizes(file, stream.read(_HEADER.size))
+            head = _head(file, stream.read(head_size))
+            size = os.fstat(stream.fileno()).st_size
+        if size != _HEADER.size + head_size + body_size:
+            raise SnapshotError(f"{file} is damaged: it has {size} bytes")
+        return _info(file, head, size)
+    except (OSError, SnapshotError) as error:
+        return SnapshotInfo(file.stem, problem=str(error))
+
+
+def _sizes(file: Path, header: bytes) -> tuple[int, int, bytes]:
+    """Return the sizes of description and states, and their digest, from a file's first bytes."""
+    if len(header) < _HEADER.size or header[: len(_MAGIC)] != _MAGIC:
+        raise SnapshotError(f"{file} is not a snapshot")
+    _, version, head_size, body_size, digest = _HEADER.unpack(header)
+    if version != VERSION:
+        raise SnapshotError(f"{file} has version {version} of the format, and this shmio knows version {VERSION}")
+    if head_size > MAX_HEAD_BYTES or body_size > MAX_FILE_BYTES:
+        raise SnapshotError(f"{file} is damaged: its sizes are wrong")
+    return head_size, body_size, digest
+
+
+def _head(file: Path, data: bytes) -> SnapshotHead:
+    try:
+        return msgspec.json.decode(data, type=SnapshotHead)
+    except (msgspec.MsgspecError, RecursionError) as error:
+        raise SnapshotError(f"{file} is invalid: {error}") from None
+
+
+def _info(file: Path, head: SnapshotHead, size: int) -> SnapshotInfo:
+    name = file.name.removesuffix(SUFFIX)
+    return SnapshotInfo(name, head.instance, head.saved_s, head.time_ns, head.step, size, head.left_out)
+
+
+def _unreadable(file: Path, error: OSError) -> SnapshotError:
+    if isinstance(error, FileNotFoundError):
+        name = file.name.removesuffix(SUFFIX)
+        there = ", ".join(one.name for one in list_snapshots(file.parent)[:20]) or "none"
+        return SnapshotError(f"there is no snapshot {name!r} in {file.parent}; there are: {there}")
+    return SnapshotError(f"{file}: {error.strerror}")
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
