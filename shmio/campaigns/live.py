@@ -20,6 +20,7 @@ from shmio.errors import ConfigError, NotRunningError, RecordingError, ShmioErro
 from shmio.judging.judge import Judge
 from shmio.judging.source import Frames, Rows
 from shmio.local.attach import Attachment
+from shmio.model.snapshot import SnapshotInfo
 from shmio.recorder.file_output import Output
 from shmio.recorder.instance_follower import BlockEntry, InstanceEntry, InstanceFollower, StartPositions
 from shmio.recorder.recorder import CLOSE_S, AttachedFiles, Recorder, no_attachments
@@ -53,6 +54,8 @@ class Plan:
         real_time: Whether to run in real time, even if all sources could be stepped.
         stop: Whether to stop at the first failure.
         record: The file to create for a recording; if None, nothing is recorded.
+        start: Name of a snapshot to restore before the run; if None, the run begins in the present
+            state.
     """
 
     injections: Sequence[Declaration]
@@ -63,6 +66,7 @@ class Plan:
     real_time: bool = False
     stop: bool = False
     record: Path | None = None
+    start: str | None = None
 
 
 class LiveRun:
@@ -102,6 +106,8 @@ class LiveRun:
         """True if the run is in virtual time."""
         self.step_s = 0.0
         """Length of a step of virtual time."""
+        self.start: SnapshotInfo | None = None
+        """The snapshot in which the run has begun; None if there is none."""
         self.problem: ShmioError | None = None
         """What ended the run early; None if nothing did."""
         self._blocks: dict[str, Block] = {source: blocks[source] for source in self.judge.sources}
@@ -118,6 +124,7 @@ class LiveRun:
                 ``step_s`` or ``real_time``.
             CommandError: A source refuses an injection.
             RecordingError: The file of the recording cannot be created.
+            SnapshotError: The snapshot cannot be restored.
         """
         plan = self._plan
         with ExitStack() as stack:
@@ -129,12 +136,17 @@ class LiveRun:
             if plan.step_s is not None and not self.virtual:
                 why = "--real-time" if plan.real_time else ", ".join(cell.real_sources())
                 raise ConfigError(f"step_ms, or --step-ms: this run is in real time, because of {why}")
+            if plan.start is not None and not self.virtual:
+                why = "--real-time" if plan.real_time else ", ".join(cell.real_sources())
+                raise ConfigError(f"start: snapshots need virtual time, but this run is in real time: {why}")
             self.step_s = plan.step_s or min(block.period_ns for block in self._segment.blocks.values()) / 1e9
             self._await_good(over)
             if self.virtual:
                 cell.pause()
                 if not was_virtual:
                     stack.callback(cell.release)
+            if plan.start is not None:
+                self.start = cell.restore_snapshot(plan.start)
             tap = InstanceFollower(self._segment, StartPositions(first=False))
             recorder = stack.enter_context(self._recording(tap))
             now_s = cell.clock.present_ns / 1e9

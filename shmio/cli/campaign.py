@@ -79,6 +79,9 @@ def _parser() -> argparse.ArgumentParser:
     live.add_argument(
         "--seed", type=seed_number, metavar="N", help="seed for those injections of the file that have none"
     )
+    live.add_argument(
+        "--start", metavar="NAME", help="restore this snapshot before the run (default: start of the file)"
+    )
     live.add_argument("--stop", action="store_true", help="stop at the first failure")
     live.add_argument("--record", type=Path, metavar="FILE.mem", help="record the run to a new file")
     _reports(live)

@@ -31,6 +31,7 @@ class Campaign(Section, omit_defaults=True):
 
     Attributes:
         config: The ``supervisor.toml`` of the instance, relative to the campaign file.
+        start: Name of a snapshot in which the run begins.
         duration_s: Duration on the instance's clock.
         step_ms: Length of a step of virtual time.
         parameters: Parameters of models, by source and name. Only laboratories can set them.
@@ -40,6 +41,7 @@ class Campaign(Section, omit_defaults=True):
     """
 
     config: Text | None = None
+    start: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$")] | None = None
     duration_s: Annotated[float, Meta(gt=0, le=1e6)] | None = None
     step_ms: Milliseconds | None = None
     parameters: dict[str, dict[str, Any]] = field(default_factory=dict)

@@ -107,6 +107,10 @@ class BlockFollower:
         """Number of the last frame that was read or counted as missed."""
         return self._frames.cursor.last
 
+    def restart_time(self) -> None:
+        """Give new entries their own times again, which may be before those of earlier entries."""
+        self._log_ns = 0
+
     def take(self, limit: int) -> Iterator[BlockEntry]:
         """Yield the entries that were published so far, at most about ``limit`` entries."""
         retired = self.block.retired  # before the read, so that the last entries are read, too
@@ -259,6 +263,8 @@ class InstanceFollower:
         """Followers of the present blocks, and of retired blocks that have unread entries."""
         self.done = 0
         """Number of the last step of virtual time whose frames have all been read."""
+        self.went_back = False
+        """True after a snapshot has set time back, until :meth:`restart_time`."""
         self._selection = selection or Selection()
         self._watched: set[str] = set()
         self._watching: list[BlockFollower] = []
@@ -269,6 +275,12 @@ class InstanceFollower:
         self._watch = ProcessWatch(segment)
         self._watched_s = time.monotonic()
         self._follow(start)
+
+    def restart_time(self) -> None:
+        """Give new entries their own times again, which may be before those of earlier entries."""
+        self.went_back = False
+        for follower in (*self.followers, *self._watching):
+            follower.restart_time()
 
     def again(self, start: StartPositions) -> InstanceFollower:
         """Return a follower of the same instance and selection that starts at other positions."""
@@ -353,6 +365,7 @@ class InstanceFollower:
 
     def _step(self, state: Clock) -> list[InstanceEntry]:
         """Return the mark for the end of a step whose frames have all been read."""
+        self.went_back |= state.done < self.done
         self.done = state.done
         if state.done != state.step or not state.dt_ns:  # the length of that step is unknown
             return []

@@ -451,7 +451,8 @@ def is_process_change(entry: BlockEntry | InstanceEntry) -> bool:
 class RotatingRecorder:
     """Records to a sequence of files.
 
-    It starts a new file when the present one is too large or old.
+    It starts a new file when the present one is too large or old, and when a snapshot has set time
+    back.
 
     No entry is lost between two files. It also starts a new file after a failed fsync, because part
     of the old file may be lost. The new file begins at the last position that an fsync has
@@ -519,7 +520,12 @@ class RotatingRecorder:
         Raises:
             RecordingError: The file was removed.
         """
-        return self.recorder.run_once()
+        more = self.recorder.run_once()
+        if self.tap.went_back:  # times go up in a file
+            self.tap.restart_time()
+            if not (self.recorder.empty or self.recorder.problem or self.recorder.losing):
+                self._rotate()
+        return more
 
     def put(self, entries: Iterable[BlockEntry | InstanceEntry]) -> None:
         """Record entries.

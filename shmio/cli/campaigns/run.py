@@ -65,6 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.real_time,
         arguments.stop,
         arguments.record,
+        arguments.start or campaign.start,
     )
     reports = Reports(arguments)
     facts = [*of_campaign(arguments.campaign, campaign.expect), ("seed", str(seed))]
@@ -76,6 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
             raise ConfigError(f"{arguments.campaign}: {error}") from None
     how = f"virtual, steps of {work.step_s * 1000:g} ms" if work.virtual else "real"
     facts += [("instance", name), ("time", how), ("duration", f"{duration_s:g} s")]
+    facts += [] if work.start is None else [("start", f"snapshot {work.start.name}, {work.start.time_ns / 1e9:g} s")]
     command = _command(arguments, seed, duration_s, work)
     reports.write(work.judge, f"Campaign {arguments.campaign.name}", facts, command, work.injections.spans)
     found: dict[str, Any] = {"instance": name, "seed": seed, "virtual": work.virtual, "command": command}
@@ -195,6 +197,10 @@ def _told(arguments: argparse.Namespace, campaign: Campaign, plan: Plan, instanc
     if arguments.json:
         return
     how = f"virtual time, steps of {work.step_s * 1000:g} ms" if work.virtual else "real time"
+    if work.start is not None:
+        say(f"{instance}: restored {work.start.name}, {work.start.time_ns / 1e9:g} s", sys.stderr)
+        for process, why in work.start.left_out.items():
+            say(f"  without {process}: {why}", sys.stderr)
     say(f"{instance}: {len(campaign.injection)} injections, {len(campaign.expect)} expectations, {how}", sys.stderr)
     seed = next(
         (laid.seed for laid, one in zip(plan.injections, campaign.injection, strict=True) if one.seed is None), None
@@ -212,6 +218,7 @@ def _command(arguments: argparse.Namespace, seed: int, duration_s: float, work: 
     words += ["--lab"] if arguments.lab else []
     words += ["--real-time"] if arguments.real_time else []
     words += ["--stop"] if arguments.stop else []
+    words += [] if work.start is None else ["--start", work.start.name]
     if arguments.config is not None:
         words += ["-c", str(arguments.config)]
     if arguments.instance is not None:

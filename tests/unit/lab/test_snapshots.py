@@ -10,11 +10,14 @@ from typing import Any
 
 import pytest
 
+from shmio.campaigns.live import Plan as RunPlan
+from shmio.config import Expectation
 from shmio.config.campaign import parse_campaign
 from shmio.errors import SnapshotError
 from shmio.lab import Laboratory, prepare_laboratory
 from shmio.local.attach import Attachment
 from shmio.plan.processes import Plan
+from shmio.recording.dump import open_dump
 from shmio.segment import EventKind
 
 SECTIONS = """
@@ -249,3 +252,26 @@ def test_names_that_are_no_file_names_are_refused(plan: Callable[..., Plan], nam
         for call in (cell.save_snapshot, cell.restore_snapshot, cell.delete_snapshot):
             with pytest.raises(SnapshotError, match="name"):
                 call(name)
+
+
+def test_a_campaign_starts_from_a_snapshot(plan: Callable[..., Plan], tmp_path: Path) -> None:
+    prepared = plan()
+    limit = Expectation(name="low", always="walk/at < 1e6")
+    with Laboratory(prepared) as lab, lab.attach() as cell:
+        go_on(cell, 30, random.Random(1))
+        cell.save_snapshot("warm")
+    recordings = []
+    for number in range(2):
+        recordings.append(tmp_path / f"{number}.mem")
+        with Laboratory(prepared) as lab:
+            run = lab.run(RunPlan(parse_campaign(CAMPAIGN), [limit], 0.5, record=recordings[-1], start="warm"))
+        assert run.problem is None
+        assert run.start is not None
+        assert [one.outcome for one in run.judge.verdicts] == ["passed"]
+    first, second = (list(open_dump(file).frames("walk")) for file in recordings)
+    assert [(one.item.clock_ns, one.item.raw, one.item.effective) for one in first] == [
+        (one.item.clock_ns, one.item.raw, one.item.effective) for one in second
+    ]
+    assert first[-1].item.clock_ns == 1_100_000_000
+    with Laboratory(prepared) as lab, pytest.raises(SnapshotError, match="no snapshot 'none'"):
+        lab.run(RunPlan([], [limit], 0.5, start="none"))
