@@ -28,7 +28,6 @@ BROWSER = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enabl
 
 def registers(cell: Cell, page: Any) -> None:
     """A register of the tree is overridden."""
-    page.locator('.tree-row[data-path="cell"]').click()
     page.locator('.tree-row[data-path="cell/Robot_800"]').click()
     row = page.locator(f'.tree-row[data-path="{AXIS}"]')
     row.click()
