@@ -16,6 +16,7 @@ import pytest
 
 from shmio import control
 from shmio.cli import target
+from shmio.cli.instance.init import comment_out
 from shmio.cli.supervisor import main
 from shmio.config import load
 from shmio.endpoints.mqtt.broker import program
@@ -50,10 +51,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def example(capsys: pytest.CaptureFixture[str]) -> Edit:
-    """Write the A50 example to this folder. A call of the result replaces one text in it by another."""
+    """Write the A50 example without its web page to this folder. A call of the result replaces one text by another."""
     assert main(["init"]) == 0
     capsys.readouterr()
     file = Path("supervisor.toml")
+    file.write_text(comment_out(file.read_text(), "web"))
 
     def edit(old: str, new: str) -> None:
         text = file.read_text()
