@@ -9,6 +9,7 @@ import pytest
 
 from shmio.cli.supervisor import main
 from shmio.connectors import registry
+from shmio.connectors.base import Connector
 from shmio.errors import ConfigError
 
 CONFIG = """
@@ -80,3 +81,12 @@ def test_two_packages_with_the_same_connector(offer: Offer, check: Check) -> Non
     assert "alpha and beta each offer a connector 'fieldbus'" in check("fieldbus", 'host = "127.0.0.1"')
     with pytest.raises(ConfigError, match="alpha and beta"):
         registry.load("fieldbus")
+
+
+@pytest.mark.parametrize("name", ["modbus", "mqtt", "opcua", "ros2", "rosbridge", "s7"])
+def test_each_connector_to_a_device_keeps_its_connection_in_a_reload(name: str) -> None:
+    found = registry.load(name)
+    assert issubclass(found, Connector)
+    assert found.register_options is not None
+    assert found.register_options <= set(found.Options.__struct_fields__)
+    assert found.take_over is not Connector.take_over
