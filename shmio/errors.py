@@ -36,8 +36,9 @@ The command-line tools print the message of any of these errors and exit with st
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal
+
+import msgspec
 
 
 class ShmioError(Exception):
@@ -48,8 +49,7 @@ class ConfigError(ShmioError):
     """The configuration cannot be used; the message names the full key and the remedy."""
 
 
-@dataclass(frozen=True, slots=True)
-class Diagnostic:
+class Diagnostic(msgspec.Struct, frozen=True):
     """An error or warning about a layout source.
 
     ``str()`` is ``file:line:column: severity: message``.

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import ipaddress
 import os
-from dataclasses import dataclass
 from typing import Final
+
+import msgspec
 
 from shmio.errors import ConfigError
 
@@ -14,8 +15,7 @@ MAX_PATH_BYTES: Final = 107
 """Maximum length in bytes of a UNIX socket's path: ``sun_path`` holds 108, including the final zero (unix(7))."""
 
 
-@dataclass(frozen=True, slots=True)
-class Address:
+class Address(msgspec.Struct, frozen=True):
     """A host name or IP address, and a TCP port (0: any free port)."""
 
     host: str
@@ -55,8 +55,7 @@ class Address:
             return False
 
 
-@dataclass(frozen=True, slots=True)
-class UnixAddress:
+class UnixAddress(msgspec.Struct, frozen=True):
     """The path of a UNIX socket."""
 
     path: str

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
 import msgspec
@@ -18,8 +17,7 @@ _Table = TypeVar("_Table", Declaration, Expectation)
 MAX_DIMENSIONS: Final = 6  # of an array; the same as in layout/model.py, which cannot be imported here
 
 
-@dataclass(frozen=True)
-class Keys:
+class Keys(msgspec.Struct, frozen=True):
     """The keys that an operation takes, besides those of every injection.
 
     Attributes:

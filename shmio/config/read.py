@@ -16,6 +16,7 @@ from shmio.config.declaration import declaration_faults
 from shmio.config.faults import MAX_KEY, MAX_PARTS, Faults, decode, explain, explain_toml, hint, near, too_long
 from shmio.config.listening import check_listening, resolve
 from shmio.config.model import (
+    RESERVED_SOURCES,
     Alert,
     Client,
     Config,
@@ -45,7 +46,6 @@ from shmio.config.opcua import check_opcua, resolve_opcua
 from shmio.config.web import check_web, resolve_web
 from shmio.errors import ConfigError
 
-RESERVED_SOURCES = frozenset({"simlog", "model", "shmio"})
 SECTION_PROCESSES = frozenset({"alerts", "broker", "grpc", "metrics", "mqtt", "opcua", "recorder", "supervisor", "web"})
 MAX_FILE_BYTES = 1 << 20
 MAX_PROPERTIES_BYTES = 64 << 10

@@ -5,18 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import msgspec
-import numpy as np
 
 from shmio.config.faults import meant
 from shmio.errors import ConfigError, ModelError, SnapshotError
 from shmio.layout.model import NUMBERS, Layout
 from shmio.layout.values.codec import Value, codec
-from shmio.simulation import ModelRunner
-from shmio.simulation.a50 import A50Cell
-from shmio.simulation.loading import load
+
+# numpy and the models are imported where they are used: most emulators need neither, and start faster without.
+if TYPE_CHECKING:
+    import numpy as np
 
 
 class Stateless:
@@ -45,6 +45,9 @@ class A50:
 
     def __init__(self, layout: Layout) -> None:
         """Find the registers. Raise ConfigError if one is missing or has another type."""
+        from shmio.simulation import ModelRunner  # noqa: PLC0415
+        from shmio.simulation.a50 import A50Cell  # noqa: PLC0415
+
         # A DB201 that was copied from a printout has spaces instead of some underscores.
         named = tuple(
             msgspec.structs.replace(register, path=register.path.replace(" ", "_")) for register in layout.registers
@@ -87,6 +90,8 @@ class Counter(Stateless):
 
     def step(self, time_s: float, frame: bytearray) -> None:
         """Write the words of the cycle at this time."""
+        import numpy as np  # noqa: PLC0415
+
         generation = np.uint64(round(time_s * 1000 / self.period_ms))
         frame[:] = (self._places + generation).astype(">u8").tobytes()[: self._size]
 
@@ -96,6 +101,8 @@ def generations(frame: bytes | bytearray | memoryview) -> list[int]:
 
     A frame from a single cycle gives one number. A wrong byte gives a number far from the others.
     """
+    import numpy as np  # noqa: PLC0415
+
     size = len(frame)
     whole = size // 8 * 8
     places = _places(size)
@@ -108,6 +115,8 @@ def generations(frame: bytes | bytearray | memoryview) -> list[int]:
 
 
 def _places(size: int) -> np.ndarray[tuple[int], np.dtype[np.uint64]]:
+    import numpy as np  # noqa: PLC0415
+
     return np.arange((size + 7) // 8, dtype=np.uint64) * np.uint64(_STRIDE)
 
 
@@ -179,6 +188,9 @@ class UserProgram:
             ConfigError: There is no such class, or the layout or the parameters do not suit it.
 
         """
+        from shmio.simulation import ModelRunner  # noqa: PLC0415
+        from shmio.simulation.loading import load  # noqa: PLC0415
+
         try:
             model = load(name, code.folder)
         except (ConfigError, ModelError) as error:

@@ -158,7 +158,7 @@ def choose(patterns: Iterable[str], layouts: Mapping[str, Layout]) -> list[tuple
         PathError: A pattern names nothing, or ends in ``/in``.
 
     """
-    chosen: dict[tuple[str, Register], None] = {}
+    chosen: dict[tuple[str, str], Register] = {}  # by path, because hashing a path is faster than hashing a register
     default = next(iter(layouts)) if len(layouts) == 1 else None
     for pattern in patterns:
         topic = parse_topic(pattern, layouts, default)
@@ -169,5 +169,6 @@ def choose(patterns: Iterable[str], layouts: Mapping[str, Layout]) -> list[tuple
         registers = named(layouts[topic.source], topic)
         if not registers:
             raise PathError(f"{pattern}: no register of {topic.source} has such a path")
-        chosen |= dict.fromkeys((topic.source, register) for register in registers)
-    return list(chosen)
+        for register in registers:
+            chosen.setdefault((topic.source, register.path), register)
+    return [(source, register) for (source, _), register in chosen.items()]

@@ -38,8 +38,7 @@ DEFAULT_STRING = 254
 MAX_PATH = 16_384  # characters
 
 
-@dataclass(frozen=True, slots=True)
-class ElementType:
+class ElementType(msgspec.Struct, frozen=True):
     """An elementary type; a string type includes its length.
 
     Attributes:

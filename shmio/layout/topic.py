@@ -16,7 +16,6 @@ exactly ``in`` or ``out``.
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -391,6 +390,8 @@ def near(layout: Layout, path: str) -> list[str]:
             name = name.rpartition("/")[0]
         if len(names) >= _NEAR_CANDIDATES:
             break
+    import difflib  # noqa: PLC0415  only this message needs it
+
     near = difflib.get_close_matches(wanted, names, n=3)
     return [written for name in near if (written := layout.in_any_case(name))]
 

@@ -7,14 +7,12 @@ import secrets
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
 import msgspec
 
 from shmio.config import Declaration
-from shmio.config.campaign import parse_campaign
 from shmio.config.declaration import check_declarations
 from shmio.errors import CommandError, ConfigError, DeclarationError, PathError, ValueRangeError
 from shmio.layout.model import Register
@@ -45,8 +43,7 @@ if the instance has stopped.
 """
 
 
-@dataclass(frozen=True, slots=True)
-class ObservedWrite:
+class ObservedWrite(msgspec.Struct, frozen=True):
     """The values that one command wrote to a source, or the part of them that an injection took.
 
     Attributes:
@@ -328,6 +325,8 @@ def _read(declarations: Iterable[Mapping[str, Any] | Declaration]) -> list[Decla
     """
     tables = [one if isinstance(one, Mapping) else msgspec.to_builtins(one) for one in declarations]
     try:
+        from shmio.config.campaign import parse_campaign  # noqa: PLC0415  few programs need it
+
         read = parse_campaign({"injection": tables}) if tables else []
     except ConfigError as error:
         raise DeclarationError(str(error)) from None

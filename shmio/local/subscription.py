@@ -11,9 +11,10 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from types import TracebackType
 from typing import Final, Generic, Self, TypeVar
+
+import msgspec
 
 from shmio.errors import PathError, SegmentError, ShmioError, ValueRangeError
 from shmio.layout.glob import choose
@@ -115,8 +116,7 @@ def _stop(relays: dict[int, Relay]) -> None:
     relays.clear()
 
 
-@dataclass(frozen=True, slots=True)
-class Update:
+class Update(msgspec.Struct, frozen=True):
     """One frame of a source with its readings. Implements :class:`shmio.model.cell.Update`."""
 
     source: str

@@ -8,8 +8,9 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from typing import Final, NamedTuple
+
+import msgspec
 
 from shmio.errors import SegmentError, ShmioError, TimeError, ValueRangeError
 from shmio.model.clock import MAX_RATE, Clock, ClockMode, check_step
@@ -41,8 +42,7 @@ log = logging.getLogger("shmio.time")
 log.addHandler(logging.NullHandler())  # without it, Python would print warnings of a program that has set up no log
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
+class Step(msgspec.Struct, frozen=True):
     """A finished step.
 
     Attributes:

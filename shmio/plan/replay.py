@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
 
-from shmio.config import Config, Mqtt, MqttTopic, Source
+from shmio.config import RESERVED_SOURCES, Config, Mqtt, MqttTopic, Source
 from shmio.config.model import NAME_RULE, Replay
-from shmio.config.read import RESERVED_SOURCES, SECTION_PROCESSES, convert
+from shmio.config.read import SECTION_PROCESSES, convert
 from shmio.errors import ConfigError, RecordingError
 from shmio.segment import Origin
 

@@ -11,10 +11,11 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
+
+import msgspec
 
 from shmio.errors import SegmentError
 from shmio.model.statuses import StatusArea, status_area
@@ -209,8 +210,7 @@ class Cursor(Generic[Entry]):
                 return
 
 
-@dataclass(frozen=True, slots=True)
-class Attributes:
+class Attributes(msgspec.Struct, frozen=True):
     """The part of a source's configuration that other processes need."""
 
     connector: str = ""

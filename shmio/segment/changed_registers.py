@@ -27,7 +27,11 @@ class ChangeScan:
 
         ``statuses`` is the layout's status area; None: compare no status codes.
         """
-        self._table = b"".join(entries([register], index, statuses) for index, register in enumerate(registers))
+        if statuses is not None:
+            parts = [entries([register], index, statuses) for index, register in enumerate(registers)]
+        else:  # the same, faster
+            parts = [_ENTRY.pack(*run, index) for index, register in enumerate(registers) for run in runs(register)]
+        self._table = b"".join(parts)
 
     @classmethod
     def joined(cls, parts: Iterable[bytes]) -> ChangeScan:

@@ -11,9 +11,10 @@ from __future__ import annotations
 import secrets
 import struct
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, NamedTuple, TypedDict
+
+import msgspec
 
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import find_each
@@ -103,8 +104,7 @@ class InjectionOptions(TypedDict, total=False):
     name: str
 
 
-@dataclass(frozen=True, slots=True)
-class Command:
+class Command(msgspec.Struct, frozen=True):
     """A command from a writer to a source.
 
     Attributes:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
 from typing import Final
+
+import msgspec
 
 from shmio.errors import FormatError, UnfinishedError
 from shmio.segment import _atomics
@@ -69,8 +70,7 @@ class SectionKind(IntEnum):
     READERS = 11
 
 
-@dataclass(frozen=True, slots=True)
-class Header:
+class Header(msgspec.Struct, frozen=True):
     """The header's fixed fields. Offsets and sizes are in bytes, times in ns."""
 
     epoch: int
@@ -135,8 +135,7 @@ class Header:
         )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class SectionEntry:
+class SectionEntry(msgspec.Struct, frozen=True):
     """An entry of the section table.
 
     If the section belongs to a block, ``layout`` is the index of the block's layout section.

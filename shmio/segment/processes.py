@@ -11,9 +11,10 @@ from __future__ import annotations
 import struct
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
+
+import msgspec
 
 from shmio.errors import SegmentError
 from shmio.segment import _atomics
@@ -84,8 +85,7 @@ class Activity(IntEnum):
     """The worker has stopped its loop, and waits until the supervisor has replaced the source's block."""
 
 
-@dataclass(frozen=True, slots=True)
-class ProcessSpec:
+class ProcessSpec(msgspec.Struct, frozen=True):
     """A process of the instance. Its ``kind`` is a key of :data:`COUNTERS`."""
 
     name: str
@@ -97,8 +97,7 @@ class ProcessSpec:
         return WRITERS.get(self.kind) if self.name == self.kind else None
 
 
-@dataclass(frozen=True, slots=True)
-class Supervised:
+class Supervised(msgspec.Struct, frozen=True):
     """The supervisor's part of a slot.
 
     ``note`` says why the process is not running; empty if it runs.
@@ -110,8 +109,7 @@ class Supervised:
     note: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Report:
+class Report(msgspec.Struct, frozen=True):
     """The worker's part of a slot.
 
     :data:`COUNTERS` names the counters. ``note`` describes a problem of the worker. In an external

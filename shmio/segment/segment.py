@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -66,8 +65,7 @@ _RING = struct.Struct("<8Iqq")
 _ATTRIBUTES = msgspec.json.Decoder(Attributes)  # created before there are threads, as in layout/document.py
 
 
-@dataclass(frozen=True, slots=True)
-class Origin:
+class Origin(msgspec.Struct, frozen=True):
     """Start time of an instance that replays a recording.
 
     ``clock_ns`` is the instance's clock at the start of the instance. ``started_utc_ns`` is the UTC
@@ -78,8 +76,7 @@ class Origin:
     started_utc_ns: int
 
 
-@dataclass(frozen=True, slots=True)
-class BlockSpec:
+class BlockSpec(msgspec.Struct, frozen=True):
     """Parameters of a source's new block."""
 
     source: str
@@ -88,7 +85,7 @@ class BlockSpec:
     stale_ns: int
     ring_bytes: int
     """Maximum size of the frame ring, in bytes."""
-    attributes: Attributes = field(default_factory=Attributes)
+    attributes: Attributes = Attributes()
     declared: bytes = b""
     """The declared injections, as a JSON document of at most LIST_SIZE bytes."""
 

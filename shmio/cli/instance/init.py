@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from shmio.cli.target import config_file, option_for
-from shmio.config import Address
-from shmio.config.read import RESERVED_SOURCES, SECTION_PROCESSES, read_properties, read_tables
+from shmio.config import RESERVED_SOURCES, Address
+from shmio.config.read import SECTION_PROCESSES, read_properties, read_tables
 from shmio.config.web import check_library
 from shmio.endpoints.mqtt.broker.program import check_installed
 from shmio.errors import ConfigError, LayoutError

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
+import gc
 import logging
 import time
 
@@ -10,7 +10,6 @@ import msgspec
 
 from shmio import worker
 from shmio.config import Mqtt
-from shmio.endpoints.mqtt.bridge import Bridge
 from shmio.endpoints.mqtt.broker.directory import folder, prepare, remove
 from shmio.endpoints.mqtt.broker.mosquitto import Mosquitto
 from shmio.endpoints.mqtt.broker.program import choose_broker
@@ -37,7 +36,12 @@ def run(worker: Worker) -> None:
 
 
 def _run_bridge(worker: Worker) -> None:
+    from shmio.endpoints.mqtt.bridge import Bridge  # noqa: PLC0415  the broker's process does not need it
+
+    gc.disable()  # the channels of all registers are made now, and stay: there is nothing to collect
     bridge = Bridge(worker.segment, worker.slot, msgspec.convert(worker.config, Mqtt))
+    gc.freeze()
+    gc.enable()
     worker.on_stop(bridge.wake)
     worker.running()
     reported_s = 0.0
@@ -70,6 +74,8 @@ def run_broker(worker: Worker) -> None:
                 "may publish everything, even values",
                 settings.listen,
             )
+            import asyncio  # noqa: PLC0415  mosquitto does not need it
+
             from shmio.endpoints.mqtt.broker import amqtt  # noqa: PLC0415  this import needs the extra, and is large
 
             asyncio.run(amqtt.serve(worker, settings, place))

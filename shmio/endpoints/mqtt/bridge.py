@@ -10,7 +10,7 @@ from collections.abc import Callable, Container, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 from paho.mqtt.client import MQTTMessage
@@ -29,14 +29,16 @@ from shmio.endpoints.mqtt.connection.connection import MOST_IN_FLIGHT, BrokerCon
 from shmio.endpoints.mqtt.connection.reconnect import ReconnectPolicy, targets
 from shmio.endpoints.mqtt.feed import Feed
 from shmio.endpoints.mqtt.outbox import Outbox
-from shmio.endpoints.mqtt.sparkplug.device import Device
-from shmio.endpoints.mqtt.sparkplug.session import Session
 from shmio.endpoints.mqtt.steps import StepDelivery
 from shmio.endpoints.mqtt.topic_guard import MOST_WAITING, TopicGuard
 from shmio.endpoints.mqtt.topics import BridgeStatusChannel, Channel, ClearedTopic, Message, TopicRules, status
 from shmio.layout.topic import shorten
 from shmio.segment import Block, ProcessSlot, Quality, Segment
 from shmio.segment.doorbell import TURN_NS, Relay
+
+if TYPE_CHECKING:
+    from shmio.endpoints.mqtt.sparkplug.device import Device
+    from shmio.endpoints.mqtt.sparkplug.session import Session
 
 OFFLINE: Final = b"offline"
 STOPPED: Final = "the bridge was stopped"
@@ -125,6 +127,8 @@ class Bridge:
         self._reader = ThreadPoolExecutor(1, "reader")
         self._sparkplug: Session | None = None
         if settings.sparkplug is not None:
+            from shmio.endpoints.mqtt.sparkplug.session import Session  # noqa: PLC0415  loads numpy and protobuf
+
             self._sparkplug = Session(settings, settings.sparkplug, segment, self._selector, self.wake)
         self._reading: Future[list[tuple[Feed, Device | None]]] | None = None
         self._add_feeds(self._read(()))
