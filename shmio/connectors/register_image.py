@@ -15,7 +15,6 @@ from shmio.model.statuses import (
     BAD_OUT_OF_RANGE,
     BAD_WAITING_FOR_INITIAL_DATA,
     GOOD,
-    RegisterStatus,
     StatusArea,
 )
 
@@ -48,6 +47,7 @@ class RegisterImage:
         self._area = StatusArea(layout)
         self._image, _ = initial_frame(layout)
         self._bytes = np.frombuffer(self._image, np.uint8)
+        self._codecs = [codec(register, layout.byte_order) for register in layout.registers]
         self._not_good: set[int] = set()
         for index in range(len(layout.registers)):
             self.fail(index, BAD_WAITING_FOR_INITIAL_DATA)
@@ -74,7 +74,7 @@ class RegisterImage:
         """
         fault = ""
         try:
-            codec(self._layout.registers[index], self._layout.byte_order).encode_into(value, self._image)
+            self._codecs[index].encode_into(value, self._image)
         except ValueRangeError as error:
             code, fault = BAD_OUT_OF_RANGE, str(error)
         self._set_status(index, code, source_ns)
@@ -100,7 +100,7 @@ class RegisterImage:
         self._set_status(index, code, source_ns)
 
     def _set_status(self, index: int, code: int, source_ns: int) -> None:
-        self._area.put(self._image, index, RegisterStatus(code, source_ns))
+        self._area.write(self._image, index, code, source_ns)
         if code == GOOD:
             self._not_good.discard(index)
         else:

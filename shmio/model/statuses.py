@@ -272,8 +272,12 @@ class StatusArea:
 
     def put(self, image: bytearray, index: int, status: RegisterStatus) -> None:
         """Write the status of the register at an index of the layout."""
-        self._code.pack_into(image, self.codes_offset + _CODE_BYTES * index, status.code)
-        self._time.pack_into(image, self.times_offset + _TIME_BYTES * index, status.source_ns)
+        self.write(image, index, status.code, status.source_ns)
+
+    def write(self, image: bytearray, index: int, code: int, source_ns: int) -> None:
+        """Write code and time of a status: :meth:`put` for those who write thousands."""
+        self._code.pack_into(image, self.codes_offset + _CODE_BYTES * index, code)
+        self._time.pack_into(image, self.times_offset + _TIME_BYTES * index, source_ns)
 
 
 def status_registers(layout: Layout, registers: Iterable[Register], *, times: bool = True) -> list[Register]:

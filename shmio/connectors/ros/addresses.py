@@ -151,18 +151,19 @@ def extract(message: Any, address: Address) -> Any:
     scopes: list[Any] = []
     found = message
     for step in address.steps:
-        if not isinstance(found, dict) or step.name not in found:
-            raise FieldError(BAD_NOT_FOUND, f"{address.text}: the message has no field {step.name!r}")
+        name, place, key = step
+        if not isinstance(found, dict) or name not in found:
+            raise FieldError(BAD_NOT_FOUND, f"{address.text}: the message has no field {name!r}")
         scopes.append(found)
-        found = found[step.name]
-        if step.whole:
+        found = found[name]
+        if place is None and key is None:
             continue
         if not isinstance(found, list):
-            raise FieldError(BAD_TYPE_MISMATCH, f"{address.text}: {step.name!r} is not a sequence")
-        index = step.place if step.place is not None else place_of(scopes, step, address)
+            raise FieldError(BAD_TYPE_MISMATCH, f"{address.text}: {name!r} is not a sequence")
+        index = place if place is not None else place_of(scopes, step, address)
         if index >= len(found):
             raise FieldError(
-                BAD_INDEX_RANGE_NO_DATA, f"{address.text}: the array {step.name!r} has only {len(found)} elements"
+                BAD_INDEX_RANGE_NO_DATA, f"{address.text}: the array {name!r} has only {len(found)} elements"
             )
         found = found[index]
     return found
@@ -182,7 +183,10 @@ def place_of(scopes: Sequence[Any], step: Step, address: Address) -> int:
     for scope in reversed(scopes):
         names = scope.get(sequence)
         if isinstance(names, list):
-            if name not in names:
-                raise FieldError(BAD_NOT_FOUND, f"{address.text}: the sequence {sequence!r} does not contain {name!r}")
-            return names.index(name)
+            try:
+                return names.index(name)
+            except ValueError:
+                raise FieldError(
+                    BAD_NOT_FOUND, f"{address.text}: the sequence {sequence!r} does not contain {name!r}"
+                ) from None
     raise FieldError(BAD_NOT_FOUND, f"{address.text}: the message has no sequence {sequence!r}")

@@ -33,6 +33,8 @@ class ValueConverter:
         if base not in (*_REALS, *_TEXTS, *model.INTEGERS, "BOOL"):
             raise ValueError(f"a {base} cannot be read from ROS: use BOOL, whole numbers, REAL, LREAL or STRING[n]")
         self._register, self._base, self._scale = register, base, register.scale
+        self._is_plain = base in _REALS and register.scale is None and not register.dims
+        """True if a float is the register's value as it is."""
         self.kind = kind
         if kind is None:
             return
@@ -58,6 +60,8 @@ class ValueConverter:
             ValueRangeError: The register cannot hold the value.
 
         """
+        if self._is_plain and type(found) is float:
+            return found
         register = self._register
         if not register.dims:
             return self._element(found)
