@@ -30,6 +30,8 @@ from shmio.connectors.mqtt.options import MqttOptions
 from shmio.errors import ConnectorError
 from shmio.logs import printable
 
+RECEIVE_BYTES: Final = 1 << 15
+"""Number of bytes to receive from the socket at once."""
 MAX_PACKET_BYTES: Final = (1 << 24) + (1 << 17)
 """Largest packet accepted; a larger one ends the connection.
 
@@ -91,6 +93,8 @@ class _Client(Client):
         """
         self._pinging = threading.Lock()
         self._last_mid = after
+        self._received, self._taken = b"", 0
+        """What was received from the socket at once, and how many of these bytes paho has taken."""
 
     @property
     def last_number(self) -> int:
@@ -116,11 +120,26 @@ class _Client(Client):
         if bufsize > MAX_PACKET_BYTES:
             self.violation = f"it sent a packet of {bufsize} bytes, more than the {MAX_PACKET_BYTES} that are accepted"
             raise ConnectionAbortedError(self.violation)
-        try:
-            return super()._sock_recv(bufsize)
-        except ssl.SSLError as error:  # with TLS 1.3 a broker rejects our certificate only after the handshake
-            self.tls_error = error
-            raise
+        if self._taken == len(self._received):  # paho asks for a byte or two at a time, each with a system call
+            try:
+                self._received = super()._sock_recv(max(bufsize, RECEIVE_BYTES))
+            except ssl.SSLError as error:  # with TLS 1.3 a broker rejects our certificate only after the handshake
+                self.tls_error = error
+                raise
+            self._taken = 0
+        taken = self._received[self._taken : self._taken + bufsize]
+        self._taken += len(taken)
+        return taken
+
+    def turn(self, timeout_s: float) -> bool:
+        """Wait for the socket, and handle all packets that are received at once.
+
+        Return whether the connection still exists.
+        """
+        code = self.loop(timeout_s)
+        while code == MQTTErrorCode.MQTT_ERR_SUCCESS and self._taken < len(self._received):
+            code = self.loop_read()
+        return code == MQTTErrorCode.MQTT_ERR_SUCCESS
 
     def _handle_publish(self) -> MQTTErrorCode:
         if self._in_packet["command"] & 0x06 == 0x04:  # paho would store such messages without a limit
@@ -488,7 +507,7 @@ class Link:
     def _run(self, client: _Client) -> None:
         why = ""
         try:
-            while not self._closing and client.loop(_TURN_S) == MQTTErrorCode.MQTT_ERR_SUCCESS:
+            while not self._closing and client.turn(_TURN_S):
                 pass
         except Exception as error:  # noqa: BLE001  paho raises errors of all kinds for wrong packets
             why = (

@@ -176,16 +176,18 @@ class Store:
         with self._changed:
             self._order += 1
             message = Message(payload, retained, self._order, time.monotonic_ns(), time.time_ns())
-            for watch in self._watched.get(topic, ()):
-                watch.take(message)
+            if topic in self._watched:
+                for watch in self._watched[topic]:
+                    watch.take(message)
                 self._all_changed = True
             if (found := self._topics.get(topic)) is not None:
                 found.message = message
-                self._changed_groups.update(dict.fromkeys(self._of_origin[id(found)]))
+                for group in self._of_origin[id(found)]:
+                    self._changed_groups[group] = None
             elif topic.startswith(_SPARKPLUG):
                 self.host.take(message, topic)
                 self._all_changed = True  # a node's message may concern all of its devices
-            if self._expected.get(topic) == payload:
+            if self._expected and self._expected.get(topic) == payload:
                 del self._expected[topic]
             self._changed.notify_all()
 
