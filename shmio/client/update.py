@@ -113,6 +113,8 @@ class Update:
         quality, reason = self.quality_of(found.path)
         status = self.table.status(place)
         source_ns = (status.source_ns if status else 0) or self.source_ns
+        if status is not None and status.waits and not self.table.injected[place]:
+            value, source_ns = None, 0
         return Reading(
             self.source,
             register or found,
@@ -120,7 +122,7 @@ class Update:
             quality,
             reason,
             str(self.provenance_of(found.path)),
-            source_ns / 1e9 if self.source_ns else None,
+            source_ns / 1e9 if source_ns and self.source_ns else None,
             round(self.age_ns / 1e9, 6) if self.age_ns or quality is not Quality.BAD else None,
         )
 

@@ -135,14 +135,17 @@ def reading(block: Block, register: Register, frame: Frame | None, *, aged: bool
     now_ns = block.now_ns()
     quality, reason = frame.assess(block.stale_ns, now_ns) if aged else (frame.quality, frame.reason)
     source_ns = frame.source_ns
+    is_injected = injected(block, (register,), frame)
     value = codec(register, block.layout.byte_order).decode(frame.image) if source_ns else None
     if source_ns and (status := status_of(block, register, frame)) is not None:
         quality, reason = worse(quality, reason, status)
         source_ns = status.source_ns or source_ns
+        if status.waits and not is_injected:
+            value, source_ns = None, 0
     if quality is not Quality.BAD and holds_none(value):
         quality, reason = Quality.BAD, f"the bytes are not a valid {register.type}"
     source_time = source_ns / 1e9 if source_ns else None
-    provenance = Provenance.INJECTED if injected(block, (register,), frame) else frame.provenance
+    provenance = Provenance.INJECTED if is_injected else frame.provenance
     age_s = round(frame.age_ns(now_ns) / 1e9, 6)
     return Reading(block.source, register, value, quality, reason, str(provenance), source_time, age_s)
 

@@ -44,6 +44,8 @@ BAD_NOT_CONNECTED: Final = 0x808A0000
 BAD_DEVICE_FAILURE: Final = 0x808B0000
 BAD_NO_DATA: Final = 0x809B0000
 
+_NAMED: Final = 0xFFFF0000
+"""The half of a code that its name stands for; the other half has flags."""
 _NAMES: Final = {  # those codes of OPC 10000-6, annex A.2, that data sources use
     0x00000000: "Good",
     0x002D0000: "GoodSubscriptionTransferred",
@@ -203,14 +205,21 @@ class RegisterStatus(NamedTuple):
         return quality_of(self.code)
 
     @property
+    def waits(self) -> bool:
+        """True if the register has had no value yet, so that its bytes in the image mean nothing."""
+        return self.code & _NAMED == BAD_WAITING_FOR_INITIAL_DATA and not self.source_ns
+
+    @property
     def reason(self) -> str:
         """Reason why the quality is not good; empty if it is."""
+        if self.waits:
+            return f"no data yet ({_NAMES[BAD_WAITING_FOR_INITIAL_DATA]})"
         return "" if self.quality is Quality.GOOD else f"the device reports {describe(self.code)}"
 
 
 def describe(code: int) -> str:
     """Return a status code as text: its name if it is known, and its number."""
-    name = _NAMES.get(code & 0xFFFF0000)  # the low half has flags
+    name = _NAMES.get(code & _NAMED)
     return f"{name} (0x{code:08X})" if name else f"status 0x{code:08X}"
 
 

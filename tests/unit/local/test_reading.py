@@ -5,10 +5,16 @@ from __future__ import annotations
 import pytest
 
 import shmio
+from shmio.connectors.register_image import RegisterImage
 from shmio.errors import QualityError
-from shmio.model.statuses import BAD_NODE_ID_UNKNOWN, UNCERTAIN_LAST_USABLE_VALUE, RegisterStatus
+from shmio.model.statuses import (
+    BAD_NODE_ID_UNKNOWN,
+    BAD_WAITING_FOR_INITIAL_DATA,
+    UNCERTAIN_LAST_USABLE_VALUE,
+    RegisterStatus,
+)
 from shmio.model.values import Quality
-from tests.unit.statuses import COUNT, ROW, SOURCE_NS, SPEED, first_image, plant
+from tests.unit.statuses import COUNT, LAYOUT, ROW, SOURCE_NS, SPEED, first_image, plant
 
 UNKNOWN = "the device reports BadNodeIdUnknown (0x80340000)"
 
@@ -28,6 +34,19 @@ def test_one_bad_register_leaves_the_others_good(instance: str) -> None:
         assert cell.read("row/2").quality is Quality.UNCERTAIN
         assert cell.frame().status("speed") == RegisterStatus(BAD_NODE_ID_UNKNOWN, SOURCE_NS + 9)
         assert cell.frame().quality is Quality.GOOD
+
+
+def test_a_register_without_a_value_yet_says_so_instead_of_showing_one(instance: str) -> None:
+    image = RegisterImage(LAYOUT)
+    with plant(instance) as (_, writer), shmio.attach(instance) as cell:
+        writer.publish(bytes(image), cycle=1)
+        speed = cell.read("speed")
+        assert (speed.value, speed.quality, speed.source_time) == (None, Quality.BAD, None)
+        assert speed.reason.startswith("no data yet")
+        image.put(SPEED, 1.5, SOURCE_NS)
+        image.fail(SPEED, BAD_WAITING_FOR_INITIAL_DATA, SOURCE_NS)  # it had a value
+        writer.publish(bytes(image), cycle=2)
+        assert cell.read("speed").value == 1.5
 
 
 def test_a_bad_source_makes_all_its_registers_bad(instance: str) -> None:

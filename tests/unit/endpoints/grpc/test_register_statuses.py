@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from shmio.client import connect, connect_aio
+from shmio.connectors.register_image import RegisterImage
 from shmio.endpoints.grpc.encoding import Subject, unless_bad
 from shmio.endpoints.grpc.shmio_v1.subscribe import BlockUpdates, EveryFrame, LatestFrame
 from shmio.endpoints.grpc.shmio_v1.tables import Selection
@@ -63,6 +64,20 @@ def test_version_2_reads_null_for_a_bad_register_and_streams_only_good_values(in
         image.put(SPEED, 2.5)
         writer.publish(bytes(image), cycle=2)
         assert await message(stream) == ("plant/speed", 2.5)
+
+    served(instance, test)
+
+
+def test_a_client_of_shmio_v1_sees_that_a_register_has_no_value_yet(instance: str) -> None:
+    async def test(endpoint: Endpoint, writer: BlockWriter) -> None:
+        image = RegisterImage(LAYOUT)
+        image.put(COUNT, 3, SOURCE_NS)
+        writer.publish(bytes(image), cycle=1)
+        async with connect_aio(f"127.0.0.1:{endpoint.port}") as client:
+            speed, count = await client.get("plant/speed", "plant/count")
+            assert (speed.value, speed.quality, speed.source_time) == (None, Quality.BAD, None)
+            assert "no data yet" in speed.reason
+            assert count.value == 3
 
     served(instance, test)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 from shmio.config import MqttTopic
+from shmio.connectors.register_image import RegisterImage
 from shmio.endpoints.mqtt.commands import CommandClient
 from shmio.endpoints.mqtt.feed import follow
 from shmio.endpoints.mqtt.sparkplug.device import Device, DeviceEvent
@@ -35,6 +36,19 @@ def test_a_bad_register_is_an_empty_text_and_json_with_its_reason(instance: str)
         found = json.loads(objects.message().payload)
         assert (found["value"], found["quality"], found["reason"]) == (1.5, "bad", UNKNOWN)
         assert found["source_time"] == SOURCE_NS / 1e9 + 5
+
+
+def test_json_of_a_register_without_a_value_yet_is_null(instance: str) -> None:
+    with plant(instance) as (segment, writer):
+        follower = follow(segment.blocks["plant"])
+        channel = RegisterChannel(follower, LAYOUT.registers[COUNT], "count", MqttTopic("**", payload="json"))
+        writer.publish(bytes(RegisterImage(LAYOUT)), cycle=1)
+        frame = follower.newest()
+        assert frame is not None
+        follower.take(frame)
+        found = json.loads(channel.message().payload)
+        assert (found["value"], found["quality"], found["source_time"]) == (None, "bad", None)
+        assert "no data yet" in found["reason"]
 
 
 def test_a_structure_has_the_quality_of_its_worst_register(instance: str) -> None:
