@@ -33,6 +33,7 @@ class SharedObject:
 
     def __init__(self, name: str, fd: int, *, writable: bool, private: bool = False) -> None:
         self.name = name
+        self._path = DIRECTORY / name
         self.writable = writable
         self._private = private
         self.inode = os.fstat(fd).st_ino
@@ -165,7 +166,7 @@ class SharedObject:
         if self._private:
             return True
         try:
-            return (DIRECTORY / self.name).stat().st_ino == self.inode
+            return self._path.stat().st_ino == self.inode
         except FileNotFoundError:
             return False
 
