@@ -23,13 +23,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from queue import Empty, SimpleQueue
 
-from common import ROOT, machine, table
+from common import ROOT, machine
 
 PORTS = (8080, 8089, 8090, 1102, 1883)
 LIMIT_S = 600.0
 REGISTER = "cell/Robot_800/Axs1_Pos"
 PATIENCE_MS = 60_000
-_ADDRESS = re.compile(r"https?://[^\s,;]+")
+_ADDRESS = re.compile(r"open (https?://\S+)")
 _MOVED = """path => {
   const canvas = document.querySelector(`canvas[aria-label$="${path}"]`);
   const picture = canvas?.toDataURL();
@@ -92,7 +92,7 @@ def _address(lines: SimpleQueue[str | None]) -> str:
             raise SystemExit(f"the demo did not print the page's address. Its output:\n{''.join(seen)}")
         seen.append(line)
         if found := _ADDRESS.search(line):
-            return found[0].rstrip(".")
+            return found[1]
 
 
 def first_command(readme: str) -> str:
@@ -118,13 +118,12 @@ def main() -> None:
     environment = {name: value for name, value in os.environ.items() if name not in ("VIRTUAL_ENV", "PYTHONPATH")}
     if arguments.no_cache:
         environment["PIP_NO_CACHE_DIR"] = "1"
-    rows = []
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place) / "shmio"
         begun_s = time.monotonic()
 
         def done(what: str) -> None:
-            rows.append([what, f"{time.monotonic() - begun_s:.1f}"])
+            print(f"{time.monotonic() - begun_s:6.1f} s  {what}", flush=True)
 
         subprocess.run(["git", "clone", "-q", arguments.repository, folder], check=True)
         done("cloned")
@@ -144,7 +143,6 @@ def main() -> None:
                 page.wait_for_timeout(50)
             done("the plot moves")
             browser.close()
-    table(["since git clone, s", ""], rows)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -54,10 +55,17 @@ def _foreground(file: Path, mode: str, keys: Mapping[str, Any]) -> int:
     say("Ctrl-C stops it, and so does closing the terminal")
     console = logging.StreamHandler(sys.stderr)
     console.setFormatter(_Console())
+    hints = list(_hints(prepared))
+
+    def on_state(state: State) -> None:
+        if state in (State.RUNNING, State.DEGRADED):  # not before: nobody would answer
+            while hints:
+                say(hints.pop(0))
+
     with hold_log_folder(plan.log_dir, plan.instance):
         logs.setup(_log_file(plan), "supervisor", form=plan.log_format)
         logging.getLogger("shmio.supervisor").addHandler(console)
-        Supervisor(plan, replan=_replan(plan, keys)).run()
+        Supervisor(plan, replan=_replan(plan, keys), on_state=on_state).run()
     return 0
 
 
@@ -87,7 +95,10 @@ def _detached(file: Path, mode: str, keys: Mapping[str, Any], report: int) -> in
 
         def on_state(state: State) -> None:
             if state is not State.STOPPING:
-                history, processes = ([*map(printable, lines)] for lines in (supervisor.history, _processes(prepared)))
+                history, processes = (
+                    [*map(printable, lines)]
+                    for lines in (supervisor.history, chain(_processes(prepared), _hints(prepared)))
+                )
                 send(Started(plan.instance, history, processes))
 
         with hold_log_folder(plan.log_dir, plan.instance):
@@ -123,7 +134,11 @@ def _processes(prepared: Prepared) -> Iterator[str]:
     for job in sorted(jobs, key=lambda job: job.rank):
         yield f"  {job.name:<{width}}  {job.kind:<8}  {_describe(job, prepared)}"
     yield from prepared.notes
-    for job in jobs:
+
+
+def _hints(prepared: Prepared) -> Iterator[str]:
+    """Yield what the user can do now that the instance runs."""
+    for job in prepared.plan.jobs:
         if job.name == "web" and Address.parse(job.config["listen"]).host not in ("0.0.0.0", "::"):  # noqa: S104
             yield f"open {_describe(job, prepared)} in a browser to see the cell"
 
