@@ -10,7 +10,17 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from shmio.cli.common import add_json, complete, exit_on_signals, load, milliseconds, run, seconds, seed_number
+from shmio.cli.common import (
+    add_json,
+    at_least,
+    complete,
+    exit_on_signals,
+    load,
+    milliseconds,
+    run,
+    seconds,
+    seed_number,
+)
 from shmio.errors import ConfigError, LayoutError, PathError, ValueRangeError
 from shmio.version import __version__
 
@@ -86,7 +96,41 @@ def _parser() -> argparse.ArgumentParser:
     live.add_argument("--record", type=Path, metavar="FILE.mem", help="record the run to a new file")
     _reports(live)
     add_json(live)
+    _falsify(verb("falsify", "search the ranges of a campaign for values at which an expectation fails"))
     return parser
+
+
+def _falsify(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument("campaign", type=Path, metavar="CAMPAIGN.toml")
+    verb.add_argument("--trials", type=at_least(1), default=200, metavar="N", help="number of trials (default: 200)")
+    verb.add_argument(
+        "-c", dest="config", type=Path, metavar="FILE", help="the supervisor.toml (default: the key config)"
+    )
+    verb.add_argument(
+        "--search",
+        choices=("tpe", "cmaes", "random", "grid"),
+        default="tpe",
+        help="the strategy (default: tpe); tpe and cmaes need optuna",
+    )
+    verb.add_argument("--jobs", type=at_least(1), default=1, metavar="N", help="trials at once (default: 1)")
+    verb.add_argument("--seed", type=seed_number, metavar="N", help="the same seed gives the same trials (default: 0)")
+    verb.add_argument("--all", action="store_true", help="go on after the first failure")
+    verb.add_argument("--resume", action="store_true", help="go on with an interrupted search")
+    verb.add_argument(
+        "-o", dest="output", type=Path, metavar="FOLDER", help="where to store it (default: NAME-falsify)"
+    )
+    _settings(verb)
+    verb.add_argument("--for", dest="for_s", type=seconds, metavar="S", help="duration (default: that of the file)")
+    verb.add_argument(
+        "--step-ms", type=milliseconds, metavar="N", help="length of a step (default: that of the file, or the period)"
+    )
+    verb.add_argument(
+        "--limit", type=seconds, default=60, metavar="S", help="maximum real time of a trial (default: 60 s)"
+    )
+    verb.add_argument(
+        "--shrink", type=at_least(0), default=100, metavar="N", help="runs to shrink a case (default: 100)"
+    )
+    add_json(verb)
 
 
 def _settings(verb: argparse.ArgumentParser) -> None:

@@ -192,6 +192,16 @@ def parse_campaign(tables: dict[str, Any]) -> list[Declaration]:
     return _parse(tables, "injection").injection
 
 
+def campaign_of(tables: dict[str, Any]) -> Campaign:
+    """Return the campaign of tables without ranges.
+
+    Raises:
+        ConfigError: A table is invalid; the message begins with its key.
+
+    """
+    return _parse(tables, "expect")
+
+
 def campaign_text(campaign: Mapping[str, Any], comment: Sequence[str] = ()) -> str:
     """Return the tables of a campaign as TOML.
 

@@ -6,20 +6,16 @@ runs this command.
 
 from __future__ import annotations
 
-import ctypes
 import os
-import signal
 import sys
-from typing import Final
 
-_PR_SET_PDEATHSIG: Final = 1  # prctl(2)
+from shmio.parent import end_with_parent
 
 
 def main() -> None:
     """Replace this process by the program, or exit if the parent has already ended."""
     parent, program = int(sys.argv[1]), sys.argv[2]
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() == parent:
+    if end_with_parent(parent):
         os.execv(program, sys.argv[2:])  # noqa: S606  to run this program is the purpose
 
 

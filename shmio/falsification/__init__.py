@@ -1,0 +1,1 @@
+"""Searches the ranges of a campaign for values at which an expectation fails."""

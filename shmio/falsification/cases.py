@@ -1,0 +1,126 @@
+"""Stores failing cases: a campaign that repeats, its recording and its report, in a folder each."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from shmio.config.campaign import campaign_text
+from shmio.errors import RecordingError
+from shmio.falsification.trial import Result
+
+CAMPAIGN: Final = "campaign.toml"
+RECORDING: Final = "run.mem"
+REPORT: Final = "report.html"
+
+
+class Stored(NamedTuple):
+    """A stored case.
+
+    Attributes:
+        folder: Its folder.
+        sha256: Digest of what its recording contains.
+        problem: Why it does not repeat; empty if it does.
+
+    """
+
+    folder: Path
+    sha256: str
+    problem: str
+
+
+def tables_for(tables: dict[str, Any], campaign: Path, config: Path, folder: Path) -> dict[str, Any]:
+    """Return tables for a campaign file in ``folder``: paths are relative to it.
+
+    Args:
+        tables: The tables of a campaign.
+        campaign: The file from which they come.
+        config: The ``supervisor.toml``.
+        folder: The new file's folder.
+
+    """
+
+    def relative(path: Path) -> str:
+        return os.path.relpath(path.resolve(), folder.resolve())
+
+    expect = [
+        {**one, "like": relative(campaign.parent / one["like"])} if "like" in one else one for one in tables["expect"]
+    ]
+    return {"config": "", **tables} | {"config": relative(config), "expect": expect}
+
+
+def store(
+    folder: Path, name: str, tables: dict[str, Any], result: Result, comment: Sequence[str], limit_s: float
+) -> Stored:
+    """Store a case, and run it twice from its file, each time in a new process.
+
+    Args:
+        folder: Folder of the search.
+        name: Name of the case's folder.
+        tables: The campaign, from :func:`tables_for`.
+        result: The result that it had in the search.
+        comment: Lines about it for the file.
+        limit_s: Maximum duration of a run in s.
+
+    Raises:
+        RecordingError: A file cannot be written, or the campaign does not run.
+
+    """
+    place = folder / name
+    file, recording = place / CAMPAIGN, place / RECORDING
+    try:
+        shutil.rmtree(place, ignore_errors=True)  # from a search that was killed
+        place.mkdir()
+        file.write_text(campaign_text(tables, comment))
+        first = _run(file, limit_s, "--record", recording)
+        recording.unlink()
+        sha256 = first.get("contents_sha256", "")
+        repeat = shlex.join(["shmio-campaign", "run", str(file), "--lab"])
+        about = [*comment, f"Repeat it: {repeat}", f"Contents of {RECORDING}: sha256 {sha256}"]
+        file.write_text(campaign_text(tables, about))
+        second = _run(file, limit_s, "--record", recording, "--report", place / REPORT)
+    except OSError as error:
+        shutil.rmtree(place, ignore_errors=True)
+        raise RecordingError(
+            f"{error.filename or place}: {error.strerror}: the case is not stored; make room, and go on with --resume"
+        ) from None
+    except RecordingError:
+        shutil.rmtree(place, ignore_errors=True)
+        raise
+    problem = ""
+    if _seen(first) != _wanted(result) or second.get("contents_sha256") != sha256:
+        problem = (
+            "it does not repeat: its runs differ. Does a model have a state outside its object, "
+            "another clock, or randomness of its own?"
+        )
+    return Stored(place, sha256, problem)
+
+
+def _run(file: Path, limit_s: float, *options: str | Path) -> dict[str, Any]:
+    command = [sys.executable, "-m", "shmio.cli.campaign", "run", str(file), "--lab", "--json", *map(str, options)]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=limit_s + 10, check=False)
+    except subprocess.TimeoutExpired:
+        raise RecordingError(f"{file}: it took longer than {limit_s:g} s (--limit)") from None
+    try:
+        found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    except (ValueError, IndexError):
+        found = {"error": f"its process ended with status {done.returncode}"}
+    if "verdicts" not in found:
+        raise RecordingError(f"{file}: the case is not stored, because it does not run: {found.get('error')}")
+    return found
+
+
+def _seen(run: dict[str, Any]) -> list[tuple[str, str, float | None]]:
+    return [(one["name"], one["outcome"], one["moment_s"]) for one in run["verdicts"]]
+
+
+def _wanted(result: Result) -> list[tuple[str, str, float | None]]:
+    return [(one.name, str(one.outcome), one.moment_s) for one in result.expectations]

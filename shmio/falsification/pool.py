@@ -1,0 +1,145 @@
+"""Runs trials in processes of their own, several at once."""
+
+from __future__ import annotations
+
+import os
+import selectors
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Final, Self, cast
+
+import msgspec
+
+from shmio.falsification.trial import Result, Task
+
+READ_BYTES: Final = 1 << 16
+MAX_LINE_BYTES: Final = 1 << 24
+"""Maximum size of an answer."""
+END_S: Final = 5.0
+"""Maximum time in s that an idle process may take to end."""
+
+
+@dataclass
+class _Process:
+    """A process, and the trial that it runs."""
+
+    popen: subprocess.Popen[bytes]
+    stdin: IO[bytes]
+    stdout: IO[bytes]
+    task: Task | None = None
+    since_s: float = 0.0
+    answer: bytearray = field(default_factory=bytearray)
+
+
+class Pool:
+    """A number of processes. A process that ends or takes too long is replaced for the next trial."""
+
+    def __init__(self, config: Path, folder: Path, jobs: int, limit_s: float) -> None:
+        """Create the pool. Processes start when they are needed.
+
+        Args:
+            config: The ``supervisor.toml``.
+            folder: Folder of the campaign file.
+            jobs: Maximum number of trials at once.
+            limit_s: Maximum duration of a trial, in s of real time.
+
+        """
+        self.jobs = jobs
+        self._config, self._folder, self._limit_s = config, folder, limit_s
+        self._processes: list[_Process] = []
+        self._selector = selectors.DefaultSelector()
+
+    @property
+    def idle(self) -> int:
+        """How many more trials can be submitted."""
+        return self.jobs - sum(one.task is not None for one in self._processes)
+
+    def submit(self, task: Task) -> None:
+        """Start a trial. There must be an idle process."""
+        one = next((one for one in self._processes if one.task is None), None) or self._start()
+        one.task, one.since_s = task, time.monotonic()
+        one.answer.clear()
+        with suppress(BrokenPipeError):  # wait() finds that it has ended
+            one.stdin.write(msgspec.json.encode(task) + b"\n")
+            one.stdin.flush()
+
+    def wait(self, timeout_s: float) -> list[Result]:
+        """Wait for results, at most for a time in s. Return those that there are."""
+        now_s = time.monotonic()
+        ends_s = [one.since_s + self._limit_s for one in self._processes if one.task is not None]
+        ready = self._selector.select(max(0.0, min([timeout_s, *(end_s - now_s for end_s in ends_s)])))
+        found = [result for key, _ in ready if (result := self._read(key.data)) is not None]
+        for one in list(self._processes):
+            if one.task is not None and time.monotonic() - one.since_s >= self._limit_s:
+                number = one.task.number
+                self._end(one)
+                found.append(Result(number, "error", reason=f"it took longer than {self._limit_s:g} s (--limit)"))
+        return found
+
+    def run(self, task: Task) -> Result:
+        """Run a trial, and wait for its result. No other trial may run."""
+        self.submit(task)
+        while True:
+            for result in self.wait(self._limit_s):
+                return result
+
+    def cancel(self) -> None:
+        """End the trials that are running, without results."""
+        for one in list(self._processes):
+            if one.task is not None:
+                self._end(one)
+
+    def _start(self) -> _Process:
+        command = [sys.executable, "-m", "shmio.falsification.worker", str(os.getpid()), str(self._config)]
+        popen = subprocess.Popen(
+            [*command, str(self._folder)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+        )
+        one = _Process(popen, cast("IO[bytes]", popen.stdin), cast("IO[bytes]", popen.stdout))
+        self._selector.register(one.stdout, selectors.EVENT_READ, one)
+        self._processes.append(one)
+        return one
+
+    def _read(self, one: _Process) -> Result | None:
+        data = os.read(one.stdout.fileno(), READ_BYTES)
+        one.answer += data
+        if data and not one.answer.endswith(b"\n") and len(one.answer) < MAX_LINE_BYTES:
+            return None
+        task, one.task = one.task, None
+        try:
+            result = msgspec.json.decode(one.answer, type=Result)
+        except msgspec.DecodeError:
+            result = None
+        if result is None or not data:
+            ended = self._end(one)
+            result = None if task is None else Result(task.number, "error", reason=f"its process {ended}")
+        return result
+
+    def _end(self, one: _Process) -> str:
+        """End a process at once, and return how it ended."""
+        self._processes.remove(one)
+        self._selector.unregister(one.stdout)
+        with suppress(BrokenPipeError):
+            one.stdin.close()
+        one.stdout.close()
+        try:
+            status = one.popen.wait(0 if one.task is not None else END_S)
+        except subprocess.TimeoutExpired:
+            one.popen.kill()
+            status = one.popen.wait()
+        return f"was ended by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for one in list(self._processes):
+            self._end(one)
+        self._selector.close()

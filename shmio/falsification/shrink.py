@@ -1,0 +1,152 @@
+"""Makes a failing case simpler, as long as the same expectation fails."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+from shmio.config.campaign import campaign_of
+from shmio.config.ranges import Dimension, Range, Space
+from shmio.errors import ConfigError
+from shmio.falsification.trial import Result
+
+HALVINGS: Final = 4
+"""How often the way from a value to a simpler one is halved."""
+DIGITS: Final = (1, 2, 3, 4)
+"""Numbers of digits to which a number may be rounded."""
+ROUNDS: Final = 2
+
+
+@dataclass(frozen=True)
+class Case:
+    """A campaign at a point, with fewer injections and a shorter time.
+
+    Attributes:
+        point: The value of each dimension.
+        duration_s: Duration in s.
+        dropped: Indices of the injections that are left out.
+
+    """
+
+    point: dict[str, Any]
+    duration_s: float
+    dropped: frozenset[int] = frozenset()
+
+    def tables(self, space: Space) -> dict[str, Any]:
+        """Return the campaign's tables."""
+        tables = space.at(self.point)
+        kept = [table for index, table in enumerate(tables.get("injection", [])) if index not in self.dropped]
+        return {**tables, "duration_s": self.duration_s, "injection": kept}
+
+
+class Shrinker:
+    """Tries simpler cases, in a fixed order, up to a number of runs."""
+
+    def __init__(
+        self, space: Space, step_s: float, runs: int, try_out: Callable[[dict[str, Any]], Result | None]
+    ) -> None:
+        """Prepare to shrink one case.
+
+        Args:
+            space: The campaign's space.
+            step_s: Length of a step in s.
+            runs: Maximum number of runs.
+            try_out: Runs a campaign; None if the user wants to stop.
+
+        """
+        self._space, self._step_s, self._try_out = space, step_s, try_out
+        self._left = runs
+        self.runs = 0
+        """Number of runs."""
+        self.stopped = False
+        """Whether the user wants to stop."""
+
+    def shrink(self, case: Case, result: Result) -> tuple[Case, Result]:
+        """Return the simplest case that was found, and its result.
+
+        Args:
+            case: A case that fails.
+            result: Its result.
+
+        """
+        worst = result.worst
+        self._expectation = result.failed[0] if worst is None else worst.name
+        self._case, self._result = case, result
+        for _ in range(ROUNDS):
+            before = self._case
+            self._shorten()
+            for index in range(len(self._space.at({}).get("injection", [])) - 1, -1, -1):
+                if index not in self._case.dropped:
+                    self._try(replace(self._case, dropped=self._case.dropped | {index}))
+            for one in self._space.dimensions:
+                if one.place[0] != "injection" or one.place[1] not in self._case.dropped:
+                    self._simplify(one)
+            self._shorten()
+            if self._case == before:
+                break
+        return self._case, self._result
+
+    def _try(self, case: Case) -> bool:
+        """Take a case over if it fails, too. Return whether it does."""
+        if self._left <= 0 or self.stopped or case == self._case:
+            return False
+        tables = case.tables(self._space)
+        try:
+            campaign_of(tables)
+        except ConfigError:  # such as an end before a start
+            return False
+        result = self._try_out(tables)
+        if result is None:
+            self.stopped = True
+            return False
+        self._left -= 1
+        self.runs += 1
+        if self._expectation not in result.failed:
+            return False
+        self._case, self._result = case, result
+        return True
+
+    def _shorten(self) -> None:
+        """Let the run end soon after the moment of the failure."""
+        moment_s = next((one.moment_s for one in self._result.expectations if one.name == self._expectation), None)
+        least = 1 if moment_s is None else math.ceil(moment_s / self._step_s + 1e-9) + 2
+        low, high = least, round(self._case.duration_s / self._step_s)
+        if low >= high or self._lasting(low):
+            return
+        for _ in range(HALVINGS):
+            middle = (low + high) // 2
+            if middle in (low, high):
+                return
+            low, high = (low, middle) if self._lasting(middle) else (middle, high)
+
+    def _lasting(self, steps: int) -> bool:
+        return self._try(replace(self._case, duration_s=float(f"{steps * self._step_s:.9g}")))
+
+    def _simplify(self, one: Dimension) -> None:
+        """Bring a value as close to the simplest one as possible, and round it."""
+        if self._with(one, one.simplest) or not isinstance(one, Range):
+            return
+        passing, failing = one.simplest, self._case.point[one.name]
+        for _ in range(HALVINGS):
+            middle = one.nearest((passing + failing) / 2)
+            if middle in (passing, failing):
+                break
+            passing, failing = (passing, middle) if self._with(one, middle) else (middle, failing)
+        if one.step is None and not one.whole:
+            for value in _rounded(self._case.point[one.name]):
+                if one.nearest(value) == value and self._with(one, value):
+                    return
+
+    def _with(self, one: Dimension, value: Any) -> bool:
+        return self._try(replace(self._case, point={**self._case.point, one.name: value}))
+
+
+def _rounded(value: float) -> Iterator[float]:
+    """Yield a number with fewer digits, the fewest first."""
+    for digits in DIGITS:
+        found = float(f"{value:.{digits}g}")
+        if found == value:
+            return
+        yield found

@@ -1,0 +1,154 @@
+"""One trial: a campaign without ranges, run in a laboratory, and what came out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from math import isfinite
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import msgspec
+
+from shmio.campaigns.live import Plan
+from shmio.config.campaign import campaign_of
+from shmio.errors import ConfigError, DeclarationError, LayoutError, ShmioError
+from shmio.judging.verdict import Outcome, Verdict
+from shmio.lab import Laboratory
+from shmio.plan.processes import Plan as InstancePlan
+from shmio.simulation.model import explain
+
+LIMIT: Final = 1e300
+"""Robustness beyond this counts as this much, because an optimiser takes no infinity."""
+
+Status = Literal["passed", "failed", "inconclusive", "error", "invalid"]
+
+
+class Task(msgspec.Struct):
+    """A trial to run.
+
+    Attributes:
+        number: Number of the trial.
+        tables: The campaign, without ranges and with all seeds.
+
+    """
+
+    number: int
+    tables: dict[str, Any]
+
+
+class Found(msgspec.Struct):
+    """The verdict on an expectation.
+
+    Attributes:
+        name: Name of the expectation.
+        outcome: The outcome.
+        robustness: The upper bound of its robustness; None if it has no limit.
+        reason: Why it is not passed.
+        moment_s: First moment at which it was not met, on the instance's clock.
+
+    """
+
+    name: str
+    outcome: Outcome
+    robustness: float | None
+    reason: str = ""
+    moment_s: float | None = None
+
+
+class Result(msgspec.Struct):
+    """What came out of a trial.
+
+    Attributes:
+        number: Number of the trial.
+        status: ``failed`` if an expectation failed; else ``error`` if the run did not come to its
+            end, ``invalid`` if the values make no valid campaign, ``inconclusive`` if an
+            expectation is, and ``passed`` if all passed.
+        expectations: The verdicts; empty if there was no run.
+        reason: Why there was no run, or why it ended early.
+        simulated_s: Simulated time in s.
+        taken_s: Duration of the trial in s.
+
+    """
+
+    number: int
+    status: Status
+    expectations: list[Found] = []
+    reason: str = ""
+    simulated_s: float = 0.0
+    taken_s: float = 0.0
+
+    @property
+    def robustness(self) -> float | None:
+        """What the search minimises: the least robustness of all expectations. Below 0: one failed.
+
+        The robustness of an expectation is the greatest that is possible, whatever unknown values
+        were: an inconclusive one is never below 0. None if there is nothing to minimise.
+        """
+        if self.status in ("error", "invalid"):
+            return None
+        known = [one.robustness for one in self.expectations if one.robustness is not None]
+        return min(known, default=None)
+
+    @property
+    def worst(self) -> Found | None:
+        """The expectation with the least robustness; None if there is none."""
+        known = [one for one in self.expectations if one.robustness is not None]
+        return min(known, key=lambda one: one.robustness or 0.0, default=None)
+
+    @property
+    def failed(self) -> list[str]:
+        """Names of the expectations that failed."""
+        return [one.name for one in self.expectations if one.outcome is Outcome.FAILED]
+
+
+def run_trial(instance: InstancePlan, folder: Path, task: Task) -> Result:
+    """Run a trial in this process.
+
+    Args:
+        instance: The plan of the instance.
+        folder: Folder of the campaign file.
+        task: The trial.
+
+    Returns:
+        The result. It describes all errors, too.
+
+    """
+    begun_s = time.monotonic()
+    expectations: list[Found] = []
+    simulated_s, reason = 0.0, ""
+    status: Status
+    try:
+        campaign = campaign_of(task.tables)
+        step_s = None if campaign.step_ms is None else campaign.step_ms / 1000
+        plan = Plan(campaign.injection, campaign.expect, campaign.duration_s or 0.0, folder, step_s)
+        with Laboratory(instance, campaign.parameters) as lab:
+            work = lab.run(plan)
+            simulated_s = lab.page.present_ns() / 1e9
+        expectations = [_found(verdict) for verdict in work.judge.verdicts]
+        status = _status(expectations, problem=work.problem)
+        reason = "" if work.problem is None else str(work.problem)
+    except (ConfigError, DeclarationError, LayoutError) as error:
+        status, reason = "invalid", str(error)
+    except ShmioError as error:
+        status, reason = "error", str(error)
+    except Exception as error:  # noqa: BLE001  a model can raise anything
+        status, reason = "error", explain(error, "")
+    taken_s = time.monotonic() - begun_s
+    return Result(task.number, status, expectations, reason, simulated_s, taken_s)
+
+
+def _found(verdict: Verdict) -> Found:
+    high = verdict.high
+    robustness = None if high == float("inf") else max(-LIMIT, min(high, LIMIT)) if isfinite(high) else -LIMIT
+    moment_s = None if verdict.moment_ns is None else verdict.moment_ns / 1e9
+    return Found(verdict.expectation.name, verdict.outcome, robustness, verdict.reason, moment_s)
+
+
+def _status(expectations: Sequence[Found], problem: ShmioError | None) -> Status:
+    outcomes = {one.outcome for one in expectations}
+    if Outcome.FAILED in outcomes:
+        return "failed"
+    if problem is not None:
+        return "error"
+    return "inconclusive" if Outcome.INCONCLUSIVE in outcomes else "passed"

@@ -1,0 +1,38 @@
+"""A process that runs trials, one after another: one line of JSON in and one out for each.
+
+A model that crashes or hangs takes only this process with it.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from pathlib import Path
+
+import msgspec
+
+from shmio.falsification.trial import Task, run_trial
+from shmio.lab import prepare_laboratory
+from shmio.parent import end_with_parent
+
+
+def main() -> None:
+    """Run the trials of the parent until it closes standard input.
+
+    The arguments are the parent's process id, the configuration, and the campaign's folder.
+    """
+    if not end_with_parent(int(sys.argv[1])):
+        return
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, too, which decides
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what models print must not get into the answers
+    instance, folder = prepare_laboratory(Path(sys.argv[2])), Path(sys.argv[3])
+    for line in sys.stdin.buffer:
+        result = run_trial(instance, folder, msgspec.json.decode(line, type=Task))
+        answers.write(msgspec.json.encode(result) + b"\n")
+        answers.flush()
+
+
+if __name__ == "__main__":
+    main()
