@@ -68,6 +68,7 @@ START_PROCESSES = (
     "tests/unit/endpoints/mqtt/broker/",
     "tests/unit/endpoints/web/test_uploads.py",
     "tests/unit/endpoints/web/test_dropped.py::test_page_",
+    "tests/unit/falsification/test_pool.py",
     "tests/unit/lab/",
     "tests/unit/plan/test_emulated_programs.py",
     "tests/unit/plan/test_sources_models.py",

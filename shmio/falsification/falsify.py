@@ -8,6 +8,7 @@ but never on how long they take.
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -115,6 +116,8 @@ class Falsifier:
         self._space, self._search, self._pool, self._journal, self._over = space, search, pool, journal, over
         self._duration_s, self._step_s, self._shrink_runs = duration_s, step_s, shrink_runs
         self.tally = Tally()
+        self.shrinking_s = 0.0
+        """Time in s that it took to shrink and store cases."""
         self._points: dict[int, Point] = {}  # of trials whose results the search has not learned
         self._asked = 0
         self._limit = 0
@@ -209,21 +212,32 @@ class Falsifier:
                 on_trial(point, result, self._learn(result))
                 self._check_beginning(result)
                 if result.status == "failed":
-                    self._pool.cancel()  # the processes are needed to shrink
-                    waiting.update((number, one) for number, one in self._points.items() if number not in ready)
+                    if to_end:  # the processes are needed to shrink
+                        ready |= self._drained()
+                    else:
+                        self._pool.cancel()
                     self.shrink(point, result, on_failure)
                     if not to_end:
                         return
                 waiting.update(self._ask())
 
+    def _drained(self) -> dict[int, Result]:
+        """Wait for the trials that are running, and return their results."""
+        found: dict[int, Result] = {}
+        while self._pool.idle < self._pool.jobs and not self._over.is_set():
+            found |= {result.number: result for result in self._pool.wait(LOOK_S)}
+        return found
+
     def shrink(self, point: Point, result: Result, on_failure: Callable[[Failure], None]) -> None:
         """Shrink a failing trial. If it is interrupted, do nothing."""
         if self._over.is_set():
             return
+        begun_s = time.monotonic()
         shrinker = Shrinker(self._space, self._step_s, self._shrink_runs, self._try_out)
         case, found = shrinker.shrink(Case(dict(point), self._duration_s), result)
         if not shrinker.stopped:
             on_failure(Failure(result.number, case, found, shrinker.runs))
+        self.shrinking_s += time.monotonic() - begun_s
 
     def _try_out(self, tables: dict[str, Any]) -> Result | None:
         self._pool.submit(Task(0, tables))

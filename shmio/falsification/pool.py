@@ -20,19 +20,22 @@ from shmio.falsification.trial import Result, Task
 READ_BYTES: Final = 1 << 16
 MAX_LINE_BYTES: Final = 1 << 24
 """Maximum size of an answer."""
+START_S: Final = 120.0
+"""Maximum time in s that a process may take to start, which does not count as a part of its first trial."""
 END_S: Final = 5.0
 """Maximum time in s that an idle process may take to end."""
 
 
 @dataclass
 class _Process:
-    """A process, and the trial that it runs."""
+    """A process, and the trial that it runs. It is ready when it has said so, with an empty line."""
 
     popen: subprocess.Popen[bytes]
     stdin: IO[bytes]
     stdout: IO[bytes]
     task: Task | None = None
     since_s: float = 0.0
+    ready: bool = False
     answer: bytearray = field(default_factory=bytearray)
 
 
@@ -70,23 +73,27 @@ class Pool:
 
     def wait(self, timeout_s: float) -> list[Result]:
         """Wait for results, at most for a time in s. Return those that there are."""
-        now_s = time.monotonic()
-        ends_s = [one.since_s + self._limit_s for one in self._processes if one.task is not None]
-        ready = self._selector.select(max(0.0, min([timeout_s, *(end_s - now_s for end_s in ends_s)])))
+        left_s = [self._left_s(one) for one in self._processes if one.task is not None]
+        ready = self._selector.select(max(0.0, min([timeout_s, *left_s])))
         found = [result for key, _ in ready if (result := self._read(key.data)) is not None]
         for one in list(self._processes):
-            if one.task is not None and time.monotonic() - one.since_s >= self._limit_s:
+            if one.task is not None and self._left_s(one) <= 0:
                 number = one.task.number
+                why = f"it took longer than {self._limit_s:g} s (--limit)" if one.ready else "its process did not start"
                 self._end(one)
-                found.append(Result(number, "error", reason=f"it took longer than {self._limit_s:g} s (--limit)"))
+                found.append(Result(number, "error", reason=why))
         return found
+
+    def _left_s(self, one: _Process) -> float:
+        """Return the time in s after which a process takes too long."""
+        return one.since_s + (self._limit_s if one.ready else START_S) - time.monotonic()
 
     def run(self, task: Task) -> Result:
         """Run a trial, and wait for its result. No other trial may run."""
         self.submit(task)
-        while True:
-            for result in self.wait(self._limit_s):
-                return result
+        while not (found := self.wait(self._limit_s)):
+            pass
+        return found[0]
 
     def cancel(self) -> None:
         """End the trials that are running, without results."""
@@ -112,7 +119,11 @@ class Pool:
         one.answer += data
         if data and not one.answer.endswith(b"\n") and len(one.answer) < MAX_LINE_BYTES:
             return None
-        task, one.task = one.task, None
+        if one.answer == b"\n":
+            one.ready, one.since_s = True, time.monotonic()
+            one.answer.clear()
+            return None
+        task, one.task, one.ready = one.task, None, True
         try:
             result = msgspec.json.decode(one.answer, type=Result)
         except msgspec.DecodeError:

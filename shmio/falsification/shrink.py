@@ -80,9 +80,15 @@ class Shrinker:
             for index in range(len(self._space.at({}).get("injection", [])) - 1, -1, -1):
                 if index not in self._case.dropped:
                     self._try(replace(self._case, dropped=self._case.dropped | {index}))
-            for one in self._space.dimensions:
-                if one.place[0] != "injection" or one.place[1] not in self._case.dropped:
-                    self._simplify(one)
+            kept = [
+                one
+                for one in self._space.dimensions
+                if one.place[0] != "injection" or one.place[1] not in self._case.dropped
+            ]
+            for key in ("start_s", "delay_ms"):
+                self._earlier([one for one in kept if isinstance(one, Range) and one.place[-1] == key])
+            for one in kept:
+                self._simplify(one)
             self._shorten()
             if self._case == before:
                 break
@@ -138,6 +144,23 @@ class Shrinker:
             for value in _rounded(self._case.point[one.name]):
                 if one.nearest(value) == value and self._with(one, value):
                     return
+
+    def _earlier(self, times: list[Range]) -> None:
+        """Move several times to earlier ones by the same amount, so that the times between them stay."""
+        if len(times) < 2:
+            return
+        before = self._case.point
+        fails, passes = 0.0, min(before[one.name] - one.low for one in times)
+        amount = passes
+        for _ in range(HALVINGS):
+            point = {one.name: one.nearest(before[one.name] - amount) for one in times}
+            if not self._try(replace(self._case, point={**self._case.point, **point})):
+                passes = amount
+            elif amount == passes:
+                return
+            else:
+                fails = amount
+            amount = (fails + passes) / 2
 
     def _with(self, one: Dimension, value: Any) -> bool:
         return self._try(replace(self._case, point={**self._case.point, one.name: value}))

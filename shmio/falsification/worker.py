@@ -1,6 +1,7 @@
 """A process that runs trials, one after another: one line of JSON in and one out for each.
 
-A model that crashes or hangs takes only this process with it.
+It begins with an empty line, which says that it is ready. A model that crashes or hangs takes only
+this process with it.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ def main() -> None:
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what models print must not get into the answers
     instance, folder = prepare_laboratory(Path(sys.argv[2])), Path(sys.argv[3])
+    answers.write(b"\n")  # it is ready
+    answers.flush()
     for line in sys.stdin.buffer:
         result = run_trial(instance, folder, msgspec.json.decode(line, type=Task))
         answers.write(msgspec.json.encode(result) + b"\n")

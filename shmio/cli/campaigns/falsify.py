@@ -125,8 +125,7 @@ class _Command:
                 self._space, search, pool, self._journal, self._over,
                 duration_s=self._duration_s, step_s=self._step_s, shrink_runs=arguments.shrink,
             )  # fmt: skip
-            self._tally = falsifier.tally
-            begun_s = time.monotonic()
+            self._falsifier, self._tally = falsifier, falsifier.tally
             try:
                 if arguments.resume:
                     self._resume(falsifier, trials)
@@ -135,7 +134,7 @@ class _Command:
                     falsifier.run(trials, self._on_trial, self._on_failure, to_end=arguments.all)
             finally:
                 self._progress.clear()
-        return self._finish(time.monotonic() - begun_s)
+        return self._finish()
 
     def _files(self) -> dict[str, str]:
         """Return the digests of what else the trials depend on."""
@@ -170,7 +169,7 @@ class _Command:
             say(f"the ranges have only {size:.0f} points: --search grid tries each of them once", sys.stderr)
 
     def _on_trial(self, _point: Point, _result: Result, best: bool) -> None:
-        self._progress.at(self._tally, best=best)
+        self._progress.at(self._falsifier, best=best)
 
     def _on_failure(self, failure: Failure) -> None:
         """Store a shrunk case, unless it is stored already."""
@@ -200,14 +199,14 @@ class _Command:
         self._journal.add(line)
         self._cases.append(line)
 
-    def _finish(self, taken_s: float) -> int:
+    def _finish(self) -> int:
         """Print the summary, and return the exit status."""
         tally, arguments = self._tally, self._arguments
         best, unclear = tally.best, tally.unclear
         interrupted = self._over.is_set()
         status = FAILED if tally.failed else UNDECIDED if unclear is not None or interrupted else 0
         folders = [str(self._output / case) for case in dict.fromkeys(line.case for line in self._cases) if case]
-        speed, factor = self._progress.speed(tally)
+        speed, factor = self._progress.speed(self._falsifier)
         if arguments.json:
             say_json({
                 "trials": tally.done, "outcomes": tally.counts, "cases": folders, "interrupted": interrupted,
@@ -221,7 +220,7 @@ class _Command:
             })  # fmt: skip
             return status
         counts = ", ".join(f"{count} {name}" for name, count in tally.counts.items()) or "none"
-        say(f"{tally.done} trials in {taken_s:.1f} s: {counts}")
+        say(f"{tally.done} trials, {speed:.1f}/s, {factor:.0f} times real time: {counts}")
         if best is not None:
             values = ", ".join(f"{name} = {_short(value)}" for name, value in tally.best_point.items())
             of = f" of {best.worst.name}" if best.worst else ""
@@ -260,18 +259,23 @@ class _Progress:
         """Set what had been done before, and begin to measure the time."""
         self._begun_s, self._before, self._simulated_s = time.monotonic(), done, simulated_s
 
-    def speed(self, tally: Any) -> tuple[float, float]:
-        """Return trials a second, and how many times as fast as real time they are."""
-        taken_s = max(time.monotonic() - self._begun_s, 1e-9)
+    def speed(self, falsifier: Falsifier) -> tuple[float, float]:
+        """Return trials a second, and how many times as fast as real time they are.
+
+        The time for shrinking does not count.
+        """
+        tally = falsifier.tally
+        taken_s = max(time.monotonic() - self._begun_s - falsifier.shrinking_s, 1e-9)
         return (tally.done - self._before) / taken_s, (tally.simulated_s - self._simulated_s) / taken_s
 
-    def at(self, tally: Any, *, best: bool) -> None:
+    def at(self, falsifier: Falsifier, *, best: bool) -> None:
         """Show the progress, if it is time to."""
         now_s = time.monotonic()
         if self._silent or (now_s < self._next_s and (self._terminal or not best)):
             return
         self._next_s = now_s + (EACH_S if self._terminal else LINES_S)
-        speed, factor = self.speed(tally)
+        tally = falsifier.tally
+        speed, factor = self.speed(falsifier)
         text = f"{tally.done} of {self._trials} trials, {speed:.1f}/s, {factor:.0f} times real time"
         if tally.best is not None:
             text += f", least robustness {tally.best.robustness:.6g} (trial {tally.best.number})"
