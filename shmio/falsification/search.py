@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import warnings
 from abc import ABC, abstractmethod
 from typing import Any, Final, Literal, get_args
@@ -10,7 +9,8 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 
 from shmio.config.ranges import Choice, Dimension, Point, Space
-from shmio.errors import ConfigError, MissingLibraryError
+from shmio.errors import ConfigError
+from shmio.libraries import library
 
 SearchName = Literal["tpe", "cmaes", "random", "grid"]
 SEARCHES: Final[tuple[SearchName, ...]] = get_args(SearchName)
@@ -18,6 +18,7 @@ MAX_TRIALS: Final = 1_000_000
 """Maximum number of trials of a search."""
 MAX_OPTIMISED: Final = 10_000
 """Maximum number of trials of an optimiser, whose time for a point grows with the points before."""
+REMEDY: Final = "pip install 'shmio[falsify]', or use --search random or grid"
 
 
 class Search(ABC):
@@ -113,14 +114,9 @@ class OptunaSearch(Search):
 
     def __init__(self, space: Space, seed: int, trials: int, jobs: int, name: SearchName) -> None:
         super().__init__(space)
-        try:
-            if name == "cmaes":
-                importlib.import_module("cmaes")  # optuna would import it only after some trials
-            import optuna  # noqa: PLC0415  an extra
-        except ImportError as error:
-            raise MissingLibraryError(
-                f"--search {name} needs {error.name}: pip install 'shmio[falsify]', or use --search random or grid"
-            ) from None
+        if name == "cmaes":
+            library("cmaes", REMEDY)  # optuna would import it only after some trials
+        optuna = library("optuna", REMEDY)
         if trials > MAX_OPTIMISED:
             raise ConfigError(
                 f"--trials {trials}: --search {name} takes at most {MAX_OPTIMISED}; "
