@@ -47,19 +47,20 @@ class Gate(Model):
         """Run a scan of the interlock, and move door and arm."""
         self._sent.append(self.arm_passed)
         arm_passed = self._sent.popleft()  # as the door's controller sees it
-        target = 1.0 if self.valve else 0.0
-        if self.door == target:
+        door, target = float(self.door), 1.0 if self.valve else 0.0
+        if door == target:
             self.door_moves = False
         elif self.door_moves or not arm_passed:
             self.door_moves = True
-            change = min(dt_s / TRAVEL_S, abs(target - self.door))
-            self.door = target if change == abs(target - self.door) else self.door + change * (1 if target else -1)
+            change = dt_s / TRAVEL_S
+            self.door = min(door + change, target) if target > door else max(door - change, target)
         stop = self.door_moves and not self.arm_passed
         wanted = 0.0 if stop else self.arm_speed if self.task else -self.arm_speed
         change = BRAKE_MM_S2 * dt_s
         self._speed += min(max(wanted - self._speed, -change), change)
-        self.arm = min(max(self.arm + self._speed * dt_s, 0.0), END_MM)
-        if self.arm in (0.0, END_MM):
+        arm = min(max(self.arm + self._speed * dt_s, 0.0), END_MM)
+        if arm in (0.0, END_MM):
             self._speed = 0.0
-        self.arm_passed = self.arm > POINT_MM and (self.arm_passed or not stop)
-        self.clearance = max(PATH_MM - self.arm, 0.0) if self.door_moves else PATH_MM
+        self.arm = arm
+        self.arm_passed = arm > POINT_MM and (self.arm_passed or not stop)
+        self.clearance = max(PATH_MM - arm, 0.0) if self.door_moves else PATH_MM
