@@ -117,7 +117,7 @@ class Shrinker:
     def _shorten(self) -> None:
         """Let the run end soon after the moment of the failure."""
         moment_s = next((one.moment_s for one in self._result.expectations if one.name == self._expectation), None)
-        least = 1 if moment_s is None else math.ceil(moment_s / self._step_s + 1e-9) + 2
+        least = 1 if moment_s is None else math.ceil((moment_s - self._result.begin_s) / self._step_s + 1e-9) + 2
         low, high = least, round(self._case.duration_s / self._step_s)
         if low >= high or self._lasting(low):
             return

@@ -66,6 +66,7 @@ class Result(msgspec.Struct):
             expectation is, and ``passed`` if all passed.
         expectations: The verdicts; empty if there was no run.
         reason: Why there was no run, or why it ended early.
+        begin_s: Start of the run on the instance's clock; not 0 if it began in a snapshot.
         simulated_s: Simulated time in s.
         taken_s: Duration of the trial in s.
 
@@ -75,6 +76,7 @@ class Result(msgspec.Struct):
     status: Status
     expectations: list[Found] = []
     reason: str = ""
+    begin_s: float = 0.0
     simulated_s: float = 0.0
     taken_s: float = 0.0
 
@@ -116,15 +118,18 @@ def run_trial(instance: InstancePlan, folder: Path, task: Task) -> Result:
     """
     begun_s = time.monotonic()
     expectations: list[Found] = []
-    simulated_s, reason = 0.0, ""
+    begin_s, simulated_s, reason = 0.0, 0.0, ""
     status: Status
     try:
         campaign = campaign_of(task.tables)
         step_s = None if campaign.step_ms is None else campaign.step_ms / 1000
-        plan = Plan(campaign.injection, campaign.expect, campaign.duration_s or 0.0, folder, step_s)
+        plan = Plan(
+            campaign.injection, campaign.expect, campaign.duration_s or 0.0, folder, step_s, start=campaign.start
+        )
         with Laboratory(instance, campaign.parameters) as lab:
             work = lab.run(plan)
-            simulated_s = lab.page.present_ns() / 1e9
+            begin_s = 0.0 if work.start is None else work.start.time_ns / 1e9
+            simulated_s = lab.page.present_ns() / 1e9 - begin_s
         expectations = [_found(verdict) for verdict in work.judge.verdicts]
         status = _status(expectations, problem=work.problem)
         reason = "" if work.problem is None else str(work.problem)
@@ -135,7 +140,7 @@ def run_trial(instance: InstancePlan, folder: Path, task: Task) -> Result:
     except Exception as error:  # noqa: BLE001  a model can raise anything
         status, reason = "error", explain(error, "")
     taken_s = time.monotonic() - begun_s
-    return Result(task.number, status, expectations, reason, simulated_s, taken_s)
+    return Result(task.number, status, expectations, reason, begin_s, simulated_s, taken_s)
 
 
 def _found(verdict: Verdict) -> Found:

@@ -34,7 +34,8 @@ def test_the_fault_is_in_the_window_alone(tmp_path: Path) -> None:
 
 def test_falsify_finds_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(EXAMPLE)
-    words = ["falsify", "campaign.toml", "--seed", "7", "--trials", "30", "--shrink", "4", "-o", str(tmp_path / "out")]
+    words = ["falsify", "campaign.toml", "--seed", "37", "--trials", "40", "--shrink", "0", "--for", "14"]
+    words += ["--set", "late-task.delay_ms=2500", "--set", "noise.value=0", "-o", str(tmp_path / "out")]
     assert main(words) == 1
     assert "failed: interlock" in capsys.readouterr().out
     assert (tmp_path / "out/case-001/run.mem").exists()

@@ -26,6 +26,7 @@ from shmio.falsification.search import MAX_TRIALS, GridSearch, begin_search
 from shmio.falsification.trial import Result
 from shmio.judging.expectation import check_texts
 from shmio.lab import prepare_laboratory
+from shmio.local.snapshot_file import file_of
 from shmio.logs import printable
 from shmio.plan.processes import Plan
 from shmio.version import __version__
@@ -140,8 +141,10 @@ class _Command:
         """Return the digests of what else the trials depend on."""
         found = [*of_configuration(self._config.resolve())]
         found += of_layouts({block.source: block.layout for block in self._instance.blocks})
-        folder = self._arguments.campaign.resolve().parent
-        for one in self._space.at({})["expect"]:
+        folder, tables = self._arguments.campaign.resolve().parent, self._space.at({})
+        if "start" in tables:
+            found.append(("snapshot", of_file(file_of(self._instance.snapshot_dir, tables["start"]))))
+        for one in tables["expect"]:
             if "like" in one:
                 found.append((f"like {one['like']}", of_file(folder / one["like"])))
         return dict(found)
