@@ -47,11 +47,13 @@ ONE_AFTER_THE_OTHER = (
         "tests/system/test_docs.py",
         "tests/unit/cli/test_supervisor_cell.py::test_configuration_from_init_runs",
     ),
-    # all tests of such a module use one instance
+    # all tests of such a module use one instance or one browser
     ("tests/system/test_inject.py",),
     ("tests/system/test_inject_grpc.py",),
     ("tests/system/test_running.py",),
     ("tests/system/test_step.py",),
+    ("tests/system/test_web_browser.py",),
+    ("tests/system/test_web_page_changes.py",),
     ("tests/system/test_write.py",),
 )
 """Beginnings of the names of tests that share something; one xdist worker runs each group."""

@@ -1,110 +1,97 @@
-"""The web page of a running cell, used by a person with a browser: real Chromium."""
+"""The web page of a running cell, used by a person with a browser. The tests share the cell, and leave it as it was."""
 
 from __future__ import annotations
 
-import base64
 import json
 import os
-import shutil
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import suppress
-from datetime import datetime
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 import shmio
-from shmio.errors import RecordingError
-from shmio.segment import EventKind
-from shmio.testing.cell import CONFIG, Cell, until
+from shmio.testing.cell import Cell, until
 from shmio.testing.ports import reserved_port
-from tests.system.page import printed
+from tests.system.browser import (
+    AXIS,
+    CHROMIUM,
+    HOSTILE,
+    keep,
+    open_tab,
+    opened_browser,
+    opened_page,
+    reading,
+    start_cell,
+)
 
 pytest.importorskip("uvicorn")
-playwright = pytest.importorskip("playwright.sync_api")
-CHROMIUM = shutil.which("chromium")
+expect: Any = pytest.importorskip("playwright.sync_api").expect
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
-expect: Any = playwright.expect
-PATIENCE_MS = 30_000
-LEFT_PX = 70
-"""Left margin of a plot."""
-SOFTWARE_GL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-AXIS = "cell/Robot_800/Axs1_Pos"
-ALERT = '[[alert]]\nname = "seven"\nwhen = "cell/Outputs/500 = 7"\nseverity = "critical"\n'
-BIT = "cell/Outputs/500.%X0"
-HOSTILE = '<img src=x onerror="document.title=1"><script>document.title=1</script>'
-"""Comment of a register and line of a log."""
-SCENE = f"""
-[[body]]
-name = "flag"
-joint = {{ type = "prismatic", axis = [1, 0, 0], register = "{BIT}", scale = 4000 }}
-shape = [{{ form = "box", size_mm = [1000, 1000, 1000], color = "#ff0000" }}]
-[[body]]
-name = "wall"
-position_mm = [0, 3000, 0]
-label = "Wall"
-shape = [{{ form = "box", size_mm = [10000, 100, 2000], color = "#00ff00" }}]
-"""
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with opened_browser() as browser:
+        yield browser
+
+
+@pytest.fixture(scope="module")
 def address() -> Iterator[str]:
     """The page's address."""
     with reserved_port() as address:
         yield str(address)
 
 
-@pytest.fixture
-def scene() -> str:
-    """The description of the cell in 3D; none."""
-    return ""
+@pytest.fixture(scope="module")
+def shared_cell(make_shared_cell: Callable[..., Cell], address: str) -> Cell:
+    return start_cell(make_shared_cell, address)
 
 
 @pytest.fixture
-def cell(make_cell: Callable[..., Cell], address: str, scene: str) -> Cell:
-    """A running cell with a page."""
-    config = CONFIG.replace("timeout = 1000", 'timeout = 1000\nwritable = ["Outputs"]')
-    more = 'scene = "scene.toml"\n' if scene else ""
-    cell = make_cell(config=f'{config}[web]\nlisten = "{address}"\n{more}[recorder]\ndirectory = "dumps"\n{ALERT}')
-    (cell.folder / "scene.toml").write_text(scene)
-    layout = cell.folder / "db201.db"
-    layout.write_text(layout.read_text().replace("Axs1_Pos : Real;", f"Axs1_Pos : Real;  // {HOSTILE}"))
-    cell.up()
-    return cell
+def cell(shared_cell: Cell) -> Iterator[Cell]:
+    """The running cell. After the test, its outputs are 0, so that nothing holds it."""
+    yield shared_cell
+    with shmio.attach(shared_cell.instance, writable=True) as attached:
+        register = attached.layouts("cell")["cell"].by_path["Outputs"]
+        zeros = [0] * attached.layouts("cell")["cell"].registers[register].size
+        until(lambda: attached.write({"cell/Outputs": zeros})[0].done, "the outputs are written")
 
 
 @pytest.fixture
-def page(cell: Cell, address: str) -> Iterator[Any]:
-    """The cell's page in a browser. The browser must report no error."""
-    expect.set_options(timeout=PATIENCE_MS)
-    errors: list[str] = []
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *SOFTWARE_GL])
-        page = browser.new_page(viewport={"width": 1280, "height": 800})
-        page.set_default_timeout(PATIENCE_MS)
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.goto(f"http://{address}/")
+def page(cell: Cell, address: str, browser: Any) -> Iterator[Any]:
+    with opened_page(browser, address) as page:
         yield page
-        assert not page.locator("img, main script").count()
-        browser.close()
-    assert not errors
 
 
-def keep(page: Any, name: str) -> None:
-    """Keep a screenshot in the folder that SHMIO_SCREENSHOTS names, if it does."""
-    if folder := os.environ.get("SHMIO_SCREENSHOTS"):
-        page.screenshot(path=Path(folder) / f"{name}.png")
+def test_user_filters_the_log(cell: Cell, page: Any) -> None:
+    with (cell.folder / "logs" / "cell.log").open("a") as log_file:
+        log_file.write(f"{HOSTILE}\n")
+    expect(page.get_by_role("tab", name="3D")).to_be_hidden()  # this cell has no scene
+    open_tab(page, "Log")
+    log = page.get_by_label("Log", exact=True).last
+    expect(log).to_contain_text("supervisor: supervising")
+    expect(log).to_contain_text(HOSTILE)
+    keep(page, "log")
+    page.get_by_label("Filter").fill("connected")
+    expect(log).not_to_contain_text("supervising")
+    expect(log).to_contain_text("connected")
 
 
-def open_tab(page: Any, name: str) -> None:
-    page.get_by_role("tab", name=name).click()
-
-
-def reading(cell: Cell, path: str) -> tuple[Any, str]:
-    found = json.loads(cell.output("shmio", "get", "--json", path))[path]
-    return found["value"], found["provenance"]
+def test_user_sees_the_registers_of_dropped_files(cell: Cell, page: Any) -> None:
+    open_tab(page, "Configuration")
+    files = page.get_by_label("Files", exact=True)
+    files.set_input_files(cell.folder / "db201.db")
+    rows = page.get_by_role("table", name="Registers of the files")
+    expect(rows.get_by_role("row").filter(has_text="Axs1_Pos").first).to_be_visible()
+    expect(page.locator(".drop [role=status]")).to_contain_text("DB201")
+    page.get_by_role("button", name="Theme").click()
+    keep(page, "configuration-dropped")
+    page.get_by_label("Search registers").fill("Robot_800/Axs3_Pos")
+    expect(rows.get_by_role("row")).to_have_count(1)
+    files.set_input_files({"name": "x.db", "mimeType": "text/plain", "buffer": b"DATA_BLOCK x STRUCT a : INTT;"})
+    expect(page.locator(".drop .messages")).to_contain_text("x.db:1:")
+    expect(rows).to_be_hidden()
 
 
 def test_user_writes_a_register_and_overrides_it(cell: Cell, page: Any) -> None:
@@ -130,6 +117,46 @@ def test_user_writes_a_register_and_overrides_it(cell: Cell, page: Any) -> None:
     until(lambda: reading(cell, AXIS) == (12.5, "injected"), "the override")
     page.get_by_role("button", name="Lift").click()
     expect(row.locator(".origin")).to_have_text("live")
+
+
+def test_user_sees_active_alerts(cell: Cell, page: Any) -> None:
+    alerts = page.get_by_role("table", name="alerts")
+    expect(page.get_by_role("button", name="Restart cell")).to_be_visible()
+    expect(alerts).to_be_hidden()
+    cell.output("shmio", "set", "cell/Outputs/500", "7")
+    expect(alerts.get_by_role("row", name="seven")).to_contain_text("cell/Outputs/500 = 7")
+    keep(page, "alerts")
+    cell.output("shmio", "set", "cell/Outputs/500", "0")
+    expect(alerts).to_be_hidden()
+
+
+def test_user_runs_a_campaign_and_lifts_everything(cell: Cell, page: Any) -> None:
+    open_tab(page, "Injections")
+    campaign = f'[[injection]]\nname = "drift"\ntarget = "{AXIS}"\noperation = "set"\nvalue = 42.0\n'
+    text = page.get_by_role("textbox", name="Campaign")
+    text.fill(campaign.replace('"set"', '"sett"'))
+    page.get_by_role("button", name="Check").click()
+    expect(page.locator(".preview")).to_contain_text("injection[0].operation")
+    text.fill("")
+    page.get_by_label("Register to inject").fill(AXIS)
+    page.get_by_label("value", exact=True).fill("42.0")
+    page.get_by_label("Name of the injection").fill("drift")
+    condition = page.get_by_label("Condition")
+    condition.fill(f"abs({AXIS}) >")
+    expect(page.locator(".condition")).to_contain_text("when: at character")
+    condition.fill(f"abs({AXIS}) < 1000")
+    expect(page.locator(".condition")).to_contain_text(f"The condition is true now: {AXIS} = ")
+    page.get_by_role("button", name="Add to the campaign").click()
+    expect(page.locator(".preview")).to_contain_text(f"drift: set when abs({AXIS}) < 1000, over {AXIS}")
+    page.get_by_role("button", name="Start").click()
+    present = page.get_by_role("table", name="injections").get_by_role("row").filter(has_text="drift")
+    expect(present).to_contain_text("active")
+    until(lambda: reading(cell, AXIS) == (42.0, "injected"), "the campaign")
+    expect(page.get_by_role("table", name="events").get_by_role("row").filter(has_text="drift").first).to_be_visible()
+    keep(page, "injections")
+    page.get_by_role("button", name="Lift all injections").click()
+    expect(present).to_have_count(0)
+    until(lambda: reading(cell, AXIS)[1] == "live", "the end of the campaign")
 
 
 def test_plot_moves_and_survives_restarts(cell: Cell, page: Any) -> None:
@@ -165,33 +192,12 @@ def test_plot_moves_and_survives_restarts(cell: Cell, page: Any) -> None:
     assert download.value.path().read_bytes().startswith(b"\x89PNG")
 
 
-def test_user_runs_a_campaign_and_lifts_everything(cell: Cell, page: Any) -> None:
-    open_tab(page, "Injections")
-    campaign = f'[[injection]]\nname = "drift"\ntarget = "{AXIS}"\noperation = "set"\nvalue = 42.0\n'
-    text = page.get_by_role("textbox", name="Campaign")
-    text.fill(campaign.replace('"set"', '"sett"'))
-    page.get_by_role("button", name="Check").click()
-    expect(page.locator(".preview")).to_contain_text("injection[0].operation")
-    text.fill("")
-    page.get_by_label("Register to inject").fill(AXIS)
-    page.get_by_label("value", exact=True).fill("42.0")
-    page.get_by_label("Name of the injection").fill("drift")
-    condition = page.get_by_label("Condition")
-    condition.fill(f"abs({AXIS}) >")
-    expect(page.locator(".condition")).to_contain_text("when: at character")
-    condition.fill(f"abs({AXIS}) < 1000")
-    expect(page.locator(".condition")).to_contain_text(f"The condition is true now: {AXIS} = ")
-    page.get_by_role("button", name="Add to the campaign").click()
-    expect(page.locator(".preview")).to_contain_text(f"drift: set when abs({AXIS}) < 1000, over {AXIS}")
-    page.get_by_role("button", name="Start").click()
-    present = page.get_by_role("table", name="injections").get_by_role("row").filter(has_text="drift")
-    expect(present).to_contain_text("active")
-    until(lambda: reading(cell, AXIS) == (42.0, "injected"), "the campaign")
-    expect(page.get_by_role("table", name="events").get_by_role("row").filter(has_text="drift").first).to_be_visible()
-    keep(page, "injections")
-    page.get_by_role("button", name="Lift all injections").click()
-    expect(present).to_have_count(0)
-    until(lambda: reading(cell, AXIS)[1] == "live", "the end of the campaign")
+def test_user_restarts_a_process(cell: Cell, page: Any) -> None:
+    before = cell.processes()["cell"]["pid"]
+    page.on("dialog", lambda dialog: dialog.accept())
+    page.get_by_role("button", name="Restart cell").click()
+    expect(page.get_by_text("cell runs again")).to_be_visible()
+    assert cell.processes()["cell"]["pid"] != before
 
 
 def test_user_steps_time_and_returns_to_real_time(cell: Cell, page: Any) -> None:
@@ -208,382 +214,3 @@ def test_user_steps_time_and_returns_to_real_time(cell: Cell, page: Any) -> None
     expect(page.locator(".time dl")).not_to_contain_text("yes, at")
     page.get_by_role("button", name="Back to real time").click()
     until(lambda: cell.status()["clock"]["mode"] == "wall", "real time")
-
-
-def saved_table(page: Any) -> list[list[str]]:
-    """Return the rows of the table that the page saves, with its head."""
-    with page.expect_download() as download:
-        page.get_by_role("button", name="Save CSV").click()
-    return [line.split(",") for line in download.value.path().read_text().splitlines()]
-
-
-def recorded_s(cell: Cell) -> float:
-    """Return the length of the recording that is being written."""
-    [file] = (cell.folder / "dumps").glob("*.mem")
-    with suppress(RecordingError), shmio.open_dump(file) as dump:
-        return (dump.end_ns - dump.begin_ns) / 1e9
-    return 0.0  # nothing is recorded yet
-
-
-def zoom(page: Any, share: float, turns: int) -> None:
-    """Turn the wheel with the pointer at a share of the time axis."""
-    box = page.locator(".lane canvas").first.bounding_box()
-    page.mouse.move(box["x"] + LEFT_PX + share * (box["width"] - LEFT_PX), box["y"] + box["height"] / 2)
-    for _ in range(turns):
-        page.mouse.wheel(0, -100)
-
-
-def test_user_examines_a_recording(cell: Cell, page: Any) -> None:
-    until(
-        lambda: any((cell.folder / "dumps").glob("*.mem")) and recorded_s(cell) > 12, "a recording longer than the ring"
-    )
-    cell.output("shmio", "set", "cell/Outputs/500", "7")
-    open_tab(page, "Recordings")
-    row = page.get_by_role("table", name="recordings").get_by_role("row").nth(1)
-    expect(row).to_contain_text("being written")
-    row.click()
-    expect(page.locator(".info")).to_contain_text("22 registers")
-    search = page.get_by_label("Add a register")
-    search.fill("cell/nothing")
-    search.press("Enter")
-    expect(
-        page.get_by_text("no register of this recording has such a path").or_(page.get_by_text("cell/nothing"))
-    ).to_be_visible()
-    expect(page.locator(".lane")).to_have_count(0)
-    search.fill(AXIS)
-    search.press("Enter")
-    value = page.locator(f'.legend li[data-path="{AXIS}"] output')
-    expect(value).not_to_have_text("no value")
-    page.get_by_role("button", name="Check for damage").click()
-    expect(page.get_by_label("Result of the check")).to_contain_text("no damage")
-    zoom(page, 0.5, 12)
-    [file] = (cell.folder / "dumps").glob("*.mem")
-
-    def shows_frames() -> bool:
-        head, *rows = saved_table(page)
-        assert head == ["time", AXIS]
-        times = [datetime.fromisoformat(time).timestamp() for time, _ in rows]
-        with shmio.open_dump(file) as dump:
-            found = dump.columns(AXIS, round((times[0] - 0.0005) * 1e9), round((times[-1] + 0.0015) * 1e9))
-        return [float(value) for _, value in rows] == [float(one) for one in found["Robot_800/Axs1_Pos"]]
-
-    until(shows_frames, "each frame in view, as it is in the file")
-    keep(page, "recordings")
-
-    open_tab(page, "Plots")
-    search.fill(AXIS)
-    search.press("Enter")
-    expect(value).not_to_have_text("no value")
-    page.get_by_label("Time span").select_option("120")
-
-    def past_s() -> float:
-        times = [datetime.fromisoformat(time).timestamp() for time, _ in saved_table(page)[1:]]
-        return times[-1] - times[0]
-
-    until(lambda: past_s() > 11, "the past from the recording")
-    keep(page, "past")
-
-
-def test_user_controls_a_replay(cell: Cell, page: Any) -> None:
-    until(lambda: recorded_s(cell) > 3, "a recording")
-    cell.output("shmio", "set", "cell/Outputs/500", "7")
-    open_tab(page, "Recordings")
-    page.get_by_role("table", name="recordings").get_by_role("row").nth(1).click()
-    page.get_by_text("Replay it", exact=True).click()
-    commands = page.locator(".command pre").last.inner_text()
-    printed(f"{commands} --paused --detach", cell.folder)
-    [file] = (cell.folder / "dumps").glob("*.mem")
-    with shmio.open_dump(file) as dump:
-        written_ns = next(entry.time_ns for entry in dump.events() if entry.item.kind == EventKind.WRITTEN)
-    expect(page.get_by_role("alert")).to_be_hidden()
-    expect(page.get_by_role("table", name="recordings").get_by_role("row").nth(1)).to_contain_text("closed")
-    position = page.get_by_label("Present position")
-    expect(position).to_contain_text("paused")
-    with shmio.attach(cell.instance) as attached:
-
-        def playing() -> Any:
-            return attached.replay.status()[0]
-
-        page.get_by_label("Position", exact=True).fill("1.5")
-        until(lambda: playing().position_s == pytest.approx(1.5), "the position")
-        expect(position).to_contain_text("1.500 s of")
-        page.get_by_label("jump there instead of playing").check()
-        page.get_by_label("Kind of event").select_option("written")
-        page.get_by_role("button", name="To the next event").click()
-        until(lambda: playing().time_s == pytest.approx(written_ns / 1e9, abs=1e-6), "the position of the event")
-        keep(page, "replay")
-        page.get_by_label("Speed").fill("2")
-        page.get_by_label("Speed").press("Enter")
-        until(lambda: playing().speed == 2, "the speed")
-        page.get_by_label("start again at the end").check()
-        until(lambda: playing().loop, "the loop")
-        page.get_by_role("button", name="Play").click()
-        until(lambda: not playing().paused, "that it plays")
-        page.get_by_role("button", name="Pause").click()
-        until(lambda: playing().paused, "the pause")
-
-
-# Counts the pixels of a PNG in which red or green is far above the others.
-COUNT_PIXELS = """async png => {
-  const picture = await createImageBitmap(new Blob([Uint8Array.from(atob(png), one => one.charCodeAt(0))]));
-  const pen = new OffscreenCanvas(picture.width, picture.height).getContext("2d");
-  pen.drawImage(picture, 0, 0);
-  const { data } = pen.getImageData(0, 0, picture.width, picture.height);
-  const found = { left: 0, right: 0, green: 0 };
-  for (let at = 0; at < data.length; at += 4) {
-    const [red, green, blue] = [data[at], data[at + 1], data[at + 2]];
-    const side = (at / 4) % picture.width < picture.width / 2 ? "left" : "right";
-    if (red > 60 && red > 2 * green && red > 2 * blue) found[side] += 1;
-    if (green > 60 && green > 2 * red && green > 2 * blue) found.green += 1;
-  }
-  return found;
-}"""
-
-
-# Returns where bodies are, of which a register with the value -90 turns one.
-PLACES = """async () => {
-  const { Kinematics } = await import("/scene/kinematics.js");
-  const still = { joint: null, position_mm: [0, 0, 0], rotation_deg: [0, 0, 0] };
-  const turned = {
-    type: "revolute", register: "r", axis: [0, 2, 0], unit: "deg", scale: -0.5, offset: 45, smooth_s: 0
-  };
-  const bodies = [
-    { ...still, parent: -1, position_mm: [1000, 0, 0], rotation_deg: [0, 0, 90] },
-    { ...still, parent: 0, position_mm: [0, 500, 0], joint: turned },
-    { ...still, parent: 1, position_mm: [200, 0, 0] },
-    { ...still, parent: -1, rotation_deg: [90, 0, 90] },
-    { ...still, parent: 3, position_mm: [0, 100, 0] },
-  ];
-  const kinematics = new Kinematics(bodies);
-  kinematics.move(() => -90, 0);
-  kinematics.judge(() => "bad");
-  return [kinematics.world.map(matrix => [...matrix.slice(12, 15)]), kinematics.states];
-}"""
-
-
-@pytest.mark.parametrize("scene", [SCENE])
-def test_registers_move_the_cell_in_3d(cell: Cell, page: Any) -> None:
-    open_tab(page, "3D")
-    page.get_by_role("button", name="Front").click()
-
-    def seen() -> dict[str, int]:
-        """Return the numbers of red pixels in both halves of the picture, and of green ones."""
-        picture = page.locator(".scene-picture canvas").screenshot()
-        found: dict[str, int] = page.evaluate(COUNT_PIXELS, base64.b64encode(picture).decode())
-        return found
-
-    until(lambda: seen()["left"] > 0 and seen()["green"] > 0, "the picture")
-    line = page.locator(f'.scene-registers tr[data-path="{BIT}"]')
-    expect(line).to_contain_text("false")
-    before = seen()
-    places, states = page.evaluate(PLACES)
-    expected = [(1, 0, 0), (0.5, 0, 0), (0.5, 0, -0.2), (0, 0, 0), (0, 0, 0.1)]
-    assert [pytest.approx(one, abs=1e-6) for one in expected] == places
-    assert states == ["good", "bad", "bad", "good", "good"]
-    cell.output("shmio", "set", BIT, "1")
-    expect(line).to_contain_text("true")
-    until(lambda: seen()["right"] > before["right"] + 500, "the body moves to the right")
-    keep(page, "scene")
-    cell.output("shmio", "set", BIT, "0")
-    until(lambda: abs(seen()["left"] - before["left"]) < before["left"] / 5, "the body moves back")
-
-    os.kill(cell.processes()["plc"]["pid"], signal.SIGSTOP)
-    expect(page.locator(".scene-reasons")).to_contain_text("stale")
-    expect(line).to_contain_text("bad")
-    until(lambda: seen()["left"] == 0 and seen()["green"] > 0, "the body is grey, the wall is not")
-    os.kill(cell.processes()["plc"]["pid"], signal.SIGCONT)
-    until(lambda: seen()["left"] > 0, "the body is red again")
-
-
-def test_user_restarts_a_process(cell: Cell, page: Any) -> None:
-    before = cell.processes()["cell"]["pid"]
-    page.on("dialog", lambda dialog: dialog.accept())
-    page.get_by_role("button", name="Restart cell").click()
-    expect(page.get_by_text("cell runs again")).to_be_visible()
-    assert cell.processes()["cell"]["pid"] != before
-
-
-def edit(cell: Cell, old: str, new: str) -> None:
-    file = cell.folder / "supervisor.toml"
-    text = file.read_text()
-    assert old in text
-    file.write_text(text.replace(old, new))
-
-
-def test_user_reloads_the_configuration(cell: Cell, page: Any) -> None:
-    edit(cell, "timeout = 1000", 'timeout = 1000 # password: "hunter2"')
-    open_tab(page, "Configuration")
-    file = page.get_by_label("Configuration file")
-    changes = page.locator(".plan .changes")
-    expect(changes).to_contain_text("change nothing")
-    expect(file).to_contain_text("timeout = 1000 # password: •••")
-    assert "hunter2" not in page.content()
-
-    edit(cell, "period_ms = 20", "period_ms = -1")
-    number = (cell.folder / "supervisor.toml").read_text().split("\n").index("period_ms = -1") + 1
-    expect(file.locator(f'[data-line="{number}"] .message')).to_contain_text("fault: source[0].period_ms")
-    expect(changes).to_contain_text("be refused: the file has a fault")
-    expect(page.get_by_role("button", name="Reload …")).to_be_disabled()
-    keep(page, "configuration-fault")
-
-    edit(cell, "period_ms = -1", "period_ms = 50")
-    edit(cell, 'writable = ["Outputs"]', 'writable = ["Outpts"]')
-    expect(file.locator(".message")).to_contain_text("warning: source[0].writable: 'Outpts' names nothing")
-    expect(changes.locator(".diff")).to_contain_text("± keep the connection of cell")
-    expect(changes.locator(".diff")).to_contain_text("period_ms: 50 instead of 20")
-    keep(page, "configuration")
-    before = {name: process["pid"] for name, process in cell.processes().items()}
-    page.get_by_role("button", name="Reload …").click()
-    dialog = page.get_by_role("dialog")
-    expect(dialog).to_contain_text("± keep the connection of cell")
-    keep(page, "configuration-confirm")
-    dialog.get_by_role("button", name="Cancel").click()
-    assert {name: process["pid"] for name, process in cell.processes().items()} == before
-    page.get_by_role("button", name="Reload …").click()
-    dialog.get_by_role("button", name="Reload", exact=True).click()
-    expect(page.locator(".plan .messages")).to_contain_text("cell: changed, and keeps its connection")
-    expect(changes).to_contain_text("change nothing")
-    after = {name: process["pid"] for name, process in cell.processes().items()}
-    assert after == before
-    with shmio.attach(cell.instance) as reader:
-        assert reader.block("cell").period_ns == 50_000_000
-
-
-def test_page_returns_after_a_reload_that_restarts_its_server(cell: Cell, page: Any) -> None:
-    open_tab(page, "Configuration")
-    edit(cell, "[web]", '[web]\nhosts = ["cell.example"]')
-    pid = cell.processes()["web"]["pid"]
-    expect(page.locator(".plan .diff")).to_contain_text("± restart web")
-    page.get_by_role("button", name="Reload …").click()
-    expect(page.get_by_role("dialog")).to_contain_text("connects again by itself")
-    page.get_by_role("dialog").get_by_role("button", name="Reload", exact=True).click()
-    expect(page.locator(".plan .changes")).to_contain_text("change nothing")
-    assert cell.processes()["web"]["pid"] != pid
-
-
-def test_user_sees_the_registers_of_dropped_files(cell: Cell, page: Any) -> None:
-    open_tab(page, "Configuration")
-    files = page.get_by_label("Files", exact=True)
-    files.set_input_files(cell.folder / "db201.db")
-    rows = page.get_by_role("table", name="Registers of the files")
-    expect(rows.get_by_role("row").filter(has_text="Axs1_Pos").first).to_be_visible()
-    expect(page.locator(".drop [role=status]")).to_contain_text("DB201")
-    page.get_by_role("button", name="Theme").click()
-    keep(page, "configuration-dropped")
-    page.get_by_label("Search registers").fill("Robot_800/Axs3_Pos")
-    expect(rows.get_by_role("row")).to_have_count(1)
-    files.set_input_files({"name": "x.db", "mimeType": "text/plain", "buffer": b"DATA_BLOCK x STRUCT a : INTT;"})
-    expect(page.locator(".drop .messages")).to_contain_text("x.db:1:")
-    expect(rows).to_be_hidden()
-
-
-def test_user_sees_active_alerts(cell: Cell, page: Any) -> None:
-    alerts = page.get_by_role("table", name="alerts")
-    expect(page.get_by_role("button", name="Restart cell")).to_be_visible()
-    expect(alerts).to_be_hidden()
-    cell.output("shmio", "set", "cell/Outputs/500", "7")
-    expect(alerts.get_by_role("row", name="seven")).to_contain_text("cell/Outputs/500 = 7")
-    keep(page, "alerts")
-    cell.output("shmio", "set", "cell/Outputs/500", "0")
-    expect(alerts).to_be_hidden()
-
-
-def test_user_filters_the_log(cell: Cell, page: Any) -> None:
-    with (cell.folder / "logs" / "cell.log").open("a") as log_file:
-        log_file.write(f"{HOSTILE}\n")
-    expect(page.get_by_role("tab", name="3D")).to_be_hidden()  # this cell has no scene
-    open_tab(page, "Log")
-    log = page.get_by_label("Log", exact=True).last
-    expect(log).to_contain_text("supervisor: supervising")
-    expect(log).to_contain_text(HOSTILE)
-    keep(page, "log")
-    page.get_by_label("Filter").fill("connected")
-    expect(log).not_to_contain_text("supervising")
-    expect(log).to_contain_text("connected")
-
-
-def test_page_says_that_the_instance_has_stopped(cell: Cell, page: Any) -> None:
-    expect(page.locator("#state")).to_have_text("running")
-    expect(page.get_by_role("cell", name="cell", exact=True).first).to_be_visible()
-    keep(page, "overview")
-    cell.down()
-    expect(page.get_by_role("alert")).to_be_visible()
-    cell.up()
-    expect(page.get_by_role("alert")).to_be_hidden()
-    expect(page.locator("#state")).to_have_text("running")
-
-
-class Fingers:
-    """Touches an element, by the protocol of Chromium's developer tools. Points are shares of its width and height."""
-
-    def __init__(self, page: Any, selector: str) -> None:
-        self._session = page.context.new_cdp_session(page)
-        self._box = page.locator(selector).first.bounding_box()
-
-    def _send(self, kind: str, points: list[tuple[float, float]]) -> None:
-        box = self._box
-        touches = [
-            {"x": box["x"] + x * box["width"], "y": box["y"] + y * box["height"], "id": number}
-            for number, (x, y) in enumerate(points)
-        ]
-        self._session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": touches})
-
-    def tap(self, x: float, y: float) -> None:
-        self._send("touchStart", [(x, y)])
-        self._send("touchEnd", [])
-
-    def move(self, *ways: tuple[tuple[float, float], tuple[float, float]]) -> None:
-        """Move each finger from one point to another."""
-        for step in range(9):
-            points = [
-                (old[0] + step / 8 * (new[0] - old[0]), old[1] + step / 8 * (new[1] - old[1])) for old, new in ways
-            ]
-            self._send("touchMove" if step else "touchStart", points)
-        self._send("touchEnd", [])
-
-
-@pytest.mark.parametrize("scene", [SCENE])
-def test_fingers_move_plots_and_the_cell(address: str, page: Any) -> None:
-    tablet = page.context.browser.new_context(has_touch=True, viewport={"width": 1024, "height": 768}).new_page()
-    tablet.set_default_timeout(PATIENCE_MS)
-    tablet.goto(f"http://{address}/")
-    tablet.get_by_role("tab", name="Plots").tap()
-    search = tablet.get_by_label("Add a register")
-    search.fill(AXIS)
-    search.press("Enter")
-    expect(tablet.locator(f'.legend li[data-path="{AXIS}"] output')).not_to_have_text("no value")
-    fingers = Fingers(tablet, ".lane canvas")
-    fingers.move(((0.4, 0.5), (0.6, 0.5)))
-    expect(tablet.get_by_role("button", name="Live")).to_be_visible()
-
-    def measured_s() -> float:
-        """Tap on two points; return the time between them."""
-        for x in (0.3, 0.8):
-            fingers.tap(x, 0.5)
-        times = tablet.get_by_text("Δt")
-        return float(times.inner_text().split("Δt ")[1].split()[0])
-
-    before_s = measured_s()
-    assert 2 < before_s < 8
-    fingers.move(((0.45, 0.5), (0.3, 0.5)), ((0.55, 0.5), (0.8, 0.5)))
-    assert measured_s() < before_s / 2
-    fingers.move(((0.3, 0.5), (0.5, 0.5)), ((0.7, 0.5), (0.5, 0.5)))
-    keep(tablet, "touch")
-
-    tablet.get_by_role("tab", name="3D").tap()
-    tablet.get_by_role("button", name="Front").tap()
-
-    def green() -> int:
-        picture = tablet.locator(".scene-picture canvas").screenshot()
-        found: dict[str, int] = tablet.evaluate(COUNT_PIXELS, base64.b64encode(picture).decode())
-        return found["green"]
-
-    until(lambda: green() > 0, "the picture")
-    front = green()
-    fingers = Fingers(tablet, ".scene-picture canvas")
-    fingers.move(((0.4, 0.5), (0.45, 0.5)), ((0.6, 0.5), (0.55, 0.5)))
-    until(lambda: green() < front / 2, "two fingers make it smaller")
-    small = green()
-    fingers.move(((0.3, 0.5), (0.6, 0.5)))
-    until(lambda: green() < small, "one finger turns it")
-    tablet.context.close()
