@@ -125,6 +125,7 @@ APART = ("tests/system/test_benchmarks.py",)
 def pytest_addoption(parser: pytest.Parser) -> None:
     tiers = parser.getgroup("tiers").addoption
     tiers("--fast", action="store_true", help="run only quick tests that start no process")
+    tiers("--slow", action="store_true", help="run only the tests that --fast leaves out")
     tiers("--all", action="store_true", help="also run the tests that otherwise run only if you name them")
 
 
@@ -186,9 +187,10 @@ def code_names(code: CodeType) -> Iterator[str]:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave out the tests that are not in the chosen tier."""
     names, finder = left_out(config), StarterFinder()
-    out = {
-        item for item in items if item.nodeid.startswith(names) or (config.option.fast and finder.starts_process(item))
-    }
+    out = {item for item in items if item.nodeid.startswith(names)}
+    if config.option.fast or config.option.slow:
+        slow = {item for item in items if item.nodeid.startswith(START_PROCESSES + SLOW) or finder.starts_process(item)}
+        out |= slow if config.option.fast else {*items} - slow
     if out:
         config.hook.pytest_deselected(items=list(out))
         items[:] = [item for item in items if item not in out]
