@@ -300,6 +300,12 @@ class ConnectorConformance:
         run.reload(next(others))
         run.good()
 
+    def test_a_stop_in_the_middle_of_a_reload(self, others: Iterator[Rig], run: Run, rig: Rig) -> None:
+        """Stopping never takes longer than the device's time-out. The fixture ``run`` checks this."""
+        run.good()
+        rig.proxy.freeze()
+        run.reload(next(others))
+
     def test_close_may_come_at_any_time(self, rig: Rig) -> None:
         """A program may close the connector before the first connect, and may close it twice."""
         connector: Any = rig.connector()
