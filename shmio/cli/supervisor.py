@@ -119,6 +119,12 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         help="source files of data blocks (.db, .udt, .scl), optionally after a plc.ini",
     )
+    text = "write the instance as an FMU for co-simulation (FMI 2.0); all its sources must be computed"
+    export = verb("export-fmu", text, file, command="export_fmu:export_fmu")
+    export.add_argument("-o", dest="output", type=Path, required=True, metavar="FILE.fmu", help="the FMU to write")
+    export.add_argument(
+        "--only", nargs="+", default=[], metavar="PATTERN", help="only these registers; * and ** are wildcards"
+    )
     _add_browse(verb("browse", "list what a device offers, as a tree or as a tag table"))
     text = "write a package with a connector of your own, which works and has tests; change its protocol"
     new = verb("new-connector", text, command="new_connector:new_connector")

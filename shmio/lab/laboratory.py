@@ -94,7 +94,7 @@ class Laboratory:
         """The clock page, which the loops read."""
         self._others: list[Segment] = []
         self._threads: list[threading.Thread] = []
-        self._sources: list[Computed] = []
+        self._sources: dict[str, Computed] = {}
         self.loops: dict[str, SteppedLoop] = {}
         """The loop of each source."""
         try:
@@ -122,7 +122,7 @@ class Laboratory:
             registry.convert_options(section["connector"], options), segment.blocks[job.name].layout
         )
         source = cast("Computed", made)  # prepare_laboratory has checked it
-        self._sources.append(source)
+        self._sources[job.name] = source
         writer = segment.writer(job.name)
         clock = _LabClock(self)
         loop = clock.loop = SteppedLoop(
@@ -140,6 +140,11 @@ class Laboratory:
         self._threads.append(thread)
         thread.start()
         return loop
+
+    def inputs(self, source: str) -> frozenset[str] | None:
+        """Return the paths of the registers that a source's model reads; None if the source has no model."""
+        found = self._sources[source]
+        return None if found.prompt else frozenset(found.inputs)
 
     def open(self) -> Segment:
         """Open the segment once more, writable, as another process would. The laboratory closes it."""
@@ -197,7 +202,7 @@ class Laboratory:
             loop.commands.stop()
         for thread in self._threads:
             thread.join(COMMANDS_S)
-        for source in self._sources:
+        for source in self._sources.values():
             source.close()
         for segment in self._others:
             segment.close()

@@ -1,0 +1,33 @@
+"""``shmio-supervisor export-fmu``: writes an instance as an FMU for co-simulation."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from shmio.cli.common import say
+from shmio.cli.target import config_file
+from shmio.lab.fmu.archive import export_fmu as export
+from shmio.logs import printable
+
+SHOWN = 10
+
+
+def export_fmu(arguments: argparse.Namespace) -> int:
+    """Write the FMU, and say what is in it.
+
+    Raises:
+        ConfigError: The instance cannot be exported.
+        LayoutError: A layout cannot be compiled.
+        PathError: A pattern names nothing.
+
+    """
+    file: Path = arguments.output
+    done = export(config_file(arguments), file, arguments.only)
+    if done.left_out:
+        more = len(done.left_out) - SHOWN
+        shown = ", ".join(done.left_out[:SHOWN]) + (f" and {more} more" if more > 0 else "")
+        say(f"left out, because FMI 2.0 has no such types: {shown}", sys.stderr)
+    print(printable(f"wrote {file}: {done.inputs} inputs, {done.outputs} outputs"))
+    return 0

@@ -1,0 +1,208 @@
+"""Writes an instance as an FMU: its description, its library, and the instance's files."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections.abc import Iterator, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+from xml.sax.saxutils import quoteattr
+
+import msgspec
+
+from shmio.errors import ConfigError, LayoutError
+from shmio.lab.fmu.exchange import Group, Values, groups_of
+from shmio.lab.fmu.process import CONFIG, MANIFEST, Manifest, image_of
+from shmio.lab.laboratory import Laboratory, prepare_laboratory
+from shmio.version import __version__
+
+IDENTIFIER: Final = "shmio_cell"
+MAX_BYTES: Final = 64 << 20
+SUFFIXES: Final = frozenset({".toml", ".db", ".udt", ".scl", ".csv", ".xlsx", ".ini", ".py", ".fmu", ".npy", ".json"})
+"""Files of the configuration's folder that the FMU contains."""
+_SKIPPED: Final = frozenset({"__pycache__", "node_modules", "logs", "dumps", "snapshots", "build", "dist"})
+_PLATFORMS: Final = {"x86_64": "linux64"}
+
+
+class Exported(NamedTuple):
+    """What was exported: number of inputs and outputs, and the registers that were left out."""
+
+    inputs: int
+    outputs: int
+    left_out: list[str]
+
+
+def export_fmu(config: Path, file: Path, patterns: Sequence[str]) -> Exported:
+    """Write an instance as an FMU for co-simulation by FMI 2.0.
+
+    Args:
+        config: The ``supervisor.toml``, whose sources must all be computed.
+        file: The FMU; an older one is replaced.
+        patterns: Registers to export; all if empty.
+
+    Raises:
+        ConfigError: The instance cannot be exported; the message says why.
+        LayoutError: A layout cannot be compiled.
+        PathError: A pattern names nothing.
+
+    """
+    machine = _PLATFORMS.get(platform.machine())
+    if machine is None:
+        raise ConfigError(f"FMI 2.0 has no name for Linux on {platform.machine()}: export on x86_64")
+    with tempfile.TemporaryDirectory(prefix="shmio-export-") as folder:
+        work = Path(folder)
+        _copy(config.resolve().parent, work / CONFIG)
+        try:
+            plan = prepare_laboratory(work / CONFIG / config.name)
+        except (ConfigError, LayoutError) as error:
+            prepare_laboratory(config)  # raises the same error if it is not for the lack of a file
+            raise ConfigError(
+                f"{error}; the FMU contains only files of {config.resolve().parent} with the endings "
+                f"{', '.join(sorted(SUFFIXES))}: put the others there"
+            ) from None
+        with Laboratory(plan) as lab, lab.attach() as cell:
+            groups, left_out = groups_of(lab, patterns)
+            values = Values(groups)
+            start = values.decode(values.encode({one.source: image_of(cell, one.source) for one in groups}))
+        names = [name for one in groups for name in one.names]
+        guid = "{" + hashlib.sha256("\n".join([*names, *(one.kind for one in groups)]).encode()).hexdigest()[:32] + "}"
+        step_s = min(block.period_ns for block in plan.blocks) / 1e9
+        description = "\n".join(_description(plan.instance, guid, groups, start, step_s)) + "\n"
+        manifest = Manifest(config.name, list(patterns), names)
+        library = _compile(work, guid)
+        _write(file, description, library, machine, manifest, work / CONFIG)
+    inputs = sum(len(one.names) for one in groups if one.is_input)
+    return Exported(inputs, len(names) - inputs, left_out)
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copy the files that an instance may need.
+
+    Raises:
+        ConfigError: They are too large, or cannot be read.
+
+    """
+    size = 0
+    try:
+        for folder, folders, files in os.walk(source):
+            folders[:] = sorted(one for one in folders if one not in _SKIPPED and not one.startswith("."))
+            for name in sorted(files):
+                file = Path(folder) / name
+                if file.suffix not in SUFFIXES or name.startswith(".") or not file.is_file():
+                    continue
+                size += file.stat().st_size
+                if size > MAX_BYTES:
+                    raise ConfigError(
+                        f"the files of {source} have more than {MAX_BYTES >> 20} MB: give the instance its own folder"
+                    )
+                copy = target / file.relative_to(source)
+                copy.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(file, copy)
+    except OSError as error:
+        raise ConfigError(f"{error.filename}: {error.strerror}") from None
+
+
+def _compile(work: Path, guid: str) -> Path:
+    """Compile the library.
+
+    Raises:
+        ConfigError: There is no C compiler, or it fails.
+
+    """
+    source, library = work / "library.c", work / f"{IDENTIFIER}.so"
+    source.write_bytes(resources.files("shmio.lab.fmu").joinpath("library.c").read_bytes())
+    command = ["cc", "-std=c11", "-O2", "-shared", "-fPIC", "-fvisibility=hidden", f'-DSHMIO_GUID="{guid}"']
+    try:
+        done = subprocess.run(
+            [*command, "-o", library, source], capture_output=True, text=True, check=False, timeout=120
+        )
+    except FileNotFoundError:
+        raise ConfigError("the export needs a C compiler: install one (Debian: apt install gcc libc6-dev)") from None
+    if done.returncode:
+        raise ConfigError(f"the C compiler cannot build the FMU's library: {done.stderr.strip()[-800:]}")
+    return library
+
+
+def _write(file: Path, description: str, library: Path, machine: str, manifest: Manifest, cell: Path) -> None:
+    """Write the archive. It replaces an older file when it is complete.
+
+    Raises:
+        ConfigError: The file cannot be written.
+
+    """
+    new = file.with_name(f".{file.name}.{os.getpid()}")
+    try:
+        with zipfile.ZipFile(new, "x", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("modelDescription.xml", description)
+            archive.write(library, f"binaries/{machine}/{IDENTIFIER}.so")
+            archive.writestr(f"resources/{MANIFEST}", msgspec.json.encode(manifest))
+            archive.writestr("resources/python", f"{sys.executable}\n")
+            for one in sorted(cell.rglob("*")):
+                if one.is_file() and "__pycache__" not in one.parts:
+                    archive.write(one, f"resources/{CONFIG}/{one.relative_to(cell)}")
+        new.rename(file)
+    except OSError as error:
+        new.unlink(missing_ok=True)
+        raise ConfigError(f"{file}: {error.strerror}") from None
+
+
+def _description(
+    name: str, guid: str, groups: Sequence[Group], start: dict[str, list[Any]], step_s: float
+) -> Iterator[str]:
+    """Yield the lines of modelDescription.xml."""
+    yield '<?xml version="1.0" encoding="UTF-8"?>'
+    yield (
+        f'<fmiModelDescription fmiVersion="2.0" modelName={quoteattr(name)} guid={quoteattr(guid)} '
+        f'generationTool="shmio {__version__}" variableNamingConvention="flat">'
+    )
+    yield (
+        f'  <CoSimulation modelIdentifier="{IDENTIFIER}" needsExecutionTool="true" '
+        'canHandleVariableCommunicationStepSize="true" canNotUseMemoryManagementFunctions="true"/>'
+    )
+    units = sorted({one.register.unit for one in groups if one.kind == "Real" and one.register.unit})
+    if units:
+        yield "  <UnitDefinitions>"
+        yield from (f"    <Unit name={quoteattr(unit)}/>" for unit in units)
+        yield "  </UnitDefinitions>"
+    yield '  <LogCategories><Category name="logStatusError"/></LogCategories>'
+    yield f'  <DefaultExperiment startTime="0" stepSize="{step_s!r}"/>'
+    yield "  <ModelVariables>"
+    outputs: list[int] = []
+    index = 0
+    for one in groups:
+        for place, path in enumerate(one.names):
+            index += 1
+            reference = one.first + place
+            causality = "input" if one.is_input else "output"
+            if not one.is_input:
+                outputs.append(index)
+            comment = f" description={quoteattr(one.register.comment)}" if one.register.comment else ""
+            variability = "continuous" if one.kind == "Real" else "discrete"
+            value = f" start={quoteattr(_text(start[one.kind][reference]))}" if one.is_input else ""
+            unit = f" unit={quoteattr(one.register.unit)}" if one.kind == "Real" and one.register.unit else ""
+            yield (
+                f'    <ScalarVariable name={quoteattr(path)} valueReference="{reference}" causality="{causality}" '
+                f'variability="{variability}"{comment}><{one.kind}{unit}{value}/></ScalarVariable>'
+            )
+    yield "  </ModelVariables>"
+    yield "  <ModelStructure>"
+    for tag in ("Outputs", "InitialUnknowns") if outputs else ():
+        yield f"    <{tag}>"
+        yield from (f'      <Unknown index="{one}"/>' for one in outputs)
+        yield f"    </{tag}>"
+    yield "  </ModelStructure>"
+    yield "</fmiModelDescription>"
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return value if isinstance(value, str) else repr(value)
