@@ -123,7 +123,7 @@ def main() -> None:
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="a50-")))
         cell, address = prepare(folder, stack)
-        stack.callback(cell.supervisor, "down")
+        stack.callback(cell.down)
         cell.up()
         time.sleep(ROUND_S)
         driver = stack.enter_context(sync_playwright())
