@@ -55,7 +55,7 @@ def main() -> int:
 
     def subscribe(client: Client, _data: object, _flags: ConnectFlags, code: ReasonCode, _: Properties | None) -> None:
         if code.is_failure:
-            over.put(f"{arguments.broker}: the broker refuses us: {code}")
+            over.put(f"{arguments.broker}: the broker refuses this client: {code}")
         else:
             client.subscribe([(topic, 1) for topic in topics])
 

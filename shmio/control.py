@@ -305,7 +305,7 @@ class ControlServer:
         try:
             request = msgspec.json.decode(line, type=self._requests)
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-            self.answer(client, {"error": f"this is not a request: {error}"})
+            self.answer(client, {"error": f"the request is invalid: {error}"})
         else:
             if _hung_up(client):  # the client gave up while the supervisor was delayed
                 self._drop(client)

@@ -22,4 +22,4 @@ def library(name: str, remedy: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name != name.partition(".")[0]:
             raise
-        raise MissingLibraryError(f"{name.partition('.')[0]} is not installed: {remedy}") from None
+        raise MissingLibraryError(f"{name.partition('.')[0]} is not installed; run {remedy}") from None

@@ -241,5 +241,5 @@ class LogRateLimit(logging.Filter):
             return count < MAX_LINES
         self._kinds[kind] = now_s + TURN_S, 1
         if count > MAX_LINES:
-            record.msg = f"{text} ({count - MAX_LINES} more like this were left out before)"
+            record.msg = f"{text} ({count - MAX_LINES} similar lines before this one were left out)"
         return True

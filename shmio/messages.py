@@ -9,6 +9,7 @@ from shmio.errors import ValueRangeError
 from shmio.model.event import Event, EventKind
 from shmio.model.values import Quality
 from shmio.wire import shmio_v1_pb2 as wire
+from shmio.wording import unknown
 
 _OPERATIONS: Final[Mapping[str, Mapping[str, str]]] = {
     "set": {"value": ""},
@@ -86,7 +87,7 @@ def declaration_to_wire(table: Mapping[str, Any], key: str) -> wire.Declaration:
     operation = left.pop("operation", None)
     own = _OPERATIONS.get(operation) if isinstance(operation, str) else None
     if own is None:
-        raise ValueRangeError(f"{key}.operation: {operation!r} is unknown; valid: {', '.join(_OPERATIONS)}")
+        raise ValueRangeError(f"{key}.operation: {unknown('operation', operation, _OPERATIONS)}")
     target = left.pop("target", [])
     try:
         found = wire.Declaration(name=left.pop("name", ""), targets=[target] if isinstance(target, str) else target)
@@ -119,7 +120,7 @@ def _set(part: Any, field: str, value: Any, key: str) -> None:
         part.bits.extend(value)
     elif field == "distribution":
         if value not in _DISTRIBUTIONS:
-            raise ValueRangeError(f"{key}: {value!r} is unknown; valid: {', '.join(_DISTRIBUTIONS)}")
+            raise ValueRangeError(f"{key}: {unknown('distribution', value, _DISTRIBUTIONS)}")
         part.distribution = _DISTRIBUTIONS[value]
     else:
         setattr(part, field, value)

@@ -226,5 +226,5 @@ def _read_spec() -> dict[str, Any]:
         ) from None
     missing = {"instance", "epoch", "name", "kind", "log_file", "config"} - set(spec)
     if missing:
-        raise ConfigError(f"the process description lacks {', '.join(sorted(missing))}")
+        raise ConfigError(f"the process description does not have {', '.join(sorted(missing))}")
     return dict(spec)

@@ -391,7 +391,11 @@ class Trail:
             except OSError as error:
                 before, self.problem = self.problem, f"audit: {self._path} cannot be written: {error.strerror}"
                 if self.problem != before:
-                    log.error("%s; up to %d entries wait, and commands are carried out", self.problem, MAX_WAITING)
+                    log.error(
+                        "%s; up to %d entries wait for the disk, and commands are still carried out",
+                        self.problem,
+                        MAX_WAITING,
+                    )
             else:
                 if self.problem:
                     log.warning("audit: %s can be written again", self._path)
@@ -407,7 +411,7 @@ class Trail:
             try:
                 what = _brief(what())
             except Exception as error:  # noqa: BLE001  whatever the client has sent, there is an entry
-                what = {"error": f"this cannot be shown: {type(error).__name__}"}
+                what = {"error": f"this value cannot be shown: {type(error).__name__}"}
         entry = Entry(
             stamp(waiting.time_s), self._instance, self.process, os.getpid(), who.endpoint, who.actor.kind,
             _cut(who.actor.name), _cut(who.actor.origin), waiting.action, waiting.outcome,

@@ -47,7 +47,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=PROGRAM,
         description="Judge what a campaign file expects of signals.",
-        epilog="Exit status: 0 all expectations passed, 1 one failed, 2 wrong usage or campaign, 3 inconclusive.",
+        epilog="Exit status: 0: all expectations passed; 1: one failed; 2: wrong usage or campaign; 3: inconclusive.",
     )
     parser.add_argument("--version", action="version", version=f"shmio {__version__}")
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")

@@ -140,7 +140,7 @@ def seconds(text: str) -> float:
     except ValueError:
         seconds = math.nan
     if not 0 < seconds <= MAX_SECONDS:
-        raise argparse.ArgumentTypeError(f"{text.strip()!r} is not a number of seconds above 0, at most {MAX_SECONDS}")
+        raise argparse.ArgumentTypeError(f"{text.strip()!r} is not a number of seconds above 0 and up to {MAX_SECONDS}")
     return seconds
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from shmio.cli.common import add_full, add_json, complete, exit_on_signals, load, run
 from shmio.version import __version__
+from shmio.wording import unknown
 
 PROGRAM = "shmio-dump"
 MODULES = {"info": "examine", "verify": "examine", "cut": "rewrite", "merge": "rewrite", "recover": "rewrite"}
@@ -205,7 +206,7 @@ def _some(verb: argparse.ArgumentParser) -> None:
 def _ignorable(text: str) -> str:
     for word in text.split(","):
         if word not in IGNORABLE:
-            raise argparse.ArgumentTypeError(f"{word!r} is unknown; valid: {', '.join(IGNORABLE)}")
+            raise argparse.ArgumentTypeError(unknown("part", word, IGNORABLE))
     return text
 
 

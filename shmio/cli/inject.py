@@ -29,6 +29,7 @@ from shmio.layout.values.write import Write, paths_of
 from shmio.logs import printable
 from shmio.model.cell import Campaign, Cell
 from shmio.model.injection import InjectionEvent
+from shmio.wording import unknown
 
 TURN_S: Final = 0.2
 """Interval in s at which to check for a campaign's events, signals and the end of the time."""
@@ -38,8 +39,9 @@ SEED_BITS: Final = 32
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the verb's own arguments."""
     parser.epilog = (
-        "Over PATH or PATH/out, consumers see VALUE. Over PATH/in, the device gets VALUE instead of what others write. "
-        "VALUE is JSON or an S7 literal. Without any PATH, the present injections are listed."
+        "An injection over PATH or PATH/out shows VALUE to consumers. An injection over PATH/in gives VALUE to the "
+        "device, instead of what others write. VALUE is JSON or an S7 literal. Without PATH, this command lists the "
+        "present injections."
     )
     parser.add_argument("pairs", nargs="*", action=Pairs, metavar="PATH VALUE", help="register or array element")
     parser.add_argument("--file", type=Path, metavar="CAMPAIGN.toml", help="inject what a campaign file declares")
@@ -59,10 +61,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=0,
         metavar="N",
-        help="the injection with the highest priority is outermost (default: 0)",
+        help="of several injections over one register, the one with the highest priority is outermost (default: 0)",
     )
     parser.add_argument("--name", default="", help="the name of the injection in the list")
-    how_long.add_argument("--keep", action="store_true", help="keep the injection until it is lifted by its number")
+    how_long.add_argument("--keep", action="store_true", help="keep the injection until you lift it by its number")
     parser.add_argument("--lift", metavar="NUMBER", type=int, help="lift one injection, of any program")
     parser.add_argument("--lift-all", action="store_true", help="lift all injections of all sources")
 
@@ -114,7 +116,7 @@ def _read(layouts: Mapping[str, Layout], path: str, text: str) -> tuple[Topic, V
     """
     topic = parse_topic(path, layouts, next(iter(layouts)) if len(layouts) == 1 else None)
     if topic.source not in layouts:
-        raise PathError(f"{path}: unknown source {topic.source}")
+        raise PathError(f"{path}: {unknown('source', topic.source, layouts)}")
     register = look_up(layouts[topic.source], topic)
     try:
         return topic, read_value(text, register)
@@ -134,7 +136,7 @@ def _lift(cell: Cell, options: argparse.Namespace) -> int:
     else:
         lifted = [(one.source, one.number, one.name) for one in cell.injections() if one.number == options.lift]
         if not lifted:
-            raise CommandError(f"there is no injection {options.lift}; shmio inject lists them")
+            raise CommandError(f"there is no injection {options.lift}; shmio inject lists the injections")
         for source, number, _ in lifted:
             cell.lift(source, number)
     for source, number, name in lifted:
@@ -218,12 +220,12 @@ def run_campaign(cell: Cell, options: argparse.Namespace) -> int:
         _refuse_past(declarations, now_s)
     with stop_on_signals() as over, cell.declare(declarations, keep=options.keep) as campaign:
         if any(declaration.seed is None for declaration in read):
-            line = dumps({"seed": seed}) if options.json else f"seed {seed}: --seed {seed} does the same again"
+            line = dumps({"seed": seed}) if options.json else f"seed {seed}: --seed {seed} repeats this run"
             print(line, flush=True)
         clock = cell.clock()
         if clock.virtual and not clock.playing and any(one.start_s or one.end_s for one in declarations):
             stands = f"time is paused at {clock.present_ns / 1e9:.3f} s"
-            print(f"{stands}: start_s and end_s wait until shmio step moves it", file=sys.stderr, flush=True)
+            print(f"{stands}; start_s and end_s wait until shmio step moves time", file=sys.stderr, flush=True)
         _follow(campaign, over, options)
     return 0
 
@@ -275,7 +277,7 @@ def _refuse_past(declarations: Sequence[Declaration], now_s: float) -> None:
     for one in declarations:
         if one.end_s is not None and one.end_s <= now_s:
             raise CommandError(
-                f"the time of injection {one.name!r} has passed: its end_s is {one.end_s:g}, the instance's clock "
+                f"the time of injection {one.name!r} has passed: its end_s is {one.end_s:g}, but the instance's clock "
                 f"is at {now_s:.3f} s; --from-now counts the file's times from now"
             )
 

@@ -16,6 +16,7 @@ from shmio.layout.model import MAX_BLOCK_BYTES, Layout, Register
 from shmio.layout.source.lexer import MAX_SOURCE_BYTES
 from shmio.logs import printable
 from shmio.version import __version__
+from shmio.wording import unknown
 
 _HEADINGS = ("offset", "size", "type", "path", "over", "initial", "comment")
 
@@ -67,15 +68,14 @@ def _compile(names: Sequence[str], block: str | None, sizes: Mapping[str, int], 
     program = Program([_read(name) for name in names])
     if block is not None and block.lower() not in {one.name.lower() for one in program.blocks}:
         program.compile(())  # reports damaged sources first
-        names = ", ".join(one.name for one in program.blocks)
-        raise ConfigError(f"--block: no data block {block!r}; there are: {names}")
+        raise ConfigError(f"--block: {unknown('data block', block, (one.name for one in program.blocks))}")
     try:
         compiled = program.compile(None if block is None else (block,), sizes)
     except LayoutError as error:
         _complain(one for one in error.diagnostics if one.severity == "warning")  # the error's text has the errors
         raise
     _complain(compiled.warnings)
-    _complain(f"warning: --type-bytes: nothing has the type {name!r}" for name in compiled.unused)
+    _complain(f"warning: --type-bytes: no member has the type {name!r}" for name in compiled.unused)
     for layout in compiled.layouts:
         _complain(_unread(layout))
     _print(compiled.layouts, as_json=as_json)

@@ -11,6 +11,7 @@ from shmio.cli.common import run
 from shmio.layout.importing.found import ImportingError
 from shmio.layout.importing.importer import FORMATS, MAX_BYTES, import_tags
 from shmio.logs import printable
+from shmio.wording import EXISTS, NOT_TOML
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -34,7 +35,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def _import(file: Path, output: Path | None, *, writable: bool) -> int:
     if output is not None and output.suffix != ".toml":
-        raise ImportingError(f"{output}: the table is TOML: have its name end in .toml")
+        raise ImportingError(f"{output}: {NOT_TOML}")
     with file.open("rb") as stream:
         data = stream.read(MAX_BYTES + 1)
     try:
@@ -44,7 +45,7 @@ def _import(file: Path, output: Path | None, *, writable: bool) -> int:
     for line in found.report():
         print(printable(line), file=sys.stderr)
     if not found.tags:
-        raise ImportingError(f"{file}: nothing to import")
+        raise ImportingError(f"{file}: the file has nothing to import")
     table = found.to_toml(file.name, writable=writable)
     if output is None:
         print(table, end="")
@@ -53,5 +54,5 @@ def _import(file: Path, output: Path | None, *, writable: bool) -> int:
         with output.open("x", encoding="utf-8") as stream:
             stream.write(table)
     except FileExistsError:
-        raise ImportingError(f"{output}: exists already; remove it, or name another file") from None
+        raise ImportingError(f"{output}: {EXISTS}") from None
     return 0

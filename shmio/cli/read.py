@@ -137,7 +137,7 @@ def _table(cell: Cell, options: argparse.Namespace) -> int:
         if options.full:
             lines = [line[at : at + columns] for line in lines for at in range(0, len(line), columns)]
         if len(lines) >= rows:
-            more = f"… and {len(lines) - rows + 2} more lines: enlarge the window, or use --lines"
+            more = f"… and {len(lines) - rows + 2} more lines; enlarge the window, or use --lines"
             lines = [*lines[: max(rows - 2, 0)], more]
         up = f"\x1b[{drawn}F" if drawn else ""
         text = "".join(f"{line}\x1b[K\n" for line in lines)

@@ -15,7 +15,7 @@ from shmio.model.cell import Cell
 from shmio.model.replay import ReplayChanges, ReplayStatus
 
 _VERBS: Final = {
-    "status": "show how they play (default)",
+    "status": "show how the recordings play (default)",
     "pause": "stand",
     "play": "continue; at the end, begin again",
     "seek": "TIME: go there",

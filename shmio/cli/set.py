@@ -33,7 +33,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "--timeout",
         type=seconds,
         metavar="S",
-        help="give up if no cycle begins to write in this time in s "
+        help="give up if the source begins no write within this many seconds "
         f"(default {WRITE_TIMEOUT_S:g}, or {WRITE_MIN_PERIODS} cycles)",
     )
     parser.add_argument("pairs", nargs="+", action=Pairs, metavar="PATH VALUE", help="register or array element")
@@ -56,7 +56,7 @@ class Pairs(argparse.Action):
         """Store the words as pairs; a path without a value is wrong usage."""
         words = [word[_NEGATIVE.match(word[1:]) is not None :] for word in values] if isinstance(values, list) else []
         if len(words) % 2:
-            parser.error(f"{words[-1]!r} has no value: give PATH VALUE [PATH VALUE ...]")
+            parser.error(f"{words[-1]!r} has no value; give PATH VALUE [PATH VALUE ...]")
         namespace.pairs = list(zip(words[::2], words[1::2], strict=True))
 
 
@@ -74,7 +74,7 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
         values = wanted.setdefault(source, {})
         name = f"{source}/{register.path}"
         if name in values:
-            raise PathError(f"{name}: given twice")
+            raise PathError(f"{name}: this path is given twice")
         try:
             values[name] = read_value(text, register)
         except ValueRangeError as error:
@@ -111,7 +111,7 @@ def _target(layouts: Mapping[str, Layout], path: str) -> tuple[str, Register]:
     if topic.direction == "out":
         raise PathError(f"{path}: an output of a source cannot be written; leave out /out")
     if topic.source not in layouts:
-        raise PathError(f"{path}: unknown source {topic.source}")
+        raise PathError(f"{path}: {unknown('source', topic.source, layouts)}")
     layout = layouts[topic.source]
     try:
         return topic.source, look_up(layout, topic)
@@ -142,9 +142,12 @@ def _print(outcomes: dict[str, Outcome], complaint: str) -> None:
 def _complaint(path: str, outcome: Outcome) -> str:
     """Return the error text for a failed write, with a remedy."""
     if outcome.kind == OutcomeKind.REJECTED:
-        return f"{path}: not written, the source accepted nothing: {outcome.text}; see shmio-supervisor status"
+        return (
+            f"{path}: not written, because the source did not accept the command: {outcome.text}; see "
+            "shmio-supervisor status"
+        )
     if outcome.kind == OutcomeKind.REFUSED:
         return f"{path}: the source refused it: {outcome.text}"
     if outcome.kind == OutcomeKind.EXPIRED:
         return f"{path}: not written: {outcome.text}; try again, or with a longer --timeout"
-    return f"{path}: {outcome.text}; look with shmio get {shlex.quote(path)} before writing it again"
+    return f"{path}: {outcome.text}; check the value with shmio get {shlex.quote(path)} before you write it again"

@@ -49,7 +49,7 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
     """
     dt_s = None if options.dt_ms is None else options.dt_ms / 1000
     if dt_s is not None and (options.pause or options.release):
-        raise CommandError(f"{'--pause' if options.pause else '--release'} does no step: leave out --dt-ms")
+        raise CommandError(f"{'--pause' if options.pause else '--release'} does no step; leave out --dt-ms")
     if not options.yes and not options.release:
         _ask(cell)
     if options.play is not None:
@@ -87,11 +87,13 @@ def _ask(cell: Cell) -> None:
     """
     if cell.clock().virtual or not (real := cell.real_sources()):
         return
-    who = f"{real[0]} goes" if len(real) == 1 else f"{real[0]} and {len(real) - 1} more go"
-    what = f"the instance's time is real: a step pauses it until it is released, while {who} on in real time"
+    who = f"source {real[0]} continues" if len(real) == 1 else f"{real[0]} and {len(real) - 1} more sources continue"
+    what = (
+        f"the instance follows real time; a step pauses its time until shmio step --release, while {who} in real time"
+    )
     if sys.stdin is None or not sys.stdin.isatty():
-        raise CommandError(f"{what}; --yes steps anyway")
-    sys.stderr.write(f"{what}. Go on? [y/N] ")
+        raise CommandError(f"{what}; to step anyway, add --yes")
+    sys.stderr.write(f"{what}. Continue? [y/N] ")
     sys.stderr.flush()
     if sys.stdin.readline().strip().lower() not in ("y", "yes"):
         raise CommandError("the clock was not changed")
@@ -108,7 +110,7 @@ def _play(cell: Cell, rate: float, dt_s: float | None) -> None:
 def _rate(text: str) -> float:
     value = _number(text)
     if not 0 < value <= MAX_RATE:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0, at most {MAX_RATE:g}")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0 and up to {MAX_RATE:g}")
     return value
 
 

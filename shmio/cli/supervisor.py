@@ -74,10 +74,10 @@ def _parser() -> argparse.ArgumentParser:
     text = "ok: as usual; delay: later; corrupt: with wrong bytes; hang: not at all; refuse: no connections"
     emulator.add_argument("answers", choices=ANSWERS, help=text)
     emulator.add_argument(
-        "--delay-ms", type=milliseconds, metavar="MS", help="with delay: of each answer (default: 100)"
+        "--delay-ms", type=milliseconds, metavar="MS", help="with delay: the delay of each answer (default: 100)"
     )
     check = verb("check", "validate the configuration and its layouts; start nothing", file)
-    text = "say of each source whether its period can be met if a request takes this long to be answered"
+    text = "say whether each source can meet its period if the answer to a request takes this long"
     check.add_argument("--round-trip-ms", type=milliseconds, metavar="MS", help=text)
     add_json(check)
     logs = verb("logs", "print the end of the log files", target)
@@ -131,7 +131,7 @@ def _parser() -> argparse.ArgumentParser:
     new.add_argument(
         "connector", metavar="NAME", help='name of the connector: you write connector = "NAME" in supervisor.toml'
     )
-    new.add_argument("-o", dest="directory", type=Path, metavar="FOLDER", help="a new folder (default: shmio-NAME)")
+    new.add_argument("-o", dest="directory", type=Path, metavar="FOLDER", help="the new folder (default: shmio-NAME)")
     return parser
 
 
@@ -153,15 +153,19 @@ def _add_replay(parser: argparse.ArgumentParser) -> None:
     """Add the options that override the keys of ``[replay]``."""
     group = parser.add_argument_group("with --mode replay, in place of the keys of [replay]")
     group.add_argument("--from", nargs="+", metavar="FILE", help="the recording: one .mem, or several of one run")
-    group.add_argument("--start", metavar="TIME", help="where to start: seconds from its beginning, or a date and time")
-    group.add_argument("--end", metavar="TIME", help="where to end, in the same form as --start")
-    group.add_argument("--speed", type=float, metavar="X", help="a factor of real time, 0.01 to 1000 (default: 1)")
     group.add_argument(
-        "--injections", choices=("keep", "leave out"), help="the injections of the recording (default: keep)"
+        "--start", metavar="TIME", help="where to start: seconds from the recording's beginning, or a date and time"
     )
-    group.add_argument("--loop", action="store_true", default=None, help="again and again")
+    group.add_argument("--end", metavar="TIME", help="where to end, in the same form as --start")
     group.add_argument(
-        "--paused", action="store_true", default=None, help="wait at the beginning until shmio replay play"
+        "--speed", type=float, metavar="X", help="the speed relative to real time, 0.01 to 1000 (default: 1)"
+    )
+    group.add_argument(
+        "--injections", choices=("keep", "leave out"), help="what to do with the recording's injections (default: keep)"
+    )
+    group.add_argument("--loop", action="store_true", default=None, help="at the end, begin again")
+    group.add_argument(
+        "--paused", action="store_true", default=None, help="wait at the beginning until you run shmio replay play"
     )
     group.add_argument("--record", action="store_true", default=None, help="start the recorder of the configuration")
 

@@ -74,7 +74,7 @@ def target(arguments: argparse.Namespace) -> Target:
     if not running:
         raise NotRunningError("no instance is running, and there is no supervisor.toml here")
     if len(running) > 1:
-        raise ControlError(f"several instances are running: choose one by --instance ({', '.join(running)})")
+        raise ControlError(f"several instances are running; choose one by --instance ({', '.join(running)})")
     return Target(running[0])
 
 

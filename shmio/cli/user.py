@@ -108,7 +108,7 @@ def _opened(arguments: argparse.Namespace, *, writable: bool) -> Iterator[Cell]:
             yield attachment
         return
     if arguments.config is not None or arguments.instance is not None:
-        raise ConfigError("--host already names the instance: remove -c and --instance")
+        raise ConfigError("--host already names the instance; remove -c and --instance")
     os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # shmio's own errors say the same
     with ended_by_interrupt():  # gRPC crashes if an exception interrupts its import
         from shmio.client import connect  # noqa: PLC0415  only for --host
@@ -128,7 +128,7 @@ def _opened(arguments: argparse.Namespace, *, writable: bool) -> Iterator[Cell]:
         except UnknownClientError as error:
             if token is not None:
                 raise
-            raise UnknownClientError(f"{error}; here: --token-file FILE, a file with only the token") from None
+            raise UnknownClientError(f"{error}; give --token-file FILE, a file with only the token") from None
 
 
 def _spelled(cell: Cell, arguments: argparse.Namespace) -> argparse.Namespace:

@@ -65,8 +65,8 @@ _PLAIN: Final = {
 }
 """Texts that replace long error messages of gRPC, by a part of the message."""
 _TLS: Final = {
-    "Hostname Verification": "its certificate does not name this host: use a name or address from the certificate",
-    "WRONG_VERSION_NUMBER": "the endpoint does not use TLS: leave the CA out (ca, --ca)",
+    "Hostname Verification": "its certificate does not name this host; use a name or address from the certificate",
+    "WRONG_VERSION_NUMBER": "the endpoint does not use TLS; leave the CA out (ca, --ca)",
     "CERTIFICATE_VERIFY_FAILED": "its certificate is not from the CA given (ca, --ca), or has expired",
 }
 """Texts that replace gRPC's messages about TLS errors, by a part of the message."""
@@ -99,8 +99,8 @@ class Target:
         if self.token is None or self.ca is not None or self.token_in_plain_text or _is_here(self.address):
             return
         raise ValueRangeError(
-            f"{self.address}: a token is not sent to another host in plain text, where others could read it: "
-            "name the CA of its certificate (ca, --ca), or allow it (token_in_plain_text, --token-in-plain-text)"
+            f"{self.address}: shmio does not send a token to another host in plain text, where others could read it; "
+            "name the CA of the host's certificate (ca, --ca), or allow it (token_in_plain_text, --token-in-plain-text)"
         )
 
     @property
@@ -122,7 +122,7 @@ class Target:
         """Convert the error of a gRPC call to an error of shmio."""
         code, details = error.code(), error.details() or ""
         if "message larger than max" in details:  # text of gRPC
-            details = f"the values are too large for one message: send or request fewer at once ({details})"
+            details = f"the values are too large for one message; send or request fewer at once ({details})"
         if kind := _ERRORS.get(code):
             return kind(details)
         error_type = _REMOTE.get(code, RemoteError)
@@ -131,7 +131,7 @@ class Target:
         closed = "Socket closed" in details and not self.address.startswith(_UNIX)
         details = next((plain for words, plain in _PLAIN.items() if words in details), details)
         if closed and self.ca is None:
-            details += ", or it speaks TLS: then name the CA of its certificate (ca, --ca)"
+            details += ", or it speaks TLS; then name the CA of its certificate (ca, --ca)"
         elif closed and self.certificate is None:
             details += ", or it needs a client certificate (certificate and key)"
         return error_type(f"{self.address}: {_MEANING.get(code, code.name)}{f': {details}' if details else ''}")

@@ -116,7 +116,7 @@ class ShadowState:
         if found.originals:
             if len(self._waiting) >= _MAX_WAITING:
                 raise RemoteError(
-                    f"{_MAX_WAITING} messages with originals are unread: iterate over them, or do not request originals"
+                    f"{_MAX_WAITING} messages with originals are unread; iterate over them, or do not request originals"
                 )
             self._waiting.append(found.originals)
 

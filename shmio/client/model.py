@@ -16,6 +16,7 @@ from shmio.client.table import FIELDS, Array, Register, Table
 from shmio.errors import ConflictError, LostError, PathError, RemoteError, ShmioError, ValueRangeError
 from shmio.model.values import Column
 from shmio.wire import shmio_v1_pb2 as wire
+from shmio.wording import unknown
 
 RETRY_S: Final = 0.25
 """Time between two attempts to join, in s."""
@@ -138,8 +139,7 @@ class Part:
         try:
             return self._outputs.place(path)
         except PathError:
-            there = ", ".join(self.outputs)
-            raise PathError(f"{path}: it is not an output of {self.source}; there are: {_shorten(there)}") from None
+            raise PathError(unknown("output", path, self.outputs, self.source)) from None
 
     @staticmethod
     def failed(step: int, reason: str) -> bytes:

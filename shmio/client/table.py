@@ -23,6 +23,7 @@ from shmio.layout.model import ElementType, element_type
 from shmio.model.statuses import RegisterStatus
 from shmio.model.values import Column
 from shmio.wire import shmio_v1_pb2 as wire
+from shmio.wording import did_you_mean
 
 Array = np.ndarray[Any, np.dtype[Any]]
 
@@ -145,8 +146,8 @@ class Register(model.Register, frozen=True, gc=False, kw_only=True):
 def unknown(path: str, paths: Sequence[str], what: str) -> PathError:
     """Return an error for a path that is not among ``paths``."""
     near = difflib.get_close_matches(path, paths[:_NEAR_CANDIDATES], n=3)
-    like = f"; near: {', '.join(near)}" if near else ""
-    return PathError(f"{path[:_SHOWN]}: not among {what}{like}")
+    like = f"; {did_you_mean(near)}" if near else ""
+    return PathError(f"{path[:_SHOWN]}: this path is not among {what}{like}")
 
 
 class Change(NamedTuple):

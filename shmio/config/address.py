@@ -33,7 +33,7 @@ class Address(msgspec.Struct, frozen=True):
         if host.startswith("[") and host.endswith("]"):
             host = host[1:-1]
         elif ":" in host:
-            raise ConfigError(f"{text!r}: an IPv6 address is written in brackets, [::1]:8089")
+            raise ConfigError(f"{text!r}: write an IPv6 address in brackets, such as [::1]:8089")
         if not colon or not host or not port.isascii() or not port.isdecimal() or int(port) > 65535:
             raise ConfigError(f"{text!r} is not an address; expected host:port, such as 127.0.0.1:8089")
         return cls(host, int(port))
@@ -74,7 +74,9 @@ class UnixAddress(msgspec.Struct, frozen=True):
         if not text.startswith(UNIX) or not path:
             raise ConfigError(f"{text!r} is not a UNIX socket; expected unix:PATH, such as unix:run/shmio.sock")
         if len(os.fsencode(path)) > MAX_PATH_BYTES:
-            raise ConfigError(f"{text}: the path is longer than the {MAX_PATH_BYTES} bytes that a socket may have")
+            raise ConfigError(
+                f"{text}: the path of a UNIX socket has at most {MAX_PATH_BYTES} bytes; choose a shorter path"
+            )
         return cls(path)
 
     def __str__(self) -> str:

@@ -10,6 +10,7 @@ from shmio.config.address import Address
 from shmio.config.model import Alert, Config
 from shmio.config.mqtt import check_publish_topic
 from shmio.errors import ConfigError
+from shmio.wording import already_named
 
 MAX_ALERTS: Final = 100
 """Maximum number of alerts of an instance."""
@@ -34,15 +35,15 @@ def alert_faults(config: Config) -> Iterator[str]:
     for index, alert in enumerate(config.alert):
         key = f"alert[{index}]"
         if sum(getattr(alert, name) is not None for name in ("when", "process", "source")) != 1:
-            yield f"{key}.when: give exactly one of when, process and source, which say what the alert watches"
+            yield f"{key}.when: give exactly one of when, process and source, to say what the alert watches"
             continue
         first = seen.setdefault(alert.title, index)
         if first != index:
             named = alert.name is not None
             yield (
-                f"{key}.name: {alert.title!r} is already the name of alert[{first}]"
+                f"{key}.name: {already_named(alert.title, f'alert[{first}]')}"
                 if named
-                else f"{key}.name: alert[{first}] watches the same: give each a name"
+                else f"{key}.name: alert[{first}] watches the same thing; give both alerts names"
             )
         for name, needed in _DEPENDENT.items():
             if getattr(alert, name) and getattr(alert, needed) is None:
@@ -76,18 +77,20 @@ def parse_webhook(url: str) -> SplitResult:
         parts = urlsplit(url)
         port = parts.port
     except ValueError as error:
-        raise ConfigError(f"webhook: not a URL: {error}") from None
+        raise ConfigError(
+            f"webhook: this is not a URL ({error}); write one such as https://alerts.example/hooks/a50"
+        ) from None
     if parts.scheme not in ("http", "https") or not parts.hostname or port == 0 or len(url) > MAX_URL:
         raise ConfigError("webhook: expected a URL such as https://alerts.example/hooks/a50")
     if not url.isascii() or " " in url:
-        raise ConfigError("webhook: write other characters than ASCII, and blanks, percent-encoded")
+        raise ConfigError("webhook: percent-encode blanks and all characters that are not ASCII")
     if parts.username is not None or parts.password is not None:
         raise ConfigError(
-            "webhook: the URL must not contain a password: put a line such as Authorization: Basic … into a file, "
-            "and name it in webhook_header_file"
+            "webhook: the URL must not contain a password; write a line such as Authorization: Basic … into a file, "
+            "and name that file in webhook_header_file"
         )
     if parts.fragment:
-        raise ConfigError(f"webhook: a server never sees what follows the #: remove #{parts.fragment}")
+        raise ConfigError(f"webhook: remove #{parts.fragment}, because a server never receives what follows a #")
     return parts
 
 
@@ -99,7 +102,7 @@ def _check_webhook(url: str, alert: Alert) -> None:
             raise ConfigError("webhook_ca: this key is only for a webhook with https")
         if not loopback and not alert.insecure:
             raise ConfigError(
-                f"webhook: {parts.hostname} would get plain text over the network; this requires https, or "
+                f"webhook: shmio would send plain text over the network to {parts.hostname}; use https, or write "
                 "insecure = true in this section"
             )
 

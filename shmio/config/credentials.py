@@ -16,6 +16,7 @@ from typing import Final, NamedTuple
 
 from shmio.config.model import MqttAccount, Token
 from shmio.errors import ConfigError
+from shmio.wording import larger_than
 
 MIN_TOKEN_BYTES: Final = 20
 MAX_TOKEN_BYTES: Final = 1024
@@ -78,8 +79,8 @@ def _read_token(key: str, name: str) -> bytes:
     text = _read_secret(key, name, MAX_TOKEN_BYTES + 3, instead="a new token").rstrip(b"\r\n")
     if not MIN_TOKEN_BYTES <= len(text) <= MAX_TOKEN_BYTES or not all(0x21 <= byte <= 0x7E for byte in text):
         raise ConfigError(
-            f"{key}: expected one token of {MIN_TOKEN_BYTES} to {MAX_TOKEN_BYTES} letters, digits and signs, and "
-            "nothing else: create one by openssl rand -hex 32"
+            f"{key}: the file must contain one token of {MIN_TOKEN_BYTES} to {MAX_TOKEN_BYTES} letters, digits and "
+            "signs, and nothing else; create one with openssl rand -hex 32"
         )
     return digest(text)
 
@@ -98,7 +99,7 @@ def read_password(name: str, key: str = _KEY) -> str:
     """
     password = _read_passwords(name, key).split("\n", 1)[0].rstrip("\r")
     if not password:
-        raise ConfigError(f"{key}: {name}: its first line, the password, is empty")
+        raise ConfigError(f"{key}: {name}: the first line is empty, but it must be the password")
     return password
 
 
@@ -121,10 +122,10 @@ def read_headers(name: str, key: str) -> dict[str, str]:
         if not colon or not _HEADER.fullmatch(header) or not (value.strip().isascii() and value.strip().isprintable()):
             raise ConfigError(f"{key}: {name}: line {number}: expected a header such as Authorization: Bearer TOKEN")
         if header.lower() in _OWN_HEADERS:
-            raise ConfigError(f"{key}: {name}: line {number}: shmio itself sets the header {header}")
+            raise ConfigError(f"{key}: {name}: line {number}: shmio itself sets the header {header}; remove this line")
         headers[header] = value.strip()
     if not headers:
-        raise ConfigError(f"{key}: {name}: it has no header; expected lines such as Authorization: Bearer TOKEN")
+        raise ConfigError(f"{key}: {name}: the file has no header; expected lines such as Authorization: Bearer TOKEN")
     return headers
 
 
@@ -149,24 +150,27 @@ def read_accounts(name: str, roles: Sequence[MqttAccount] = ()) -> dict[str, str
         if not colon or not user.strip() or not secret:
             raise ConfigError(f"{_KEY}: {name}: line {number}: expected name:password")
         if user in accounts:
-            raise ConfigError(f"{_KEY}: {name}: line {number}: this name is given twice")
+            raise ConfigError(f"{_KEY}: {name}: line {number}: this name is given twice; remove one of the lines")
         if user != user.strip() or secret != secret.strip():
             raise ConfigError(
-                f"{_KEY}: {name}: line {number}: a blank next to the colon, or at an end, would belong to the name "
-                "or the password: remove it"
+                f"{_KEY}: {name}: line {number}: remove the blanks next to the colon and at both ends of the line, "
+                "because they would belong to the name or the password"
             )
         known = _is_hash(secret)
         if not known and _HASH.match(secret):
             raise ConfigError(
-                f"{_KEY}: {name}: line {number}: an unknown or damaged hash: use "
+                f"{_KEY}: {name}: line {number}: the hash is damaged, or of an unknown kind; make one with "
                 "mosquitto_passwd -H sha512-pbkdf2, or write the password itself"
             )
         accounts[user] = secret if known else hashed(secret)
     if not accounts:
-        raise ConfigError(f"{_KEY}: {name}: it has no accounts; expected lines name:password")
+        raise ConfigError(f"{_KEY}: {name}: the file has no accounts; expected lines such as name:password")
     for index, account in enumerate(roles):
         if account.name is not None and account.name not in accounts:
-            raise ConfigError(f"mqtt.account[{index}].name: {account.name!r} has no line in {name}")
+            raise ConfigError(
+                f"mqtt.account[{index}].name: {name} has no password for {account.name!r}; add a line "
+                f"{account.name}:PASSWORD"
+            )
     return accounts
 
 
@@ -195,11 +199,11 @@ def _read_passwords(name: str, key: str = _KEY) -> str:
     key = f"{key}: {name}"
     data = _read_secret(key, name, MAX_PASSWORDS_BYTES + 1, instead="new passwords")
     if len(data) > MAX_PASSWORDS_BYTES:
-        raise ConfigError(f"{key}: larger than {MAX_PASSWORDS_BYTES} bytes")
+        raise ConfigError(f"{key}: {larger_than(MAX_PASSWORDS_BYTES)}")
     try:
         return data.decode()
     except UnicodeDecodeError:
-        raise ConfigError(f"{key}: not UTF-8") from None
+        raise ConfigError(f"{key}: the file is not UTF-8; save it as UTF-8") from None
 
 
 def _read_secret(key: str, name: str, most_bytes: int, *, instead: str) -> bytes:
@@ -223,10 +227,11 @@ def _read_secret(key: str, name: str, most_bytes: int, *, instead: str) -> bytes
     try:
         mode = os.fstat(fd).st_mode
         if not stat.S_ISREG(mode):
-            raise ConfigError(f"{key}: not a file")
+            raise ConfigError(f"{key}: this is not a regular file")
         if mode & _OTHERS:
             raise ConfigError(
-                f"{key}: mode {stat.S_IMODE(mode):04o} lets other users read it: chmod 600, and {instead}"
+                f"{key}: other users may have read this file, because its mode is {stat.S_IMODE(mode):04o}; "
+                f"run chmod 600, and use {instead}"
             )
         return os.read(fd, most_bytes)
     finally:

@@ -10,6 +10,7 @@ import msgspec
 
 from shmio.config.model import Declaration, Expectation
 from shmio.errors import ConfigError
+from shmio.wording import already_named
 
 MAX_DECLARATIONS: Final = 256
 """Maximum number of declarations in one file."""
@@ -100,7 +101,7 @@ def faults_of_tables(
     for index, table in enumerate(tables):
         first = seen.setdefault(table.name, index)
         if first != index:
-            yield f"{key}[{index}].name: {table.name!r} is already the name of {key}[{first}]"
+            yield f"{key}[{index}].name: {already_named(table.name, f'{key}[{first}]')}"
         for contradiction in contradictions_of(table):
             yield f"{key}[{index}].{contradiction}"
 
@@ -137,7 +138,7 @@ def _fault(value: Any, depth: int = 0) -> str:
     """Return why a value cannot be written to a register or compared with one; "" if it can."""
     if isinstance(value, list):
         if depth > MAX_DIMENSIONS:
-            return f"lists are nested in more than {MAX_DIMENSIONS} others"
+            return f"lists are nested more than {MAX_DIMENSIONS} deep"
         return next((fault for item in value if (fault := _fault(item, depth + 1))), "")
     if isinstance(value, bool | str):
         return ""

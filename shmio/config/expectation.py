@@ -47,7 +47,7 @@ def _contradictions(expectation: Expectation) -> Iterator[str]:
     forms = [key for key in given if key in FORMS]
     if len(forms) != 1:
         if forms:
-            yield f"{forms[1]}: there is {forms[0]} already; an expectation has only one of {', '.join(FORMS)}"
+            yield f"{forms[1]}: this expectation already has {forms[0]}; give only one of {', '.join(FORMS)}"
         else:
             yield f"formula: an expectation needs one of {', '.join(FORMS)}"
         return
@@ -55,10 +55,10 @@ def _contradictions(expectation: Expectation) -> Iterator[str]:
     needed, free = FORMS[form]
     for key in needed:
         if key not in given:
-            yield f"{key}: this key is needed beside {form}"
+            yield f"{key}: this key is needed with {form}"
     for key in given:
         if key not in (form, *needed, *free):
             takers = ", ".join(name for name, other in FORMS.items() if key in (*other.needed, *other.free))
             yield f"{key}: {form} takes no such key; the key is for {takers}"
     if form == "max_rate" and isinstance(expectation.signal, list):
-        yield "signal: max_rate is for one signal: write an expectation for each"
+        yield "signal: max_rate is for one signal; write an expectation for each"

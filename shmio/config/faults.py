@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -35,14 +34,14 @@ from shmio.config.model import (
 )
 from shmio.config.tokens import TOKEN
 from shmio.errors import ConfigError, LayoutError
+from shmio.wording import unknown
 
 MAX_KEY: Final = 1_000
 """Maximum number of characters of a key, with all its dotted parts."""
 MAX_PARTS: Final = 64
 """Maximum number of dotted parts of a key, because the parser's time grows with their square."""
 MAX_LINE: Final = 80
-MAX_HINTED: Final = 100
-"""Maximum length in characters of an unknown word for which a similar word is suggested."""
+
 MAX_SHOWN: Final = 1_000
 MAX_CHARACTERS: Final = 500
 """Maximum number of characters of a message.
@@ -206,9 +205,11 @@ def explain(error: ValidationError, key: str = "") -> str:
         return f"{path}.{missing[1]}: this key is needed".lstrip(".")
     if repr(NAME_PATTERN) in text:
         text = f"expected a name: {NAME_RULE}"
-    elif unknown := re.fullmatch(r"Invalid enum value ('.*')", text):
+    elif word := re.fullmatch(r"Invalid enum value '(.*)'", text):
         words = get_args(_WORDS[path.rpartition(".")[2].partition("[")[0]])
-        text = f"{unknown[1]} is unknown; valid: {', '.join(words)}{meant(unknown[1].strip(_QUOTES), words)}"
+        text = unknown(path.rpartition(".")[2].partition("[")[0], word[1], words)
+    elif field := re.search(r"unknown field `([^`]*)`", text):
+        text = f"unknown key {field[1]!r}"
     elif text.endswith("of length >= 1"):
         text = "must not be empty"
     text = re.sub(r"`([a-z]+(?: \| [a-z]+)*)`", _types, text)
@@ -231,27 +232,10 @@ def decode(data: bytes, place: str) -> str:
         text = data.decode("utf-8-sig")  # some editors write a byte order mark
     except UnicodeDecodeError as error:
         utf16 = ", but UTF-16" if data.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else f" at byte {error.start}"
-        raise ConfigError(f"{place}: not UTF-8{utf16}; save the file as UTF-8") from None
+        raise ConfigError(f"{place}: the file is not UTF-8{utf16}; save it as UTF-8") from None
     if "\0" in text:
-        raise ConfigError(f"{place}: zero bytes, as in UTF-16; save the file as UTF-8")
+        raise ConfigError(f"{place}: the file contains zero bytes, as UTF-16 does; save it as UTF-8")
     return text
-
-
-def near(word: str, names: Iterable[str]) -> list[str]:
-    """Return a list with only the name most similar to ``word``, ignoring case; empty if none is similar."""
-    folded = {name.lower(): name for name in names}
-    found = difflib.get_close_matches(word.lower(), folded, 1) if len(word) <= MAX_HINTED else []
-    return [folded[found[0]]] if found else []
-
-
-def hint(word: str, names: Iterable[str], otherwise: str) -> str:
-    """Return "did you mean …?" for an unknown word; ``otherwise`` if no name is similar."""
-    return next((f"did you mean {name}?" for name in near(word, names)), otherwise)
-
-
-def meant(word: str, names: Iterable[str]) -> str:
-    """Return "; did you mean …?" to append to a message about an unknown word; "" if no name is similar."""
-    return "".join(f"; did you mean {name}?" for name in near(word, names))
 
 
 def explain_toml(error: Exception, text: str) -> str:
@@ -269,21 +253,21 @@ def explain_toml(error: Exception, text: str) -> str:
     double = Lines(text).double
     if double and str(error).startswith(_DOUBLE):
         key, first, second = double
-        return f"{error}: {key[:MAX_LINE]} is given twice, in lines {first} and {second}; keep one of them"
+        return f"{error}: {key[:MAX_LINE]} is given twice, in lines {first} and {second}; remove one of them"
     return f"{error}: {shown}{_slip(str(error), line, column)}" if shown else str(error)
 
 
 def _slip(message: str, line: str, column: int) -> str:
     if message.startswith("Illegal character '\\n'"):
-        return "; a quote is missing at its end"
+        return "; the closing quote is missing"
     if "\\" in line and message.startswith(_ESCAPE):
-        return "; in double quotes a backslash has a special meaning: write a path in single quotes, 'C:\\cell.db'"
+        return "; in double quotes a backslash has a special meaning, so write a path in single quotes, 'C:\\cell.db'"
     word = next((word[0] for word in _BARE.finditer(line) if word.start() <= column < word.end()), "").strip("“”")
     if message.startswith("Expected '='") or not _TEXT.fullmatch(word):
         return ""
     if word.lower() in ("true", "false"):
         return f"; write {word.lower()}"
-    return f'; text is written in quotes: "{word[:MAX_LINE]}"'
+    return f'; write text in quotes: "{word[:MAX_LINE]}"'
 
 
 def named(message: str, tables: Mapping[str, Any]) -> str:

@@ -16,12 +16,12 @@ _PROBE: Final = bytes(4096)  # an empty file fits even on a full disk
 _FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 _NO_UNNAMED: Final = (errno.EOPNOTSUPP, errno.EISDIR)
 _MEANING: Final = {
-    errno.ENOENT: "its file system accepts no files: choose another folder",
-    errno.EROFS: "it is mounted read-only: remount it, or choose another folder",
-    errno.ENOSPC: "the disk is full: make room, or choose another folder",
-    errno.EDQUOT: "the disk quota is used up: make room, or choose another folder",
-    errno.EACCES: "no permission: let this user write there, or choose another folder",
-    errno.EPERM: "no permission: let this user write there, or choose another folder",
+    errno.ENOENT: "its file system accepts no files; choose another folder",
+    errno.EROFS: "it is mounted read-only; remount it, or choose another folder",
+    errno.ENOSPC: "the disk is full; make room, or choose another folder",
+    errno.EDQUOT: "the disk quota is used up; make room, or choose another folder",
+    errno.EACCES: "this user has no permission; let this user write there, or choose another folder",
+    errno.EPERM: "this user has no permission; let this user write there, or choose another folder",
 }
 
 
@@ -51,7 +51,7 @@ def unwritable(folder: Path) -> Obstacle | None:
     try:
         _write(place)
     except OSError as error:
-        what = f"{folder} cannot be written" if place == folder else f"{folder} cannot be made in {place}"
+        what = f"{folder} cannot be written" if place == folder else f"{folder} cannot be created in {place}"
         return Obstacle(f"{what}: {_MEANING.get(error.errno or 0, error.strerror)}", error.errno in _FULL)
     return None
 

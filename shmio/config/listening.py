@@ -7,9 +7,9 @@ from contextlib import AbstractContextManager
 from typing import Final
 
 from shmio.config.address import UNIX, Address, UnixAddress, parse_address
-from shmio.config.faults import hint
 from shmio.config.model import ROLES, Config, Grpc, Listening, Token
 from shmio.errors import ConfigError
+from shmio.wording import already_named, plain_text, unknown
 
 Place = Address | UnixAddress
 
@@ -22,7 +22,7 @@ def check_listening(config: Config, catching: Callable[[], AbstractContextManage
     ``catching`` returns a context manager that collects a ConfigError instead of raising it.
     """
     for index, emulator in enumerate(config.emulator):
-        key, remedy = f"emulator[{index}].listen", "insecure = true beside it"
+        key, remedy = f"emulator[{index}].listen", "write insecure = true in the same section"
         with catching():
             _check_address(key, emulator.listen, Address.parse, safe=emulator.insecure, remedy=remedy)
     if config.grpc:
@@ -76,18 +76,18 @@ def _check_addresses(grpc: Grpc) -> None:
     if not grpc.listening:
         raise ConfigError("grpc.listen: this key is needed")
     for key, address in grpc.listening.items():
-        remedy = "a [grpc.tls] table, or insecure = true beside it"
+        remedy = "add a [grpc.tls] table, or write insecure = true in the same section"
         _check_address(key, address.listen, parse_address, safe=address.insecure or grpc.tls is not None, remedy=remedy)
         if not address.roles and grpc.token and not takes_tokens(grpc, address):
             raise ConfigError(
-                f"{key}: {address.listen} is plain text, so other hosts could read the tokens of [[grpc.token]]: "
-                "give it a [grpc.tls] table; or make it a [[grpc.address]] with roles for clients without a token; "
-                "or write tokens_in_plain_text = true beside it, if that is acceptable"
+                f"{key}: {address.listen} is plain text, so other hosts could read the tokens of [[grpc.token]]; "
+                "add a [grpc.tls] table; or write a [[grpc.address]] for it, with roles for clients without a token; "
+                "or accept the risk with tokens_in_plain_text = true in the same section"
             )
         if not address.roles and not grpc.token and not encrypted(grpc, address):
             raise ConfigError(
-                f"{key}: {address.listen} uses no certificates, so no [[grpc.client]] can be recognised: make it "
-                "a [[grpc.address]] with roles for all who reach it, or add a [[grpc.token]]"
+                f"{key}: {address.listen} uses no certificates, so it cannot recognise a [[grpc.client]]; write a "
+                "[[grpc.address]] for it, with roles for all who reach it, or add a [[grpc.token]]"
             )
     for index, address in enumerate(grpc.address):
         _check_roles(f"grpc.address[{index}]", address.roles)
@@ -99,7 +99,7 @@ def _check_address(key: str, text: str, parse: Callable[[str], Place], *, safe: 
     except ConfigError as error:
         raise ConfigError(f"{key}: {error}") from None
     if not address.loopback and not safe:
-        raise ConfigError(f"{key}: {text} can be reached from other hosts in plain text; this requires {remedy}")
+        raise ConfigError(f"{key}: {plain_text(text, remedy)}")
 
 
 def _check_tokens(grpc: Grpc) -> None:
@@ -107,7 +107,7 @@ def _check_tokens(grpc: Grpc) -> None:
     for index, token in enumerate(grpc.token):
         key = f"grpc.token[{index}]"
         if token.name in names:
-            raise ConfigError(f"{key}.name: {token.name!r} is already the name of {names[token.name]}")
+            raise ConfigError(f"{key}.name: {already_named(token.name, names[token.name])}")
         names[token.name] = key
         _check_roles(key, token.roles)
         _check_secret(key, token)
@@ -115,19 +115,20 @@ def _check_tokens(grpc: Grpc) -> None:
         _check_roles(f"grpc.client[{index}]", client.roles)
     if grpc.client and (grpc.tls is None or grpc.tls.client_ca is None):
         raise ConfigError(
-            "grpc.client: clients are identified by their certificates, which requires client_ca in [grpc.tls]"
+            "grpc.client: this section identifies clients by their certificates, so it needs client_ca in [grpc.tls]"
         )
 
 
 def _check_roles(key: str, roles: Sequence[str]) -> None:
     for index, role in enumerate(roles):
         if role not in ROLES:
-            remedy = hint(role, ROLES, f"there are: {', '.join(ROLES)}")
-            raise ConfigError(f"{key}.roles[{index}]: no role {role!r}; {remedy}")
+            raise ConfigError(f"{key}.roles[{index}]: {unknown('role', role, ROLES)}")
 
 
 def _check_secret(key: str, token: Token) -> None:
     if (token.token_file is None) == (token.sha256 is None):
         raise ConfigError(f"{key}: give either token_file, a file with only the token, or sha256, the token's hash")
     if token.sha256 is not None and (len(token.sha256) != 64 or not _DIGITS.issuperset(token.sha256)):
-        raise ConfigError(f"{key}.sha256: expected 64 digits, as by: printf %s TOKEN | sha256sum")
+        raise ConfigError(
+            f"{key}.sha256: expected 64 hexadecimal digits, as this command prints: printf %s TOKEN | sha256sum"
+        )

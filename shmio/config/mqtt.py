@@ -10,6 +10,7 @@ from unicodedata import category
 from shmio.config.address import Address
 from shmio.config.model import Config, Mqtt, MqttTopic
 from shmio.errors import ConfigError
+from shmio.wording import already_named, unknown
 
 PORT: Final = 1883
 TLS_PORT: Final = 8883
@@ -97,8 +98,8 @@ def _is_no_text(part: str) -> bool:
 def _check_level(key: str, name: str) -> None:
     if len(name) > MAX_PREFIX or set("/+#").intersection(name) or _is_no_text(name):
         raise ConfigError(
-            f"{key}: {name!r} is a part of a topic: at most {MAX_PREFIX} characters are allowed, no control "
-            "characters, no / + #"
+            f"{key}: {name!r} cannot be a part of a topic; write at most {MAX_PREFIX} characters, without control "
+            "characters and without / + #"
         )
 
 
@@ -106,8 +107,8 @@ def _check_prefix(prefix: str) -> None:
     bad = prefix.startswith("$") or "" in prefix.split("/") or set("+#").intersection(prefix)
     if bad or len(prefix) > MAX_PREFIX or _is_no_text(prefix):
         raise ConfigError(
-            f"mqtt.prefix: {prefix!r} cannot begin a topic: at most {MAX_PREFIX} characters are allowed, no control "
-            "characters, no + and #, no $ at the beginning, no / at the ends and no //; an example is shmio/a50"
+            f"mqtt.prefix: a topic cannot begin with {prefix!r}; write at most {MAX_PREFIX} characters, such as "
+            "shmio/a50, without control characters, + and #, without $ at the beginning, / at the ends and //"
         )
 
 
@@ -125,15 +126,16 @@ def _check_external(mqtt: Mqtt) -> None:
         raise ConfigError("mqtt.account: an external broker has accounts of its own; remove this section")
     if mqtt.listen is not None:
         raise ConfigError(
-            'mqtt.listen: an external broker listens by itself; remove this key, or set broker = "embedded"'
+            'mqtt.listen: shmio does not start an external broker; remove this key, or set broker = "embedded"'
         )
     if mqtt.host is None:
         raise ConfigError(
-            'mqtt.host: this key is needed with broker = "external": the broker\'s host, host:port, or a list of these'
+            'mqtt.host: this key is needed with broker = "external"; give the broker\'s host, host:port, or a '
+            "list of these"
         )
     for address in brokers(mqtt):
         if not (address.loopback or mqtt.tls or mqtt.insecure):
-            _refuse_plain_text("mqtt.host", f"{address} would get plain text over the network")
+            _refuse_plain_text("mqtt.host", f"shmio would send plain text over the network to {address}")
     if mqtt.password_file is not None and mqtt.username is None:
         raise ConfigError("mqtt.username: this key is needed, because mqtt.password_file contains this user's password")
     if mqtt.tls and (mqtt.tls.certificate is None) != (mqtt.tls.key is None):
@@ -153,15 +155,17 @@ def _check_own(mqtt: Mqtt) -> None:
     if not address.port:
         raise ConfigError(f"mqtt.listen: {address} has no port; the usual one is {PORT}")
     if not (address.loopback or mqtt.tls or mqtt.insecure):
-        _refuse_plain_text("mqtt.listen", f"{address} can be reached from other hosts in plain text")
+        _refuse_plain_text("mqtt.listen", f"other hosts can reach {address} in plain text")
     if mqtt.tls:
         for key in ("certificate", "key"):
             if getattr(mqtt.tls, key) is None:
-                raise ConfigError(f"mqtt.tls.{key}: this key is needed: the broker shows its clients a certificate")
+                raise ConfigError(
+                    f"mqtt.tls.{key}: this key is needed, because the broker shows its clients a certificate"
+                )
 
 
 def _refuse_plain_text(key: str, why: str) -> None:
-    raise ConfigError(f"{key}: {why}; this requires a [mqtt.tls] table, or insecure = true beside it")
+    raise ConfigError(f"{key}: {why}; add a [mqtt.tls] table, or write insecure = true in [mqtt]")
 
 
 def _check_accounts(mqtt: Mqtt, instance: str) -> None:
@@ -169,20 +173,20 @@ def _check_accounts(mqtt: Mqtt, instance: str) -> None:
     for index, account in enumerate(mqtt.account):
         key = f"mqtt.account[{index}]"
         if account.name in names:
-            whose = (
-                "an account without a name, for clients that do not log in,"
+            first = names[account.name]
+            raise ConfigError(
+                f"{key}.name: {first} has no name either, and only one account may be for clients that do not log in"
                 if account.name is None
-                else f"an account with the name {account.name!r}"
+                else f"{key}.name: {already_named(account.name, first)}"
             )
-            raise ConfigError(f"{key}.name: {whose} exists already: {names[account.name]}")
         names[account.name] = key
         if account.name is not None and mqtt.password_file is None:
             raise ConfigError(
-                f"{key}.name: {account.name!r} needs a password: set mqtt.password_file, and add a line for it there"
+                f"{key}.name: {account.name!r} needs a password; set mqtt.password_file, and add a line for it there"
             )
         for place, role in enumerate(account.roles):
             if role not in ROLES:
-                raise ConfigError(f"{key}.roles[{place}]: no role {role!r}; there are: {', '.join(ROLES)}")
+                raise ConfigError(f"{key}.roles[{place}]: {unknown('role', role, ROLES)}")
         if account.publish and "write" not in account.roles:
             raise ConfigError(f"{key}.publish: this key needs the role write")
         for place, topics in enumerate(account.publish):
@@ -194,12 +198,15 @@ def _check_filter(key: str, topics: str, own: Sequence[str]) -> None:
     wild = any(set("+#").intersection(level) and level not in ("+", "#") for level in levels)
     if wild or "#" in levels[:-1] or topics.startswith("$") or len(topics) > MAX_PREFIX or _is_no_text(topics):
         raise ConfigError(
-            f"{key}: {topics!r} is not a topic filter: at most {MAX_PREFIX} characters are allowed, no $ at the "
-            "beginning, + and # only as whole levels, and # only as the last; an example is homeassistant/#"
+            f"{key}: {topics!r} is not a topic filter; write at most {MAX_PREFIX} characters, such as "
+            "homeassistant/#, without $ at the beginning, + and # only as whole levels, and # only as the last"
         )
     for one in own:
         if _overlap(levels, one.split("/")):
-            raise ConfigError(f"{key}: {topics!r} would let others publish on the instance's own topics, such as {one}")
+            raise ConfigError(
+                f"{key}: {topics!r} would let others publish on the instance's own topics, such as {one}; choose a "
+                "narrower filter"
+            )
 
 
 def _overlap(one: Sequence[str], other: Sequence[str]) -> bool:
@@ -220,11 +227,11 @@ def check_publish_topic(key: str, topic: str, mqtt: Mqtt, config: Config) -> Non
     """
     if len(topic) > MAX_PREFIX or set("+#").intersection(topic) or topic.startswith("$") or _is_no_text(topic):
         raise ConfigError(
-            f"{key}: {topic!r} is not a topic: at most {MAX_PREFIX} characters are allowed, no control characters, "
-            "no + and #, no $ at the beginning; an example is plant/alerts/a50"
+            f"{key}: {topic!r} is not a topic; write at most {MAX_PREFIX} characters, such as plant/alerts/a50, "
+            "without control characters, + and #, and without $ at the beginning"
         )
     prefix = f"{mqtt.prefix or f'shmio/{config.instance.name}'}/"
     first = topic.removeprefix(prefix).partition("/")[0] if topic.startswith(prefix) else None
     taken = {"status", "simlog", *(source.name for source in config.source)}
     if first in taken or topic.startswith("spBv1.0/"):
-        raise ConfigError(f"{key}: {topic!r} is a topic of the bridge; an example of another one is {prefix}alerts")
+        raise ConfigError(f"{key}: {topic!r} is a topic of the MQTT bridge; choose another one, such as {prefix}alerts")

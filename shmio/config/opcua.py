@@ -6,11 +6,11 @@ import importlib.util
 from typing import Final
 
 from shmio.config.address import Address
-from shmio.config.faults import hint
 from shmio.config.model import ROLES, Config, OpcUa
 from shmio.errors import ConfigError
+from shmio.wording import PLAIN_REMEDY, already_named, plain_text, unknown
 
-EXTRA: Final = "opcua: the OPC UA endpoint needs another library: pip install 'shmio[opcua]'"
+EXTRA: Final = "opcua: the OPC UA endpoint needs another library; run pip install 'shmio[opcua]'"
 
 
 def check_opcua(config: Config) -> None:
@@ -30,21 +30,24 @@ def check_opcua(config: Config) -> None:
     except ConfigError as error:
         raise ConfigError(f"opcua.listen: {error}") from None
     if not address.loopback and opcua.certificate is None and not opcua.insecure:
-        raise ConfigError(
-            f"opcua.listen: {opcua.listen} can be reached from other hosts in plain text; this requires certificate "
-            "and "
-            "key, or insecure = true beside it"
-        )
+        raise ConfigError(f"opcua.listen: {plain_text(opcua.listen, PLAIN_REMEDY)}")
     if opcua.trusted and opcua.certificate is None:
-        raise ConfigError("opcua.trusted: clients show certificates only to a server that has certificate and key")
+        raise ConfigError(
+            "opcua.trusted: clients show certificates only to a server that has one; give certificate and key"
+        )
     if opcua.trusted and opcua.insecure:
-        raise ConfigError("opcua.trusted: has no effect with insecure = true, which admits clients without certificate")
+        raise ConfigError(
+            "opcua.trusted: this key has no effect with insecure = true, which admits clients without "
+            "certificate; remove one of the two"
+        )
     if opcua.client and not opcua.trusted:
         raise ConfigError(
-            "opcua.client: clients are identified by their certificates, which requires trusted in [opcua]"
+            "opcua.client: this section identifies clients by their certificates, so it needs trusted in [opcua]"
         )
     if opcua.account and opcua.certificate is None and not address.loopback:
-        raise ConfigError("opcua.account: beyond loopback, passwords need an encrypted channel: certificate and key")
+        raise ConfigError(
+            "opcua.account: other hosts would send passwords without encryption; give certificate and key in [opcua]"
+        )
     _check_roles(opcua)
 
 
@@ -55,20 +58,19 @@ def _check_roles(opcua: OpcUa) -> None:
     for key, roles in given.items():
         for index, role in enumerate(roles):
             if role not in ROLES:
-                remedy = hint(role, ROLES, f"there are: {', '.join(ROLES)}")
-                raise ConfigError(f"{key}[{index}]: no role {role!r}; {remedy}")
+                raise ConfigError(f"{key}[{index}]: {unknown('role', role, ROLES)}")
     names: dict[str, int] = {}
     for index, account in enumerate(opcua.account):
         key = f"opcua.account[{index}]"
         if account.name in names:
-            raise ConfigError(
-                f"{key}.name: {account.name!r} is already the name of opcua.account[{names[account.name]}]"
-            )
+            raise ConfigError(f"{key}.name: {already_named(account.name, f'opcua.account[{names[account.name]}]')}")
         names[account.name] = index
         if (account.token_file is None) == (account.sha256 is None):
             raise ConfigError(f"{key}: give either token_file, a file with only the password, or sha256, its hash")
         if account.sha256 is not None and (len(account.sha256) != 64 or set(account.sha256) - set("0123456789abcdef")):
-            raise ConfigError(f"{key}.sha256: expected 64 digits, as by: printf %s PASSWORD | sha256sum")
+            raise ConfigError(
+                f"{key}.sha256: expected 64 hexadecimal digits, as this command prints: printf %s PASSWORD | sha256sum"
+            )
 
 
 def resolve_opcua(opcua: OpcUa, config: Config) -> None:

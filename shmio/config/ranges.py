@@ -8,8 +8,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from shmio.config.faults import hint, meant
 from shmio.errors import ConfigError
+from shmio.wording import did_you_mean, near, unknown
 
 MAX_DIMENSIONS: Final = 64
 """Maximum number of ranges in one campaign."""
@@ -141,7 +141,7 @@ class Space:
         seen: set[str] = set()
         for one in self.dimensions:
             if one.name in seen:
-                raise ConfigError(f"{key_of(one.place)}: another range has the name {one.name} already")
+                raise ConfigError(f"{key_of(one.place)}: another range already has the name {one.name!r}")
             seen.add(one.name)
 
     def at(self, point: Point) -> dict[str, Any]:
@@ -169,8 +169,7 @@ class Space:
         known = [one.name for one in self.dimensions]
         for name in names:
             if name not in known:
-                there = f"there are: {', '.join(known)}" if known else "the campaign has none"
-                raise ConfigError(f"there is no range {name!r}; {hint(name, known, there)}")
+                raise ConfigError(unknown("range", name, known))
 
 
 def key_of(place: Sequence[str | int]) -> str:
@@ -221,7 +220,8 @@ def _dimension(table: Mapping[str, Any], name: str, place: tuple[str | int, ...]
     """
     for key in table:
         if key not in _KEYS:
-            raise ConfigError(f".{key}: a range has no such key{meant(key, _KEYS) or f': {SYNTAX}'}")
+            remedy = did_you_mean(near(key, _KEYS)) or SYNTAX
+            raise ConfigError(f".{key}: unknown key; {remedy}")
     if "choice" in table:
         return _choice(table, name, place)
     low, high = (_number(table, key) for key in ("from", "to"))
@@ -235,7 +235,7 @@ def _dimension(table: Mapping[str, Any], name: str, place: tuple[str | int, ...]
     if step is not None and log:
         raise ConfigError(".log: a range with step has no log")
     if log and low <= 0:
-        raise ConfigError(f".from: {low:g} is not above 0, so it has no logarithm: leave out log, or begin above 0")
+        raise ConfigError(f".from: {low:g} is not above 0, so it has no logarithm; leave out log, or begin above 0")
     if step is not None and not 0 < step <= high - low:
         raise ConfigError(f".step: {step:g} is not above 0 and at most {high - low:g}, the length of the range")
     whole = whole_key or (step is not None and all(isinstance(one, int) for one in (low, high, step)))
@@ -256,13 +256,13 @@ def _choice(table: Mapping[str, Any], name: str, place: tuple[str | int, ...]) -
         if isinstance(one, dict):
             raise ConfigError(f".choice[{index}]: a choice has no ranges in it")
         if any(one == other and type(one) is type(other) for other in options[:index]):
-            raise ConfigError(f".choice[{index}]: {one!r} is there already")
+            raise ConfigError(f".choice[{index}]: {one!r} is given twice; remove one of them")
     return Choice(name, place, tuple(options))
 
 
 def _number(table: Mapping[str, Any], key: str) -> float:
     if key not in table:
-        raise ConfigError(f".{key}: this key is needed: {SYNTAX}")
+        raise ConfigError(f".{key}: this key is needed; {SYNTAX}")
     value = table[key]
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or abs(value) > 1e300:
         raise ConfigError(f".{key}: expected a number")

@@ -13,7 +13,7 @@ import msgspec
 
 from shmio.config.alert import alert_faults, resolve_alert
 from shmio.config.declaration import declaration_faults
-from shmio.config.faults import MAX_KEY, MAX_PARTS, Faults, decode, explain, explain_toml, hint, near, too_long
+from shmio.config.faults import MAX_KEY, MAX_PARTS, Faults, decode, explain, explain_toml, too_long
 from shmio.config.listening import check_listening, resolve
 from shmio.config.model import (
     RESERVED_SOURCES,
@@ -45,6 +45,7 @@ from shmio.config.mqtt import check_mqtt, resolve_mqtt
 from shmio.config.opcua import check_opcua, resolve_opcua
 from shmio.config.web import check_web, resolve_web
 from shmio.errors import ConfigError
+from shmio.wording import already_named, did_you_mean, larger_than, listed, near, unknown
 
 SECTION_PROCESSES = frozenset({"alerts", "broker", "grpc", "metrics", "mqtt", "opcua", "recorder", "supervisor", "web"})
 MAX_FILE_BYTES = 1 << 20
@@ -163,7 +164,7 @@ def read_text(file: Path, remedy: str = "") -> str:
     except OSError as error:
         raise ConfigError(f"{file}: {error.strerror}") from None
     if len(data) > MAX_FILE_BYTES:
-        raise ConfigError(f"{file}: larger than {MAX_FILE_BYTES} bytes")
+        raise ConfigError(f"{file}: {larger_than(MAX_FILE_BYTES)}")
     return decode(data, str(file))
 
 
@@ -179,7 +180,7 @@ def parse(file: Path, text: str) -> dict[str, Any]:
     try:
         tables = tomllib.loads(text)
     except ValueError as error:  # TOMLDecodeError, or a number too long for int()
-        raise ConfigError(f"{file}: not TOML: {explain_toml(error, text)}") from None
+        raise ConfigError(f"{file}: the file is not valid TOML: {explain_toml(error, text)}") from None
     except RecursionError:
         tables = None
     if tables is None or _depth(tables) > MAX_DEPTH:
@@ -223,7 +224,7 @@ def read_properties(file: Path, key: str) -> dict[str, tuple[str, int]]:
     except OSError as error:
         raise ConfigError(f"{place}: {error.strerror}") from None
     if len(data) > MAX_PROPERTIES_BYTES:
-        raise ConfigError(f"{place} is larger than {MAX_PROPERTIES_BYTES} bytes")
+        raise ConfigError(f"{place}: {larger_than(MAX_PROPERTIES_BYTES)}")
     values: dict[str, tuple[str, int]] = {}
     for number, line in enumerate(decode(data, place).splitlines(), 1):
         stripped = line.strip()
@@ -234,7 +235,7 @@ def read_properties(file: Path, key: str) -> dict[str, tuple[str, int]]:
         if not equals or not name:
             raise ConfigError(f"{place}:{number}: expected key=value")
         if name in values:
-            raise ConfigError(f"{place}:{number}: {name} is given twice")
+            raise ConfigError(f"{place}:{number}: {name} is given twice; remove one of the lines")
         values[name] = value.strip(), number
     return values
 
@@ -343,12 +344,12 @@ class Structure:
         if isinstance(value, dict):
             self._faults.add(f"{key}: write [[{key}]] with double brackets, because there can be several")
         else:
-            self._faults.add(f"{key}: expected tables [[{key}]]")
+            self._faults.add(f"{key}: expected tables, each with the header [[{key}]]")
 
     def table(self, value: Any, key: str, name: str) -> tuple[bool, dict[str, Any]]:
         """Return whether a table has no faults, and its faultless keys with their values."""
         if not isinstance(value, dict):
-            self._faults.add(f"{key}: expected a table [{name}]")
+            self._faults.add(f"{key}: expected a table with the header [{name}]")
             return False, {}
         kind = self._kinds[name]
         before = self._faults.count
@@ -426,7 +427,8 @@ class _ConfigStructure(Structure):
             return super()._one(value, name, index)
         key = f"{name}[{index}]"
         common = {*Source.__struct_fields__} - {*_DERIVED}
-        options = {name: item for name, item in value.items() if name not in common}
+        connector, misspelled = _connector_of(value, common)
+        options = {name: item for name, item in value.items() if name not in common and name != misspelled}
         before = self._faults.count
         for fault in text_faults(options, key):
             self._faults.add(fault)
@@ -438,13 +440,22 @@ class _ConfigStructure(Structure):
                 texts = {name: text for name, (text, _) in read.items() if name not in options}
                 self._faults.lies_in(properties, key, {name: line for name, (_, line) in read.items() if name in texts})
         usable = self._faults.count == before
-        good, found = self.table({name: value[name] for name in value if name in common}, key, name)
+        good, found = self.table({name: value[name] for name in value if name not in options}, key, name)
         if good and usable:
             return True, found | {"options": options, "texts": texts}
-        connector = value.get("connector")
         if isinstance(connector, str) and usable:
             self._broken[index] = connector, options, texts
         return False, found
+
+
+def _connector_of(source: dict[str, Any], common: Collection[str]) -> tuple[object, str]:
+    """Return the connector of a ``[[source]]``, and the misspelled key that gives it; "" if it is not misspelled."""
+    if "connector" in source:
+        return source["connector"], ""
+    for key, value in source.items():
+        if key not in common and near(key, ["connector"]):
+            return value, key
+    return None, ""
 
 
 def convert(tables: dict[str, Any], kind: type[_Table]) -> _Table:
@@ -475,14 +486,14 @@ def _known(kind: type[Section]) -> list[str]:
 
 
 def _unknown(key: str, known: Sequence[str]) -> str:
-    remedy = hint(key.rpartition(".")[2], known, f"known here: {', '.join(known)}")
+    remedy = did_you_mean(near(key.rpartition(".")[2], known)) or listed(known)
     return f"{key}: unknown key; {remedy}"
 
 
 def unknown_option(index: int, key: str, known: list[str]) -> str:
     """Return the message for a key of ``source[index]`` that neither shmio nor the connector knows."""
     names = [*known, *_known(Source)]
-    remedy = hint(key, names, f"the connector knows: {', '.join(known)}")
+    remedy = did_you_mean(near(key, names)) or f"the connector's keys are {', '.join(known)}"
     return f"source[{index}].{key}: unknown key; {remedy}"
 
 
@@ -502,7 +513,7 @@ def check_text(value: Any, key: str) -> None:
 def text_faults(value: Any, key: str) -> Iterator[str]:
     """Yield a fault for each text with control characters, however deeply it is nested."""
     if isinstance(value, str) and any(char < " " or char == "\x7f" for char in value):
-        path = "; a path with backslashes is written in single quotes" if _SLIPPED.search(value) else ""
+        path = "; write a path with backslashes in single quotes" if _SLIPPED.search(value) else ""
         yield f"{key}: must not contain control characters{path}"
     if isinstance(value, dict):
         for name, item in value.items():
@@ -519,11 +530,13 @@ def _name_faults(config: Config) -> Iterator[str]:
             key = f"{table}[{index}].name"
             folded = section.name.lower()
             if folded in RESERVED_SOURCES:
-                yield f"{key}: {section.name!r} is reserved"
+                yield f"{key}: {section.name!r} is reserved; choose another name"
             elif folded in SECTION_PROCESSES:
-                yield f"{key}: {section.name!r} is the name of one of shmio's processes"
+                yield f"{key}: {section.name!r} is the name of one of shmio's processes; choose another name"
             elif folded in seen:
-                yield f"{key}: {section.name!r} is already the name of {seen[folded]} (case does not count)"
+                yield (
+                    f"{key}: {already_named(section.name, seen[folded])} (names that differ only in case are the same)"
+                )
             seen[folded] = f"{table}[{index}]"
 
 
@@ -531,9 +544,9 @@ def _reference_faults(config: Config) -> Iterator[str]:
     names = [source.name for source in config.source]
     for name in config.recorder.sources if config.recorder else ():
         if name not in names:
-            yield f"recorder.sources: no source {name!r}; there are: {', '.join(names)}"
+            yield f"recorder.sources: {unknown('source', name, names)}"
     if config.grpc and config.grpc.default_source is not None and config.grpc.default_source not in names:
-        yield f"grpc.default_source: no source {config.grpc.default_source!r}; there are: {', '.join(names)}"
+        yield f"grpc.default_source: {unknown('source', config.grpc.default_source, names)}"
 
 
 def _time_faults(config: Config) -> Iterator[str]:
@@ -541,7 +554,7 @@ def _time_faults(config: Config) -> Iterator[str]:
         if source.stale_ms is not None and source.stale_ms < 2 * source.period_ms:
             yield (
                 f"source[{index}].stale_ms: {source.stale_ms:g} is less than two periods of {source.period_ms:g} ms: "
-                "one late frame would make the source bad"
+                "one late frame would make the source bad; raise stale_ms"
             )
 
 
@@ -549,4 +562,7 @@ def _rotation_faults(config: Config) -> Iterator[str]:
     for key, least in (("rotate_min", 0.1), ("rotate_mb", 1)) if config.recorder else ():
         value: float = getattr(config.recorder, key)
         if 0 < value < least:
-            yield f"recorder.{key}: {value:g} is less than {least:g}, which would create too many files; 0: never"
+            yield (
+                f"recorder.{key}: {value:g} is less than {least:g} and would create too many files; write 0 to "
+                "disable it"
+            )

@@ -212,12 +212,12 @@ def _shape_faults(shape: Shape, *, template: bool) -> Iterator[str]:
             takers = ", ".join(form for form, other in _KEYS.items() if key in (*other.needed, *other.free))
             yield f"{key}: form {shape.form!r} has no such key; the key is for {takers}"
     if not (is_color(shape.color) or (template and _PLACEHOLDER.search(shape.color))):
-        yield f'color: {shape.color!r} is no colour; write it as "#RRGGBB", such as "#ff8800"'
+        yield f'color: {shape.color!r} is not a colour; write it as "#RRGGBB", such as "#ff8800"'
 
 
 def _joint_faults(joint: Joint) -> Iterator[str]:
     if not any(joint.axis):
-        yield "axis: it has no direction; write for example [0, 0, 1]"
+        yield "axis: all its numbers are 0, so it has no direction; write, for example, [0, 0, 1]"
     known = _UNITS[joint.type]
     if unit(joint) not in known:
         yield f"unit: a {joint.type} joint cannot have the unit {joint.unit}; valid: {', '.join(known)}"

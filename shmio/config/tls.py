@@ -38,7 +38,11 @@ def read_tls(tls: Tls) -> TlsFiles:
         _load_pair(context, tls.certificate, tls.key, "grpc.tls.key")
     except ssl.SSLError as error:
         other = error.reason == "KEY_VALUES_MISMATCH"
-        why = "this is not the key of grpc.tls.certificate" if other else f"it has no usable PEM key{_detail(error)}"
+        why = (
+            "this key does not belong to grpc.tls.certificate"
+            if other
+            else f"the file has no usable PEM key{_detail(error)}"
+        )
         raise ConfigError(f"grpc.tls.key: {tls.key}: {why}") from None
     return found
 
@@ -140,7 +144,7 @@ def _load_authority(context: ssl.SSLContext, name: str, key: str) -> None:
     try:
         context.load_verify_locations(name)
     except ssl.SSLError as error:
-        raise ConfigError(f"{key}: {name}: it has no usable PEM certificate{_detail(error)}") from None
+        raise ConfigError(f"{key}: {name}: the file has no usable PEM certificate{_detail(error)}") from None
     except OSError as error:
         raise ConfigError(f"{key}: {name}: {error.strerror}") from None
 

@@ -29,7 +29,7 @@ def clear(path: str) -> None:
         Path(path).unlink(missing_ok=True)
     except OSError as error:  # another user's file in a shared folder
         raise EndpointError(
-            f"cannot listen on unix:{path}: the socket of an earlier process cannot be removed ({error.strerror}): "
+            f"cannot listen on unix:{path}: the socket of an earlier process cannot be removed ({error.strerror}); "
             "ask its owner to remove it, or choose another path"
         ) from None
 
@@ -38,7 +38,7 @@ def obstacle(path: str) -> str | None:
     """Return why processes of this user cannot listen at a path; None if they can."""
     folder = Path(path).parent
     if not folder.is_dir():
-        return f"there is no folder {folder}: create it, or choose another path"
+        return f"there is no folder {folder}; create it, or choose another path"
     if (found := unwritable(folder)) and not found.full:
         return found.reason
     try:
@@ -46,9 +46,9 @@ def obstacle(path: str) -> str | None:
     except FileNotFoundError:
         return None
     if not stat.S_ISSOCK(mode):
-        return "a file of that name exists and is not a socket: move it away, or choose another path"
+        return "a file of this name exists and is not a socket; move it away, or choose another path"
     if listened_on(path):
-        return f"another program listens there; choose another path, or see which: ss -xlp src {path}"
+        return f"another program listens there; choose another path, or find that program with ss -xlp src {path}"
     return None
 
 

@@ -8,8 +8,9 @@ from typing import Final
 from shmio.config.address import Address
 from shmio.config.model import ROLES, Config, Metrics, Web
 from shmio.errors import ConfigError
+from shmio.wording import PLAIN_REMEDY, plain_text, unknown
 
-EXTRA: Final = "{}: the HTTP endpoint needs other libraries: pip install 'shmio[web]'"
+EXTRA: Final = "{}: the HTTP endpoint needs other libraries; run pip install 'shmio[web]'"
 _LIBRARIES: Final = ("uvicorn", "starlette", "websockets", "prometheus_client")
 
 
@@ -28,10 +29,7 @@ def check_web(config: Config) -> None:
         except ConfigError as error:
             raise ConfigError(f"{key}.listen: {error}") from None
         if not address.loopback and section.certificate is None and not section.insecure:
-            raise ConfigError(
-                f"{key}.listen: {section.listen} can be reached from other hosts in plain text; this requires "
-                "certificate and key, or insecure = true beside it"
-            )
+            raise ConfigError(f"{key}.listen: {plain_text(section.listen, PLAIN_REMEDY)}")
         if isinstance(section, Web):
             _check_roles(section, address, config)
 
@@ -47,15 +45,15 @@ def _check_roles(web: Web, address: Address, config: Config) -> None:
     if web.roles is None:
         if not guarded and not address.loopback:
             raise ConfigError(
-                f"web.roles: other hosts can reach {web.listen}: give the roles of users who show no token, such as "
+                f"web.roles: other hosts can reach {web.listen}; give the roles of users who show no token, such as "
                 'roles = ["read"], or add a [[grpc.token]]'
             )
         web.roles = [] if guarded else list(ROLES)
     for role in web.roles:
         if role not in ROLES:
-            raise ConfigError(f"web.roles: unknown role {role!r}; there are: {', '.join(ROLES)}")
+            raise ConfigError(f"web.roles: {unknown('role', role, ROLES)}")
     if not web.roles and not guarded:
-        raise ConfigError("web.roles: nobody could use the page: give a role, or add a [[grpc.token]]")
+        raise ConfigError("web.roles: nobody could use the page; give a role, or add a [[grpc.token]]")
 
 
 def resolve_web(config: Config) -> None:

@@ -87,7 +87,9 @@ class _Running:
 
         """
         if not self.poll.is_alive() or not self.commands.is_alive():
-            raise ConnectorError("the poll loop or the command thread ended unexpectedly; its traceback is in the log")
+            raise ConnectorError(
+                "the source's poll loop or command thread ended unexpectedly; the log has the traceback"
+            )
         loop = self.part.loop
         busy_s = _busy_s(loop.counters.busy_since_ns)
         if busy_s > self.part.timeout_s + HANG_MARGIN_S:
@@ -212,7 +214,7 @@ def _replay_loop(worker: Worker, options: Any) -> _LoopHandle:
     source = Replay(options, worker.name)
     if source.layout.hash != segment.blocks[worker.name].layout.hash:
         raise ConfigError(
-            f"the recording of source {worker.name} now has a different layout: run shmio-supervisor reload"
+            f"the recording of source {worker.name} now has a different layout; run shmio-supervisor reload"
         )
     block = segment.blocks[worker.name]
     beginning = begin(source, block, segment.header.started_ns, segment.blocks.values())

@@ -594,7 +594,7 @@ class CommandProcessor:
     def _refusal(self, command: Command) -> str:
         """Return why the command is too late, or for an earlier process; "" if it is neither."""
         if command.incarnation != self._writer.incarnation:
-            return "the source was restarted after the command was sent: send it again"
+            return "the source was restarted after the command was sent; send it again"
         late_ns = self._now_ns() - command.deadline_ns
         if late_ns > 0:
             return f"the command came {late_ns / 1e6:.0f} ms after its deadline"

@@ -120,9 +120,9 @@ class LayerStack:
     def add(self, injection: Layer) -> str:
         """Add a layer; return the reason why it cannot be added, or "" if it was added."""
         if any(layer.id == injection.id for layer in self.layers):
-            return f"there is an injection {injection.id} already"
+            return f"injection {injection.id} exists already"
         if len(self.layers) >= MAX_INJECTIONS:
-            return f"{MAX_INJECTIONS} injections cover this source already, which is the maximum: lift one"
+            return f"{MAX_INJECTIONS} injections cover this source already, which is the maximum; lift one first"
         place = sum(layer.priority <= injection.priority for layer in self.layers)
         self.layers.insert(place, injection)
         return ""

@@ -567,7 +567,7 @@ class InjectionProcessor:
 
     def _shadow(self, layer: Layer, command: Command) -> str:
         if isinstance(layer, DeclaredLayer):
-            return f"the injection {layer.name} computes its values: clients cannot set them"
+            return f"the injection {layer.name} computes its values, so clients cannot set them"
         with self._output.lock:
             if reason := shadow(layer, command.writes):
                 return reason

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from shmio.config.faults import explain, meant
+from shmio.config.faults import explain
 from shmio.connectors.base import Computed, Connector, Replayed
 from shmio.errors import ConfigError
+from shmio.wording import unknown
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint, EntryPoints
@@ -58,11 +59,11 @@ def clash(name: str) -> str:
     if name in BUILT_IN and packages:
         return (
             f"{name!r} is a connector of shmio, and {' and '.join(packages)} {'offer' if packages[1:] else 'offers'} "
-            f"another one of this name: rename the entry point, or pip uninstall {' '.join(packages)}"
+            f"another one with this name; rename the entry point, or pip uninstall {' '.join(packages)}"
         )
     if len(packages) > 1:
         return (
-            f"{' and '.join(packages)} each offer a connector {name!r}: pip uninstall all but the one that you mean, "
+            f"{' and '.join(packages)} each offer a connector {name!r}; pip uninstall all but the one that you want, "
             "or rename an entry point"
         )
     return ""
@@ -86,7 +87,7 @@ def load(name: str) -> type[Connector] | type[Computed] | type[Replayed]:
     else:
         points = [point for point in _offered() if point.name == name]
         if not points:
-            raise ConfigError(f"no connector {name!r}; there are: {', '.join(names())}{meant(name, names())}")
+            raise ConfigError(unknown("connector", name, names()))
         if len(points) > 1:
             raise ConfigError(clash(name) or f"the package {_package(points[0])} offers the connector {name!r} twice")
         try:

@@ -43,18 +43,18 @@ def written_registers(layout: Layout, write: Write, present: Callable[[int], Val
         none = False
         if share != wanted:
             if not _whole_elements(register, share):
-                raise ValueError(f"{register.path}: a message cannot carry a part of a value: write the whole register")
+                raise ValueError(f"{register.path}: a message cannot carry a part of a value; write the whole register")
             try:
                 codec(register, layout.byte_order).encode_into(present(index), image)
             except ValueRangeError:
                 raise ValueError(
-                    f"{register.path}: the other elements are unknown, because the last message does not contain them: "
+                    f"{register.path}: the other elements are unknown, because the last message does not contain them; "
                     "write the whole array"
                 ) from None
         apply(write, image)
         yield index, codec(register, layout.byte_order).decode(image)
     if none:
-        raise ValueError("the layout has no register at the written bytes")
+        raise ValueError("no register of the layout covers the written bytes")
 
 
 def _whole_elements(register: Register, share: bytes) -> bool:

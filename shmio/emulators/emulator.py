@@ -150,7 +150,9 @@ class Emulator:
         """Serve a block with its initial values, under ``number`` or the block's own number."""
         number = layout.number if number is None else number
         if number is None:
-            raise ConfigError(f"dbNumber: the layout {layout.name!r} names no number; give one")
+            raise ConfigError(
+                f"dbNumber: this key is needed, because the layout {layout.name!r} has no number in its name"
+            )
         frame, _ = initial_frame(layout)
         self._server.add_block(number, frame)
         self._memory[Area.BLOCK, number] = frame
@@ -168,7 +170,7 @@ class Emulator:
                 if len(self._memory[place]) < size - 1:
                     raise ConfigError(
                         f"layout: a tag table needs {size} bytes of {place_name(place)}, whose layout has "
-                        f"{len(self._memory[place])}: correct one of them"
+                        f"{len(self._memory[place])}; correct one of the two"
                     )
                 continue
             area = self._memory[place] = bytearray(size)

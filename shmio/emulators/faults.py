@@ -52,7 +52,7 @@ class FaultControl:
         path = emulator_socket_path(worker.segment.header.control, worker.name)
         if len(path.encode()) > MAX_PATH_BYTES:
             raise ControlError(
-                f"faults: the control socket {path} has a path of more than {MAX_PATH_BYTES} bytes: give the instance "
+                f"faults: the control socket {path} has a path of more than {MAX_PATH_BYTES} bytes; give the instance "
                 "or the emulator a shorter name, or leave out faults"
             )
         with ExitStack() as cleanup:

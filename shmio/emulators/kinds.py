@@ -17,7 +17,7 @@ KINDS: Final = (S7, "modbus", "opcua")
 FAULTY: Final = (S7, "modbus")
 """The kinds that can misbehave on command."""
 _LIBRARIES: Final = {"modbus": "pymodbus", "opcua": "asyncua"}
-_EXTRA: Final = "kind: the emulator {kind} needs another library: pip install 'shmio[{kind}]'"
+_EXTRA: Final = "kind: the emulator {kind} needs another library; run pip install 'shmio[{kind}]'"
 
 
 def create(

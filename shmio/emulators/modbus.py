@@ -26,6 +26,7 @@ from shmio.layout.addresses.modbus import Address as Place
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout, Register
 from shmio.layout.values.codec import codec, flatten, nest
+from shmio.wording import IN_USE
 
 if TYPE_CHECKING:
     from pymodbus.server import ModbusTcpServer
@@ -232,7 +233,7 @@ class ModbusEmulator:
 
         server.callback_new_connection = connect
         if not await server.listen():
-            raise EndpointError(f"cannot listen on {self.address}: the address is in use, or not one of this host")
+            raise EndpointError(f"cannot listen on {self.address}: {IN_USE}")
         self._server = server
 
     def _step(self, time_s: float) -> None:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import msgspec
 
-from shmio.config.faults import meant
 from shmio.errors import ConfigError, ModelError, SnapshotError
 from shmio.layout.model import NUMBERS, Layout
 from shmio.layout.values.codec import Value, codec
@@ -281,7 +280,7 @@ def program(name: str, layout: Layout, code: UserCode = BUILT_IN) -> Program:
         build = PROGRAMS[name]
     except KeyError:
         raise ConfigError(
-            f"program: {name!r} is unknown; valid: {', '.join(sorted(PROGRAMS))}, and a class of your own as "
-            f"package.module:Class{meant(name, PROGRAMS)}"
+            f"program: {unknown('program', name, sorted(PROGRAMS))} (the name of a class of your own is "
+            "package.module:Class)"
         ) from None
     return build(layout)

@@ -178,7 +178,7 @@ class _Parser:
     def _counted(self, tree: Tree) -> Tree:
         self._count += 1
         if self._count > MAX_NODES:
-            raise ConfigError(f"the {self._what} has more than {MAX_NODES} parts: shorten it")
+            raise ConfigError(f"the {self._what} has more than {MAX_NODES} parts; shorten it")
         return tree
 
     def _operation(self, name: str, *operands: Tree, bounds: tuple[int, int] | None = None, at: int = 0) -> Tree:

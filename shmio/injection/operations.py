@@ -167,7 +167,7 @@ def places(registers: Iterable[Register], byte_order: ByteOrder) -> list[ValueGr
     for register in registers:
         count += register.count
         if count > _MAX_ELEMENTS:
-            raise ValueError(f"the registers have more than {_MAX_ELEMENTS} single values: name fewer registers")
+            raise ValueError(f"the registers have more than {_MAX_ELEMENTS} single values; name fewer registers")
         element, into = register.element, found.setdefault(register.element, [])
         if element.base == "BOOL":
             into += [(register.offset + byte, bit) for byte, bit in bit_positions(register)]

@@ -39,6 +39,7 @@ from shmio.layout.values.literal import parse_literal
 from shmio.layout.values.text import from_text, wire_type
 from shmio.layout.values.write import bits_of, chosen
 from shmio.model.statuses import trusted_codec
+from shmio.wording import unknown
 
 _NS: Final = 1_000_000_000
 MAX_REGISTERS: Final = 4096
@@ -152,7 +153,7 @@ def number_register(path: str, layouts: Mapping[str, Layout]) -> tuple[str, Regi
     """
     source, register = single(path, layouts)
     if register.dims:
-        raise ConfigError(f"{path} is an array, but a condition reads single values: name one of its elements")
+        raise ConfigError(f"{path} is an array, but a condition reads single values; name one of its elements")
     if register.type != "BOOL" and not scalar_codec(register.element).plain:
         raise ConfigError(f"{path}: {register.type} is neither a number nor a BOOL")
     return source, register
@@ -185,7 +186,7 @@ def resolve(texts: Iterable[str], layouts: Mapping[str, Layout]) -> Target:
         found += _registers(text, layouts)
         if len(found) > MAX_REGISTERS:
             raise PathError(
-                f"{text} names more than {MAX_REGISTERS} registers and elements: declare an injection for each part"
+                f"{text} names more than {MAX_REGISTERS} registers and elements; declare an injection for each part"
             )
     places = {(source, direction) for source, direction, _ in found}
     if len(places) != 1:
@@ -232,7 +233,7 @@ def _registers(text: str, layouts: Mapping[str, Layout]) -> Iterator[tuple[str, 
             return
     if not count:
         look_up(layout, topic)  # its error suggests similar names
-        raise PathError(f"{text} names no register")
+        raise PathError(f"{text}: no register has this path")
 
 
 def _default(layouts: Collection[str]) -> str | None:
@@ -241,7 +242,7 @@ def _default(layouts: Collection[str]) -> str | None:
 
 def _layout(source: str, text: str, layouts: Mapping[str, Layout]) -> Layout:
     if source not in layouts:
-        raise PathError(f"{text}: unknown source {source}")
+        raise PathError(f"{text}: {unknown('source', source, layouts)}")
     return layouts[source]
 
 

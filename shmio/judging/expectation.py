@@ -117,7 +117,7 @@ def _made(
 def _formula(expectation: Expectation, registers: Registers) -> Formula:
     tree = _parsed(expectation, "formula")
     if not temporal(tree, ("always", "eventually", "until")):
-        raise ConfigError("formula: it says something about the first moment only: write always(…) or eventually(…)")
+        raise ConfigError("formula: this formula judges only the first moment; write always(…) or eventually(…)")
     trigger = None
     match tree:
         case Operation("always", (Operation("implies", (condition, _)),)):
@@ -168,7 +168,7 @@ def _like(expectation: Expectation, registers: Registers) -> Formula:
         _check_count(found)
     except ConfigError as error:
         raise ConfigError(f"signal: {error}") from None
-    return Formula(expectation, None, None, found, f"it was not like {expectation.like}")
+    return Formula(expectation, None, None, found, f"it differed from {expectation.like}")
 
 
 def _check_count(found: Sequence[Signal]) -> None:

@@ -108,7 +108,9 @@ def check(tree: Tree) -> None:
         if not isinstance(node, Operation):
             continue
         if node.name in _TRUTH and constant(node):
-            raise ConfigError(f"at character {node.at}: {node.name!r} is always the same here, as it reads no register")
+            raise ConfigError(
+                f"at character {node.at}: {node.name!r} is always the same here, because it reads no register"
+            )
         if node.name in ASPECTS and not isinstance(node.operands[0], Reference):
             raise ConfigError(f"at character {node.at}: {node.name}( ) takes one register, not an expression")
         if node.name in _EDGES | {"rate"} and temporal(node.operands[0]):
@@ -120,7 +122,7 @@ def check(tree: Tree) -> None:
         raise ConfigError("it must read a register")
     _check_bounds(tree, outer=True)
     if _changes(tree) > MAX_CHANGES:
-        raise ConfigError("temporal operators with bounds are nested too deeply: at most 6 levels")
+        raise ConfigError("temporal operators with bounds are nested more than 6 levels deep")
     if horizon_ns(tree) > MAX_HORIZON_S * _NS:
         raise ConfigError(f"the formula's bounds add up to more than {MAX_HORIZON_S} s")
 

@@ -31,6 +31,7 @@ from shmio.plan.prepare import prepare
 from shmio.plan.processes import Job, Plan
 from shmio.recorder.recorder import AttachedFiles, ConfigFiles
 from shmio.segment import Segment
+from shmio.wording import unknown
 
 COMMANDS_S: Final = 2.0
 """Maximum time in s that :meth:`Laboratory.close` waits for each thread."""
@@ -59,8 +60,8 @@ def prepare_laboratory(file: Path) -> Plan:
         if name == "remote" or not issubclass(registry.load(name), Computed):
             raise ConfigError(
                 f'{file}: source[{index}].connector: source {job.name!r} has connector = "{name}", but a laboratory '
-                "has only sources that are computed in its process, such as simulation and memory: "
-                "use shmio-campaign run, which takes a whole instance"
+                "has only sources that are computed in its process, such as simulation and memory; "
+                "use shmio-campaign run, which runs a whole instance"
             )
     return plan
 
@@ -99,11 +100,10 @@ class Laboratory:
         """The loop of each source."""
         try:
             jobs = [job for job in plan.jobs if job.kind == "source"]
+            names = [job.name for job in jobs]
             for source in parameters or ():
-                if all(job.name != source for job in jobs):
-                    raise ConfigError(
-                        f"there is no source {source!r}; there are: {', '.join(job.name for job in jobs)}"
-                    )
+                if source not in names:
+                    raise ConfigError(unknown("source", source, names))
             for job in jobs:
                 self.loops[job.name] = self._loop(job, (parameters or {}).get(job.name))
             for loop in self.loops.values():

@@ -30,6 +30,7 @@ from shmio.layout.source.syntax import (
     TypeDeclaration,
     Unit,
 )
+from shmio.wording import larger_than
 
 MAX_ALL_REGISTERS = 500_000
 MAX_ALL_STRUCTURES = 500_000
@@ -39,7 +40,7 @@ _Declaration = TypeVar("_Declaration", TypeDeclaration, BlockDeclaration, Consta
 
 _OPTIMIZED = (
     "the block {name} has optimized access: its values have no fixed addresses and the classic S7 protocol cannot "
-    "read it; switch off 'Optimized block access' in the block's properties, and compile and load the block; or read "
+    "read them; switch off 'Optimized block access' in the block's properties, and compile and load the block; or read "
     'it by OPC UA: connector = "opcua" with nodes = "siemens". The offsets are those it would have with standard '
     "access"
 )
@@ -124,8 +125,11 @@ class Program:
         tables = [source for source in sources if source.file.lower().endswith(tags.SUFFIXES)]
         if tables and len(tables) == len(sources):
             if len(tables) > 1:
-                what = "a tag table is a layout of its own, or lies over a data block whose source is beside it"
-                report.add(Diagnostic(tables[1].file, 1, 1, f"{what}: give one of them, or add that source"))
+                what = (
+                    "there are several tag tables without a data block; give only one of them, or add the "
+                    "block's source"
+                )
+                report.add(Diagnostic(tables[1].file, 1, 1, what))
                 report.raise_errors()
             self._table = tags.compile_tags(tables[0].file, tables[0].text, report)
             self.blocks = (BlockName(self._table.name, None),)
@@ -144,7 +148,7 @@ class Program:
         self.blocks = tuple(BlockName(block.name, block.number) for block in blocks)
         if not blocks and not report.errors and not any(fault.severity == "error" for fault in self._faults()):
             file = sources[0].file if sources else "<none>"
-            report.add(Diagnostic(file, 1, 1, "expected a DATA_BLOCK, found none"))
+            report.add(Diagnostic(file, 1, 1, "the files have no DATA_BLOCK"))
 
     def _by_name(self, declarations: Sequence[_Declaration]) -> tuple[dict[str, _Declaration], dict[str, Diagnostic]]:
         """Index declarations by name in lower case; also return an error for each duplicate."""
@@ -203,10 +207,11 @@ class Program:
                     continue
                 spent = spent.plus(group.cost, 1, 0)
                 if spent.registers > MAX_ALL_REGISTERS or spent.structures > MAX_ALL_STRUCTURES:
-                    most = (
-                        f"{MAX_ALL_REGISTERS} registers and {MAX_ALL_STRUCTURES} structures in all data blocks together"
+                    what = (
+                        f"the data blocks up to this one have more than {MAX_ALL_REGISTERS} registers or "
+                        f"{MAX_ALL_STRUCTURES} structures; choose one data block"
                     )
-                    report.add(block.position.error(f"expected at most {most}, found more up to this one: choose one"))
+                    report.add(block.position.error(what))
                     break
                 layout = _layout(block, group, self._is_optimized(block), own, report)
                 if layout is not None:
@@ -239,12 +244,12 @@ def is_of_access(warning: Diagnostic) -> bool:
 
 def _double(first: _Declaration, second: _Declaration) -> Diagnostic:
     where = f"{first.position.file}:{first.position.line}"
-    return second.position.error(f"{second.name!r} is declared already, in {where}")
+    return second.position.error(f"{second.name!r} is declared twice, first in {where}")
 
 
 def _read(source: Source, report: Report) -> Unit:
     if len(source.text) > lexer.MAX_SOURCE_BYTES:
-        report.add(Diagnostic(source.file, 1, 1, f"the file is larger than {lexer.MAX_SOURCE_BYTES} bytes"))
+        report.add(Diagnostic(source.file, 1, 1, larger_than(lexer.MAX_SOURCE_BYTES)))
         return Unit()
     if what := foreign(source.file, source.text):
         report.add(Diagnostic(source.file, 1, 1, what))
@@ -263,14 +268,14 @@ def _layout(
 ) -> Layout | None:
     limit = MAX_BLOCK_BYTES if optimized else MAX_STANDARD_BYTES
     if group.size > limit:
-        report.add(block.position.error(f"expected at most {limit} bytes, found a block of {group.size}"))
+        report.add(block.position.error(f"the data block has {group.size} bytes, but at most {limit} are allowed"))
         return None
     registers, characters = [], 0
     for register in emit.registers(group, report):
         registers.append(register)
         characters += len(register.path) + len(register.comment) + len(register.initial or "")
         if characters > MAX_TEXT:
-            what = f"expected at most {MAX_TEXT} characters of names, comments and values"
+            what = f"the names, comments and values have more than {MAX_TEXT} characters together"
             report.add(block.position.error(what))
             return None
     assigned = emit.assign(group, registers, block.assignments, constants, report)

@@ -57,7 +57,7 @@ def load_layout(data: bytes) -> Layout:
 
     """
     if len(data) > MAX_JSON_BYTES:
-        raise LayoutError(f"layout: larger than {MAX_JSON_BYTES} bytes")
+        raise LayoutError(f"layout: the document is larger than {MAX_JSON_BYTES} bytes")
     try:
         document = _DECODER.decode(data)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -89,7 +89,7 @@ def _check(document: _Layout) -> None:
             elements += register.count
             continue
         if over:
-            raise LayoutError(f"layout: {register.path!r} is behind registers that lie over the block")
+            raise LayoutError(f"layout: {register.path!r} must come before the registers that lie over the block")
         if register.size != size or register.count != count or register.partial:
             raise LayoutError(f"layout: {register.path!r} has a size or count that does not fit its type")
         bit = register.bit

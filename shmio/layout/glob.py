@@ -14,6 +14,7 @@ from collections.abc import Iterable, Mapping
 from shmio.errors import PathError
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import Topic, canonical_path, decode_segment, encode_segment, look_up_each, parse_topic, shorten
+from shmio.wording import unknown
 
 MAX_PATTERN = 1024
 
@@ -41,7 +42,7 @@ class Glob:
         self._final = 0
         segments = pattern.split("/")
         if "" in segments:
-            raise PathError(f"{shorten(pattern)!r}: empty segment in the pattern")
+            raise PathError(f"{shorten(pattern)!r}: the pattern has an empty segment")
         for position, segment in enumerate(segments):
             if position:
                 self._literal("/")
@@ -165,10 +166,10 @@ def choose(patterns: Iterable[str], layouts: Mapping[str, Layout]) -> list[tuple
         if topic.direction == "in":
             raise PathError(f"{pattern}: an input of a source cannot be read; leave out /in")
         if topic.source not in layouts:
-            raise PathError(f"{pattern}: unknown source {topic.source}")
+            raise PathError(f"{pattern}: {unknown('source', topic.source, layouts)}")
         registers = named(layouts[topic.source], topic)
         if not registers:
-            raise PathError(f"{pattern}: no register of {topic.source} has such a path")
+            raise PathError(f"{pattern}: source {topic.source!r} has no such register")
         for register in registers:
             chosen.setdefault((topic.source, register.path), register)
     return [(source, register) for (source, _), register in chosen.items()]

@@ -287,7 +287,7 @@ class Layout:
             low <= i <= high for i, (low, high) in zip(index, register.dims, strict=True)
         ):
             if not register.dims:
-                raise PathError(f"{register.path}: a single {register.type}, not an array")
+                raise PathError(f"{register.path}: this is a single {register.type}, not an array")
             bounds = ",".join(f"{low}..{high}" for low, high in register.dims)
             raise PathError(f"{register.path}: index {list(index)} is outside [{bounds}]")
         if not index:

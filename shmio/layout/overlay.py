@@ -103,11 +103,11 @@ def _bits(base: Layout, path: str, over: str, named: Register, whole: Register, 
     if not dims:
         raise ValueError(f"type: a BOOL needs the address of a bit, such as {shorten(over)}.%X0")
     if len(dims) > 1 or whole.element.size > 1:
-        raise ValueError(f"type: a row of BOOLs lies over bytes and has one dimension; {shorten(over)} is {whole.type}")
+        raise ValueError(f"type: an array of BOOL needs bytes and one dimension, but {shorten(over)} is {whole.type}")
     first, count = named.bit or 0, math.prod(shape_of(dims))
     room = 8 * _room(base, whole, over.rpartition(".%")[0] if named.type == "BOOL" else over) - first
     if count > room:
-        raise ValueError(f"type: {count} bits are needed, {shorten(over)} has {room}")
+        raise ValueError(f"type: {count} bits are needed, but {shorten(over)} has {room}")
     return Register(path, "BOOL", dims, named.offset, first, -(-(first + count) // 8), count, partial=True, over=over)
 
 
@@ -131,9 +131,9 @@ def _array_of(base: Layout, path: str) -> str:
 
 def _has(over: str, room: int, exact: bool) -> str:
     if not exact:
-        return f"from {shorten(over)} on there {'is' if room == 1 else 'are'} {room}"
+        return f"but from {shorten(over)} on there {'is' if room == 1 else 'are'} only {room}"
     hint = f"; name a part of it, such as {shorten(over)}.%{_PARTS[room // 2]}0" if room in (2, 4, 8) else ""
-    return f"{shorten(over)} has {room}{hint if not names_part(over) else ''}"
+    return f"but {shorten(over)} has {room}{hint if not names_part(over) else ''}"
 
 
 def _written(name: str, dims: Dims) -> str:

@@ -20,7 +20,7 @@ from typing import Annotated, Any, Final, Literal
 
 import msgspec
 
-from shmio.config.faults import explain, meant
+from shmio.config.faults import explain
 from shmio.errors import Diagnostic, PathError
 from shmio.layout import tag_sheets
 from shmio.layout.model import MAX_ELEMENTS, MAX_REGISTERS, Layout, Register
@@ -31,6 +31,7 @@ from shmio.layout.spelling import block_path
 from shmio.layout.tags import Lines, parse_type, read_sheet, read_toml
 from shmio.layout.topic import MAX_TOPIC, canonical_path, shorten
 from shmio.logs import printable
+from shmio.wording import near, unknown
 
 _NEEDED: Final = ("path", "address")
 
@@ -96,7 +97,7 @@ class _Placer:
         self._keys[register.path] = key
         self._elements += register.count
         if self._elements > MAX_ELEMENTS or len(self._layout.registers) + len(self._found) > MAX_REGISTERS:
-            self._complain(key, f"expected at most {MAX_REGISTERS} registers and {MAX_ELEMENTS} elements, found more")
+            self._complain(key, f"there are more than {MAX_REGISTERS} registers or {MAX_ELEMENTS} elements")
             raise TooManyErrors
 
     def check_names(self) -> None:
@@ -106,7 +107,7 @@ class _Placer:
         for path, key in self._keys.items():
             first = in_lower_case.setdefault(path.lower(), path)
             if first != path:
-                self._complain(key, f"differs only in case from {shorten(first)}", "warning")
+                self._complain(key, f"this path differs from {shorten(first)} only in upper and lower case", "warning")
             head = path.rpartition("/")[0]
             while head:
                 if head in names:
@@ -120,12 +121,12 @@ class _Placer:
     def _register(self, key: str, entry: _Entry) -> Register:
         layout = self._layout
         if key.rpartition("/")[2] in ("in", "out"):
-            raise PathError("the path ends in a direction; leave that out: each register has both")
+            raise PathError("leave out /in or /out at the end of the path, because each register has both")
         path = canonical_path(key)
         if len(path) > MAX_TOPIC:
             raise PathError(f"a path is at most {MAX_TOPIC} characters long")
         if path in self._found:
-            raise PathError("given twice")
+            raise PathError("this path is given twice; remove one of the entries")
         if path in layout.by_path:
             over = layout.registers[layout.by_path[path]].over
             what = "another table has this register" if over else f"{layout.name} has a register of this path"
@@ -135,7 +136,7 @@ class _Placer:
         _refuse_conversions(entry, layout)
         if not entry.address:
             raise ValueError(
-                f"address: needed: the register of {layout.name} that it names, such as {_example(layout)}"
+                f"address: this key is needed; name a register of {layout.name}, such as {_example(layout)}"
             )
         over = self._over(entry.address)
         register = overlay_register(layout.base, path, over, parse_type(entry.type) if entry.type else None)
@@ -164,8 +165,8 @@ def _entry(given: object) -> _Entry:
     known = _Entry.__struct_fields__
     if isinstance(given, dict) and (others := given.keys() - set(known)):
         other = min(others)
-        hint = meant(other, known) or "; write a path with a dot in quotes"
-        raise ValueError(f"there is no {shorten(printable(other))!r} here, only {', '.join(known)}{hint}")
+        hint = "" if near(other, known) else "; write a path with a dot in quotes"
+        raise ValueError(f"{unknown('key', other, known)}{hint}")
     try:
         return msgspec.convert(given, _Entry)
     except msgspec.ValidationError as error:
@@ -175,12 +176,12 @@ def _entry(given: object) -> _Entry:
 def _refuse_conversions(entry: _Entry, layout: Layout) -> None:
     """Raise ValueError if the entry has a column that is only for registers with bytes of their own."""
     if entry.initial is not None:
-        raise ValueError(f"initial: the initial values are those of {layout.name}; leave it out")
+        raise ValueError(f"initial: leave out this key, because the initial values are those of {layout.name}")
     for name in ("scale", "deadband"):
         if getattr(entry, name):
             raise ValueError(
-                f"{name}: a name over a data block shows the bytes of {layout.name} as they are; leave it out, and say "
-                "in unit or comment what the number means"
+                f"{name}: leave out this key, because a name over a data block shows the bytes of {layout.name} as "
+                "they are; say in unit or comment what the number means"
             )
 
 
@@ -208,18 +209,15 @@ def lay_tables(
     """
     for table in tables:
         if table.block and table.block.lower() not in {name.lower() for name in blocks}:
-            names = ", ".join(blocks)
-            report.add(Diagnostic(table.file, 1, 1, f"block: no data block {table.block!r}; there are: {names}"))
+            report.add(Diagnostic(table.file, 1, 1, f"block: {unknown('data block', table.block, blocks)}"))
             continue
         if not table.block and len(layouts) > 1 and not chosen:
             names = ", ".join(blocks)
-            what = (
-                f'the sources have several data blocks ({names}): say by block = "NAME" which one the table lies over'
-            )
+            what = f'the sources have several data blocks ({names}); choose one by block = "NAME" in this table'
             report.add(Diagnostic(table.file, 1, 1, what))
             continue
         if table.block and layouts and table.block.lower() not in {layout.name.lower() for layout in layouts}:
-            what = f"the table lies over {table.block}, but {layouts[0].name} is read: its names are left out"
+            what = f"the names of this table are left out: it is for {table.block}, but {layouts[0].name} is read"
             report.add(Diagnostic(table.file, 1, 1, what, "warning"))
         layouts = [
             table.apply(layout, report) if table.block.lower() in ("", layout.name.lower()) else layout

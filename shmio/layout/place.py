@@ -43,9 +43,9 @@ _MAX_NAME = 128  # characters, as in TIA Portal
 MAX_TEXT = 32 << 20  # characters of all expanded paths, comments and initial values together
 _OPAQUE = (
     "the system type '{name}' is kept as {size} bytes without meaning, because its members are not public; "
-    'if you know them, give it as a PLC data type: TYPE "{name}" STRUCT … END_STRUCT; END_TYPE'
+    'if you know them, declare it as a PLC data type, TYPE "{name}" STRUCT … END_STRUCT; END_TYPE'
 )
-_SIZE = 'type_bytes = {{ "{name}" = … }} in the configuration, --type-bytes "{name}=…" of shmio-layout'
+_SIZE = 'type_bytes = {{ "{name}" = … }} in the configuration, or --type-bytes "{name}=…" of shmio-layout'
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,8 +267,8 @@ class Placer:
     def _member(self, member: Member, fields: dict[str, Field], depth: int) -> Leaf | Group | Repeat | None:
         first = fields.get(member.name.lower())
         if first is not None:
-            where = f"line {first.member.position.line}"
-            self._refuse(member.position, f"expected a new name, found {member.name!r} again ({where})")
+            line = first.member.position.line
+            self._refuse(member.position, f"{member.name!r} is declared twice, first in line {line}")
             return None
         if len(member.name) > _MAX_NAME:
             self._refuse(member.position, f"a name is at most {_MAX_NAME} characters long")
@@ -319,13 +319,13 @@ class Placer:
     def _unknown(self, name: Named) -> str:
         if reason := system_types.refusal(name.name):
             return (
-                f"the system type {name.name} is not supported: {reason}; if you know its members, give it as a PLC "
-                f'data type: TYPE "{name.name}" STRUCT … END_STRUCT; END_TYPE; if you know only its size, give '
-                f"that: {_SIZE.format(name=name.name)}"
+                f"shmio does not know the members of the system type {name.name}: {reason}; declare it as a PLC data "
+                f'type, TYPE "{name.name}" STRUCT … END_STRUCT; END_TYPE, or give only its size by '
+                f"{_SIZE.format(name=name.name)}"
             )
         return (
-            f"expected a known type, found {name.name!r}; if it is a PLC data type or a function block, name its "
-            "source (.udt, .scl, .awl) as well; if you know only its size, give that: " + _SIZE.format(name=name.name)
+            f"unknown type {name.name!r}; if it is a PLC data type or a function block, name its source (.udt, .scl, "
+            f".awl) as well; or give only its size by {_SIZE.format(name=name.name)}"
         )
 
     def _refuse(self, position: Position, message: str) -> None:

@@ -13,13 +13,13 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
-from shmio.config.faults import meant
 from shmio.errors import Diagnostic
 from shmio.layout.model import MAX_REGISTERS
 from shmio.layout.report import Report
 from shmio.layout.topic import shorten
 from shmio.layout.workbook import WorkbookError, read_rows
 from shmio.logs import printable
+from shmio.wording import unknown
 
 SUFFIXES: Final = (".csv", ".xlsx")
 COLUMNS: Final = ("path", "type", "address", "unit", "comment", "scale", "initial", "deadband", "writable")
@@ -40,10 +40,10 @@ def read_sheet(file: str, data: bytes, report: Report, needed: Sequence[str] = (
         rows, comma = _rows_of(file, data)
         return _sheet(file, rows, report, needed, decimal_comma=comma)
     except WorkbookError as error:
-        report.add(Diagnostic(file, error.row, 1, f"not a tag table: {error}"))
+        report.add(Diagnostic(file, error.row, 1, f"the file is not a tag table: {error}"))
         return Sheet({}, {})
     except (ValueError, csv.Error) as error:
-        report.add(Diagnostic(file, 1, 1, f"not a tag table: {error}"))
+        report.add(Diagnostic(file, 1, 1, f"the file is not a tag table: {error}"))
         return Sheet({}, {})
 
 
@@ -55,7 +55,7 @@ def _rows_of(file: str, data: bytes) -> tuple[Iterable[tuple[int, Sequence[str]]
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        raise ValueError(f"line {line} is not in UTF-8: save the file as 'CSV UTF-8'") from None
+        raise ValueError(f"line {line} is not in UTF-8; save the file as 'CSV UTF-8'") from None
     header = text.partition("\n")[0]
     delimiter = max(",;\t", key=header.count)
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
@@ -99,7 +99,7 @@ def _sheet(
             if not path:
                 raise ValueError("the path is missing")
             if path in registers:
-                raise ValueError(f"given twice, first in row {places[path]}")
+                raise ValueError(f"this path is given twice, first in row {places[path]}")
             if missing := [name for name in needed if name != "path" and name not in cells]:
                 raise ValueError(f"the {missing[0]} is missing")
             registers[path] = _entry(cells, decimal_comma=decimal_comma)
@@ -107,7 +107,7 @@ def _sheet(
         except ValueError as error:
             report.add(Diagnostic(file, number, 1, f"{shorten(printable(path)) or 'row'}: {error}"))
         if len(registers) > MAX_REGISTERS:
-            raise ValueError(f"expected at most {MAX_REGISTERS} registers")
+            raise ValueError(f"there are more than {MAX_REGISTERS} registers")
     if not registers and not report.errors:
         raise ValueError("there are no rows below the header")
     return Sheet(registers, places)
@@ -120,15 +120,13 @@ def _columns(header: Sequence[str], needed: Sequence[str]) -> list[str]:
     if missing := [name for name in needed if name not in header]:
         found = shorten(printable(", ".join(header))) or "nothing"
         raise ValueError(
-            f"its first row must name the columns {' and '.join(missing)}; it has {found}. "
-            f"The columns are {', '.join(COLUMNS)}"
+            f"the first row must name the columns {' and '.join(missing)}, but has {found}; valid: {', '.join(COLUMNS)}"
         )
     for name in header:
         if name and name not in COLUMNS:
-            known = ", ".join(COLUMNS)
-            raise ValueError(f"there is no column {shorten(printable(name))!r}, only {known}{meant(name, COLUMNS)}")
+            raise ValueError(unknown("column", name, COLUMNS))
         if name and header.count(name) > 1:
-            raise ValueError(f"the column {name} is there twice")
+            raise ValueError(f"the header has the column {name} twice; remove one of them")
     return list(header)
 
 

@@ -61,6 +61,7 @@ from shmio.layout.source.lexer import MAX_SOURCE_BYTES
 from shmio.layout.topic import MAX_TOPIC, canonical_path, shorten
 from shmio.layout.values.literal import parse_literal, split_array
 from shmio.logs import printable
+from shmio.wording import larger_than, near, unknown
 
 SUFFIXES: Final = (".toml", *tag_sheets.SUFFIXES)
 _MAX_ALIGN: Final = 8
@@ -118,7 +119,7 @@ def _compile_sheet(file: str, data: bytes, report: Report) -> Layout:
 def read_sheet(file: str, data: bytes, report: Report, needed: Sequence[str] = ("path", "type")) -> tag_sheets.Sheet:
     """Read the rows of a CSV file or a spreadsheet; raise LayoutError if any are wrong."""
     if len(data) > MAX_SOURCE_BYTES:
-        report.add(Diagnostic(file, 1, 1, f"the file is larger than {MAX_SOURCE_BYTES} bytes"))
+        report.add(Diagnostic(file, 1, 1, larger_than(MAX_SOURCE_BYTES)))
         report.raise_errors()
     sheet = tag_sheets.read_sheet(file, data, report, needed)
     report.raise_errors()
@@ -148,19 +149,21 @@ def read_toml(file: str, data: bytes, report: Report, kind: type[_Read]) -> _Rea
     found = _read(file, data, report, kind)
     report.raise_errors()
     if found is None:
-        raise LayoutError(f"{file}: it cannot be read")
+        raise LayoutError(f"{file}: the file cannot be read")
     return found
 
 
 def _read(file: str, data: bytes, report: Report, kind: type[_Read]) -> _Read | None:
     """Return the file's content as ``kind``; after an error report it and return None."""
     if len(data) > MAX_SOURCE_BYTES:
-        report.add(Diagnostic(file, 1, 1, f"the file is larger than {MAX_SOURCE_BYTES} bytes"))
+        report.add(Diagnostic(file, 1, 1, larger_than(MAX_SOURCE_BYTES)))
         return None
     try:
         text = data.decode()
     except UnicodeDecodeError as error:
-        report.add(Diagnostic(file, data.count(b"\n", 0, error.start) + 1, 1, "it is not in UTF-8"))
+        report.add(
+            Diagnostic(file, data.count(b"\n", 0, error.start) + 1, 1, "the file is not UTF-8; save it as UTF-8")
+        )
         return None
     if line := too_long(text, MAX_SOURCE_BYTES):
         what = f"a key has more than {MAX_PARTS} parts; write a path with dots in quotes"
@@ -169,7 +172,7 @@ def _read(file: str, data: bytes, report: Report, kind: type[_Read]) -> _Read | 
     try:
         return msgspec.convert(tomllib.loads(text), kind)
     except msgspec.ValidationError as error:
-        report.add(Diagnostic(file, 1, 1, f"not a tag table: {explain(error)}"))
+        report.add(Diagnostic(file, 1, 1, f"the file is not a tag table: {explain(error)}"))
     except (ValueError, RecursionError) as error:
         report.add(_syntax_error(file, text, error))
     return None
@@ -189,7 +192,7 @@ def _syntax_error(file: str, text: str, error: Exception) -> Diagnostic:
     while line > 1 and not _KEY.match(lines[line - 1]):
         line -= 1  # tomllib reports the end of the value
     key = shorten(lines[line - 1].partition("=")[0].strip())
-    return Diagnostic(file, line, 1, f"{key}: given twice; write a path with a dot in quotes")
+    return Diagnostic(file, line, 1, f"{key}: this key is given twice; write a path with a dot in quotes")
 
 
 class Lines:
@@ -260,16 +263,16 @@ class _Placer:
         for path in self._registers:
             first = in_lower_case.setdefault(path.lower(), path)
             if first != path:
-                problem = f"differs only in case from {shorten(first)}"
+                problem = f"this path differs from {shorten(first)} only in upper and lower case"
                 self._complain(self._keys[path], problem, "warning")
             head = path.rpartition("/")[0]
             while head:
                 if head in self._registers:
-                    self._complain(self._keys[path], f"{shorten(head)} is already a register")
+                    self._complain(self._keys[path], f"{shorten(head)} is already a register; choose another path")
                 head = head.rpartition("/")[0]
         if self._end > MAX_BLOCK_BYTES or self._elements > MAX_ELEMENTS:
-            most = f"{MAX_BLOCK_BYTES} bytes and {MAX_ELEMENTS} elements"
-            self._report.add(Diagnostic(self._file, 1, 1, f"expected at most {most}, found more"))
+            what = f"the registers have more than {MAX_BLOCK_BYTES} bytes or {MAX_ELEMENTS} elements"
+            self._report.add(Diagnostic(self._file, 1, 1, what))
 
     def layout(self, table: _Table) -> Layout:
         """Return the layout of the placed registers."""
@@ -283,7 +286,7 @@ class _Placer:
     def _place_all(self, key: str, tag: _Tag) -> None:
         """Place the register of an entry; if its type is a structure, place its members."""
         if key.rpartition("/")[2] in ("in", "out"):
-            raise PathError("the path ends in a direction; leave that out: each register has both")
+            raise PathError("leave out /in or /out at the end of the path, because each register has both")
         inside = members(tag.type)
         if inside is None:
             self._place(key, key, tag)
@@ -298,9 +301,9 @@ class _Placer:
         if len(path) > MAX_TOPIC:
             raise PathError(f"a path is at most {MAX_TOPIC} characters long")
         if path in self._registers:
-            raise PathError("given twice")
+            raise PathError("this path is given twice; remove one of the entries")
         if len(self._registers) >= MAX_REGISTERS:
-            self._complain(key, f"expected at most {MAX_REGISTERS} registers, structures' members included")
+            self._complain(key, f"there are more than {MAX_REGISTERS} registers, with the members of structures")
             raise TooManyErrors
         element, dims = parse_type(tag.type)
         shape = shape_of(dims)
@@ -349,11 +352,9 @@ def _tag(key: str, given: object) -> _Tag:
         return _Tag(given)
     if isinstance(given, dict) and (others := given.keys() - set(_Tag.__struct_fields__)):
         other = min(others)
-        known = ", ".join(_Tag.__struct_fields__)
-        raise ValueError(
-            f"there is no {shorten(printable(other))!r} here, only {known}; write a path with a dot in quotes, "
-            f'"{shorten(printable(f"{key}.{other}"))}"'
-        )
+        known = _Tag.__struct_fields__
+        quoted = f'; write a path with a dot in quotes, "{shorten(printable(f"{key}.{other}"))}"'
+        raise ValueError(f"{unknown('key', other, known)}{'' if near(other, known) else quoted}")
     try:
         return msgspec.convert(given, _Tag)
     except msgspec.ValidationError as error:
@@ -393,12 +394,12 @@ def parse_type(text: str) -> tuple[ElementType, Dims]:
     element = element_type(text.strip())
     if element is None and _PATH.search(text):
         raise ValueError(
-            f"there is no type {shorten(text)!r}; a table of names over a data block is given beside the block's "
-            'source: layout = "cell.db" and tags = "names.toml"'
+            f"unknown type {shorten(text)!r}; if this table names registers of a data block, give it together with the "
+            'block\'s source: layout = "cell.db" and tags = "names.toml"'
         )
     if element is None:
         raise ValueError(
-            f"there is no type {text!r}; valid: BOOL, INT, DINT, REAL, LREAL, STRING[20] and similar, and the "
+            f"unknown type {text!r}; valid: BOOL, INT, DINT, REAL, LREAL, STRING[20] and similar, and the "
             f"structures {', '.join(CONTENTS)}"
         )
     return element, tuple(dims)

@@ -24,6 +24,7 @@ from typing import Final, Literal, TypeVar, cast
 from shmio.config import RESERVED_SOURCES
 from shmio.errors import PathError
 from shmio.layout.model import INTEGERS, MAX_DEPTH, MAX_DIMENSIONS, MAX_PATH, Layout, Register, array_size
+from shmio.wording import did_you_mean, unknown
 
 Direction = Literal["in", "out"]
 
@@ -118,7 +119,7 @@ def canonical_path(path: str, *, parts: bool = False) -> str:
     if len(segments) > _MAX_SEGMENTS:
         raise PathError(f"{shorten(path)}: a path has at most {_MAX_SEGMENTS} segments")
     if "" in segments:
-        raise PathError(f"{shorten(path)}: empty segment in the path")
+        raise PathError(f"{shorten(path)}: the path has an empty segment")
     suffix = ""
     if parts and (part := _PART.fullmatch(segments[-1])):
         segments[-1], suffix = part["head"], f".%{part['kind']}{int(part['number'])}"
@@ -194,16 +195,16 @@ def _source_of_scheme(scheme: str, sources: Collection[str]) -> str:
     for source in (*sources, *sorted(RESERVED_SOURCES)):
         if source.lower() == scheme.lower():
             return source
-    raise PathError(f"{shorten(scheme)}://: no source of this name; there are: {', '.join(sources)}")
+    raise PathError(unknown("source", scheme, sources))
 
 
 def _which(first: str, sources: Collection[str]) -> str:
     """Return a message for a path that must begin with a source, but begins with ``first``."""
     if not sources:
-        return "there is no source"
+        return "there are no sources"
     some = [f"{source}/…" for source in sources][:_SOURCES_SHOWN]
     more = ", …" if len(sources) > len(some) else ""
-    return f"{first!r} is not one of the {len(sources)} sources: write {' or '.join(some)}{more}"
+    return f"{first!r} is not one of the {len(sources)} sources; begin the path with {' or '.join(some)}{more}"
 
 
 def look_up(layout: Layout, topic: Topic) -> Register:
@@ -224,7 +225,7 @@ def _with_source_in_errors(layout: Layout, topic: Topic, search: Callable[[Layou
             raise PathError(f"{topic.source}/{error}") from None
         if topic.named:
             raise
-        raise PathError(f"{error}; searched in source {topic.source}, because the path names no source") from None
+        raise PathError(f"{error} (searched in source {topic.source!r}, because the path names no source)") from None
 
 
 def find(layout: Layout, path: str) -> Register:
@@ -262,7 +263,7 @@ def part_of(layout: Layout, register: Register, kind: str, number: int) -> Regis
     path = f"{register.path}.%{kind}{number}"
     if register.dims or register.type not in INTEGERS:
         what = "an array" if register.dims else register.type
-        raise PathError(f"{path}: {what} has no such part: bits, bytes and words are of one integer")
+        raise PathError(f"{path}: {what} has no such part; only a single integer has bits, bytes and words")
     size = register.size
     if kind == "X":
         byte, bit = divmod(number, 8)
@@ -361,14 +362,14 @@ def _unknown(layout: Layout, path: str) -> str:
         return f"{layout.name}: the path names a source, not a register"
     if below := layout.members(path):
         inside = ", ".join(layout.registers[i].path for i in below[:3])
-        return f"{shorten(path)}: a structure, not a register; it contains {inside}{', …' if below[3:] else ''}"
+        return f"{shorten(path)}: this is a structure, not a register; it contains {inside}{', …' if below[3:] else ''}"
     known, missing, names = _where_it_ends(layout, path)
     prefix = f"{known}/" if known else ""
     if names and all(map(_INDEX.fullmatch, names)):
         numbers = sorted(map(int, names))
         return f"{shorten(prefix + missing)}: the index is outside {numbers[0]}..{numbers[-1]}"
-    like = ", ".join(near(layout, path))
-    return f"{shorten(path)}: no such register in {layout.name}{f'; near: {like}' if like else ''}"
+    like = near(layout, path)
+    return f"{shorten(path)}: {layout.name} has no such register{f'; {did_you_mean(like)}' if like else ''}"
 
 
 def near(layout: Layout, path: str) -> list[str]:

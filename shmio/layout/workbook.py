@@ -24,7 +24,7 @@ MAX_PARTS: Final = 1000
 MAX_COLUMNS: Final = 64
 MAX_ROWS: Final = 1 << 20
 """Maximum number of rows, as in Excel; a damaged workbook may have larger row numbers."""
-INSTALL: Final = "reading .xlsx needs openpyxl: pip install 'shmio[xlsx]', or save the sheet as CSV UTF-8 (.csv)"
+INSTALL: Final = "reading .xlsx needs openpyxl; run pip install 'shmio[xlsx]', or save the sheet as CSV UTF-8 (.csv)"
 
 Row = tuple[int, list[str]]
 """A row: its number as Excel shows it, and the text of its cells."""
@@ -71,7 +71,7 @@ def read_rows(data: bytes, choose: Callable[[list[str]], str | None]) -> list[Ro
     except WorkbookError:
         raise
     except Exception as error:  # noqa: BLE001  (openpyxl raises whatever its parsers raise)
-        raise WorkbookError(f"not a workbook that can be read ({type(error).__name__}): save it again") from None
+        raise WorkbookError(f"the workbook cannot be read ({type(error).__name__}); save it again") from None
 
 
 def _check_archive(data: bytes) -> None:
@@ -85,7 +85,7 @@ def _check_archive(data: bytes) -> None:
         raise WorkbookError(f"expected a workbook of at most {MAX_PARTS} parts, found {len(parts)}")
     unpacked = sum(part.file_size for part in parts)
     if unpacked > MAX_UNPACKED_BYTES:
-        raise WorkbookError(f"it unpacks to more than {MAX_UNPACKED_BYTES} bytes")
+        raise WorkbookError(f"the workbook unpacks to more than {MAX_UNPACKED_BYTES} bytes")
 
 
 def _rows(book: Workbook, name: str) -> Iterator[Row]:

@@ -50,6 +50,7 @@ from shmio.segment.commands import Direction
 from shmio.segment.injection_list import InjectionEntry
 from shmio.segment.processes import Activity, Report
 from shmio.segment.segment import Segment, running_instances
+from shmio.wording import name_one, unknown
 
 _TURN_S: Final = 1.0
 """Interval in s at which a waiting reader checks whether the instance still runs."""
@@ -133,7 +134,7 @@ class Attachment:
         if source is None and len(blocks) == 1:
             return next(iter(blocks.values()))
         if source not in blocks:
-            raise PathError(f"no source {source!r}; there are: {', '.join(blocks)}")
+            raise PathError(name_one("source", blocks) if source is None else unknown("source", source, blocks))
         return blocks[source]
 
     def resolve(self, path: str) -> tuple[Block, Register]:
@@ -148,7 +149,7 @@ class Attachment:
         blocks = self._blocks()
         topic = parse_topic(path, blocks, next(iter(blocks)) if len(blocks) == 1 else None)
         if topic.source not in blocks:
-            raise PathError(f"{path}: unknown source {topic.source}")
+            raise PathError(f"{path}: {unknown('source', topic.source, blocks)}")
         if topic.direction == "in":
             raise PathError(f"{path}: an input of a source cannot be read; follow it by written(), or leave out /in")
         block = blocks[topic.source]
@@ -610,7 +611,7 @@ class Attachment:
         The first call takes an external slot for this attachment, until it is closed.
         """
         if not self._segment.shared.writable:
-            raise CommandError("this attachment only reads: attach with writable=True")
+            raise CommandError("this attachment only reads; attach with writable=True")
         with self._lock:
             if self._slot is None:
                 self._slot = _take_external_slot(self._segment)
@@ -672,7 +673,7 @@ def attach(instance: str | None = None, *, writable: bool = False) -> Attachment
         if not running:
             raise NotRunningError("no instance is running; start one with shmio-supervisor up")
         if len(running) > 1:
-            raise NotRunningError(f"several instances are running, name one of them: {', '.join(running)}")
+            raise NotRunningError(f"several instances are running; name one of them: {', '.join(running)}")
         instance = running[0]
     return Attachment(Segment.open(instance, writable=writable))
 
@@ -694,7 +695,7 @@ def _take_external_slot(segment: Segment) -> int:
             return slot.writer
     pids = ", ".join(str(slot.report.pid) for slot in places)
     raise SegmentError(
-        f"instance {segment.instance!r} allows only {len(places)} programs that write: end one of pids {pids}"
+        f"instance {segment.instance!r} allows only {len(places)} programs that write; end one of pids {pids}"
     )
 
 
@@ -720,10 +721,13 @@ def _of_one_source(
     topics = [parse_topic(path, blocks, default) for path in paths]
     for path, topic in zip(paths, topics, strict=True):
         if topic.source not in blocks:
-            raise PathError(f"{path}: unknown source {topic.source}")
+            raise PathError(f"{path}: {unknown('source', topic.source, blocks)}")
     sources = {topic.source for topic in topics}
     if len(sources) != 1:
-        raise PathError(f"one {what} must be for one source, but the paths name {', '.join(sorted(sources)) or 'none'}")
+        raise PathError(
+            f"all paths of one {what} must belong to the same source, but these belong to "
+            f"{', '.join(sorted(sources)) or 'none'}"
+        )
     for path, topic in zip(paths, topics, strict=True):
         if written and topic.direction == "out":
             raise PathError(f"{path}: an output of a source cannot be written; leave out /out")

@@ -212,7 +212,7 @@ def written(
     chosen = list(patterns)
     bits = cover(block.layout, chosen)
     if not any(bits):
-        raise PathError(f"{block.source}: {', '.join(chosen)} names no register")
+        raise PathError(f"{block.source}: no register matches {', '.join(chosen)}")
     return _written(block, bits, names_in(block.layout, chosen), events, next_event, timeout_s)
 
 
@@ -280,7 +280,7 @@ def compile_declarations(
     programs = []
     for index, declaration in enumerate(declarations):
         if not wanted():
-            raise CommandError("the compilation was cancelled: the program that requested it no longer waits")
+            raise CommandError("the compilation was cancelled, because the program that requested it no longer waits")
         try:
             programs.append(compile_program(declaration, layouts, periods_ns))
         except ConfigError as error:
@@ -452,7 +452,7 @@ def by_path(topics: Iterable[Topic], values: Mapping[str, object]) -> dict[str, 
     found: dict[str, object] = {}
     for topic, (path, value) in zip(topics, values.items(), strict=True):
         if topic.path in found:
-            raise ValueRangeError(f"{path}: given twice")
+            raise ValueRangeError(f"{path}: this path is given twice")
         found[topic.path] = value
     return found
 

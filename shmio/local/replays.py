@@ -185,7 +185,7 @@ class Replays:
                 given up the search.
         """
         if not self._segment.shared.writable:
-            raise CommandError("this attachment only reads: attach with writable=True")
+            raise CommandError("this attachment only reads; attach with writable=True")
         if wanted.speed is not None and not (math.isfinite(wanted.speed) and MIN_SPEED <= wanted.speed <= MAX_SPEED):
             raise ValueRangeError(f"the speed must be from {MIN_SPEED:g} to {MAX_SPEED:g}, not {wanted.speed:g}")
         plays = self._chosen(wanted)
@@ -224,7 +224,7 @@ class Replays:
         meant = {_recording(plays[source]) for source in names or plays}
         if wanted.event and len(meant) > 1:  # positions in different recordings are unrelated
             raise CommandError(
-                f"several recordings are playing: choose one by the name of one of its sources ({', '.join(plays)})"
+                f"several recordings are playing; choose one by the name of one of its sources ({', '.join(plays)})"
             )
         return {source: play for source, play in plays.items() if _recording(play) in meant}
 

@@ -227,11 +227,11 @@ class Subscription(Following[Update]):
 def _check(patterns: Sequence[str], max_rate_hz: float, *, every_frame: bool) -> None:
     """Raise ValueRangeError for invalid arguments, as the endpoints do."""
     if not patterns:
-        raise ValueRangeError("no pattern is given: name a path, a structure, a glob, or a source")
+        raise ValueRangeError("no pattern is given; name a path, a structure, a glob, or a source")
     if not 0 <= max_rate_hz < math.inf:
         raise ValueRangeError(f"max_rate_hz must be 0 or a positive number, not {max_rate_hz}")
     if max_rate_hz and every_frame:
-        raise ValueRangeError("max_rate_hz and every_frame cannot be used together: give only one of them")
+        raise ValueRangeError("max_rate_hz and every_frame cannot be used together; give only one of them")
 
 
 class _Follower:

@@ -299,7 +299,7 @@ class Coordinator:
 
     def _check_writable(self) -> None:
         if not self._segment.shared.writable:
-            raise TimeError("this attachment only reads: attach with writable=True")
+            raise TimeError("this attachment only reads; attach with writable=True")
 
     def _unlock(self) -> None:
         self._segment.shared.unlock(self._lock_byte)
@@ -320,9 +320,9 @@ class Coordinator:
             if rest_ns <= 0 or state.playing:
                 name = self._segment.instance
                 how = (
-                    ", which is playing it: stop that program first"
+                    ", which is playing it; stop that program first"
                     if state.playing
-                    else ": wait until that program ends"
+                    else "; wait until that program ends"
                 )
                 raise TimeError(f"the time of instance {name!r} is moved by {self._owner(state.owner)}{how}")
             bell.wait(seen, min(rest_ns, _TURN_NS))
@@ -456,7 +456,7 @@ class Timekeeper:
             ValueRangeError: The length is not between 1 us and 1 h.
         """
         if self._player is not None:
-            raise TimeError("time is playing: pause it before you step it")
+            raise TimeError("time is playing; pause it before you step it")
         self._take_over()
         return self._coordinator.step(dt_ns)
 
@@ -608,8 +608,8 @@ def _unmoved_note(segment: Segment, participants: Sequence[Block]) -> str:
         if play is not None and play.paused:
             found["over" if play.over else "paused"].append(block.source)
     return "; ".join(
-        f"the replay of {names[0]}{f' and {len(names) - 1} more' if names[1:] else ''} was {how} and did not move: "
-        "shmio replay play starts it"
+        f"the replay of {names[0]}{f' and {len(names) - 1} more' if names[1:] else ''} was {how} and did not move; "
+        "start it with shmio replay play"
         for how, names in found.items()
         if names
     )

@@ -93,10 +93,10 @@ class CommandSender:
             if len(record) + 8 > queues.capacity:
                 most = queues.capacity - 8
                 raise CommandError(
-                    f"{source}: the command has {len(record)} bytes, but at most {most} are allowed: write fewer values"
+                    f"{source}: the command has {len(record)} bytes, but at most {most} are allowed; write fewer values"
                 )
             if self._pid != os.getpid():
-                raise CommandError("this process was forked after it had attached: attach again in this process")
+                raise CommandError("this process was forked after it had attached; attach again in this process")
             if not queues.push(self.writer, record):
                 raise CommandError(
                     f"{source}: its command queue is full: the source is not reading commands, or too many are queued"
@@ -228,7 +228,7 @@ class SourceWriter:
         """
         bits = cover(self.block.layout, patterns)
         if not any(bits):
-            raise PathError(f"{self.block.source}: {', '.join(patterns)} names no register")
+            raise PathError(f"{self.block.source}: no register matches {', '.join(patterns)}")
         ticket = self.ask_to_inject(merge(bits, bits, [(0, len(bits))]), timeout_s, **options)
         self._expect(ticket, EventKind.INJECTED)
         return ticket.number

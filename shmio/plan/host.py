@@ -99,7 +99,8 @@ def _check_opcua(opcua: OpcUa) -> Iterator[str]:
     identity = read_identity(opcua)
     if identity is not None and application_uri(identity[0]) is None:
         yield (
-            f"opcua.certificate: {opcua.certificate}: it has no application URI (a URI among its subject alternative "
+            f"opcua.certificate: {opcua.certificate}: this certificate has no application URI (a URI among its "
+            "subject alternative "
             "names); many clients refuse such a certificate"
         )
 
@@ -119,7 +120,11 @@ def _check_alert(key: str, alert: Alert) -> None:
             there = Path(program).is_file()
             raise ConfigError(
                 f"{key}.command: {program}: "
-                + ("not executable: chmod +x" if there else "no such program; give its full path")
+                + (
+                    "this file is not executable; run chmod +x"
+                    if there
+                    else "there is no such program; give its full path"
+                )
                 + ". The list holds the program and its arguments; no shell reads it"
             )
     if alert.webhook_header_file is not None:
@@ -174,7 +179,7 @@ def exposure(config: Config) -> str | None:
     names = ", ".join(users[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
     return (
         f"note: other users of this host ({names}) may {'; and '.join(ways)} without logging in: "
-        "a UNIX socket, tokens or accounts prevent that, see SECURITY.md"
+        "a UNIX socket, tokens or accounts prevent this (see SECURITY.md)"
     )
 
 

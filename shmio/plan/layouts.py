@@ -13,6 +13,7 @@ from shmio.errors import ConfigError, Diagnostic, LayoutError
 from shmio.layout import compiler
 from shmio.layout.model import Layout
 from shmio.layout.source.lexer import MAX_SOURCE_BYTES
+from shmio.wording import unknown
 
 _QUOTED = re.compile(r"'[^']*'")
 
@@ -63,7 +64,7 @@ class LayoutFiles:
     def _program(self, key: str, section: Source | Emulator) -> tuple[tuple[Path, ...], compiler.Program]:
         if section.layout is None:
             raise ConfigError(
-                f"{key}.layout: this key is needed: name the data block's source file (.db), and the files of its UDTs"
+                f"{key}.layout: this key is needed; name the data block's source file (.db), and the files of its UDTs"
             )
         names = [section.layout] if isinstance(section.layout, str) else section.layout
         paths = tuple(self._config.path(name) for name in names)
@@ -96,7 +97,7 @@ class LayoutFiles:
         warnings = [one for one in compiled.warnings if not (optimized and compiler.is_of_access(one))]
         self.warnings += [line for line in summarize(warnings) if line not in self.warnings]
         names = ", ".join(layout.name for layout in compiled.layouts)
-        self.odd += [f"{key}.type_bytes: nothing in {names} has the type {name!r}" for name in compiled.unused]
+        self.odd += [f"{key}.type_bytes: no member in {names} has the type {name!r}" for name in compiled.unused]
         return compiled.layouts
 
 
@@ -108,13 +109,15 @@ def _choose(
         for block in blocks:
             if block.name.lower() == section.block.lower():
                 return block
-        raise ConfigError(f"{key}.block: no data block {section.block!r}; there are: {names}")
+        raise ConfigError(f"{key}.block: {unknown('data block', section.block, (block.name for block in blocks))}")
     found = [block for block in blocks if block.number is not None and block.number == number]
     if len(found) != 1:
         if number is not None:
-            raise ConfigError(f"{key}.dbNumber: no data block has the number {number} ({names}); choose one by block")
+            raise ConfigError(
+                f"{key}.dbNumber: no data block has the number {number} ({names}); choose one with the key block"
+            )
         raise ConfigError(
-            f"{key}.layout: the files contain several data blocks ({names}); choose one by block or dbNumber"
+            f"{key}.layout: the files contain several data blocks ({names}); choose one with the key block or dbNumber"
         )
     return found[0]
 

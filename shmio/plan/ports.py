@@ -112,7 +112,7 @@ def _places(address: Address) -> list[tuple[int, tuple[Any, ...]]]:
     try:
         found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError) as error:  # UnicodeError: a part of the name is empty, or too long
-        why = error.strerror if isinstance(error, OSError) else "it is not the name of a host"
+        why = error.strerror if isinstance(error, OSError) else "this is not the name of a host"
         raise ConfigError(
             f"{address}: {address.host!r} cannot be resolved ({why}); write an address or a name of this host"
         ) from None
@@ -159,7 +159,10 @@ def _holder(address: Address) -> str:
     for pid in _pids():
         if links.intersection(_open_files(pid)):
             return f"{_command(pid)}, pid {pid}, listens there; choose another port, or end that program"
-    return f"another program listens there; choose another port, or see which: ss -ltnp sport = :{address.port}"
+    return (
+        "another program listens there; choose another port, or find that program with ss -ltnp sport = "
+        f":{address.port}"
+    )
 
 
 def _listening(address: Address) -> Iterator[str]:

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from shmio.config import Address, Alert, Config, Emulator, Mqtt, Source
 from shmio.config.credentials import read_accounts
-from shmio.config.faults import Faults, meant
+from shmio.config.faults import Faults
 from shmio.config.read import examine
 from shmio.config.web import http_sections
 from shmio.connectors.models.simulation import Simulation
@@ -38,6 +38,7 @@ from shmio.plan.replay import Recordings, replayed
 from shmio.plan.scene import check_scene
 from shmio.plan.sources import check_sources, describe, note_options
 from shmio.recording.selection import Selection
+from shmio.wording import did_you_mean, unknown
 
 DEVICE_KEYS = ("nodes", "unit", "word_order", "byte_order")
 """Keys of a source that say how its device names or stores values."""
@@ -78,7 +79,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
     origin, notices = None, list[str]()
     if mode == "log" and config.recorder is None and not faults:
         raise ConfigError(
-            f"{file}: --mode log records the sources and needs a [recorder] section: "
+            f"{file}: --mode log records the sources and needs a [recorder] section; "
             'add one, such as [recorder] with directory = "dumps", or leave out --mode log'
         )
     directory = config.path(config.recorder.directory) if config.recorder else None  # a replay leaves out the recorder
@@ -224,8 +225,7 @@ def _check_alert(key: str, alert: Alert, config: Config, layouts: dict[str, Layo
         for name, patterns, known in (("process", alert.processes, others), ("source", alert.sources, list(layouts))):
             for pattern in patterns:
                 if not any(map(Glob(pattern).matches, known)):
-                    what = f"{name}: no {name} {pattern!r}; there are: {', '.join(known)}{meant(pattern, known)}"
-                    raise ConfigError(what)
+                    raise ConfigError(f"{name}: {unknown(name, pattern, known)}")
     except (ConfigError, PathError) as error:
         raise ConfigError(f"{key}.{error}") from None
 
@@ -234,9 +234,7 @@ def _check_emulator(index: int, emulator: Emulator, config: Config, files: Layou
     """Check an emulator; return the blocks and tag tables that it serves. Its program runs on the first."""
     key = f"emulator[{index}]"
     if emulator.kind not in KINDS:
-        raise ConfigError(
-            f"{key}.kind: {emulator.kind!r} is unknown; valid: {', '.join(KINDS)}{meant(emulator.kind, KINDS)}"
-        )
+        raise ConfigError(f"{key}.kind: {unknown('kind', emulator.kind, KINDS)}")
     if emulator.layout is None:
         return _check_served(key, emulator, _read_from(key, emulator, config, files), config)
     if emulator.kind != S7 and emulator.dbNumber is not None:
@@ -257,14 +255,14 @@ def _check_served(key: str, emulator: Emulator, served: Sequence[Served], config
     elif emulator.dbNumber is None:
         _check_numbers(key, blocks)
     elif not blocks:
-        raise ConfigError(f"{key}.dbNumber: leave it out: each address of a tag table names its block")
+        raise ConfigError(f"{key}.dbNumber: leave out this key, because each address of a tag table names its block")
     program = emulator.program
     if is_user_code(program):
         options = Simulation.Options(program, emulator.parameters, folder=str(config.path(emulator.folder)))
         describe(key, options, served[0].layout, "program")
         program = IDLE  # the user's code stays out of this process
     elif emulator.parameters:
-        raise ConfigError(f"{key}.parameters: program {program} has none; leave out this key")
+        raise ConfigError(f"{key}.parameters: program {program} has no parameters; leave out this key")
     if emulator.faults and emulator.kind not in FAULTY:
         raise ConfigError(f"{key}.faults: only emulators of kind {' or '.join(FAULTY)} can have faults")
     try:
@@ -356,9 +354,9 @@ def _odd_patterns(key: str, source: Source, layout: Layout, faults: Faults) -> I
         for pattern in patterns:
             try:
                 if not _covers(pattern, layout):
-                    yield f"{key}.{name}: {pattern!r} names nothing in {layout.name}{_near(pattern, layout)}"
+                    yield f"{key}.{name}: {pattern!r} matches no register of {layout.name}{_near(pattern, layout)}"
                 elif name == "allow_nonfinite" and not _covers(pattern, layout, NONFINITE):
-                    yield f"{key}.{name}: {pattern!r} names no REAL or LREAL in {layout.name}"
+                    yield f"{key}.{name}: {pattern!r} matches no REAL or LREAL of {layout.name}"
             except PathError as error:
                 faults.add(f"{key}.{name}: {error}")
 
@@ -376,7 +374,9 @@ def _odd_topics(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
     for key, pattern, frames in _topics(config):
         if frames:
             if pattern not in layouts:
-                raise ConfigError(f"{key}: {pattern!r}: frames need the name of a whole source")
+                raise ConfigError(
+                    f"{key}: {pattern!r} is not the name of a source, but frames are published only for a whole source"
+                )
             continue
         try:
             if names_part(pattern) and key.startswith("mqtt.topic"):
@@ -387,7 +387,7 @@ def _odd_topics(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
             raise ConfigError(f"{key}: {error}") from None
         paths = (f"{source}/{register.path}" for source, layout in layouts.items() for register in layout.registers)
         if not any(map(glob.matches, paths)):
-            yield f"{key}: {pattern!r} names no register; the path of a register begins with its source"
+            yield f"{key}: {pattern!r} matches no register; the path of a register begins with its source"
 
 
 def _check_part(path: str, layouts: dict[str, Layout]) -> None:
@@ -407,13 +407,16 @@ def _odd_accounts(mqtt: Mqtt, address: Address) -> Iterator[str]:
     shown = mqtt.tls is not None and mqtt.tls.ca is not None
     if free and (mqtt.password_file or not (address.loopback or shown)):
         yield (
-            f"mqtt.listen: anyone who reaches {mqtt.listen} may publish commands without an account: set "
+            f"mqtt.listen: anyone who reaches {mqtt.listen} may publish commands without an account; set "
             "mqtt.password_file, and give each [[mqtt.account]] with the role write a name"
         )
     if mqtt.password_file:
         named = {account.name for account in mqtt.account}
         if others := ", ".join(name for name in read_accounts(mqtt.password_file) if name not in named):
-            yield f"mqtt.password_file: {others} may only read: an [[mqtt.account]] with the role write changes this"
+            yield (
+                f"mqtt.password_file: {others} may only read; to let a client write, give its [[mqtt.account]] the "
+                "role write"
+            )
 
 
 def _odd_recorder(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
@@ -439,7 +442,7 @@ def _topics(config: Config) -> Iterator[tuple[str, str, bool]]:
 
 def _near(pattern: str, layout: Layout) -> str:
     names = [] if "*" in pattern else near(layout, pattern)
-    return f"; did you mean {' or '.join(names)}?" if names else ""
+    return f"; {did_you_mean(names)}" if names else ""
 
 
 def _not_served(config: Config, layouts: dict[str, Layout], emulated: dict[str, tuple[Served, ...]]) -> Iterator[str]:

@@ -10,7 +10,7 @@ import msgspec
 from msgspec.structs import replace
 
 from shmio.config import Config
-from shmio.config.faults import Faults, meant
+from shmio.config.faults import Faults
 from shmio.config.scene import (
     MAX_BODIES,
     MAX_SHAPES,
@@ -28,6 +28,7 @@ from shmio.config.scene import (
 from shmio.errors import ConfigError, PathError
 from shmio.layout.model import NUMBERS, Layout
 from shmio.layout.topic import look_up, parse_topic
+from shmio.wording import already_named, unknown
 
 MAX_REGISTERS: Final = 200
 """Maximum number of registers that move bodies: as many as one page follows."""
@@ -100,8 +101,7 @@ def _expanded(scene: Scene, faults: Faults) -> list[_Placed]:
     for index, copy in enumerate(scene.copy):
         found = templates.get(copy.template)
         if found is None:
-            remedy = meant(copy.template, templates)
-            faults.add(f"copy[{index}].template: there is no template {copy.template!r}{remedy}")
+            faults.add(f"copy[{index}].template: {unknown('template', copy.template, templates)}")
             continue
         root = Body(name=copy.name, position_mm=copy.position_mm, rotation_deg=copy.rotation_deg)
         placed.append(_Placed(f"copy[{index}]", copy.name, copy.parent, root, copy.label))
@@ -129,7 +129,7 @@ def _copied(key: str, copy: Copy, place: int, template: Template, faults: Faults
             return
         for shape in own.shape:
             if not is_color(shape.color):
-                faults.add(f'{key}.values: {shape.color!r} is no colour; write it as "#RRGGBB"')
+                faults.add(f'{key}.values: {shape.color!r} is not a colour; write it as "#RRGGBB"')
         parent = copy.name if body.parent is None else f"{copy.name}/{body.parent}"
         yield _Placed(f"template[{place}].body[{index}]", f"{copy.name}/{body.name}", parent, own, label)
 
@@ -140,10 +140,10 @@ def _ordered(placed: list[_Placed], faults: Faults) -> list[_Placed]:
     for one in placed:
         first = names.setdefault(one.name, one)
         if first is not one:
-            faults.add(f"{one.key}.name: {one.name!r} is already the name of {first.key}")
+            faults.add(f"{one.key}.name: {already_named(one.name, first.key)}")
     for one in placed:
         if one.parent is not None and one.parent not in names:
-            faults.add(f"{one.key}.parent: there is no body {one.parent!r}{meant(one.parent, names)}")
+            faults.add(f"{one.key}.parent: {unknown('body', one.parent, names)}")
     if faults:
         return []
     done: dict[str, _Placed] = {}
@@ -152,7 +152,10 @@ def _ordered(placed: list[_Placed], faults: Faults) -> list[_Placed]:
         while one.name not in done:
             if one.name in chain:
                 circle = [*list(chain)[list(chain).index(one.name) :], one.name]
-                faults.add(f"{one.key}.parent: the bodies hang on each other in a circle: {' on '.join(circle)}")
+                faults.add(
+                    f"{one.key}.parent: the parents form a loop, in which each body hangs on the next: "
+                    f"{' on '.join(circle)}"
+                )
                 return []
             chain[one.name] = one
             if one.parent is None:
@@ -203,7 +206,7 @@ def _moved(joint: Joint, layouts: Mapping[str, Layout]) -> dict[str, Any]:
     """
     topic = parse_topic(joint.register, layouts, next(iter(layouts)) if len(layouts) == 1 else None)
     if topic.source not in layouts:
-        raise PathError(f"{joint.register}: unknown source {topic.source}")
+        raise PathError(f"{joint.register}: {unknown('source', topic.source, layouts)}")
     if topic.direction == "in":
         raise PathError(f"{joint.register}: an input of a source cannot be followed; leave out /in")
     register = look_up(layouts[topic.source], topic)

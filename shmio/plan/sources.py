@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 import msgspec
 
 from shmio.config import Config, Source
-from shmio.config.faults import Faults, near
+from shmio.config.faults import Faults
 from shmio.config.read import unknown_option
 from shmio.connectors import registry
 from shmio.connectors.base import Computed, Connector, Replayed
@@ -19,10 +19,11 @@ from shmio.errors import ConfigError, PathError, RecordingError, ShmioError, Val
 from shmio.layout.document import load_layout
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
-from shmio.layout.topic import find, parse_topic, shorten
+from shmio.layout.topic import find, parse_topic
 from shmio.layout.values.codec import codec
 from shmio.plan.layouts import LayoutFiles
 from shmio.plan.replay import Recordings
+from shmio.wording import near, unknown
 
 NEEDED: Final = "this key is needed"
 PATIENCE_S: Final = 60.0
@@ -178,7 +179,7 @@ def _recorded(key: str, source: Source, config: Config, recordings: Recordings) 
     for name in ("layout", "block", "type_bytes", "properties"):
         if getattr(source, name):
             raise ConfigError(
-                f"{key}.{name}: a replay does not take this key: its registers are those of the recording"
+                f"{key}.{name}: leave out this key in a replay, because its registers are those of the recording"
             )
     options = msgspec.convert(source.options, Replay.Options)
     source.options["file"] = [str(config.path(file)) for file in files(options)]
@@ -263,10 +264,10 @@ def _check_connection(
     source: str, path: str, text: str, inputs: tuple[str, ...], layouts: Mapping[str, Layout]
 ) -> None:
     if path not in inputs:
-        raise PathError(f"the model has no such input; there are: {shorten(', '.join(inputs), 400) or 'none'}")
+        raise PathError(unknown("input", path, inputs, "the model"))
     topic = parse_topic(text, layouts, source)
     if topic.source not in layouts:
-        raise PathError(f"{text}: no source {topic.source!r}; there are: {', '.join(layouts)}")
+        raise PathError(f"{text}: {unknown('source', topic.source, layouts)}")
     if topic.direction == "in":
         raise PathError(f"{text}: an input reads an output of a source; leave out /in")
     register, own = find(layouts[topic.source], topic.path), find(layouts[source], path)

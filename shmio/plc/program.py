@@ -47,7 +47,7 @@ class Program(Model):
             raise ModelError(f"program {cls.__qualname__}: a program has no step(); rename it to scan()")
         for name, value in vars(cls).items():
             if isinstance(value, FunctionBlock) and hasattr(Program, name):
-                raise ModelError(f"program {cls.__qualname__}: {name}: this name is reserved: rename the block")
+                raise ModelError(f"program {cls.__qualname__}: {name}: this name is reserved; rename the block")
 
     @final
     def step(self, time_s: float, dt_s: float) -> None:

@@ -109,7 +109,7 @@ class PreTriggerBuffer:
             self._logged = True
             kept_s = (entry.log_ns - self._entries[0].log_ns) / 1e9
             log.warning(
-                "only the last %.1f s before a trigger fit in memory: raise recorder.trigger.before_mb to keep more",
+                "only the last %.1f s before a trigger fit in memory; raise recorder.trigger.before_mb to keep more",
                 kept_s,
             )
         while self._size > self._limit:
@@ -224,7 +224,8 @@ class TriggeredRecorder:
         if sum(series.waiting for series in self._ending) > self._settings.buffer_bytes:
             if not self._held:
                 log.error(
-                    "the trigger %s has fired, but no new file is started: earlier files still wait for the disk",
+                    "the trigger %s has fired, but no new file is started, because earlier files still wait for "
+                    "the disk",
                     self._trigger.when,
                 )
             self._held = True

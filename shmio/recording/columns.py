@@ -187,7 +187,7 @@ class Collector:
             return
         if self._codec is not None and self._codec.dtype != codec.dtype:
             raise RecordingError(
-                f"{self._source}: a reload changed these registers within the range: choose a range before or after it"
+                f"{self._source}: a reload changed these registers within the range; choose a range before or after it"
             )
         self._flush()
         self._codec, self._registers = codec, registers

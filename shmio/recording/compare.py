@@ -19,6 +19,7 @@ from shmio.recording.reading.part import DumpBlock, Entry
 from shmio.segment import Event, EventKind, Frame, Provenance
 from shmio.segment.changed_registers import ChangeScan
 from shmio.segment.playhead import OWN_WORDS
+from shmio.wording import unknown
 
 EVENT_FIELDS: Final = ("kind", "quality", "text", "offset", "size", "mask", "data")
 """The fields of an event that are equal if the same happens in two runs."""
@@ -190,9 +191,9 @@ def compare(
     if how.only:
         names = [name for name in names if any(block.source == name for some in chosen for block in some)]
     if sources is not None:
-        unknown = [source for source in sources if source not in names]
-        if unknown:
-            raise PathError(f"no source {unknown[0]!r} in the recordings; there are: {', '.join(names)}")
+        for source in sources:
+            if source not in names:
+                raise PathError(unknown("source", source, names))
         names = list(sources)
     for name in names:
         yield _Source(first, second, name, how, chosen, progress).compare()

@@ -34,6 +34,7 @@ from shmio.recording.reading.part import (
 from shmio.recording.reading.reader import Item, Reader
 from shmio.segment import Event, Frame
 from shmio.segment.changed_registers import runs
+from shmio.wording import name_one, unknown
 
 MAX_FILES: Final = 512
 OVERLAP_NS: Final = 1_000_000_000
@@ -94,7 +95,7 @@ class Dump:
         for part in self._parts[1:]:
             for key in ("instance", "epoch"):
                 if part.reader.about.get(key) != self.about.get(key):
-                    raise RecordingError(f"{first.file} and {part.file} come from different runs: open them separately")
+                    raise RecordingError(f"{first.file} and {part.file} come from different runs; open them separately")
         blocks: dict[tuple[str, int, str], DumpBlock] = {}
         self._contents = [contents(part, blocks) for part in self._parts]
         self.blocks = tuple(blocks.values())
@@ -425,8 +426,7 @@ class _Names:
         if name is None and len(self.sources) == 1:
             return self.sources[0]
         if name not in self.sources:
-            which = "name a source" if name is None else f"no source {name!r}"
-            raise PathError(f"{which}; there are: {', '.join(self.sources) or 'none'}")
+            raise PathError(name_one("source", self.sources) if name is None else unknown("source", name, self.sources))
         return name
 
     def several(self, names: str | Collection[str] | None) -> set[str]:
@@ -467,7 +467,7 @@ class _Names:
         sources = sorted({block.source for block in chosen})
         if len(sources) != 1:
             raise PathError(
-                f"these registers belong to {' and '.join(sources) or 'no source'}: "
+                f"these registers belong to {' and '.join(sources) or 'no source'}; "
                 "choose registers of one source at a time"
             )
         return chosen
@@ -475,7 +475,7 @@ class _Names:
     def _named(self, path: str, topic: Topic) -> Chosen:
         """Return the registers that a topic names, by block. Blocks may have different layouts."""
         found: Chosen = {}
-        problem = PathError(f"{path}: no register of this recording has such a path")
+        problem = PathError(f"{path}: this recording has no such register")
         for block in self._blocks:
             if block.source == topic.source:
                 try:

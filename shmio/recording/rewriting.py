@@ -21,6 +21,7 @@ from shmio.recording.times import span
 from shmio.recording.writer import JSON, TEXT, TOML, Channels, Writer
 from shmio.segment import Event, Frame
 from shmio.version import __version__
+from shmio.wording import EMPTY, EXISTS
 
 MAX_ATTACHMENT_BYTES: Final = 16 << 20
 FLUSH_BYTES: Final = 4 << 20
@@ -154,7 +155,7 @@ def new_file(path: Path) -> Iterator[IO[bytes]]:
     try:
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     except FileExistsError:
-        raise RecordingError(f"{path} exists already: choose another name, no file is overwritten") from None
+        raise RecordingError(f"{path}: {EXISTS}") from None
     try:
         with os.fdopen(fd, "wb", buffering=FLUSH_BYTES) as stream:
             yield stream
@@ -247,11 +248,9 @@ def _part(
         elif (kept := parts.of(entry)) is not None:
             yield kept
     if not anything and not dump.begin_ns:
-        raise RecordingError(f"{dump.files[0]}: nothing is recorded in it")
+        raise RecordingError(f"{dump.files[0]}: {EMPTY}")
     if not anything:
-        raise RecordingError(
-            f"{dump.files[0]} has nothing in that time: it was recorded {span(dump.begin_ns, dump.end_ns)}"
-        )
+        raise RecordingError(f"{dump.files[0]} has nothing in that time; it goes {span(dump.begin_ns, dump.end_ns)}")
 
 
 class _Parts:

@@ -15,6 +15,7 @@ from shmio.layout.topic import near, parse_topic
 from shmio.layout.values.write import chosen, covering
 from shmio.model.statuses import StatusArea
 from shmio.segment import Block, Frame
+from shmio.wording import did_you_mean, unknown
 
 
 class RecordedRegisters:
@@ -100,13 +101,9 @@ class Selection:
 
         ``layouts`` are the layouts of all sources, by name.
         """
-        missing = [
-            f"no source {source!r}; there are: {', '.join(layouts)}"
-            for source in self._sources or ()
-            if source not in layouts
-        ]
+        missing = [unknown("source", source, layouts) for source in self._sources or () if source not in layouts]
         missing += [
-            f"{pattern}: no register has such a path{_near(pattern, layouts)}"
+            f"{pattern}: no register has this path{_near(pattern, layouts)}"
             for pattern in self._registers
             if not any(_paths(pattern, source, layout, layouts) for source, layout in layouts.items())
         ]
@@ -120,7 +117,7 @@ def _near(pattern: str, layouts: Mapping[str, Layout]) -> str:
     except PathError:
         return ""
     alike = [] if "*" in pattern or topic.source not in layouts else near(layouts[topic.source], topic.path)
-    return f"; near: {', '.join(f'{topic.source}/{path}' for path in alike)}" if alike else ""
+    return f"; {did_you_mean([f'{topic.source}/{path}' for path in alike])}" if alike else ""
 
 
 def _paths(pattern: str, source: str, layout: Layout, sources: Collection[str]) -> set[str]:

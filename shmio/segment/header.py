@@ -113,8 +113,9 @@ class Header(msgspec.Struct, frozen=True):
         # fmt: on
         if abi != ABI_VERSION:
             raise FormatError(
-                f"{name} has segment ABI {abi} (written by shmio {text(version)}), this shmio {__version__} knows "
-                f"ABI {ABI_VERSION}: use the same version of shmio as the instance"
+                f"{name} has segment ABI {abi} (written by shmio {text(version)}), but this shmio {__version__} "
+                "knows only "
+                f"ABI {ABI_VERSION}; use the same version of shmio as the instance"
             )
         sound = (
             header_size == HEADER_SIZE
@@ -128,7 +129,7 @@ class Header(msgspec.Struct, frozen=True):
             and HEADER_SIZE <= processes <= len(memory) - process_capacity * SLOT_SIZE
         )
         if not sound:
-            raise FormatError(f"{name}: the header is inconsistent")
+            raise FormatError(f"{name}: the header is inconsistent; restart the instance")
         return cls(
             epoch, size, utc_ns, started_ns, sections, section_capacity, processes, process_capacity,
             text(mode), text(instance), text(version), text(control),

@@ -88,7 +88,7 @@ def encode(items: Iterable[bytes], growth: int = 0) -> bytes:
     document = b"[" + b",".join(items) + b"]"
     if len(document) + growth > LIST_SIZE:
         raise ValueError(
-            "the injections of one source are too large: create fewer, or cover whole structures or arrays"
+            "the injections of one source are too large; create fewer, or cover whole structures or arrays"
         )
     return document
 

@@ -20,6 +20,7 @@ from shmio.model.values import Provenance, Quality
 from shmio.segment import _atomics
 from shmio.segment.header import cut, text
 from shmio.segment.shm import SharedObject
+from shmio.wording import did_you_mean
 
 SLOTS: Final = 4
 MAX_NAME_BYTES: Final = 103
@@ -100,7 +101,7 @@ def model_ports(layout: Layout, outputs: Sequence[str], inouts: Sequence[str]) -
     computed, both = (_named(layout, *item) for item in (("outputs", outputs), ("inouts", inouts)))
     if twice := sorted(computed & both):
         path = layout.registers[twice[0]].path
-        raise ConfigError(f"inouts: {path} is in outputs, too: name an in-out register only in inouts")
+        raise ConfigError(f"inouts: {path} is in outputs, too; name an in-out register only in inouts")
     registers = list(enumerate(layout.registers))
     return ModelPorts(
         tuple(register for index, register in registers if index not in computed),
@@ -116,9 +117,9 @@ def _named(layout: Layout, key: str, patterns: Sequence[str]) -> set[int]:
         except PathError as error:
             raise ConfigError(f"{key}: {error}") from None
         if not some:
-            alike = "" if "*" in pattern else ", ".join(path for path in near(layout, pattern) if path != pattern)
-            what = f"{key}: {pattern!r} names no register of {layout.name}; only whole registers are allowed"
-            raise ConfigError(f"{what}; near: {alike}" if alike else what)
+            alike = [] if "*" in pattern else [path for path in near(layout, pattern) if path != pattern]
+            what = f"{key}: {pattern!r} matches no register of {layout.name}; only whole registers are allowed"
+            raise ConfigError(f"{what}; {did_you_mean(alike)}" if alike else what)
         found.update(some)
     return found
 

@@ -206,7 +206,7 @@ class Playhead:
         self._shared = shared
         self._memory = memory
         first, second = _COPIES_AT
-        complaint = "a playhead is invalid: restart its source: shmio-supervisor restart NAME"
+        complaint = "a playhead is invalid; restart its source with shmio-supervisor restart NAME"
         self._state = DoubleBuffer(memory, (offset + first, offset + second), complaint)
         self._ask_at = offset + _ASK_AT
         self._lock_byte = lock_byte
@@ -305,7 +305,7 @@ class Playhead:
             until_s = time.monotonic() + _LOCK_S
             while not self._shared.try_lock(self._lock_byte):
                 if time.monotonic() > until_s:
-                    raise CommandError("another program is moving this recording: try again when it is done")
+                    raise CommandError("another program is moving this recording; try again when it is done")
                 time.sleep(_LOCK_TURN_S)  # unlocking rings no doorbell
             try:
                 yield

@@ -237,8 +237,8 @@ class ProcessTable(Sequence[ProcessSlot]):
         vacant = self._header.process_capacity - len(self.external) - len(self._slots)
         if count > vacant:
             raise SegmentError(
-                f"segment {self._shared.name} has room for {vacant} more processes, not for {count}: "
-                "restart the instance: shmio-supervisor down, up"
+                f"segment {self._shared.name} has room for {vacant} more processes, not for {count}; "
+                "restart the instance with shmio-supervisor down and up"
             )
 
     def add(self, spec: ProcessSpec) -> ProcessSlot:

@@ -48,7 +48,7 @@ def _align(size: int, to: int) -> int:
     return -(-size // to) * to
 
 
-_DAMAGED = "; the segment is damaged: restart the instance"
+_DAMAGED = "; the segment is damaged; restart the instance"
 _RING_SECONDS = 8
 _SECTIONS_PER_BLOCK = 9  # at most: one of every kind
 _SPARE_SECTIONS = 40 * _SECTIONS_PER_BLOCK
@@ -454,7 +454,7 @@ class Segment:
             return
         used = "an unknown file (its version of shmio does not record the file)" if self.config is None else self.config
         raise WrongInstanceError(
-            f"the running instance {self.instance!r} was started from {used}, not from {file.resolve()}: "
+            f"the running instance {self.instance!r} was started from {used}, not from {file.resolve()}; "
             f"to use that instance anyway, add --instance {self.instance}"
         )
 
@@ -527,7 +527,8 @@ class Segment:
         if count > vacant:
             raise SegmentError(
                 f"segment {self.shared.name} has room for {vacant} more blocks, not for {count} (each new or "
-                "changed source takes one, until the instance ends): restart the instance: shmio-supervisor down, up"
+                "changed source takes one, until the instance ends); restart the instance with shmio-supervisor "
+                "down and up"
             )
 
     def reserve(self, add: Sequence[BlockSpec]) -> int:

@@ -49,8 +49,8 @@ def claim(instance: str) -> SharedObject | None:
         if not shared.try_lock(SUPERVISOR_LOCK):
             refuse_second(instance)
             raise AlreadyRunningError(
-                f"another supervisor is starting instance {instance!r}, or it is of another version of shmio: "
-                "end it with the version that started it"
+                f"another supervisor is starting instance {instance!r}, or another version of shmio runs it; "
+                "stop it with that version"
             )
         if shared.current():
             return shared
@@ -294,7 +294,7 @@ def survivor(pid: int) -> str:
         if state == "D"
         else "still runs"
     )
-    return f"pid {pid} was killed and {alive}: remove the cause, or restart the host"
+    return f"pid {pid} was killed and {alive}; remove the cause, or restart the host"
 
 
 def _ended(pidfds: Collection[int], timeout_s: float) -> set[int]:

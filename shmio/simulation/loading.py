@@ -12,6 +12,7 @@ from typing import Any, TypeGuard
 from shmio.errors import ConfigError
 from shmio.simulation import fmu
 from shmio.simulation.model import Model, explain
+from shmio.wording import unknown
 
 
 def load(text: str, folder: str | Path | None = None) -> type[Model]:
@@ -39,7 +40,7 @@ def load(text: str, folder: str | Path | None = None) -> type[Model]:
         there = [
             name for name, value in vars(module).items() if _is_model(value) and value.__module__ == module.__name__
         ]
-        raise ConfigError(f"{name} has no {attribute}; its models are: {', '.join(there) or 'none'}")
+        raise ConfigError(unknown("class", attribute, there, name))
     if not _is_model(found):
         raise ConfigError(f"{text} is not a subclass of shmio.simulation.Model")
     if inspect.isabstract(found):

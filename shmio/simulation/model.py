@@ -131,7 +131,7 @@ class Declaration:
 
     def _check_limits(self, limits: tuple[float, float]) -> None:
         if isinstance(self, Output):
-            raise ModelError("limits: an output has none; the model computes it")
+            raise ModelError("limits: an output has no limits, because the model computes it")
         with suppress(ValueError):  # an invalid type is reported when it is placed
             if self.members is not None or parse_type(str(self.type))[0].base not in NUMBERS:
                 raise ModelError("limits: only a number or an array of numbers can have limits")
@@ -189,7 +189,7 @@ class InOut(Declaration):
         return self if model is None else model._ends[self.name]
 
     def __set__(self, model: _DeclaringModel, value: object) -> None:
-        raise AttributeError(f"{self.name} is {self.kind}: set {self.name}.shown")
+        raise AttributeError(f"{self.name} is {self.kind}; set {self.name}.shown")
 
 
 def place_declarations(model: str, declarations: Iterable[Declaration]) -> Layout:
@@ -256,7 +256,7 @@ class Model(ABC):
         cls.declarations = {name: value for name, value in found.items() if isinstance(value, Declaration)}
         for name in cls.declarations:
             if name in _OWN or name.startswith("_"):
-                raise ModelError(f"model {cls.__qualname__}: {name}: this name is reserved: rename it, and set path")
+                raise ModelError(f"model {cls.__qualname__}: {name}: this name is reserved; rename it, and set path")
         _check(cls)
 
     @classmethod
@@ -374,7 +374,7 @@ def layout_of(model: type[Model]) -> Layout:
     """
     registers = declared(model, Input, Output, InOut)
     if not registers:
-        raise ModelError(f"model {model.__qualname__} declares no register: give it an Input, an Output or an InOut")
+        raise ModelError(f"model {model.__qualname__} declares no register; give it an Input, an Output or an InOut")
     return place_declarations(model.__qualname__, registers)
 
 

@@ -137,8 +137,7 @@ class ModelRunner:
         for path, value in values.items():
             port = self._inputs.get(path)
             if port is None:
-                there = ", ".join(self._inputs) or "none"
-                raise PathError(f"model {self.name} has no input {path}; there are: {there}")
+                raise PathError(unknown("input", path, self._inputs, f"model {self.name}"))
             port.write(value)
 
     def begin(self) -> bytes:
@@ -295,10 +294,7 @@ def _parameters(model: type[Model], given: Mapping[str, object]) -> dict[str, Po
         ports[declaration.name] = port_of(declaration.name, registers, layout.byte_order, values, declaration.limits)
     for name, value in given.items():
         if name not in ports:
-            there = ", ".join(ports) or "none"
-            raise ConfigError(
-                f"parameters.{name}: model {model.__qualname__} has no such parameter; there are: {there}"
-            )
+            raise ConfigError(f"parameters.{name}: {unknown('parameter', name, ports, f'model {model.__qualname__}')}")
         try:
             ports[name].write(value)
         except ValueRangeError as error:

@@ -91,8 +91,8 @@ def refusal(plan: Plan, running: Plan) -> str | None:
     for key, (old, new) in fixed.items():
         if old != new:
             return (
-                f"{key}: {_shown(new)} instead of {_shown(old)} cannot be applied while the instance runs; "
-                "nothing has changed: apply it by shmio-supervisor down and up"
+                f"{key}: this key cannot change from {_shown(old)} to {_shown(new)} while the instance runs, so "
+                "nothing was changed; to apply it, run shmio-supervisor down and up"
             )
     return None
 
@@ -158,7 +158,7 @@ def _reasons(name: str, plan: Plan, running: Plan, fleet: Fleet) -> list[str]:
     managed = fleet.named(name)
     old, new = (next((job for job in one.jobs if job.name == name), None) for one in (running, plan))
     blocks = [next((block for block in one.blocks if block.source == name), None) for one in (running, plan)]
-    found = [] if managed.well else [f"it does not run: {managed.life.note or managed.life.state.value}"]
+    found = [] if managed.well else [f"it is not running: {managed.life.note or managed.life.state.value}"]
     if old is not None and new is not None:
         found += _differences(old.config, new.config)
     if blocks[0] is not None and blocks[1] is not None:

@@ -172,7 +172,7 @@ class ManagedProcess:
         state = self.life.state
         if self.life.stuck:
             for answer in self.waiting:
-                answer.error(f"{self.name}: {self.life.note}; it starts again as soon as it has ended")
+                answer.error(f"{self.name}: {self.life.note}; it starts again as soon as the old process has ended")
             self.waiting.clear()
         if state not in (State.RUNNING, State.BACKOFF, State.FATAL, State.STOPPED):
             return
@@ -180,7 +180,7 @@ class ManagedProcess:
             if state is State.RUNNING:
                 answer.ok()
             else:
-                answer.error(f"{self.name} did not come back: {self.life.note or state.value}")
+                answer.error(f"{self.name} did not start again: {self.life.note or state.value}")
         self.waiting.clear()
 
 
@@ -193,7 +193,7 @@ def _log_step(managed: ManagedProcess, before: Life, action: Action | None, limi
     elif life.state is State.RUNNING:
         log.info("%s running", name, extra=fields(pid=managed.child.pid) if managed.child else None)
     elif life.state is State.HUNG:
-        log.warning("%s hangs, %s: it is killed", name, life.note)
+        log.warning("%s hangs (%s); killing it", name, life.note)
     elif life.state is State.FATAL:
         log.error("%s cannot work as configured: %s", name, life.note)
     elif life.state is State.BACKOFF:
@@ -203,7 +203,7 @@ def _log_step(managed: ManagedProcess, before: Life, action: Action | None, limi
     elif life.state is State.STOPPED:
         log.info("%s stopped", name)
     elif action is Action.KILL and before.state is life.state:
-        log.warning("%s does not stop: it is killed", name)
+        log.warning("%s does not stop; killing it", name)
 
 
 def brief(error: Exception) -> str:
@@ -336,9 +336,9 @@ class Fleet:
             return
         if worker.pid not in spared:  # our child may have occupied the slot since the check above
             log.warning(
-                "the slot of %s is occupied by pid %d, which no supervisor knows: this process is killed",
-                managed.name,
+                "pid %d occupies the slot of %s, but this supervisor did not start it; killing it",
                 worker.pid,
+                managed.name,
             )
             with suppress(ProcessLookupError):
                 signal.pidfd_send_signal(worker.pidfd, signal.SIGKILL)

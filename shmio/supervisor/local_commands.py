@@ -41,7 +41,7 @@ MAX_OPEN: Final = 4096
 """Maximum number of commands of a block whose outcome is awaited."""
 CLOSE_S: Final = 2.0
 """Longest time in s to wait for the end of the thread."""
-RESTARTED: Final = "the source was restarted before it told the outcome"
+RESTARTED: Final = "the source was restarted before it reported the outcome"
 
 _KINDS: Final = {writer: kind for kind, writer in WRITERS.items()}
 _WRITES: Final = frozenset(
@@ -86,7 +86,7 @@ class Programs:
         """Return who acts as the process with this pid."""
         if self.is_own(pid, writer):
             kind = "web" if writer is None else _KINDS.get(writer, "web")
-            return Acting(Actor("process", kind, f"pid {pid}, which has ended before it could tell for whom"), kind)
+            return Acting(Actor("process", kind, f"pid {pid}, which ended before shmio could find its user"), kind)
         found = self._others.get(pid)
         if found is None:
             uid = _uid_of(pid, None)

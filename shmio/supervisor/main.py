@@ -32,6 +32,7 @@ from shmio.supervisor.local_commands import LocalCommands
 from shmio.supervisor.policy import Event, Limits, State
 from shmio.supervisor.reload import Reloader
 from shmio.supervisor.takeover import take_over
+from shmio.wording import unknown
 
 START_TICK_S: Final = 0.01
 """Interval in s of checks while a process starts: the process's report cannot wake the supervisor."""
@@ -229,7 +230,7 @@ class Supervisor:
 
     def _restart(self, name: str, answer: Answer) -> None:
         if name not in self._fleet.names:
-            answer.error(f"no process {name!r}; there are: {', '.join(self._fleet.names) or 'none'}")
+            answer.error(unknown("process", name, self._fleet.names))
         elif reason := self._busy():
             answer.error(reason)
         else:
@@ -240,7 +241,7 @@ class Supervisor:
             managed.answer()  # a stuck process is reported at once
 
     def _reload(self, answer: Answer, *, dry_run: bool) -> None:
-        reason = self._busy() or (None if self._started else "the instance is starting: try again when it is running")
+        reason = self._busy() or (None if self._started else "the instance is starting; try again when it is running")
         if not dry_run:
             log.info("a client asked to reload %s", self._reloader.plan.config_file)
         if reason:
@@ -294,7 +295,8 @@ class Supervisor:
             stuck = "; ".join(f"{managed.name}: {managed.life.note}" for managed in there)
             for answer in self._stop_answers:
                 answer.error(
-                    f"all other processes are stopped, but {stuck}; the stop continues as soon as it has ended"
+                    f"all other processes are stopped, but {stuck}; the stop continues as soon as that process "
+                    "has ended"
                 )
             self._stop_answers.clear()
 

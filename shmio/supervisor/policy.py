@@ -221,7 +221,7 @@ def _crashes(life: Life, event: Event, to: State, now_ns: int, limits: Limits) -
 
 def _hang(life: Life, limits: Limits) -> str:
     late = life.state is State.STARTING
-    return f"not running {limits.start_s:g} s after its start" if late else f"no heartbeat for {limits.hang_s:g} s"
+    return f"not ready {limits.start_s:g} s after its start" if late else f"no heartbeat for {limits.hang_s:g} s"
 
 
 def _note(life: Life, to: State, note: str) -> str:

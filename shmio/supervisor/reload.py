@@ -63,7 +63,7 @@ class _Followers:
     def _fail(self, name: str, why: str) -> None:
         self._pids.pop(name, None)
         self.failed[name] = why
-        log.warning("%s is restarted, as it cannot keep its connection: %s", name, why)
+        log.warning("restarting %s, because it cannot keep its connection: %s", name, why)
 
     def _all(self, activity: Activity) -> bool:
         """Return whether all remaining sources have reported an activity; give up those that ended or are late."""
@@ -214,16 +214,16 @@ class InstanceChange:
         problems = []
         for job in self._coming:
             managed = self._fleet.named(job.name)
-            how = "restarted, as its configuration has changed" if job.name in self._replaced else "started"
+            how = "restarted, because its configuration has changed" if job.name in self._replaced else "started"
             if why := self._followers.failed.get(job.name):
                 how += f"; it cannot keep its connection: {why}"
             if job.name in self.changes.replaced and job.name in self._unwell:
-                how = "started again, as it was not running"
+                how = "started again, because it was not running"
             if managed.life.state is State.RUNNING:
                 done.append(f"{job.name}: {how}")
             else:
                 why = managed.life.note or managed.life.state.value
-                problems.append(f"{job.name}: {how}, but it does not run: {why}")
+                problems.append(f"{job.name}: {how}, but it is not running: {why}")
         return done, problems
 
 
@@ -259,7 +259,7 @@ class _PendingPlan:
         if not self.over:
             raise ShmioError(
                 f"the files that the configuration names could not be read within {self.limit_s:g} s; nothing has "
-                "changed: check whether a file system hangs, then reload again"
+                "changed; check whether a file system hangs, then reload again"
             )
         if self._plan is None:
             raise self._error or RuntimeError("there is no plan")
@@ -304,7 +304,7 @@ class Reloader:
             return None
         if stuck := self._change.stuck:
             return f"another change of the instance is in progress and waits for a process that does not end: {stuck}"
-        return "another change of the instance is in progress: try again when it is done"
+        return "another change of the instance is in progress; try again when it is done"
 
     def follow(self) -> None:
         """Begin to change an instance that was taken over, so that it matches the plan.
@@ -317,7 +317,7 @@ class Reloader:
 
     def reload(self, answer: Answer) -> None:
         """Make a new plan and apply it. Refuse this if another reload is in progress."""
-        reason = self.busy() or (self._planning and "another reload is being prepared: try again when it is done")
+        reason = self.busy() or (self._planning and "another reload is being prepared; try again when it is done")
         if reason:
             answer.error(reason)
             return
@@ -337,7 +337,7 @@ class Reloader:
         elif self._previewers:
             self._next_previewers.append(answer)
         else:  # the time limit has passed
-            answer.error("a file of the configuration still cannot be read: check whether a file system hangs")
+            answer.error("a file of the configuration still cannot be read; check whether a file system hangs")
 
     def drop(self) -> None:
         """Cancel the change, because the instance stops."""
@@ -417,7 +417,7 @@ class Reloader:
         if not change.step():
             if stuck := change.stuck:
                 self._answer_client(
-                    lambda answer: answer.error(f"{stuck}; the reload continues as soon as it has ended")
+                    lambda answer: answer.error(f"{stuck}; the reload continues as soon as that process has ended")
                 )
             return
         done, problems = change.outcome()

@@ -47,7 +47,7 @@ def _whose(plan: Plan) -> str:
     down = f"shmio-supervisor down --instance {plan.instance} stops it"
     with suppress(ShmioError), Segment.open(plan.instance) as segment:
         if segment.config not in (None, plan.config_file):
-            return f", started from {segment.config}: {down}; or give this one another instance.name"
+            return f", started from {segment.config}; {down}; or choose another instance.name in this file"
     return f"; {down}"
 
 
@@ -75,7 +75,7 @@ def hold_log_folder(folder: Path, instance: str) -> Iterator[None]:
             if (other := file.read(64).strip()) == instance:
                 raise AlreadyRunningError(f"instance {instance!r} is already running, or just starting") from None
             raise ConfigError(
-                f"instance.log_dir: instance {other!r} writes its logs to {folder}: give each instance a folder of "
+                f"instance.log_dir: instance {other!r} writes its logs to {folder}; give each instance a folder of "
                 "its own"
             ) from None
         line = f"{instance}\n".encode()

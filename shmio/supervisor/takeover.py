@@ -17,7 +17,7 @@ from shmio.segment.shm import SharedObject
 from shmio.supervisor.policy import Limits
 from shmio.supervisor.process import AdoptedProcess
 
-_START_AGAIN: Final = "the old processes are stopped, and the instance is started again"
+_START_AGAIN: Final = "stopping the old processes, and starting the instance again"
 
 
 @dataclass
@@ -75,19 +75,19 @@ def _usable_segment(shared: SharedObject, plan: Plan) -> tuple[Segment | None, l
         return None, []
     segment.require_config(plan.config_file)
     if segment.header.mode != plan.mode:
-        return None, [f"{plan.instance} ran in mode {segment.header.mode}, not {plan.mode}: {_START_AGAIN}"]
+        return None, [f"{plan.instance} ran in mode {segment.header.mode}, not {plan.mode}; {_START_AGAIN}"]
     if plan.stepped != segment.clock.stepped:
         began, wanted = ("stepped", "wall") if segment.clock.stepped else ("wall", "stepped")
-        return None, [f"{plan.instance} was started with instance.clock {began}, not {wanted}: {_START_AGAIN}"]
+        return None, [f"{plan.instance} was started with instance.clock {began}, not {wanted}; {_START_AGAIN}"]
     if plan.origin and segment.header.started_utc_ns != plan.origin.started_utc_ns:
-        return None, [f"{plan.instance} played another recording: {_START_AGAIN}"]
+        return None, [f"{plan.instance} played another recording; {_START_AGAIN}"]
     status = (shm.DIRECTORY / shared.name).stat()
     if status.st_uid != os.geteuid():
-        return None, [f"segment {shared.name} belongs to another user: {_START_AGAIN}"]
+        return None, [f"segment {shared.name} belongs to another user; {_START_AGAIN}"]
     if stat.S_IMODE(status.st_mode) & 0o040 != (0o040 if plan.group else 0) or (
         plan.group and status.st_gid != grp.getgrnam(plan.group).gr_gid
     ):
-        return None, [f"instance.group has changed: {_START_AGAIN}"]
+        return None, [f"instance.group has changed; {_START_AGAIN}"]
     return segment, []
 
 
@@ -109,7 +109,7 @@ def _adopt_or_end(
             worker = stale_segment.holder(slot, shared)
             if worker is not None and (reason := _unfit_reason(slot, limits)):
                 unfit.append(worker)
-                done.append(f"{name}, pid {worker.pid}, {reason}: it is replaced")
+                done.append(f"replacing {name}, pid {worker.pid}, which {reason}")
             elif worker is not None:
                 fit.append((slot, AdoptedProcess(worker.pid, worker.pidfd)))
                 done.append(f"took over {name}, pid {worker.pid}, which had lost its supervisor")

@@ -87,7 +87,7 @@ def test_sources_and_layouts(cell: shmio.Cell) -> None:
     outputs = layout.registers[layout.by_path["Outputs"]]
     assert (layout.name, layout.byte_order, outputs.type, outputs.dims) == ("DB201", "big", "BYTE", ((0, 1099),))
     assert cell.real_sources() == ["cell"]
-    with pytest.raises(PathError, match="no source 'nix'"):
+    with pytest.raises(PathError, match="unknown source 'nix'"):
         cell.layouts("nix")
 
 
@@ -213,7 +213,7 @@ def test_events_name_the_writer(cell: shmio.Cell, running: Cell) -> None:
 
 
 def test_events_of_an_unknown_source_are_refused_at_once(cell: shmio.Cell) -> None:
-    with pytest.raises(PathError, match="no source 'nix'"):
+    with pytest.raises(PathError, match="unknown source 'nix'"):
         cell.events("cell", "nix")
 
 

@@ -54,7 +54,7 @@ def test_a_reload_adds_and_removes_tokens(guarded: Cell) -> None:
     assert nobody.returncode == 1
     assert "UNAUTHENTICATED: Subscribe needs the role read" in nobody.stderr
     get = ("get", "--host", address, "cell/Inputs")
-    assert guarded.run("shmio", *get).stderr.endswith("; here: --token-file FILE, a file with only the token\n")
+    assert guarded.run("shmio", *get).stderr.endswith("; give --token-file FILE, a file with only the token\n")
     assert guarded.run("shmio", *get, "--token-file", "dash").returncode == 0
     assert "--token-file" not in guarded.run("shmio", *get, "--token-file", "other").stderr
     assert subscribe(guarded, address, "--token-file", "dash").returncode == 0
@@ -77,7 +77,7 @@ def test_a_reload_adds_and_removes_tokens(guarded: Cell) -> None:
         assert next(stream).value, "the stream of a token that is still valid continues"
         (guarded.folder / "other").chmod(0o644)
         refused = guarded.supervisor("reload")
-        assert (refused.returncode, "mode 0644 lets other users read it" in refused.stderr) == (1, True)
+        assert (refused.returncode, "because its mode is 0644" in refused.stderr) == (1, True)
         file.write_text(before.replace('token_file = "dash"', 'token_file = "other"'))
         (guarded.folder / "other").chmod(0o600)
         assert guarded.supervisor("reload").returncode == 0
@@ -134,5 +134,5 @@ def test_a_unix_socket_is_replaced_after_a_death_and_removed_at_the_end(guarded:
     assert not socket.exists()
     socket.write_text("precious")
     refused = guarded.supervisor("up", "--detach")
-    assert (refused.returncode, "not a socket: move it away" in refused.stderr) == (1, True)
+    assert (refused.returncode, "not a socket; move it away" in refused.stderr) == (1, True)
     assert socket.read_text() == "precious"

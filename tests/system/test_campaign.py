@@ -119,7 +119,7 @@ def noise_of(cell: Cell, local: Attachment, seed: int) -> dict[int, tuple[object
     block = local.block("cell")
     frames, events = block.cursor(), block.events.cursor()
     with campaign(cell, "--seed", str(seed)) as told:
-        assert told[0] == f"seed {seed}: --seed {seed} does the same again\n"
+        assert told[0] == f"seed {seed}: --seed {seed} repeats this run\n"
         event(events, EventKind.ACTIVATED, "doubled")
         (outcome,) = local.write({"cell/Outputs/98": 21})
         assert outcome.done

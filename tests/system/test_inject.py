@@ -125,7 +125,10 @@ def test_a_kept_injection_stays_until_it_is_lifted(cell: Cell) -> None:
     assert cell.output("shmio", "inject", "--lift", number).startswith(f"{number}: lifted from cell")
     assert get(cell, POSITION)["value"] != 11
     again = cell.run("shmio", "inject", "--lift", number)
-    assert (again.returncode, again.stderr) == (1, f"there is no injection {number}; shmio inject lists them\n")
+    assert (again.returncode, again.stderr) == (
+        1,
+        f"there is no injection {number}; shmio inject lists the injections\n",
+    )
     cell.run("shmio", "inject", "--keep", POSITION, "11", "panel/speed", "2")
     assert len(cell.output("shmio", "inject", "--lift-all").splitlines()) == 2
     assert cell.output("shmio", "inject") == ""

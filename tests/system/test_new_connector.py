@@ -30,7 +30,7 @@ def test_the_new_package_passes_its_tests_and_check_finds_it(
 @pytest.mark.parametrize(
     ("name", "error"),
     [
-        ("modbus", "'modbus' is a connector of shmio: choose another name"),
+        ("modbus", "'modbus' is a connector of shmio; choose another name"),
         ("../bus", "is not a name for a connector"),
         ("Bus", "lower-case letters"),
         ("a" * 41, "at most 40"),

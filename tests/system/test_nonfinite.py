@@ -40,7 +40,10 @@ def test_every_interface_refuses_nonfinite_values_until_a_reload_allows_them(mak
     until(lambda: cell.processes()["sim"]["quality"] == "good", "good quality")
 
     done = cell.run("shmio", "set", "sim/a", "NaN")
-    assert (done.returncode, f"sim/a: not written, the source accepted nothing: a: {REASON}" in done.stderr) == (
+    assert (
+        done.returncode,
+        f"sim/a: not written, because the source did not accept the command: a: {REASON}" in done.stderr,
+    ) == (
         1,
         True,
     )

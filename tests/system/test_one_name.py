@@ -101,7 +101,7 @@ def test_every_command_refuses_the_file_of_another_plant(
     assert run(words, *option) == 1
     output = capsys.readouterr()
     refusal = (
-        f"the running instance {shared_instance!r} was started from {running}, not from {other}: "
+        f"the running instance {shared_instance!r} was started from {running}, not from {other}; "
         f"to use that instance anyway, add --instance {shared_instance}"
     )
     assert output.err == f"{refusal}\n"

@@ -126,7 +126,7 @@ def test_notes_and_process_deaths_are_recorded(make_cell: Callable[..., Cell]) -
         (["x" * 257], "a note must have 1 to 256 bytes in UTF-8, but this one has 257"),
         ([""], "a note must have 1 to 256 bytes in UTF-8, but this one has 0"),
         (["Greifer \udce4b"], "a note must be UTF-8 text, but character 9 is not"),
-        (["x", "--source", "press"], "no source 'press'; there are: cell"),
+        (["x", "--source", "press"], "unknown source 'press'; valid: cell"),
     ):
         failed = cell.run("shmio-dump", "note", *arguments)
         assert (failed.returncode, message in failed.stderr) == (1, True), failed.stderr

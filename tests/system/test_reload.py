@@ -63,7 +63,7 @@ def test_adding_and_removing_a_source_leaves_other_streams_alone(cell: Cell, stu
     add_second(cell)
     done = cell.supervisor("reload")
     assert (done.returncode, done.stderr) == (0, "")
-    error = f"{PATH}: 'Robot_800' is not one of the 2 sources: write cell/… or second/…\n"
+    error = f"{PATH}: 'Robot_800' is not one of the 2 sources; begin the path with cell/… or second/…\n"
     assert cell.run("shmio", "get", PATH).stderr == error
     assert done.stdout.splitlines() == ["second: started", f"{cell.instance}: 3 processes kept as they were"]
     until(lambda: cell.processes()["second"]["quality"] == "good", "the new source is good")
@@ -112,7 +112,7 @@ def test_a_new_layout_keeps_the_streams_of_registers_that_remain(cell: Cell, stu
 def test_reload_prints_the_same_warnings_as_check(cell: Cell) -> None:
     edit(cell, "period_ms = 20", 'period_ms = 20\nwritable = ["Outpts"]')
     file = cell.folder / "supervisor.toml"
-    warning = f"{file}: warning: source[0].writable: 'Outpts' names nothing in DB201; did you mean Outputs?"
+    warning = f"{file}: warning: source[0].writable: 'Outpts' matches no register of DB201; did you mean 'Outputs'?"
     dry = cell.supervisor("reload", "--dry-run")
     assert (dry.returncode, dry.stderr) == (0, f"{warning}\n")
     assert dry.stdout.splitlines() == [

@@ -98,7 +98,7 @@ def test_registers_come_and_go_over_the_same_connection(plant: Plant) -> None:
     assert (plant.pid, plant.proxy.accepted) == (pid, 1)
     file.write_text(file.read_text().replace("timeout = 500", "timeout = 600"))
     assert plant.reload("--dry-run")[0] == "would restart pumps: options.timeout: 600 instead of 500"
-    assert plant.reload()[0] == "pumps: restarted, as its configuration has changed"
+    assert plant.reload()[0] == "pumps: restarted, because its configuration has changed"
     plant.good()
     assert plant.pid != pid
 

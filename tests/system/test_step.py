@@ -267,7 +267,7 @@ def test_the_step_command_prints_the_step_size_and_refuses_conflicting_options(l
     told = line.output("shmio", "step", "--dt-ms", "20", "--count", "2")
     assert re.fullmatch(r"virtual time [0-9.]+ s, step [0-9]+ of 20 ms, step size 50 ms\n", told), told
     refused = line.run("shmio", "step", "--pause", "--dt-ms", "20")
-    assert (refused.returncode, refused.stderr) == (1, "--pause does no step: leave out --dt-ms\n")
+    assert (refused.returncode, refused.stderr) == (1, "--pause does no step; leave out --dt-ms\n")
     refused = line.run("shmio", "step", "--play", "--count", "2")
     assert (refused.returncode, "--count: not allowed with argument --play" in refused.stderr) == (2, True)
 
@@ -354,13 +354,12 @@ def test_a_take_over_keeps_the_time_unless_the_configured_clock_changed(
     taken_over = step(line)["step"]
     assert "took over belt" in up_again(), "its configuration has the wall clock, though time is virtual"
     assert step(line)["step"] == taken_over + 1
-    assert (
-        f"{line.instance} was started with instance.clock wall, not stepped: the old processes are stopped"
-        in up_again("stepped")
+    assert f"{line.instance} was started with instance.clock wall, not stepped; stopping the old processes" in up_again(
+        "stepped"
     )
     assert line.status()["clock"]["step"] == 0
     assert step(line, "--count", "3")["step"] == 3
     assert "took over belt" in up_again()
     assert step(line)["step"] == 4
-    assert "with instance.clock stepped, not wall: the old processes are stopped" in up_again("wall")
+    assert "with instance.clock stepped, not wall; stopping the old processes" in up_again("wall")
     assert line.status()["clock"]["mode"] == "wall"

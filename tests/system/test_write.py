@@ -114,7 +114,7 @@ def test_a_refused_write_gives_one_clear_line(cell: Cell) -> None:
     for path, value, message in [
         ("cell/Inputs/0", "1", "cell/Inputs/0 is not writable; name it in the source's"),
         ("cell/Outputs/100.%X8", "1", "Outputs/100.%X8: BYTE has bits 0 to 7"),
-        ("cell/Robot_800/Axs7_Pos", "1", "near: Robot_800/Axs6_Pos"),
+        ("cell/Robot_800/Axs7_Pos", "1", "did you mean 'Robot_800/Axs6_Pos'"),
         ("cell/Outputs/100", "256", "cell/Outputs/100: BYTE: 256 is out of range"),
         ("cell/Outputs", "[1, 2]", "cell/Outputs: expected all of the array's 1100 elements, found 2"),
     ]:
@@ -131,7 +131,9 @@ def test_without_a_controller_writes_are_rejected_with_the_reason(make_cell: Cal
     until(lambda: "refused" in (cell.processes()["cell"]["note"] or ""), "no controller")
     done = cell.run("shmio", "set", PLACE, "5")
     assert (done.returncode, done.stdout) == (1, f"{PLACE}  rejected\n")
-    assert done.stderr.startswith(f"{PLACE}: not written, the source accepted nothing: the source is not connected")
+    assert done.stderr.startswith(
+        f"{PLACE}: not written, because the source did not accept the command: the source is not connected"
+    )
     assert "shmio-supervisor status" in done.stderr
     assert done.stderr.count("\n") == 1
     with client(cell) as stub:

@@ -27,7 +27,7 @@ def test_lines_of_a_kind_are_rate_limited_and_the_rest_is_counted(caplog: pytest
             log.warning("step failed: %s", text)
         log.warning("another kind: %s", 2)
         assert [record.getMessage() for record in caplog.records] == [
-            "step failed: a (5 more like this were left out before)", "step failed: b", "another kind: 2",
+            "step failed: a (5 similar lines before this one were left out)", "step failed: b", "another kind: 2",
         ]  # fmt: skip
     finally:
         log.removeFilter(rate_limit)

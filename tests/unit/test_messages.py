@@ -47,7 +47,7 @@ def test_an_empty_value_is_refused() -> None:
         ({"operation": "drop", "name": 5}, "injection: "),
         ({"operation": "drop", "target": 5}, "injection: "),
         ({"operation": "flip", "bits": [-1]}, "injection: "),
-        ({"operation": "noise", "distribution": "even"}, "injection.distribution: 'even' is unknown"),
+        ({"operation": "noise", "distribution": "even"}, "injection.distribution: unknown distribution 'even'"),
         ({"operation": "random", "values": [None]}, "injection.values: a Python NoneType"),
     ],
 )

@@ -30,6 +30,7 @@ from shmio.recorder.recorder import AttachedFiles, ConfigFiles, no_attachments
 from shmio.recording.digest import digest_of_contents
 from shmio.recording.dump import open_dump
 from shmio.segment import Segment, running_instances
+from shmio.wording import EXISTS
 
 SEED_BITS: Final = 32
 WHERE_S: Final = 2.0
@@ -53,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     except ConfigError as error:
         raise ConfigError(f"{arguments.campaign}: {error}") from None
     if arguments.record is not None and arguments.record.exists():
-        raise ConfigError(f"--record {arguments.record}: the file exists already; no recording is overwritten")
+        raise ConfigError(f"--record {arguments.record}: {EXISTS}")
     seed = secrets.randbits(SEED_BITS) if arguments.seed is None else arguments.seed
     step_ms = arguments.step_ms or (None if arguments.real_time else campaign.step_ms)
     plan = Plan(
@@ -111,7 +112,7 @@ def duration_of(arguments: argparse.Namespace, campaign: Campaign) -> float:
     duration_s: float | None = arguments.for_s or campaign.duration_s
     if duration_s is None:
         raise ConfigError(
-            f"{arguments.campaign}: duration_s: this key is needed, or --for S: how long the campaign runs"
+            f"{arguments.campaign}: duration_s: give this key or --for S, to say how long the campaign runs"
         )
     return duration_s
 

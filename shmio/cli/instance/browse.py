@@ -16,15 +16,16 @@ from shmio.connectors.browsing import Browsed, Offer, Wanted
 from shmio.errors import ConfigError
 from shmio.layout.importing.found import Found
 from shmio.logs import printable
+from shmio.wording import EXISTS, NOT_TOML, unknown
 
 
 def browse(arguments: argparse.Namespace) -> int:
     """List what a device offers; return 1 if the list may be incomplete."""
     output = arguments.output
     if output is not None and output.suffix != ".toml":
-        raise ConfigError(f"{output}: the table is TOML: have its name end in .toml")
+        raise ConfigError(f"{output}: {NOT_TOML}")
     if output is not None and output.exists():
-        raise ConfigError(f"{output}: exists already; remove it, or name another file")
+        raise ConfigError(f"{output}: {EXISTS}")
     wanted = Wanted(arguments.paths, depth=arguments.depth, nodes=arguments.limit)
     connector, options = _connector(arguments.url, arguments.keys)
     found = connector.browse(options, wanted)
@@ -34,9 +35,11 @@ def browse(arguments: argparse.Namespace) -> int:
         for line in tree(found.offers):
             print(printable(line))
     if found.incomplete:
-        print(printable(f"this is not all: {found.incomplete}"), file=sys.stderr)
+        print(printable(f"this list is incomplete: {found.incomplete}"), file=sys.stderr)
     elif not found.offers:
-        raise ConfigError(f"{arguments.url}: nothing found{' that fits' if arguments.paths else ''}")
+        raise ConfigError(
+            f"{arguments.url}: the device offers nothing{' that matches the patterns' if arguments.paths else ''}"
+        )
     return 1 if found.incomplete else 0
 
 
@@ -45,7 +48,7 @@ def _connector(url: str, keys: list[str]) -> tuple[type[Connector], Any]:
     scheme = urlsplit(url).scheme
     if scheme not in registry.BROWSED:
         valid = ", ".join(f"{one}://HOST:PORT" for one in registry.BROWSED)
-        raise ConfigError(f"{url}: devices with this URL cannot be browsed; those with these can: {valid}")
+        raise ConfigError(f"{url}: shmio cannot browse a device with this kind of URL; valid: {valid}")
     name = registry.BROWSED[scheme]
     connector = registry.load(name)
     assert issubclass(connector, Connector)  # noqa: S101 - for the type checker
@@ -56,10 +59,8 @@ def _connector(url: str, keys: list[str]) -> tuple[type[Connector], Any]:
             raise ConfigError(f"--set {pair}: expected KEY=VALUE")
         texts[key] = value
     known = {field.encode_name for field in msgspec.structs.fields(connector.Options)} - {"url"}
-    if unknown := texts.keys() - known:
-        raise ConfigError(
-            f"--set {min(unknown)}: no such key of connector {name}; there are: {', '.join(sorted(known))}"
-        )
+    if others := texts.keys() - known:
+        raise ConfigError(f"--set: {unknown('key', min(others), sorted(known), f'connector {name}')}")
     return connector, registry.convert_options(name, {"url": url}, texts)
 
 
@@ -73,12 +74,12 @@ def _write(arguments: argparse.Namespace, found: Browsed) -> None:
     for line in table.report():
         print(printable(line), file=sys.stderr)
     if not table.tags:
-        raise ConfigError(f"{arguments.url}: nothing found for a tag table")
+        raise ConfigError(f"{arguments.url}: the device offers nothing that a tag table can hold")
     try:
         with arguments.output.open("x", encoding="utf-8") as stream:
             stream.write(table.to_toml(arguments.url, writable=arguments.writable))
     except FileExistsError:
-        raise ConfigError(f"{arguments.output}: exists already; remove it, or name another file") from None
+        raise ConfigError(f"{arguments.output}: {EXISTS}") from None
 
 
 def tree(offers: list[Offer]) -> Iterator[str]:

@@ -132,7 +132,8 @@ def _described(block: BlockSpec, peer: str) -> dict[str, Any]:
 def _line(source: dict[str, Any]) -> str:
     at = f" at {source['peer']}" if source["peer"] else ""
     return (
-        f"source {source['source']}{at}: {source['block']}, {source['registers']} registers, {source['bytes']} bytes; "
+        f"source {source['source']}{at}: {source['block']}, {counted(source['registers'], 'register')}, "
+        f"{source['bytes']} bytes; "
         f"ring of {source['ring_frames']} frames, {source['ring_s']:.1f} s, {source['ring_bytes'] / 1e6:.2f} MB"
     )
 
@@ -196,7 +197,7 @@ def _load_lines(source: dict[str, Any]) -> Iterator[str]:
         patterns = shorten(", ".join(source["writable"]), MAX_PATTERNS)
         yield f"  writable: {counted(count, 'register')}: {patterns}"
     elif source["writable"]:
-        yield "  writable: none: the connector cannot write, or the patterns match nothing"
+        yield "  writable: no registers, because the connector cannot write, or the patterns match nothing"
 
 
 def _case_text(case: dict[str, Any], period_ms: float) -> str:

@@ -45,7 +45,7 @@ def down(arguments: argparse.Namespace) -> int:
     wanted = target(arguments)
     name = wanted.name
     if name not in instances():
-        raise NotRunningError(f"no instance {name!r} is running: there is nothing to stop")
+        raise NotRunningError(f"no instance {name!r} is running: nothing to stop")
     try:
         with suppress(UnfinishedError), wanted.open() as segment:
             if segment.supervised:

@@ -32,6 +32,7 @@ from shmio.logs import printable
 from shmio.plan.layouts import read_program, summarize
 from shmio.plan.ports import in_use
 from shmio.segment import instances
+from shmio.wording import unknown
 
 EXAMPLE = ("supervisor.toml", "db201.db", "scene.toml")
 EXAMPLE_NAME = "a50"
@@ -74,7 +75,7 @@ def init(arguments: argparse.Namespace) -> int:
         for line in warnings:
             print(printable(line), file=sys.stderr)
     elif arguments.block:
-        raise ConfigError("--block chooses a data block of the files that are given, and there are none")
+        raise ConfigError("--block chooses a data block in the given files, but no file is given")
     written = {file: text} if text is not None else _example(file, left_out)
     other = vacant_name(EXAMPLE_NAME, file) if text is None else EXAMPLE_NAME  # before this instance takes the name
     _write(written)
@@ -84,7 +85,8 @@ def init(arguments: argparse.Namespace) -> int:
         print(line)
     if other != EXAMPLE_NAME:
         print(
-            f"an instance or a configuration nearby is called {EXAMPLE_NAME}, too: to run both, call this one {other}"
+            f"another instance or configuration has the name {EXAMPLE_NAME}, too; to run both, give this one the "
+            f"name {other}"
         )
     left = [f"{' and '.join(keys)} in {place}" for place, keys in missing.items()]
     first = f"fill in {', and '.join(left)}, then " if left else ""
@@ -226,7 +228,7 @@ def new_config(file: Path, files: Sequence[Path], name: str | None = None, *, em
         f"default_source = {_toml(names[0])}",
         "",
         *_addresses(["read", "write", "inject", "control"] if emulated else ["read"]),
-        "# [recorder]                          # without the first #: everything, to files that shmio-dump reads",
+        "# [recorder]                          # remove the # of both lines to record everything for shmio-dump",
         '# directory = "dumps"',
         "",
     ]
@@ -243,7 +245,7 @@ def _compile(program: Program, name: str | None, number: str) -> tuple[list[Layo
     if name is not None:
         wanted = [block.name for block in program.blocks if block.name.lower() == name.lower()]
         if not wanted:
-            raise ConfigError(f"--block: no data block {name!r}; there are: {held}")
+            raise ConfigError(f"--block: {unknown('data block', name, (block.name for block in program.blocks))}")
     else:
         wanted = [block.name for block in program.blocks if str(block.number) == number]
     if not wanted and len(program.blocks) > 1 and number:
@@ -280,7 +282,8 @@ def _refuse_table(path: Path, file: Path) -> None:
     if match := _URL.match(text):  # a path has lost one of the slashes
         url = f"{match[1]}://{text[match.end() :]}"
         raise ConfigError(
-            f"{url}: init takes files: shmio-supervisor browse {url} -o tags.toml writes a tag table of what an OPC UA "
+            f"{url}: init takes files, not URLs; shmio-supervisor browse {url} -o tags.toml writes a tag table "
+            "of what an OPC UA "
             f"server offers; {_in_source(file, 'tags.toml')}"
         )
     suffix = path.suffix.lower()
@@ -288,7 +291,7 @@ def _refuse_table(path: Path, file: Path) -> None:
     others = f"if it is an export of another tool, {others} makes a tag table of it"
     remedies = [text for text, kinds in ((table, TABLES), (others, LISTS)) if suffix in kinds]
     if remedies:
-        raise ConfigError(f"{path}: init takes sources of data blocks; {'; '.join(remedies)}")
+        raise ConfigError(f"{path}: this is not a source of data blocks, which init needs; {'; '.join(remedies)}")
 
 
 def _in_source(file: Path, table: str) -> str:
@@ -338,7 +341,7 @@ def _emulated(block: Layout, number: str, address: Address) -> list[str]:
     """Return the lines of a source that give the address of its emulated controller."""
     return [
         f"host = {_toml(address.host):<31}# the emulator below; for a real controller: its address",
-        f"port = {address.port:<31}# for a real controller: without this line",
+        f"port = {address.port:<31}# for a real controller: remove this line",
         f"dbNumber = {_number(block, number):<27}# for a real controller: the number of its data block",
     ]
 
@@ -352,14 +355,14 @@ def _emulators(layout: str, blocks: Sequence[Layout], count: int, number: str) -
     ports = _free(S7_PORTS, 1 if together else len(blocks))
     if not together and len(ports) < len(blocks):
         raise ConfigError(
-            f"{len(blocks)} data blocks need {len(blocks)} ports, but only {len(ports)} are free: "
-            "choose one of them with --block NAME"
+            f"{len(blocks)} data blocks need {len(blocks)} ports, but only {len(ports)} are free; "
+            "choose one data block with --block NAME"
         )
     lines: list[str] = []
     for index, block in enumerate(blocks[: len(ports)]):
         key = [f"block = {_toml(block.name)}"] if count > 1 else []
         lines += [
-            "[[emulator]]                          # a process that plays the controller; for a real one: without it",
+            "[[emulator]]                          # a process that plays the controller; remove it for a real one",
             f"name = {_toml('plc' if index == 0 else f'plc-{index + 1}')}",
             'kind = "s7"',
             layout,
@@ -379,7 +382,7 @@ def _instance(block: Layout) -> str:
 
 def _addresses(roles: list[str]) -> list[str]:
     """Return the sections of the gRPC addresses, with the roles of unauthenticated clients."""
-    others = "all that there are" if len(roles) > 1 else "there are write, inject and control, too"
+    others = "these are all roles" if len(roles) > 1 else "other roles: write, inject, control"
     comment = f"# what every user of this host may do here; {others}"
     lines = []
     for address in _free(GRPC_PORTS, 2):

@@ -17,6 +17,7 @@ from shmio.local.log_files import Follower, as_text, last_lines, parse_line
 from shmio.local.supervisor import ask_supervisor
 from shmio.logs import printable
 from shmio.plan.processes import process_names
+from shmio.wording import unknown
 
 WHERE_S = 5.0
 SUPERVISOR = "supervisor"
@@ -28,11 +29,11 @@ def logs(arguments: argparse.Namespace) -> int:
     names = [SUPERVISOR, *processes]
     if arguments.name is not None:
         if arguments.name not in names:
-            raise ConfigError(f"no process {arguments.name!r}; there are: {', '.join(names)}")
+            raise ConfigError(unknown("process", arguments.name, names))
         names = [arguments.name]
     files = [folder / f"{name}.log" for name in names]
     if not any(file.exists() for file in files):
-        raise ConfigError(f"no log file in {folder} yet")
+        raise ConfigError(f"{folder} has no log files yet")
     if not arguments.follow:
         _print(last_lines(files, arguments.lines), as_json=arguments.json)
         return 0

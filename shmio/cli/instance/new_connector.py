@@ -75,10 +75,10 @@ def package(name: str) -> dict[str, str]:
 def _check_name(name: str) -> None:
     if len(name) > MAX_LENGTH or not _NAME.fullmatch(name):
         raise ConfigError(
-            f"{name[:MAX_LENGTH]!r} is not a name for a connector: use lower-case letters and digits, between them '-' "
+            f"{name[:MAX_LENGTH]!r} is not a name for a connector; use lower-case letters and digits, between them '-' "
             f"or '_', at most {MAX_LENGTH}, such as my-bus"
         )
     if name in BUILT_IN:
-        raise ConfigError(f"{name!r} is a connector of shmio: choose another name")
+        raise ConfigError(f"{name!r} is a connector of shmio; choose another name")
     if name in names():
-        raise ConfigError(f"an installed package offers a connector {name!r}: choose another name, or pip uninstall it")
+        raise ConfigError(f"an installed package offers a connector {name!r}; choose another name, or pip uninstall it")

@@ -33,6 +33,7 @@ from shmio.recording.times import iso, local, span
 from shmio.segment import Event, EventKind, Frame, Quality
 from shmio.segment.changed_registers import ChangeScan
 from shmio.segment.explain import ABOUT, Explained, Explainer, cells_of, kind_of, object_of
+from shmio.wording import EMPTY
 
 MAX_PLACES: Final = 4
 """Maximum number of registers that the text output shows of an event."""
@@ -93,8 +94,10 @@ def _printer(arguments: argparse.Namespace, views: Sequence[View]) -> Printer:
 def _nothing(found: Survey) -> str:
     """Return why nothing was printed."""
     if not found.begin_ns:
-        return "nothing is recorded in it"
-    return f"nothing of what was asked for is in it then; it goes {span(found.begin_ns, found.end_ns)}"
+        return EMPTY
+    return (
+        f"nothing that you selected was recorded in that time; the recording goes {span(found.begin_ns, found.end_ns)}"
+    )
 
 
 def _views(
@@ -122,7 +125,7 @@ def _views(
     chosen: dict[int, dict[str, Register]] = {}
     for pattern in patterns:
         topic = parse_topic(pattern, sources, default)
-        problem, some = PathError(f"{pattern}: no register of this recording has such a path"), False
+        problem, some = PathError(f"{pattern}: this recording has no such register"), False
         for number, (channel, layout) in blocks.items():
             if channel.source != topic.source:
                 continue
@@ -147,7 +150,9 @@ def _one_file(patterns: Sequence[str]) -> None:
     """
     for pattern in patterns:
         if Path(pattern).is_file():
-            raise PathError(f"{pattern} is a file, but cat prints only one: shmio-dump merge FILE… -o NEW joins them")
+            raise PathError(
+                f"{pattern} is a file, but cat prints only one; join the files with shmio-dump merge FILE… -o NEW"
+            )
 
 
 def _layout(reader: Reader, channel: Channel) -> Layout | None:

@@ -54,7 +54,7 @@ class DamageReport:
 
 def not_closed(end: str) -> str:
     """Return a text that says that a file was not closed. ``end`` says how the file ends."""
-    return f"not closed ({end}): still being written, or its recorder was killed"
+    return f"not closed ({end}): it is still being written, or its recorder was killed"
 
 
 class Progress:

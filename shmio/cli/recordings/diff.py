@@ -28,7 +28,7 @@ def diff(arguments: argparse.Namespace) -> int:
         progress.total = one.end_ns - one.begin_ns
         found = list(compare(one, other, how, arguments.sources, lambda time_ns: progress.at(time_ns - one.begin_ns)))
     if not found:
-        raise RecordingError(f"{first} and {second}: there is nothing to compare")
+        raise RecordingError(f"{first} and {second}: they have nothing to compare")
     same = all(source.same for source in found)
     if arguments.json:
         print(dumps({"same": same, "files": [str(first), str(second)], "sources": list(map(_object, found))}, indent=2))
@@ -67,7 +67,7 @@ def _side(side: Side, name: str) -> str:
     if side.same:
         return f"{side.compared} {name} are the same"
     alone = f", {side.only_first} only in the first, {side.only_second} only in the second"
-    return f"of {side.compared} {name} {side.differing} differ{alone if side.only_first or side.only_second else ''}"
+    return f"{side.differing} of {side.compared} {name} differ{alone if side.only_first or side.only_second else ''}"
 
 
 def _where(first: Difference) -> str:

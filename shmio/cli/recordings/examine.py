@@ -18,6 +18,7 @@ from shmio.recording.description import describe
 from shmio.recording.format.encoding import SUPERVISED
 from shmio.recording.reading.reader import Reader
 from shmio.recording.times import local
+from shmio.wording import EMPTY
 
 
 def info(arguments: argparse.Namespace) -> int:
@@ -43,7 +44,7 @@ def _lines(found: dict[str, Any]) -> list[str]:
         lines.append(f"  triggered {found['triggered']} by {found['trigger']}")
     if found["doubtful"]:
         where = f"after byte {found['doubtful_from']} of {found['doubtful']}"
-        lines.append(f"  what is {where} may be lost: the disk failed at its fsync")
+        lines.append(f"  what is {where} may be lost, because the disk failed to store it (fsync)")
     for block in found["blocks"]:
         hertz = f" at {block['rate_hz']:.1f} Hz" if block["rate_hz"] else ""
         lines.append(
@@ -98,7 +99,7 @@ def checked_lines(found: dict[str, Any]) -> list[str]:
     """Return the result as lines of text."""
     whole = f"{found['chunks']} chunks and {found['messages']} messages are whole"
     if not found["chunks"]:
-        whole = "nothing is recorded in it"
+        whole = EMPTY
     return [f"{found['file']}: {_ended(found)}; {whole}{'' if found['damage'] else ', no damage'}"] + [
         f"  damage: {text}" for text in found["damage"]
     ]

@@ -16,6 +16,7 @@ from shmio.recording.export import TABLES, BlockTables, export_events, export_mc
 from shmio.recording.reading.part import DumpBlock
 from shmio.recording.rewriting import new_file
 from shmio.recording.times import span
+from shmio.wording import EMPTY, unknown
 
 FORMATS: Final = (*TABLES, "mcap")
 SHEETS: Final = frozenset({"ods", "xls", "xlsx"})
@@ -30,7 +31,9 @@ def export(arguments: argparse.Namespace) -> int:
     report = DamageReport()
     named, form = _form(arguments.output, arguments.format)
     if arguments.events and (not named or form not in TABLES):
-        raise RecordingError(f"{arguments.output}: --events makes one table: have its name end in .csv or .parquet")
+        raise RecordingError(
+            f"{arguments.output}: --events writes one table; choose a name that ends in .csv or .parquet"
+        )
     with (
         report.open(arguments.files) as dump,
         Progress(f"exporting to {arguments.output}") as progress,
@@ -38,7 +41,7 @@ def export(arguments: argparse.Namespace) -> int:
         from_ns, to_ns = time_range(arguments, dump.begin_ns)
         chosen = _chosen(dump, arguments)
         if not chosen:
-            raise RecordingError(f"{dump.files[0]}: nothing is recorded in it")
+            raise RecordingError(f"{dump.files[0]}: {EMPTY}")
         sources = list(dict.fromkeys(block.source for block in chosen))
         if arguments.events:
             progress.total = dump.end_ns - dump.begin_ns
@@ -62,7 +65,7 @@ def export(arguments: argparse.Namespace) -> int:
                     progress.at(place * (dump.end_ns - dump.begin_ns) + past)
         if not tables.files:
             raise RecordingError(
-                f"no frames of {dump.files[0]} are in that time; it goes {span(dump.begin_ns, dump.end_ns)}"
+                f"{dump.files[0]} has no frames in that time; it goes {span(dump.begin_ns, dump.end_ns)}"
             )
     return _print_result(arguments, report, tables.files, "rows")
 
@@ -93,17 +96,17 @@ def _form(output: Path, asked: str | None) -> tuple[bool, str]:
     if suffix not in FORMATS or output.is_dir():
         return False, asked or "parquet"
     if asked not in (None, suffix):
-        raise RecordingError(f"{output}: the ending of its name contradicts --format {asked}; change one of the two")
+        raise RecordingError(f"{output}: the ending of this name contradicts --format {asked}; change one of the two")
     return True, suffix
 
 
 def _remedy(output: Path, suffix: str) -> str:
     if suffix in SHEETS:
-        return f"-o {output.with_suffix('.csv')} makes a file that Excel and LibreOffice open"
+        return f"-o {output.with_suffix('.csv')} writes a file that Excel and LibreOffice can open"
     if suffix == "mem":
         return f"shmio-dump cut FILE… -o {output} writes a part of a recording to a new one"
     formats = ", ".join(f".{form}" for form in FORMATS)
-    return f"it writes {formats}, by the end of the name, or into a folder by --format"
+    return f"choose a name that ends in one of {formats}, or a folder and --format"
 
 
 def _within(block: DumpBlock, from_ns: int, to_ns: int) -> bool:
@@ -119,7 +122,7 @@ def _require_one(output: Path, blocks: Sequence[DumpBlock]) -> None:
     """
     if len(blocks) > 1:
         names = ", ".join(block.source for block in blocks)
-        raise RecordingError(f"{output} holds one block, and there are {len(blocks)} ({names}): name a folder")
+        raise RecordingError(f"{output} can hold only one block, but there are {len(blocks)} ({names}); name a folder")
 
 
 def _chosen(dump: Dump, arguments: argparse.Namespace) -> Chosen:
@@ -129,5 +132,5 @@ def _chosen(dump: Dump, arguments: argparse.Namespace) -> Chosen:
         chosen = {block: list(block.layout.registers) for block in dump.blocks}
     for source in arguments.sources or ():
         if source not in dump.sources:
-            raise PathError(f"no source {source!r}; there are: {', '.join(dump.sources)}")
+            raise PathError(unknown("source", source, dump.sources))
     return {block: some for block, some in chosen.items() if not arguments.sources or block.source in arguments.sources}

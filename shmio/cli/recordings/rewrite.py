@@ -17,6 +17,7 @@ from shmio.recording.reading.part import Entry
 from shmio.recording.reading.reader import Item
 from shmio.recording.rewriting import Rewriter, part
 from shmio.recording.times import lost
+from shmio.wording import EMPTY
 
 MAX_TOLD = 1000
 
@@ -61,7 +62,7 @@ def recover(arguments: argparse.Namespace) -> int:
 
     with open_dump(file, damaged) as dump:
         if not dump.blocks:
-            raise RecordingError(dump.damage[0] if dump.damage else f"{file}: nothing is recorded in it")
+            raise RecordingError(dump.damage[0] if dump.damage else f"{file}: {EMPTY}")
         layouts = [text for text in dump.damage if "layout" in text]
         records = dump.readers[0].records
         end = "" if records.closed else records.damage

@@ -165,7 +165,7 @@ class ModbusConnector(Connector):
         try:
             self._refusals = Refusals(elements, limits)
         except ValueError as error:
-            raise ConfigError(f"layout: {error}: raise max_registers or max_bits") from None
+            raise ConfigError(f"layout: {error}; raise max_registers or max_bits") from None
         self._image = RegisterImage(layout) if layout.status_offset is not None else None
         self._byte_places = {
             one.index: places for one in self._registers if (places := one.byte_places(layout.byte_order)) is not None
@@ -401,7 +401,7 @@ class ModbusConnector(Connector):
                     self._exchange(*step)
                     done = True
             except (RefusedError, ValueError) as error:
-                reason = f"a part was written, and then {error}" if done else str(error)
+                reason = f"only a part was written, and then: {error}" if done else str(error)
             except ConnectorError as error:
                 reason = Lost.UNSENT if not (done or self._client.sent) else Lost.UNKNOWN
                 for place in places:
@@ -479,14 +479,14 @@ class ModbusConnector(Connector):
             else:
                 yield from self._values(one, parts)
         if not found:
-            raise ValueError("the tag table has no register at the written bytes")
+            raise ValueError("no register of the tag table covers the written bytes")
 
     def _bit_of_word(self, one: _Register, write: Write) -> tuple[int, int, bytes]:
         """Return the request that writes one bit of an integer and no other bit (function 22)."""
         register, address = one.register, one.address
         options = self._options
         if register.scale is not None or address.kind is not register.element or address.kind.base == "STRING":
-            raise ValueError("a bit of a converted value cannot be written: write the whole value")
+            raise ValueError("a bit of a converted value cannot be written; write the whole value")
         size = register.element.size
         element, byte = divmod(write.offset - register.offset, register.element.stride)
         byte = byte if self._layout.byte_order == "little" else size - 1 - byte  # 0: the lowest
@@ -511,7 +511,7 @@ class ModbusConnector(Connector):
         for place, (at, size, bits) in enumerate(_places(register)):
             part = any(byte & bits for byte in covered[at : at + size])
             if part and any(byte & bits != bits for byte in covered[at : at + size]):
-                raise ValueError("a part of a value cannot be written: write the whole value")
+                raise ValueError("a part of a value cannot be written; write the whole value")
             if part:
                 chosen.append(place)
         values = _flat(codec(register, self._layout.byte_order).decode(bytes(image)))

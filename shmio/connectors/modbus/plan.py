@@ -92,7 +92,9 @@ def plan(elements: Iterable[Element], limits: Limits, refused: Collection[Place]
         end = 0
         for one in group:
             if one.size > most:
-                raise ValueError(f"{table.value} {one.start}: {one.size} words, but a request reads at most {most}")
+                raise ValueError(
+                    f"{table.value} {one.start} takes {one.size} words, but a request reads at most {most}"
+                )
             stop = max(end, one.start + one.size)
             over = any((*key, address) in refused for address in range(end, one.start)) if refused and part else False
             if part and (over or one.start - end > limits.gap or stop - part[0].start > most):

@@ -156,7 +156,7 @@ class Remote(Computed):
         if model is None:
             source = self._writer.block.source
             raise ConnectorError(
-                f'no model is connected: connect one with simulate("{source}", …) of shmio.client, or with Simulate '
+                f'no model is connected; connect one with simulate("{source}", …) of shmio.client, or with Simulate '
                 "of shmio.v1"
             )
         return model
@@ -179,7 +179,7 @@ class Remote(Computed):
             rest_ns = until_ns - time.monotonic_ns()
             if rest_ns <= 0:
                 raise ConnectorError(
-                    f"model {model.name!r} did not answer within {self._options.timeout_ms:g} ms: check whether it "
+                    f"model {model.name!r} did not answer within {self._options.timeout_ms:g} ms; check whether it "
                     "hangs, or raise timeout_ms"
                 )
             link.answered.wait(seen, min(rest_ns, TURN_NS))

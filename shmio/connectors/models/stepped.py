@@ -84,7 +84,7 @@ class Inputs:
         if path not in self._found:
             block = self._segment.blocks.get(topic.source)
             if block is None:
-                raise PathError(f"there is no source {topic.source!r} any more")
+                raise PathError(f"source {topic.source!r} no longer exists")
             self._found[path] = block, trusted_codec(find(block.layout, topic.path), block.layout)
         return self._found[path]
 

@@ -76,7 +76,7 @@ def parse(text: str) -> Address:
     """
     text = text.strip()
     if not text:
-        raise ValueError(f"its `address` is missing; {EXAMPLES}")
+        raise ValueError(f"the key `address` is missing; {EXAMPLES}")
     before, arrow, after = f" {text} ".rpartition(_ARROW)
     if text.startswith("sparkplug "):
         return Address(_metric(text), None)
@@ -109,9 +109,9 @@ def _topic(text: str) -> str:
             f"{text[:60]!r}: a topic has at most {MAX_TOPIC} characters, and no control or invalid characters"
         )
     if text.startswith("$share/"):
-        raise ValueError(f"{text!r}: a shared subscription would get only some of the messages: leave out $share/NAME/")
+        raise ValueError(f"{text!r}: a shared subscription would get only some of the messages; leave out $share/NAME/")
     if text.split("/", 1)[0] == NAMESPACE:
-        raise ValueError(f"{text!r}: this is Sparkplug: write sparkplug GROUP/NODE/DEVICE metric NAME")
+        raise ValueError(f"{text!r}: this is a topic of Sparkplug; write sparkplug GROUP/NODE/DEVICE metric NAME")
     return text
 
 

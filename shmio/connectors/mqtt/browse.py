@@ -55,7 +55,7 @@ class Listener:
         with self._changed:
             size = self._size + len(kept or b"") - len(self._payloads.get(topic) or b"")
             if (topic not in self._payloads and len(self._payloads) >= self._wanted.nodes) or size > MAX_BYTES:
-                self.incomplete = "there are more topics: select some of them by a PATTERN, or raise --limit"
+                self.incomplete = "there are more topics; select some of them by a PATTERN, or raise --limit"
                 self._changed.notify_all()
                 return
             self._payloads[topic], self._size = kept, size
@@ -80,9 +80,7 @@ class Listener:
                 offers += _values(topic, names, payload, self._wanted.depth)
         incomplete = self.incomplete
         if quiet and not incomplete:
-            incomplete = (
-                f"no birth has arrived from {', '.join(sorted(quiet)[:5])}: list again at a time when it sends one"
-            )
+            incomplete = f"no birth has arrived from {', '.join(sorted(quiet)[:5])}; list again when the node sends one"
         return Browsed([one for one in offers if self._wanted.takes(one.names)], incomplete)
 
 
@@ -128,7 +126,7 @@ def _members(topic: str, names: tuple[str, ...], found: Any, steps: Steps, depth
     if kind:
         yield _offer(names, kind, Place(topic, steps))
     elif found is None:
-        yield Offer(names, refused="it is null, so that its type is unknown")
+        yield Offer(names, refused="it is null, so its type is unknown")
     elif isinstance(found, str) or not found:
         yield Offer(names, refused="it is empty" if not found else "its text is too long")
     elif len(steps) >= min(depth, MAX_STEPS):

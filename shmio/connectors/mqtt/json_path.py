@@ -80,7 +80,7 @@ def assign(document: Any, steps: Steps, value: Any) -> Any:
         if not isinstance(elements, list):
             raise ValueError(f"the value that should contain [{step}] is not an array")
         if step > len(elements):
-            raise ValueError(f"the elements before [{step}] have no value: write them in the same command")
+            raise ValueError(f"the elements before [{step}] have no value; write them in the same command")
         inside = elements[step] if step < len(elements) else None
         return [*elements[:step], assign(inside, rest, value), *elements[step + 1 :]]
     members = {} if document is None else document

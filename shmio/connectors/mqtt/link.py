@@ -118,7 +118,7 @@ class _Client(Client):
 
     def _sock_recv(self, bufsize: int) -> bytes:
         if bufsize > MAX_PACKET_BYTES:
-            self.violation = f"it sent a packet of {bufsize} bytes, more than the {MAX_PACKET_BYTES} that are accepted"
+            self.violation = f"it sent a packet of {bufsize} bytes, but at most {MAX_PACKET_BYTES} are accepted"
             raise ConnectionAbortedError(self.violation)
         if self._taken == len(self._received):  # paho asks for a byte or two at a time, each with a system call
             try:
@@ -143,7 +143,7 @@ class _Client(Client):
 
     def _handle_publish(self) -> MQTTErrorCode:
         if self._in_packet["command"] & 0x06 == 0x04:  # paho would store such messages without a limit
-            self.violation = "it sent a message with QoS 2, which was not asked for"
+            self.violation = "it sent a message with QoS 2, which shmio did not request"
             return MQTTErrorCode.MQTT_ERR_PROTOCOL
         return super()._handle_publish()
 
@@ -257,10 +257,10 @@ class Link:
         assert self._connack is not None  # noqa: S101 - for the type checker
         if self._connack.is_failure:
             if str(self._connack) == _UNSUPPORTED:
-                raise UnsupportedVersionError(f"{self.peer} does not support this version of MQTT: set version")
+                raise UnsupportedVersionError(f"{self.peer} does not support this version of MQTT; set version")
             raise ConnectorError(f"{self.peer} refuses the connection: {self._refusal(self._connack)}")
         if self._options.retain and not self._limits.get("RetainAvailable", 1):
-            raise ConnectorError(f"{self.peer} does not retain messages: remove retain = true")
+            raise ConnectorError(f"{self.peer} does not retain messages; remove retain = true")
         return self.subscribe(list(filters), until_s)
 
     def _connected_socket(self, until_s: float) -> socket.socket:
@@ -574,7 +574,7 @@ class Link:
                 self._deliver(topic, bytes(message.payload), retained=message.retain)
         except Exception:
             log.exception("a message on %s could not be handled", printable(topic))
-            self._fail(f"a message on {printable(topic)[:200]} could not be handled: see the log")
+            self._fail(f"a message on {printable(topic)[:200]} could not be handled; see the log")
             raise
 
     def _on_pong(self) -> None:
@@ -586,7 +586,7 @@ class Link:
         if code.value in _LOGIN:
             return f"{code}: check username, password_file, and the accounts of the broker"
         if code.value == _TAKEN_OVER:
-            return f"another client has connected as {self._client_id}: give one of them another client_id"
+            return f"another client has connected as {self._client_id}; give one of them another client_id"
         return printable(str(code))
 
 
@@ -604,9 +604,9 @@ def _close_socket(client: Client) -> None:
 
 def _tls(error: OSError) -> str:
     if isinstance(error, ssl.SSLCertVerificationError):
-        return f"its certificate is not trusted ({error.verify_message}): check ca, and the host's name in url"
+        return f"its certificate is not trusted ({error.verify_message}); check ca, and the host's name in url"
     if isinstance(error, ssl.SSLError):
         if "_ALERT_" in (error.reason or ""):
-            return f"it refuses our TLS ({error.reason}): check certificate and key, which it may require"
-        return f"the TLS handshake failed ({error.reason or 'it ended the connection'}): check the port of url"
-    return f"it ended the TLS handshake ({error.strerror or error}): check the port of url"
+            return f"it refuses TLS with shmio ({error.reason}); check certificate and key, which it may require"
+        return f"the TLS handshake failed ({error.reason or 'it ended the connection'}); check the port of url"
+    return f"it ended the TLS handshake ({error.strerror or error}); check the port of url"

@@ -90,7 +90,7 @@ class MqttOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_on
             raise ValueError(f"url: expected mqtt://HOST:PORT or mqtts://HOST:PORT, without a user, found {self.url!r}")
         for name in ("ca", "certificate", "key"):
             if getattr(self, name) is not None and not self.tls:
-                raise ValueError(f"{name}: has no effect without TLS: write url = 'mqtts://…'")
+                raise ValueError(f"{name}: this key has no effect without TLS; write url = 'mqtts://…'")
         if self.texts[0].strip().casefold() == self.texts[1].strip().casefold():
             raise ValueError("texts: the text for false and the text for true must differ")
         if (self.certificate is None) != (self.key is None):
@@ -99,7 +99,7 @@ class MqttOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_on
             raise ValueError("username: this key is needed, because password_file contains this user's password")
         if not (self.tls or self.address.loopback or self.insecure):
             raise ValueError(
-                f"url: shmio would send {self.address} plain text over the network: write mqtts:// instead, or set "
+                f"url: shmio would send plain text over the network to {self.address}; write mqtts:// instead, or set "
                 "insecure = true"
             )
 

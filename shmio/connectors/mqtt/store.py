@@ -129,7 +129,7 @@ class Store:
             self.converters.append(ValueConverter(register, self._options.texts))
             for place in (address.source, address.target):
                 if register.dims and isinstance(place, Place) and place.steps is None:
-                    raise ValueError(f"an array is read from JSON: write {place.topic} $, or a path such as $.values")
+                    raise ValueError(f"an array is read from JSON; write {place.topic} $, or a path such as $.values")
             source = address.source
             if register.writable and isinstance(source, Place) and source.steps is not None and not address.target:
                 raise ValueError(
@@ -406,7 +406,7 @@ class _Ages:
                 return age_ns
         if needed:
             raise ConfigError(
-                f"max_age_ms: {path} would stay good for ever after its device has died: say after how many ms its "
+                f"max_age_ms: {path} would stay good forever after its device died; give the age in ms at which its "
                 "last message is too old (0: never), or set will to the topic of the device's last will"
             )
         return 0
@@ -417,7 +417,7 @@ def _time_path(options: MqttOptions) -> Steps | None:
         return None
     try:
         if not options.time.startswith("$"):
-            raise ValueError(f"{options.time!r} is not a path: write, for example, $.timestamp")
+            raise ValueError(f"{options.time!r} is not a path; write, for example, $.timestamp")
         return json_path.parse(options.time)
     except ValueError as error:
         raise ConfigError(f"time: {error}") from None

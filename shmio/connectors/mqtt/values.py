@@ -50,7 +50,7 @@ class ValueConverter:
         """
         base = register.element.base
         if base not in (*_REALS, *_TEXTS, *model.INTEGERS, "BOOL"):
-            raise ValueError(f"a {base} cannot be read from MQTT: use BOOL, whole numbers, REAL, LREAL or STRING[n]")
+            raise ValueError(f"a {base} cannot be read from MQTT; use BOOL, whole numbers, REAL, LREAL or STRING[n]")
         self._register, self._base, self._scale, self._texts = register, base, register.scale, texts
         self._bools = _BOOLS | {texts[0].casefold(): False, texts[1].casefold(): True}
 
@@ -152,7 +152,7 @@ class ValueConverter:
         found = self.to_value(value)
         for one in flatten(found, self._register.shape, self._register.path):
             if isinstance(one, float) and not math.isfinite(one):
-                raise ValueError("JSON has neither NaN nor infinity: write a finite number")
+                raise ValueError("JSON has neither NaN nor infinity; write a finite number")
         return found
 
     def to_value(self, value: Value) -> Any:

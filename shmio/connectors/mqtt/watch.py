@@ -57,7 +57,7 @@ class Watch:
         """Why the device may be offline; "" if it is online."""
         if self.there:
             return ""
-        said = "has had no message yet" if self.there is None else f"says {printable(self._said)[:40]!r}"
+        said = "has no message yet" if self.there is None else f"says {printable(self._said)[:40]!r}"
         return f"the device is offline: {self.place.topic} {said}"
 
     def covers(self, path: str) -> bool:
@@ -76,7 +76,7 @@ class Watch:
 
     def refuse(self) -> None:
         """Note that the broker refuses the subscription, so that the device counts as offline."""
-        self._said, self.there = "unknown: the subscription was refused", False
+        self._said, self.there = "unknown, because the broker refused the subscription", False
 
     def _text(self, payload: bytes) -> str:
         if self.place.steps is None or len(payload) > MAX_TEXT:

@@ -114,7 +114,7 @@ class _Search:
                 break
             if depth == self._wanted.depth:
                 names = "/".join(level[0].names)
-                self._stop(f"{shorten(names, 200)} is deeper than {depth} levels: set --depth")
+                self._stop(f"{shorten(names, 200)} is deeper than {depth} levels; set --depth")
         return self._found
 
     @property
@@ -140,7 +140,7 @@ class _Search:
                 self._add(node, one)
         if left_out or self._references >= self._wanted.nodes * REFERENCES_PER_NODE:
             self._stop(
-                f"the server sends more references than {self._wanted.nodes} nodes need: name a part of it by a "
+                f"the server sends more references than {self._wanted.nodes} nodes need; name a part of it by a "
                 "PATTERN, or set --limit"
             )
 
@@ -158,12 +158,12 @@ class _Search:
             return
         if len(self._seen) >= self._wanted.nodes:
             self._stop(
-                f"the server has more than {self._wanted.nodes} nodes: name a part of it by a PATTERN, or set --limit"
+                f"the server has more than {self._wanted.nodes} nodes; name a part of it by a PATTERN, or set --limit"
             )
             return
         self._count(name, key.Identifier)
         if self._characters > MAX_CHARACTERS:
-            self._stop("the names of the server's nodes are too long: name a part of it by a PATTERN")
+            self._stop("the names of the server's nodes are too long; name a part of it by a PATTERN")
             return
         self._seen.add(key)
         parent.children.append(_Node(key, names, reference.NodeClass == ua.NodeClass.Variable))
@@ -217,7 +217,7 @@ class _Search:
         kept: list[Listed] = []
         try:
             kept += itertools.islice(members_of(read_value(self._types.structures, value)), MAX_MEMBERS + 1)
-            problem = f"a structure with more than {MAX_MEMBERS} members: write those you need into the tag table"
+            problem = f"a structure with more than {MAX_MEMBERS} members; write those you need into the tag table"
         except (MismatchError, AbsentError) as error:
             problem = str(error)
         if not 0 < len(kept) <= MAX_MEMBERS:
@@ -235,7 +235,7 @@ class _Search:
             columns = {"address": f"{address}{member_text(one.member)}"}
             self._count(*names, columns["address"])
             if self._characters > MAX_CHARACTERS:
-                self._stop("the names of the server's members are too long: name a part of it by a PATTERN")
+                self._stop("the names of the server's members are too long; name a part of it by a PATTERN")
                 return
             self._found.offers.append(Offer(names, kind, columns, refused))
 
@@ -263,7 +263,7 @@ def _type(value: Sample, data_type: Sample) -> tuple[str, str]:
     if dims is None:
         return base, ""
     if not all(dims):
-        return "", "an array without elements: give it values, or write its length into the tag table"
+        return "", "an array without elements; give it values, or write its length into the tag table"
     return f"ARRAY[{', '.join(f'0..{size - 1}' for size in dims)}] OF {base}", ""
 
 

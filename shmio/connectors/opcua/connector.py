@@ -48,7 +48,7 @@ from shmio.model.values import Quality
 if TYPE_CHECKING:
     from shmio.connectors.opcua.session import Item, Session
 
-EXTRA: Final = "connector: opcua needs another library: pip install 'shmio[opcua]'"
+EXTRA: Final = "connector: opcua needs another library; run pip install 'shmio[opcua]'"
 CONNECT_TIMEOUTS: Final = 3
 """Maximum time for connecting, as a multiple of the time-out."""
 CLOSE_S: Final = 0.5
@@ -165,7 +165,7 @@ class OpcUaConnector(Connector):
         _need_library()
         if layout.optimized and options.nodes != "siemens":
             raise ConfigError(
-                f'layout: the block {layout.name} has optimized access: set nodes = "siemens" to read it by names'
+                f'layout: the block {layout.name} has optimized access; set nodes = "siemens" to read it by names'
             )
         self._options, self._layout = options, layout
         self._nodes, self._members = _nodes(options, layout)
@@ -320,7 +320,7 @@ class OpcUaConnector(Connector):
             item.unread = True
             for index in node.registers:
                 image.fail(index, BAD_DECODING_ERROR, sample.source_ns)
-            self._report(node.registers[0], f"{error}: list its members with shmio-supervisor browse")
+            self._report(node.registers[0], f"{error}; list the node's members with shmio-supervisor browse")
             return
         for index in node.registers:
             try:
@@ -329,7 +329,7 @@ class OpcUaConnector(Connector):
                 image.fail(index, BAD_NO_DATA, sample.source_ns)
             except MismatchError as error:
                 image.fail(index, BAD_TYPE_MISMATCH, sample.source_ns)
-                self._report(index, f"{error}: correct its address in the layout")
+                self._report(index, f"{error}; correct the register's address in the layout")
             else:
                 code = member.code if quality_of(member.code) is Quality.BAD else sample.code
                 source_ns = member.source_ns or sample.source_ns
@@ -343,7 +343,7 @@ class OpcUaConnector(Connector):
             image.put(index, self._converters[index].value(sample), sample.source_ns, sample.code)
         except MismatchError as error:
             image.fail(index, BAD_TYPE_MISMATCH, sample.source_ns)
-            self._report(index, f"{error}: correct its type in the layout")
+            self._report(index, f"{error}; correct the register's type in the layout")
         except (ValueRangeError, ValueError, OverflowError):
             image.fail(index, BAD_OUT_OF_RANGE, sample.source_ns)
 
@@ -355,7 +355,7 @@ class OpcUaConnector(Connector):
         if len(self._reported) <= MAX_REPORTED:
             log.warning("%s: %s", self._layout.registers[index].path, what)
         elif len(self._reported) == MAX_REPORTED + 1:
-            log.warning("more registers are bad: use shmio get to see all of them")
+            log.warning("more registers are bad; use shmio get to see all of them")
 
     # -- writing -------------------------------------------------------------------------------------------------------
 
@@ -409,7 +409,9 @@ class OpcUaConnector(Connector):
             if time.monotonic_ns() < sending.deadline_ns:
                 return None
             sending.future.cancel()
-            raise sending.lost(f"{self._options.peer} takes too long for the writes of a cycle: write less") from None
+            raise sending.lost(
+                f"{self._options.peer} takes too long for the writes of a cycle; write fewer values at once"
+            ) from None
         except ConnectorError as error:
             raise sending.lost(str(error)) from None
         return [str(outcome) for outcome in sending.outcomes]
@@ -420,7 +422,7 @@ class OpcUaConnector(Connector):
         for step in sending.steps:
             if isinstance(step, _NodeWrite) and step.elements is not None and not await link.has_ranges(step):
                 path = self._path(step)
-                outcomes[step.write] = f"{path}: the server does not write single elements: write the whole array"
+                outcomes[step.write] = f"{path}: the server does not write single elements; write the whole array"
         sending.steps = [step for step in sending.steps if any(outcomes[number] == "" for number in step.writes)]
         for batch in _batches(sending.steps, link.per_write):
             if isinstance(batch, _StructureWrite):
@@ -496,7 +498,7 @@ class OpcUaConnector(Connector):
             found = True
             item = link.items[self._node_of[index]]
             if item.node is None:
-                raise ValueError(f"{register.path}: the server does not know its node")
+                raise ValueError(f"{register.path}: the server does not know the node of this register")
             value = codec(register, layout.byte_order).decode(image)
             like, converter = self._latest.get(index), self._converters[index]
             try:
@@ -517,7 +519,7 @@ class OpcUaConnector(Connector):
             last = first + count - 1
             yield _NodeWrite(number, item, f"{first}:{last}" if last > first else str(first), sample)
         if not found:
-            raise ValueError("the layout has no register at the written bytes")
+            raise ValueError("no register of the layout covers the written bytes")
 
 
 def _need_library() -> None:
@@ -578,7 +580,7 @@ def _credentials(options: OpcUaOptions) -> Credentials:
     uri = trust.application_uri(certificate)
     if uri is None:
         raise ConfigError(
-            f"certificate: {options.certificate}: no application URI in it; a certificate for OPC UA has one as an "
+            f"certificate: {options.certificate}: this certificate has no application URI; OPC UA needs one as an "
             "alternative name, such as URI:urn:cell:shmio"
         )
     return Credentials(uri, (certificate, key), password)
@@ -598,9 +600,9 @@ def _elements(register: Register, share: bytes) -> tuple[int, int]:
         ValueError: The bits are not those of consecutive whole elements.
     """
     if not register.dims:
-        raise ValueError("OPC UA cannot write a part of a value: write the whole register")
+        raise ValueError("OPC UA cannot write a part of a value; write the whole register")
     if len(register.dims) > 1:
-        raise ValueError("elements of an array with several dimensions cannot be written: write the whole array")
+        raise ValueError("elements of an array with several dimensions cannot be written; write the whole array")
     chosen: list[int] = []
     whole = True
     if register.type == "BOOL":
@@ -613,7 +615,7 @@ def _elements(register: Register, share: bytes) -> tuple[int, int]:
                 chosen.append(place)
                 whole = whole and part == b"\xff" * len(part)
     if not whole or not chosen or chosen[-1] - chosen[0] + 1 != len(chosen):
-        raise ValueError("OPC UA cannot write a part of an element: write the whole element")
+        raise ValueError("OPC UA cannot write a part of an element; write the whole element")
     return chosen[0], len(chosen)
 
 

@@ -60,12 +60,13 @@ class OpcUaOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_o
             if secured and getattr(self, name) is None:
                 raise ValueError(f"{name}: this key is needed with security = {self.security!r}")
             if not secured and getattr(self, name) is not None:
-                raise ValueError(f'{name}: has no effect without security = "SignAndEncrypt" or "Sign"')
+                raise ValueError(f'{name}: this key has no effect without security = "SignAndEncrypt" or "Sign"')
         if (self.username is None) != (self.password_file is None):
             raise ValueError("username: give both username and password_file, or neither")
         if self.username and self.security != "SignAndEncrypt" and not self.address.loopback and not self.insecure:
             raise ValueError(
-                "username: beyond loopback, a password needs security = 'SignAndEncrypt', or insecure = true beside it"
+                "username: shmio would send the password over the network without encryption; set security = "
+                "'SignAndEncrypt', or write insecure = true in the same section"
             )
 
     @property

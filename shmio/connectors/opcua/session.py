@@ -1026,18 +1026,18 @@ def _flat(values: list[Any]) -> list[Any]:
 
 def _refused_user(code: int, options: OpcUaOptions) -> str:
     if options.username is None:
-        return f"the server does not admit clients without a user ({describe(code)}): set username and password_file"
-    return f"the server refuses the user {options.username!r} ({describe(code)}): check username and password_file"
+        return f"the server does not admit clients without a user ({describe(code)}); set username and password_file"
+    return f"the server refuses the user {options.username!r} ({describe(code)}); check username and password_file"
 
 
 def _explained_code(code: int, options: OpcUaOptions) -> str:
     name = describe(code)
     if (0x80120000 <= code < 0x801F0000 or code & 0xFFFF0000 == 0x810D0000) and options.security != "None":
-        return f"the server refuses this client's certificate ({name}): let the server trust {options.certificate}"
+        return f"the server refuses this client's certificate ({name}); let the server trust {options.certificate}"
     if code & 0xFFFF0000 in (0x80560000, 0x80770000, 0x80DB0000):  # sessions, subscriptions, monitored items
-        return f"the server has no more room ({name}): close other clients, or read less"
+        return f"the server has no free resources ({name}); close other clients, or read less"
     if code & 0xFFFF0000 in (0x80540000, 0x80550000):
-        return f"the server refuses security {options.security} ({name}): set security and policy to what it offers"
+        return f"the server refuses security {options.security} ({name}); set security and policy to what it offers"
     return f"the server refuses the request: {name}"
 
 

@@ -129,7 +129,7 @@ def complete(structure: Structure, form: int, fields: list[Field]) -> None:
     structure.form, structure.fields = form, fields
     names = [one.name for one in fields]
     if form not in (_PLAIN, _OPTIONAL, _UNION):
-        structure.fault = "it may have values of other types than its definition says, which cannot be read"
+        structure.fault = "it may have values of types that its definition does not name"
     elif form == _OPTIONAL and sum(one.optional for one in fields) > _MAX_OPTIONAL:
         structure.fault = f"it has more than {_MAX_OPTIONAL} optional members"
     elif len({*names}) < len(names) or not all(names):
@@ -146,9 +146,9 @@ def _read(structure: Structure, reading: _Reading) -> Members:
     try:
         found = reading.members(structure, 0)
     except MalformedError as error:
-        raise MismatchError(f"the structure {structure.name} is not as the server defines it") from error
+        raise MismatchError(f"the structure {structure.name} does not match the server's definition") from error
     if reading.left:
-        raise MismatchError(f"the structure {structure.name} is longer than the server defines it")
+        raise MismatchError(f"the structure {structure.name} is longer than in the server's definition")
     return found
 
 
@@ -243,7 +243,7 @@ def _read_value(
     structures: Mapping[NodeKey, Structure], sample: Sample, reading_of: Callable[[bytes, int], _Reading]
 ) -> Members | Elements:
     if sample.kind != ua.EXTENSION:
-        raise MismatchError(f"the node is {_named(sample)}, and no structure")
+        raise MismatchError(f"the node is {_named(sample)}, not a structure")
     values: list[Extension] = sample.value if sample.dims is not None else [sample.value]
     found: list[Members] = []
     left = MAX_VALUES
@@ -270,7 +270,7 @@ def find(found: Found, member: Member) -> Sample:
     """
     found = _walk(found, member)
     if not isinstance(found, Sample):
-        raise MismatchError(f"it is {_named(found)}: give the address of a member")
+        raise MismatchError(f"it is {_named(found)}; give the address of a member")
     return found
 
 

@@ -23,6 +23,7 @@ from cryptography.hazmat.primitives.asymmetric import rsa
 from cryptography.x509.oid import NameOID
 
 from shmio.errors import ConfigError, ConnectorError
+from shmio.wording import larger_than
 
 MAX_FILE_BYTES: Final = 1 << 16
 MAX_FILES: Final = 1000
@@ -42,17 +43,17 @@ def read_identity(certificate: Path, key: Path) -> tuple[x509.Certificate, rsa.R
     """
     found = _certificates(_read("certificate", certificate))
     if not found:
-        raise ConfigError(f"certificate: {certificate}: no certificate in PEM or DER")
+        raise ConfigError(f"certificate: {certificate}: the file has no usable certificate in PEM or DER")
     data = _read("key", key)
     load = serialization.load_pem_private_key if b"-----BEGIN" in data else serialization.load_der_private_key
     try:
         private = load(data, password=None)
     except (ValueError, TypeError):
-        raise ConfigError(f"key: {key}: no private key in PEM or DER without a password") from None
+        raise ConfigError(f"key: {key}: the file has no usable private key in PEM or DER, without a password") from None
     if not isinstance(private, rsa.RSAPrivateKey) or private.key_size < _MIN_KEY_BITS:
         raise ConfigError(f"key: {key}: the policies of OPC UA need an RSA key of {_MIN_KEY_BITS} bits or more")
     if private.public_key() != found[0].public_key():
-        raise ConfigError(f"key: {key}: not the key of the certificate {certificate}")
+        raise ConfigError(f"key: {key}: this key does not belong to the certificate {certificate}")
     return found[0], private
 
 
@@ -88,7 +89,7 @@ def check_server(data: bytes, trusted: Path, host: str) -> x509.Certificate:
         _check_dates(issuer, "the authority of the server's certificate")
         if not _is_for(certificate, host):
             raise ConnectorError(
-                f"the server's certificate is signed by a trusted authority, but is not for {host}: use the name in "
+                f"the server's certificate is signed by a trusted authority, but is not for {host}; use the name in "
                 "it in url, or trust the certificate itself"
             )
     _check_dates(certificate, "the server's certificate")
@@ -107,13 +108,13 @@ def _reject(certificate: x509.Certificate, data: bytes, trusted: Path) -> str:
         rejected.mkdir(mode=0o755, exist_ok=True)
         if not file.exists():
             if sum(1 for _ in rejected.iterdir()) >= MAX_REJECTED:
-                return f"{text}; it cannot be stored, because {rejected} has {MAX_REJECTED} files: delete old ones"
+                return f"{text}; it cannot be stored, because {rejected} has {MAX_REJECTED} files; delete old ones"
             file.write_bytes(data)
             # Log the text, too, because the returned text may be cut off where it is shown.
-            log.warning("%s; if it is the right one: mv '%s' '%s/'", text, file, trusted)
+            log.warning("%s; to trust it, run mv '%s' '%s/'", text, file, trusted)
     except OSError as error:
         return f"{text}, and cannot be stored in {rejected}: {error.strerror}"
-    return f"{text}; if it is the right one: mv '{file}' '{trusted}/'"
+    return f"{text}; to trust it, run mv '{file}' '{trusted}/'"
 
 
 def _check_dates(certificate: x509.Certificate, what: str) -> None:
@@ -121,7 +122,7 @@ def _check_dates(certificate: x509.Certificate, what: str) -> None:
     if now < certificate.not_valid_before_utc:
         raise ConnectorError(f"{what} is valid only from {certificate.not_valid_before_utc:%Y-%m-%d %H:%M} UTC on")
     if now > certificate.not_valid_after_utc:
-        raise ConnectorError(f"{what} has expired on {certificate.not_valid_after_utc:%Y-%m-%d}: renew it")
+        raise ConnectorError(f"{what} has expired on {certificate.not_valid_after_utc:%Y-%m-%d}; renew it")
 
 
 def _folder(trusted: Path) -> list[x509.Certificate]:
@@ -179,5 +180,5 @@ def _read(key: str, file: Path) -> bytes:
     except OSError as error:
         raise ConfigError(f"{key}: {file}: {error.strerror}") from None
     if len(data) > MAX_FILE_BYTES:
-        raise ConfigError(f"{key}: {file}: larger than {MAX_FILE_BYTES} bytes")
+        raise ConfigError(f"{key}: {file}: {larger_than(MAX_FILE_BYTES)}")
     return data

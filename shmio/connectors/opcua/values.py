@@ -150,7 +150,7 @@ class ValueConverter:
 
     def _dtl(self, found: Extension) -> Scalar:
         if len(found.body) != _DTL.size:
-            raise MismatchError(f"the node is a structure of {len(found.body)} bytes, a DTL has {_DTL.size}")
+            raise MismatchError(f"the node is a structure of {len(found.body)} bytes, but a DTL has {_DTL.size}")
         return self._decoded(_DTL_THERE.pack(*_DTL.unpack(found.body)))
 
     # -- writing -------------------------------------------------------------------------------------------------------
@@ -170,7 +170,7 @@ class ValueConverter:
         flat: list[Any] = list(flatten(value, register.shape, register.path)) if register.dims else [value]
         kind = like.kind if like is not None and like.kind else _DEFAULTS.get(self._base, 0)
         if not kind:
-            raise ValueError(f"the node has no value yet, so its type for a {register.type} is unknown")
+            raise ValueError(f"the node has no value yet, so the type to write for a {register.type} is unknown")
         if self._base in _OF_BYTES and kind in (ua.BYTE, ua.BYTE_STRING):
             data = b"".join(self._encoded(one) for one in flat)
             dims = None if kind == ua.BYTE_STRING else (len(data),) if not register.dims else (*register.shape, 8)
@@ -184,7 +184,7 @@ class ValueConverter:
         """Convert consecutive elements of an array to the node's type. Raise ValueError if this is impossible."""
         kind = like.kind if like is not None and like.kind else _DEFAULTS.get(self._base, 0)
         if not kind or kind == ua.BYTE_STRING or self._base in _OF_BYTES:
-            raise ValueError("the node has no single elements: write the whole array")
+            raise ValueError("the node has no single elements; write the whole array")
         return Sample(kind, [self._there(one, kind, like) for one in values], (len(values),), 0, 0)
 
     def _encoded(self, value: Any) -> bytes:
@@ -207,7 +207,7 @@ class ValueConverter:
             return Extension(known.encoding, _DTL.pack(*_DTL_THERE.unpack(self._encoded(value))))
         if kind == ua.DATE_TIME and isinstance(value, str) and (ns := calendar.parse_moment(value)) is not None:
             if ns % 1000:
-                raise ValueError(f"{value} is more precise than the microseconds that can be written")
+                raise ValueError(f"{value} is too precise; only whole microseconds can be written")
             return ns
         if kind in (ua.STRING, ua.LOCALIZED_TEXT) and isinstance(value, str):
             return value

@@ -19,7 +19,7 @@ from shmio.connectors.poll_loop import Counters
 from shmio.connectors.replay.recording import MAX_NS, Entry, RecordedSource
 from shmio.connectors.replay.source import Replay, ReplayStart, as_others, stamp
 from shmio.errors import PathError, SegmentError, ValueRangeError
-from shmio.layout.topic import find, shorten
+from shmio.layout.topic import find
 from shmio.layout.values.write import Write, bits_of
 from shmio.segment import NO_WRITER, BlockWriter, Event, EventKind, Frame, Provenance, Quality, Record, Stamp
 from shmio.segment.commands import MAX_WRITES
@@ -34,6 +34,7 @@ from shmio.segment.playhead import (
     PlayState,
     with_answer,
 )
+from shmio.wording import unknown
 
 OVER: Final = f"{OWN_WORDS}the recording is over"
 STOPPED: Final = f"{OWN_WORDS}the source was stopped"
@@ -330,7 +331,7 @@ def _event_matcher(name: str, *, keep: bool) -> Callable[[Entry], bool]:
     if name == ANY:
         return lambda entry: isinstance(entry.item, Event) and is_replayed(entry.item, keep=keep)
     if name not in kinds:
-        raise PathError(f"event {shorten(name, 16)!r} is unknown; valid: {', '.join(kinds)}, {ANY}")
+        raise PathError(unknown("kind of event", name, [*kinds, ANY]))
     return lambda entry: isinstance(entry.item, Event) and entry.item.kind == kinds[name]
 
 
@@ -545,7 +546,7 @@ class ReplayLoop:
         self._head.write(play)
 
     def _refuse(self, writes: Sequence[Write]) -> list[str]:
-        return [f"source {self._writer.block.source} replays a recording: it cannot be written"] * len(writes)
+        return [f"source {self._writer.block.source} replays a recording, so it cannot be written"] * len(writes)
 
     # ---- requests ------------------------------------------------------------------------------------------------
 

@@ -154,18 +154,18 @@ class Recording:
     def _measure(self) -> None:
         started = self._dump.about.get("started_utc_ns", "")
         if not (started.isdecimal() and len(started) < 20):
-            raise RecordingError(f"{self._file} does not say when its instance was started: it cannot be played")
+            raise RecordingError(f"{self._file} does not say when its instance was started, so it cannot be played")
         self.utc_ns = int(started)
         """The UTC time of position 0, the start of the recorded instance, in ns since 1970."""
         names = self._dump.sources
         if len(names) > MAX_PROCESSES:
             raise RecordingError(
-                f"{self._file} has {len(names)} sources, but an instance has at most {MAX_PROCESSES}: copy some of "
+                f"{self._file} has {len(names)} sources, but an instance has at most {MAX_PROCESSES}; copy some of "
                 "them to another file with shmio-dump cut --source"
             )
         spans = {name: span for name in names if (span := self._measured(name))}
         if not spans:
-            raise RecordingError(f"{self._file} has no frames: there is nothing to play")
+            raise RecordingError(f"{self._file} has no frames, so it cannot be played")
         self.sources = list(spans)
         """The names of the sources that have frames."""
         self.whole = Span(
@@ -178,7 +178,7 @@ class Recording:
             for block in self._dump.blocks
         )
         if not even or max(self.utc_ns, *map(abs, self.whole)) > MAX_NS:
-            raise RecordingError(f"{self._file} has invalid times: it cannot be played")
+            raise RecordingError(f"{self._file} has invalid times, so it cannot be played")
 
     def _measured(self, name: str) -> Span | None:
         """Return the span of a source's frames in UTC, up to one period after the last frame.
@@ -257,8 +257,8 @@ class Recording:
         if any(block.layout_hash != last.layout_hash for block in played):
             at_s = (last.begin_ns - self.utc_ns - self.whole.begin_ns) / 1e9
             raise RecordingError(
-                f"source {source}: its layout changes within the part to play, at {at_s:.3f} s: end before "
-                "that, or start there"
+                f"the layout of source {source} changes within the part to play, at {at_s:.3f} s; end before "
+                "that time, or start there"
             )
         return RecordedSource(self._dump, self._damage, last, self.utc_ns)
 

@@ -79,12 +79,14 @@ def parse(text: str) -> Address:
     """
     parts = text.split(None, 2)
     if len(parts) != 3:
-        raise ValueError(f"{text!r} is not an address; {EXAMPLE}" if parts else f"its `address` is missing; {EXAMPLE}")
+        raise ValueError(
+            f"{text!r} is not an address; {EXAMPLE}" if parts else f"the key `address` is missing; {EXAMPLE}"
+        )
     topic, kind, field = parts[0], parts[1], parts[2].strip()
     if not _TOPIC.fullmatch(topic) or len(topic) > 256:
-        raise ValueError(f"{topic!r} is not a topic: write its full name, such as /joint_states")
+        raise ValueError(f"{topic!r} is not a topic; write its full name, such as /joint_states")
     if not TYPE.fullmatch(kind):
-        raise ValueError(f"{kind!r} is not a message type: write, for example, sensor_msgs/JointState")
+        raise ValueError(f"{kind!r} is not a message type; write, for example, sensor_msgs/JointState")
     return Address(topic, kind, _steps(field), field)
 
 
@@ -121,7 +123,7 @@ def leaf_type(address: Address) -> str:
         raise KeyError(kind)
     for step in address.steps:
         if kind in PRIMITIVES or kind.endswith("[]"):
-            what = f"a {kind}" if kind in PRIMITIVES else "a sequence: choose an element, as in [0]"
+            what = f"a {kind}" if kind in PRIMITIVES else "a sequence; choose an element, such as [0]"
             raise ValueError(f"{address.text}: the value that should contain {step.name!r} is {what}")
         fields = DEFINITIONS[kind]
         if step.name not in fields:
@@ -131,13 +133,13 @@ def leaf_type(address: Address) -> str:
         if step.whole:
             continue
         if not kind.endswith("[]"):
-            raise ValueError(f"{address.text}: {step.name!r} is a {kind} and not a sequence: leave out the brackets")
+            raise ValueError(f"{address.text}: {step.name!r} is a {kind} and not a sequence; leave out the brackets")
         if step.key and not any(DEFINITIONS[scope].get(step.key[0]) == "string[]" for scope in scopes):
             raise ValueError(f"{address.text}: {scopes[-1]} has no sequence of names {step.key[0]!r}")
         kind = kind[:-2]
     if kind.removesuffix("[]") not in PRIMITIVES:
         inside = ", ".join(DEFINITIONS[kind.removesuffix("[]")])
-        raise ValueError(f"{address.text} is a {kind}, not a value: name one of its fields: {inside}")
+        raise ValueError(f"{address.text} is a {kind}, not a value; name one of its fields: {inside}")
     return kind
 
 

@@ -185,7 +185,7 @@ def _message(topics: Topics, draft: Publication, base: Any) -> Any:
     if missing:
         shown = ", ".join(missing[:5]) + (", …" if len(missing) > 5 else "")
         raise ValueError(
-            f"no complete message has arrived on {topic.name} yet: "
+            f"no complete message has arrived on {topic.name} yet; "
             f"write all registers of the topic in one command, including {shown}"
         )
     message = default(kind)

@@ -67,7 +67,7 @@ class Ros2Connector(Connector):
 
     def __init__(self, options: Ros2Options, layout: Layout) -> None:
         if importlib.util.find_spec("cyclonedds") is None:
-            raise ConfigError("connector: ros2 needs another library: pip install 'shmio[ros2]'")
+            raise ConfigError("connector: ros2 needs another library; run pip install 'shmio[ros2]'")
         self._options = options
         self._topics = Topics(layout, options, known_types=True)
         self._participant: Participant | None = None
@@ -141,7 +141,7 @@ class Ros2Connector(Connector):
             if time.monotonic() > end_s:
                 self.close()
                 raise ConnectorError(
-                    f"found no publisher or subscriber of any topic in DDS {self._where} within {options.timeout} ms: "
+                    f"found no publisher or subscriber of any topic in DDS {self._where} within {options.timeout} ms; "
                     "check that ROS_DOMAIN_ID, topic names and types are those of the robot"
                 )
             time.sleep(POLL_S)
@@ -171,7 +171,7 @@ class Ros2Connector(Connector):
             if not topic.received_ns and topic.name not in self._incompatible and joined.incompatible(topic.name):
                 self._incompatible.add(topic.name)
                 log.warning(
-                    "%s: the topic's publisher offers less than this source requests: remove the topic from latched, "
+                    "%s: the topic's publisher offers less than this source requests; remove the topic from latched, "
                     "or set reliability to best_effort", topic.name,
                 )  # fmt: skip
         return self._topics.image(time.monotonic_ns())

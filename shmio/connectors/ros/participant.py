@@ -159,7 +159,7 @@ class Participant:
         except DDSException as error:
             self.close()
             raise ConnectorError(
-                f"cannot join DDS domain {domain}: {error.msg or error}; does the interface exist, and is it up?"
+                f"cannot join DDS domain {domain}: {error.msg or error}; check that the interface exists and is up"
             ) from None
 
     def _add(self, topics: Iterable[Topic], *, reliable: bool) -> None:

@@ -74,7 +74,7 @@ class RosbridgeConnector(Connector):
 
     def __init__(self, options: RosbridgeOptions, layout: Layout) -> None:
         if importlib.util.find_spec("websockets") is None:
-            raise ConfigError("connector: rosbridge needs another library: pip install 'shmio[rosbridge]'")
+            raise ConfigError("connector: rosbridge needs another library; run pip install 'shmio[rosbridge]'")
         self._options = options
         self._topics = Topics(layout, options, known_types=False)
         self._numbers = itertools.count(1)
@@ -215,7 +215,7 @@ class RosbridgeConnector(Connector):
         message, topic = publication.message, publication.topic
         if not publication.begun:
             if not finite(message):
-                return "JSON has neither NaN nor infinity: write a finite number"
+                return "JSON has neither NaN nor infinity; write a finite number"
             link.check()
             publication.begun = True
             link.publish(topic.name, self._stampless(message, publication), f"write:{next(self._numbers)}")

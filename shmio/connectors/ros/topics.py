@@ -192,7 +192,7 @@ class Topics:
         if len(self._reported) <= MAX_REPORTED:
             log.warning("%s: %s", self.layout.registers[index].path, what)
         else:
-            log.warning("more registers are bad: use shmio get to see all of them")
+            log.warning("more registers are bad; use shmio get to see all of them")
 
     def waiting(self) -> Iterable[str]:
         """Yield the names of the topics on which no message has arrived."""

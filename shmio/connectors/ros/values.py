@@ -31,7 +31,7 @@ class ValueConverter:
         """
         base = register.element.base
         if base not in (*_REALS, *_TEXTS, *model.INTEGERS, "BOOL"):
-            raise ValueError(f"a {base} cannot be read from ROS: use BOOL, whole numbers, REAL, LREAL or STRING[n]")
+            raise ValueError(f"a {base} cannot be read from ROS; use BOOL, whole numbers, REAL, LREAL or STRING[n]")
         self._register, self._base, self._scale = register, base, register.scale
         self._is_plain = base in _REALS and register.scale is None and not register.dims
         """True if a float is the register's value as it is."""

@@ -219,7 +219,7 @@ class Link:
             failure = f"the connection to {self._peer} was lost: {_why(error)}"
         except Exception:
             log.exception("a message of %s could not be handled", self._peer)
-            failure = f"a message of {self._peer} could not be handled: see the log"
+            failure = f"a message of {self._peer} could not be handled; see the log"
         with self._condition:
             self._failure = failure
             self._condition.notify_all()
@@ -241,7 +241,7 @@ class Link:
             try:
                 for one in self._socket.recv_streaming():
                     if not isinstance(one, str):
-                        raise ConnectorError(f"{self._peer} sent a binary message, which was not asked for")
+                        raise ConnectorError(f"{self._peer} sent a binary message, which shmio did not request")
                     fragments.append(one)
                     if len(fragments) > MAX_FRAGMENTS:
                         raise ConnectorError(f"{self._peer} sent a message of more than {MAX_FRAGMENTS} fragments")

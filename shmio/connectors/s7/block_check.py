@@ -84,7 +84,7 @@ class BlockChangeMonitor(Query):
 
     def given_up(self, why: str) -> None:
         """Log that shmio will not notice changes, and why."""
-        log.debug("no more questions about blocks: the controller %s; a change of a block will not be noticed", why)
+        log.debug("shmio will not notice a change of a block, because the controller %s", why)
 
     def lost(self, *, alive: bool = True) -> None:
         """Forget an open question; the next session begins with the first block."""
@@ -110,7 +110,7 @@ class BlockChangeMonitor(Query):
             return
         doubt = ""
         if info.size and info.size != before.size:
-            text = f"it had {before.size} bytes and has {info.size}"
+            text = f"it had {before.size} bytes and now has {info.size}"
             if _fits(block, info.size):
                 text += ", as in its layout" if block.whole else ""
             else:
@@ -153,6 +153,6 @@ def _fits(block: ExpectedBlock, size: int) -> bool:
 
 
 def _misfit(block: ExpectedBlock, size: int) -> str:
-    what = "its layout has" if block.whole else "its registers need"
+    what = "but its layout has" if block.whole else "but its registers need"
     gone = block.beyond(size)
     return f", {what} {block.size}" + (f"; beyond its end: {names_of(gone)}" if gone else "")

@@ -31,7 +31,7 @@ class S7Client(S7Session):
 
         """
         if not 1 <= size <= pdu.MAX_BLOCK_SIZE:
-            raise ConfigError(f"DB{db_number} of {size} bytes: S7 reads blocks of 1 to {pdu.MAX_BLOCK_SIZE} bytes")
+            raise ConfigError(f"DB{db_number} has {size} bytes, but S7 reads blocks of 1 to {pdu.MAX_BLOCK_SIZE} bytes")
         if not 1 <= db_number <= 65535:
             raise ConfigError(f"DB{db_number}: data blocks are numbered 1 to 65535")
         super().__init__(options)

@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Final, NamedTuple
 
-from shmio.config.faults import meant
 from shmio.connectors.register_image import RegisterImage
 from shmio.connectors.s7.explain import ACCESS_DENIED, RefusedError, names_of
 from shmio.connectors.s7.mode import MODES, ModeQuery
@@ -30,6 +29,7 @@ from shmio.model.statuses import (
     BAD_WAITING_FOR_INITIAL_DATA,
     GOOD,
 )
+from shmio.wording import unknown
 
 CLOCK_INTERVAL_NS: Final = 1_000_000_000
 _MODULES, _COMPONENTS = 0x0011, 0x001C
@@ -83,10 +83,7 @@ def parse(place: int, register: Register) -> CpuTag:
     name = text.lower().removeprefix(CPU)
     if name not in _NAMES:
         known = [CPU + one for one in _NAMES]
-        raise ValueError(
-            f"address: {text[:80]!r} is not a value of the CPU; its values are "
-            f"{', '.join(known)}{meant(text.lower()[:80], known)}"
-        )
+        raise ValueError(f"address: {unknown('value', text, known, 'the CPU')}")
     if register.writable:
         raise ValueError("writable: values of the CPU can only be read")
     if register.dims or register.scale:
@@ -234,7 +231,7 @@ class _TextsQuery(_CpuQuery):
             self.tags,
             lambda tag: _text(tag.name, records),
             BAD_NO_DATA,
-            f"list 0x{self._szl:04X} of the CPU does not contain it",
+            f"list 0x{self._szl:04X} of the CPU does not contain this value",
         )
 
 
@@ -265,4 +262,4 @@ class _ClockQuery(_CpuQuery):
         """Give the registers the time."""
         clock = parse_clock(data)
         text = None if clock is None else clock.isoformat(timespec="milliseconds")
-        self.note(self.tags, lambda _: text, BAD_NO_DATA, "the CPU's clock has no valid time: set the clock")
+        self.note(self.tags, lambda _: text, BAD_NO_DATA, "the CPU's clock has no valid time; set the clock")

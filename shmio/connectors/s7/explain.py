@@ -24,12 +24,12 @@ KNOWN_CODES: Final = frozenset(
 )
 """The codes for which python-snap7 has texts. It is imported only when a text is needed, because that is slow."""
 
-_NO_OPTIMIZED = "clear 'Optimized block access' of the block, compile and load, or read it by OPC UA"
+_NO_OPTIMIZED = "if the block is optimized, clear 'Optimized block access', compile and load it, or read it by OPC UA"
 _ACCESS_DENIED = (
-    "access denied {where}: enable 'Permit access with PUT/GET communication' and 'Full access' in the CPU's "
-    f"protection settings; if both are enabled, {_NO_OPTIMIZED}"
+    "access denied {where}; enable 'Permit access with PUT/GET communication' and 'Full access' in the CPU's "
+    f"protection settings; {_NO_OPTIMIZED}"
 )
-_PROTECTED = "the CPU's protection level forbids the access {where}: choose 'Full access' in its protection settings"
+_PROTECTED = "the CPU's protection level forbids the access {where}; choose 'Full access' in its protection settings"
 
 # Errors of a whole job for which the texts of python-snap7 do not name the remedy.
 _ERRORS = {
@@ -58,16 +58,15 @@ def explain_error(error: int) -> str:
     from snap7.error import S7_PROTOCOL_ERROR_CODES  # noqa: PLC0415  a source without errors starts faster
 
     known = S7_PROTOCOL_ERROR_CODES.get(error)
-    return f"the controller refused the request: {known or 'no text known'} (error 0x{error:04X})"
+    return f"the controller refused the request: {known or 'unknown error'} (error 0x{error:04X})"
 
 
 def explain_read(code: int, db_number: int, size: int) -> str:
     """Return a message for the return code of an item that reads a block of ``size`` bytes."""
     if code == OUT_OF_RANGE:
         return (
-            f"DB{db_number} does not have {size} bytes (item code 0x05): the layout is of another version of the "
-            "block: "
-            f"export it again; or the block is optimized: {_NO_OPTIMIZED}"
+            f"DB{db_number} does not have {size} bytes (item code 0x05); if the layout is of another version of the "
+            f"block, export it again; {_NO_OPTIMIZED}"
         )
     return f"DB{db_number}: {explain_item(code)}"
 
@@ -79,18 +78,17 @@ def explain_size(db_number: int, size: int, found: int, name: str = "", gone: Se
     """
     if not found:
         return (
-            f"DB{db_number} has no byte that can be addressed (item code 0x05): the block is optimized: "
-            f"{_NO_OPTIMIZED}; or it is empty"
+            f"DB{db_number} has no byte that can be addressed (item code 0x05), because it is empty or optimized; "
+            f"{_NO_OPTIMIZED}"
         )
     if gone:
         return (
-            f"{block_name(db_number, name)} has {found} bytes, not {size} as in its layout (item code 0x05): export "
+            f"{block_name(db_number, name)} has {found} bytes, not {size} as in its layout (item code 0x05); export "
             f"the layout again; beyond the end of the block: {names_of(gone)}"
         )
     return (
         f"DB{db_number} does not have {size} bytes but {found} bytes (item code 0x05): the layout is of another "
-        "version "
-        "of the block: export it again"
+        "version of the block; export it again"
     )
 
 
@@ -109,7 +107,7 @@ def explain_write(code: int, db_number: int, last: int) -> str:
     """Return a message for the return code of an item that writes up to byte ``last``."""
     if code == OUT_OF_RANGE:
         return (
-            f"DB{db_number} has no byte {last} (item code 0x05): the layout is of another version of the block: export "
+            f"DB{db_number} has no byte {last} (item code 0x05): the layout is of another version of the block; export "
             "it again"
         )
     return f"DB{db_number}: {explain_item(code)}"
@@ -127,8 +125,8 @@ def explain_place(code: int, text: str, db_number: int, last: int) -> str:
     """
     if code == OUT_OF_RANGE and db_number:
         return (
-            f"DB{db_number} has no byte {last} (item code 0x05): correct the address {text}; or the block in the "
-            f"controller is of another version; or it is optimized: {_NO_OPTIMIZED}"
+            f"DB{db_number} has no byte {last} (item code 0x05); correct the address {text}, or load the right version "
+            f"of the block; {_NO_OPTIMIZED}"
         )
     return explain_item(code)
 
@@ -151,11 +149,11 @@ def explain_item(code: int) -> str:
         return _ACCESS_DENIED.format(where=where)
     if code == NO_SUCH_OBJECT:
         return (
-            f"the block does not exist {where}: check dbNumber, and that the block is loaded; on an S7-1200 or S7-1500 "
-            f"the block may be optimized: {_NO_OPTIMIZED}"
+            f"the block does not exist {where}; check dbNumber, and that the block is loaded; on an S7-1200 or "
+            f"S7-1500, {_NO_OPTIMIZED}"
         )
     if code == OUT_OF_RANGE:
-        return f"the controller has no such address {where}: correct it; or the block is optimized: {_NO_OPTIMIZED}"
+        return f"the controller has no such address {where}; correct the address; {_NO_OPTIMIZED}"
     if code in {NO_SUCH_TYPE, OTHER_SIZE}:
         return f"the controller does not accept data of this type or length {where}"
-    return f"the controller refused the request: {_item_texts().get(code, 'no text known')} {where}"
+    return f"the controller refused the request: {_item_texts().get(code, 'unknown error')} {where}"

@@ -104,7 +104,7 @@ class ModeQuery(Query):
         self.unknown = True
         if not self._logged:
             self._logged = True
-            log.debug("no more questions about the operating mode: the controller %s; STOP will not be noticed", why)
+            log.debug("shmio will not notice STOP, because the controller %s", why)
 
     def _forget(self) -> None:
         self.doubt, self.mode = "", None

@@ -154,12 +154,13 @@ def check_answer(frame: memoryview) -> int:
     error = frame[17] << 8 | frame[18]
     if HEADER_END + parameter_length + data_length != len(frame):
         raise ConnectorError(
-            f"answer of {len(frame)} bytes names {parameter_length} of parameters and {data_length} of data"
+            f"the controller's answer has {len(frame)} bytes, but its header says {parameter_length} of "
+            f"parameters and {data_length} of data"
         )
     if error:
         raise RefusedError(explain_error(error))
     if kind != _ACK_DATA:
-        raise ConnectorError("answer without data")
+        raise ConnectorError("the controller's answer has no data")
     return data_length
 
 
@@ -194,7 +195,7 @@ def parse_connect_confirm(frame: memoryview) -> int:
         )
     if frame[4] != len(frame) - 5:
         raise ConnectorError(
-            "the peer's connection confirm has the wrong length: check that host and port are those of an S7 controller"
+            "the peer's connection confirm has the wrong length; check that host and port are those of an S7 controller"
         )
     position = 11
     while position + 2 < len(frame):

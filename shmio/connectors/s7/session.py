@@ -18,7 +18,6 @@ from typing import Annotated, Literal, Protocol
 
 import msgspec
 
-from shmio.config.faults import meant
 from shmio.connectors.base import Lost, WriteLostError
 from shmio.connectors.s7 import pdu
 from shmio.connectors.s7.blocks import BlockWrite, ends
@@ -28,6 +27,7 @@ from shmio.connectors.s7.query import Query
 from shmio.connectors.s7.transport import Operation, Transport, Window
 from shmio.errors import ConnectorError
 from shmio.layout.values.write import Write
+from shmio.wording import unknown
 
 MAX_DEPTH = 4  # largest number of reads in flight; with more, images would only be older
 REGISTER_OPTIONS = frozenset({"dbNumber", "every", "packetSize"})
@@ -73,9 +73,7 @@ class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only
         if not _is_host(self.host):
             raise ValueError(f"host: {self.host!r} is not a host name or address; give the port in the key port")
         if self.model is not None and _family(self.model) not in _CPU_SLOT:
-            raise ValueError(
-                f"model: {self.model!r} is unknown; valid: {', '.join(_CPU_SLOT)}{meant(self.model, _CPU_SLOT)}"
-            )
+            raise ValueError(f"model: {unknown('model', self.model, _CPU_SLOT)}")
 
     @property
     def cpu_slot(self) -> int:
@@ -489,7 +487,7 @@ class S7Session(ABC):
                 raise TimeoutError
             if now_ns >= end_ns and not wave.complete:
                 raise ConnectorError(
-                    f"{self.options.peer} has not answered all writes of a cycle within {self.timeout_s:g} s: "
+                    f"{self.options.peer} has not answered all writes of a cycle within {self.timeout_s:g} s; "
                     "write fewer values at once"
                 )
 

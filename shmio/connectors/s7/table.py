@@ -365,7 +365,7 @@ class S7TableConnector(S7Session, Connector):
         """
         super().__init__(options)
         if options.dbNumber is not None:
-            raise ConfigError("dbNumber: leave it out: each address of a tag table names its block")
+            raise ConfigError("dbNumber: leave out this key, because each address of a tag table names its block")
         self._layout = layout
         self._tags: dict[int, Tag] = {}
         of_cpu: list[cpu.CpuTag] = []
@@ -384,7 +384,7 @@ class S7TableConnector(S7Session, Connector):
             self._tags[index] = Tag(index, register, address, layout.byte_order, rate)
         if not self._tags:
             raise ConfigError(
-                "layout: the tag table has only values of the CPU: add a register with an address such as %MB0"
+                "layout: the tag table has only values of the CPU; add a register with an address such as %MB0"
             )
         self._of_cpu = of_cpu
         self._cpu = cpu.CpuValues(of_cpu, self._mode)
@@ -543,7 +543,7 @@ class S7TableConnector(S7Session, Connector):
                 for one in self._of_cpu
             ):
                 raise ValueError("values of the CPU can only be read")
-            raise ValueError("the tag table has no register at the written bytes")
+            raise ValueError("no register of the tag table covers the written bytes")
 
     def _elements(self, tag: Tag, write: Write) -> Iterator[tuple[Tag, int, int | None, bytes]]:
         """Yield the changes that a write of bytes makes to one register, as :meth:`_steps` does."""
@@ -621,7 +621,7 @@ def _covered(register: Register, there: bytes | bytearray) -> Iterator[tuple[int
             count += 1
             continue
         if part:
-            raise ValueError("a part of a value cannot be written: write the whole value")
+            raise ValueError("a part of a value cannot be written; write the whole value")
         if count:
             yield first, count
             count = 0

@@ -92,7 +92,7 @@ def parse_answer(frame: memoryview, service: Service) -> Part:
         raise ConnectorError(what)
     begin = pdu.USERDATA_END + _PARAMETERS.size
     if parameters_size != _PARAMETERS.size or begin + data_size != len(frame) or data_size < _ITEM.size:
-        raise ConnectorError(f"{what}: inconsistent lengths")
+        raise ConnectorError(f"{what}: its lengths are inconsistent")
     head, size, method, group, function, sequence, _, last, error = _PARAMETERS.unpack_from(frame, pdu.USERDATA_END)
     if (head, size, method) != (_PARAMETERS_HEAD, 8, _ANSWER):
         raise ConnectorError(what)
@@ -104,7 +104,7 @@ def parse_answer(frame: memoryview, service: Service) -> Part:
     if (group, function) != (0x80 | service.group, service.function):
         raise ConnectorError(what)
     if length != data_size - _ITEM.size:
-        raise ConnectorError(f"{what}: {data_size - _ITEM.size} bytes of data, but its header says {length}")
+        raise ConnectorError(f"{what}: it has {data_size - _ITEM.size} bytes of data, but its header says {length}")
     return Part(bytes(frame[begin + _ITEM.size :]), sequence, bool(last))
 
 
@@ -125,7 +125,7 @@ def szl_records(data: bytes, szl: int) -> list[bytes]:
 
     """
     if len(data) < _SZL_HEAD.size:
-        raise ConnectorError(f"the controller's answer to '{READ_SZL.name}' lacks its head")
+        raise ConnectorError(f"the controller's answer to '{READ_SZL.name}' has no head")
     found, _, size, count = _SZL_HEAD.unpack_from(data)
     if found != szl:
         raise ConnectorError(

@@ -178,7 +178,7 @@ class Sender:
             if self.problem:
                 log.info("alert %s: %s works again", self._alert, self._action.text)
             self.problem = ""
-        log.info("alert %s: %s, told by %s", self._alert, notice.state, self._action.text)
+        log.info("alert %s: %s, reported by %s", self._alert, notice.state, self._action.text)
         self._on_change()
 
     def _fail(self, notice: Notice, problem: str, *, again: bool) -> None:

@@ -58,7 +58,7 @@ class RegisterWatch:
         try:
             self._condition = compile_condition(when, Layouts(blocks))
         except ConfigError as error:  # a reload has removed its registers
-            log.warning("an alert is unknown until its registers exist again: %s", error)
+            log.warning("an alert cannot be evaluated until its registers exist again: %s", error)
         self.sources: Collection[str] = {source for source, _ in self._condition.reads} if self._condition else ()
         self._memory = Memory()
         self._values: list[Number | None] = []
@@ -145,7 +145,11 @@ class ProcessWatch:
                 state = slot.supervised
                 phase, note = state.phase, state.note
                 if not supervised:
-                    phase, note = (Phase.RUNNING, "") if slot.alive() else (Phase.STOPPED, "dead, as is the supervisor")
+                    phase, note = (
+                        (Phase.RUNNING, "")
+                        if slot.alive()
+                        else (Phase.STOPPED, "its process is dead, and so is the supervisor")
+                    )
                 elif phase is Phase.STARTING and note and note != RESTARTING:
                     phase = Phase.BACKOFF
                 self._present[slot.name] = str(phase), note

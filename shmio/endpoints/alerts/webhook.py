@@ -114,9 +114,9 @@ class Webhook:
 
 def _why(error: Exception) -> str:
     if isinstance(error, ssl.SSLCertVerificationError):
-        return f"its certificate is not trusted ({error.verify_message}): check webhook_ca, and the host's name"
+        return f"its certificate is not trusted ({error.verify_message}); check webhook_ca, and the host's name"
     if isinstance(error, ssl.SSLError):
-        return f"the TLS handshake failed ({error.reason}): check https, and the port"
+        return f"the TLS handshake failed ({error.reason}); check https, and the port"
     if isinstance(error, socket.gaierror):
         return f"unknown host name ({error.strerror})"
     if isinstance(error, ConnectionRefusedError):

@@ -11,6 +11,7 @@ from shmio.errors import PathError
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import Topic, look_up, parse_topic, shorten
 from shmio.segment import Block
+from shmio.wording import unknown
 
 
 class TimeTopic(Enum):
@@ -100,7 +101,7 @@ class Topics:
         """
         for source in sources:
             if source not in self._feeds:
-                raise PathError(f"no source {shorten(source)!r}; there are: {', '.join(self._feeds)}")
+                raise PathError(unknown("source", source, self._feeds))
         return [self._feeds[source].block for source in dict.fromkeys(sources) or self._feeds]
 
     def layout(self, topic: Topic) -> Layout:

@@ -23,6 +23,7 @@ from shmio.layout.values.write import sizes
 from shmio.local.writer import REPLACED, RETIRED, SourceWriter
 from shmio.segment import DONE, Block, EventKind
 from shmio.segment.commands import End, worst
+from shmio.wording import unknown
 
 REPLIES: Final = "shmio/results"
 """Start of the response topics, after the prefix, that clients may choose for results.
@@ -91,7 +92,7 @@ class CommandClient:
         """
         cost = CommandCost.of(sizes(register))
         if self._pending and self._pending.open_events + cost.events > MAX_OPEN:
-            raise CommandError(f"{self.block.source}: too many commands are in flight: wait for their results")
+            raise CommandError(f"{self.block.source}: too many commands are in flight; wait for their results")
         if self.block.retired:
             raise CommandError(RETIRED)
         ticket = self._source_writer.submit({register.path: value})
@@ -207,7 +208,7 @@ class CommandReceiver:
         topic = parse_topic(text, self._clients, None)
         client = self._clients.get(topic.source)
         if client is None:
-            raise PathError(f"{topic.source}: there is no such source")
+            raise PathError(unknown("source", topic.source, self._clients))
         return client, look_up(client.block.layout, topic)
 
 

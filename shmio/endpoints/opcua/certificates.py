@@ -11,6 +11,7 @@ from cryptography.hazmat.primitives.asymmetric import rsa
 
 from shmio.config import OpcUa
 from shmio.errors import ConfigError
+from shmio.wording import larger_than
 
 MAX_PEM_BYTES: Final = 1 << 20
 MIN_KEY_BITS: Final = 2048
@@ -24,7 +25,7 @@ def read_certificates(key: str, file: Path) -> list[x509.Certificate]:
             return list(x509.load_pem_x509_certificates(data))
         return [x509.load_der_x509_certificate(data)]
     except ValueError:
-        raise ConfigError(f"{key}: {file}: no usable certificate in PEM or DER") from None
+        raise ConfigError(f"{key}: {file}: the file has no usable certificate in PEM or DER") from None
 
 
 def read_identity(opcua: OpcUa) -> tuple[x509.Certificate, rsa.RSAPrivateKey] | None:
@@ -42,13 +43,15 @@ def read_identity(opcua: OpcUa) -> tuple[x509.Certificate, rsa.RSAPrivateKey] | 
         load = serialization.load_pem_private_key if b"-----BEGIN" in data else serialization.load_der_private_key
         key = load(data, password=None)
     except (ValueError, TypeError):
-        raise ConfigError(f"opcua.key: {opcua.key}: no usable private key in PEM or DER, without a password") from None
+        raise ConfigError(
+            f"opcua.key: {opcua.key}: the file has no usable private key in PEM or DER, without a password"
+        ) from None
     if not isinstance(key, rsa.RSAPrivateKey) or key.key_size < MIN_KEY_BITS:
         raise ConfigError(
             f"opcua.key: {opcua.key}: the policies of OPC UA need an RSA key of {MIN_KEY_BITS} bits or more"
         )
     if key.public_key() != certificate.public_key():
-        raise ConfigError(f"opcua.key: {opcua.key}: not the key of opcua.certificate")
+        raise ConfigError(f"opcua.key: {opcua.key}: this key does not belong to opcua.certificate")
     return certificate, key
 
 
@@ -69,5 +72,5 @@ def _read(key: str, file: Path) -> bytes:
     except OSError as error:
         raise ConfigError(f"{key}: {file}: {error.strerror}") from None
     if len(data) > MAX_PEM_BYTES:
-        raise ConfigError(f"{key}: {file}: larger than {MAX_PEM_BYTES} bytes")
+        raise ConfigError(f"{key}: {file}: {larger_than(MAX_PEM_BYTES)}")
     return data

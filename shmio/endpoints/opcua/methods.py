@@ -43,7 +43,7 @@ class Stepping:
 
     def _step(self, length_ns: int | None) -> list[ua.Variant]:
         if not self._segment.clock.read().virtual:
-            raise TimeError("time is real: first take control of it, for example with shmio step")
+            raise TimeError("time is real; first take control of it, for example with shmio step")
         try:
             self._coordinator.take_over(PATIENCE_S, steps=True)
             done = self._coordinator.step(length_ns)

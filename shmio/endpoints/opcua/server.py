@@ -126,7 +126,7 @@ class InternalServer(LibraryInternalServer):
         name, secret = token.UserName or "", token.Password or b""
         if not token.EncryptionAlgorithm:
             if not isession.trusted_channel:
-                log.warning("a client sent its password without encryption: replace the password")
+                log.warning("a client sent its password without encryption; replace the password")
                 raise ServiceError(ua.StatusCodes.BadIdentityTokenRejected)
             return name, secret.decode() if isinstance(secret, bytes) else str(secret)
         decrypt = _OAEP.get(token.EncryptionAlgorithm)

@@ -148,14 +148,14 @@ class PageApp:
         if kind.lower() == "bearer":
             if self._sessions.blocked(host):
                 _record_sign_in(host, "too many wrong tokens")
-                return PlainTextResponse("too many wrong tokens: try again in a minute\n", 429)
+                return PlainTextResponse("too many wrong tokens; try again in a minute\n", 429)
             owner = self._sessions.owner(token, host)
             if owner is None:
                 _record_sign_in(host, "wrong token")
             user = owner or user
         if "read" in user.roles:
             return None
-        text = "this needs the role read: send a token of [[grpc.token]] as Authorization: Bearer\n"
+        text = "this needs the role read; send a token of [[grpc.token]] as Authorization: Bearer\n"
         return PlainTextResponse(text, 401, {"www-authenticate": "Bearer"})
 
     async def _session(self, request: Request) -> Response:
@@ -170,10 +170,10 @@ class PageApp:
             return answer
         if self._sessions.blocked(host):
             _record_sign_in(host, "too many wrong tokens")
-            return JSONResponse({"error": "too many wrong tokens: try again in a minute"}, 429)
+            return JSONResponse({"error": "too many wrong tokens; try again in a minute"}, 429)
         body = await _body(request, MAX_LOGIN_BYTES)
         if body is None:
-            return JSONResponse({"error": "this is no token"}, 413)
+            return JSONResponse({"error": "this text is too long for a token"}, 413)
         try:
             token = msgspec.json.decode(body, type=_Login).token
         except (msgspec.MsgspecError, UnicodeDecodeError):
@@ -181,7 +181,7 @@ class PageApp:
         opened = self._sessions.open(token, host)
         if opened is None:
             _record_sign_in(host, "wrong token")
-            return JSONResponse({"error": "this is no token of [[grpc.token]]"}, 403)
+            return JSONResponse({"error": "this token is not in [[grpc.token]]"}, 403)
         cookie, user = opened
         self._sessions.close(request.cookies.get(self._cookie, ""))
         trail.record("sign in", {}, "done", who=trail.Acting(user.actor, "web"))
@@ -194,7 +194,7 @@ class PageApp:
     async def _layout(self, request: Request) -> Response:
         """Return the registers in files that the user has dropped on the page. The files are not stored."""
         if "read" not in self._user(request).roles:
-            return JSONResponse({"error": "this needs the role read: sign in"}, 403)
+            return JSONResponse({"error": "this needs the role read; sign in"}, 403)
         try:
             body = await self._uploads.receive(request.stream())
             if body is None:
@@ -241,7 +241,7 @@ class PageApp:
         """Count a page that makes its first call. Return the reason to close it; empty: it stays open."""
         self._silent.pop(page, None)
         if len(self._pages) >= MAX_PAGES:
-            return f"{MAX_PAGES} pages are open: close one of them"
+            return f"{MAX_PAGES} pages are open; close one of them"
         self._pages.add(page)
         return ""
 

@@ -274,7 +274,7 @@ class Page:
                 number = message.id
                 made, tab = self._calls.get(message.call, (None, None))
                 if made is None:
-                    raise ShmioError(f"there is no call {message.call[:80]!r}")
+                    raise ShmioError(f"unknown call {message.call[:80]!r}")
                 attempt = None if made.role == "read" else self._attempt(message)
                 if made.role not in self.user.roles:
                     denial = self._denial(made.role)

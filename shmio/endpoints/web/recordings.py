@@ -70,7 +70,7 @@ class _Watch:
             raise _StoppedError
         if time.monotonic() > self.until_s:
             raise RecordingError(
-                "this takes too long: examine the file with shmio-dump verify, and repair it with shmio-dump recover"
+                "this takes too long; examine the file with shmio-dump verify, and repair it with shmio-dump recover"
             )
 
 
@@ -193,9 +193,9 @@ class Recordings:
 
         """
         if self.folder is None:
-            raise RecordingError("this instance has no recorder: add [recorder] to its configuration")
+            raise RecordingError("this instance has no recorder; add [recorder] to its configuration")
         if len(name) > MAX_NAME or not _NAME.fullmatch(name):
-            raise RecordingError(f"{name[:80]!r} is not the name of a recording: it is not a name such as a50.mem")
+            raise RecordingError(f"{name[:80]!r} is not the name of a recording; a name is, for example, a50.mem")
         return self.folder / name
 
     async def open(self, name: str, since_s: float | None = None) -> Opened:
@@ -220,7 +220,7 @@ class Recordings:
                     known.users += 1
                     return known
                 if len(self._opened) >= MAX_OPEN:
-                    raise RecordingError(f"{MAX_OPEN} recordings are open: try again in a minute")
+                    raise RecordingError(f"{MAX_OPEN} recordings are open; try again in a minute")
                 opened = await self.in_thread(lambda: _open(path, state))
                 opened.users = 1
                 self._opened[name] = opened
@@ -351,7 +351,7 @@ def _open(path: Path, state: _State) -> Opened:
             part.close()
             raise
     except OSError as error:
-        why = "it is a link, and the page follows none" if path.is_symlink() else error.strerror
+        why = "it is a link, and the page does not follow links" if path.is_symlink() else error.strerror
         raise RecordingError(f"{path.name}: {why}") from None
     return Opened(path.name, state, dump, watch, time.monotonic() - started_s, damage)
 

@@ -166,7 +166,7 @@ class _Guarded:
             await with_headers({"type": "http.response.body", "body": text})
 
         if not known:
-            text = b"this server has another name: use its address in listen, or add the name to hosts beside it\n"
+            text = b"this server has another name; use its address in listen, or add the name to hosts beside it\n"
             await refuse(421, text)
         elif scope["method"] not in ("GET", "HEAD") and not _same_origin(
             origins, hosts[0], secure=scope["scheme"] == "https"

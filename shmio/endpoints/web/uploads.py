@@ -85,7 +85,7 @@ class Uploads:
         try:
             async for part in parts:
                 if number not in self._receiving:
-                    raise EndpointError("too many files are being received: try again")
+                    raise EndpointError("too many files are being received; try again")
                 body += part
                 if len(body) > MAX_BYTES + MAX_HEAD_BYTES:
                     return None
@@ -105,7 +105,7 @@ class Uploads:
             async with asyncio.timeout(WAIT_S):
                 await self._compiling.acquire()
         except TimeoutError:
-            raise EndpointError("other files are being read: try again") from None
+            raise EndpointError("other files are being read; try again") from None
         try:
             return await compile_uploads(body)
         finally:
@@ -140,7 +140,7 @@ async def compile_uploads(body: bytes) -> bytes:
             await process.wait()
     if process.returncode != 0 or not answer:
         raise CommandError(
-            f"reading these files took more than {LIMIT_S} s or {MEMORY_BYTES >> 20} MB: use shmio-layout for them"
+            f"reading these files took more than {LIMIT_S} s or {MEMORY_BYTES >> 20} MB; use shmio-layout for them"
         )
     return answer
 

@@ -92,11 +92,11 @@ def parse(register: Register) -> Address:
     """
     text = register.address.strip()
     if not text:
-        raise ValueError("its `address` is missing; write one such as holding 100")
+        raise ValueError("the key `address` is missing; write one such as holding 100")
     found = _ADDRESS.fullmatch(text)
     if found is None:
         raise ValueError(
-            f"{text!r} is no Modbus address; write coil, discrete, input or holding and a number from 0, such as "
+            f"{text!r} is not a Modbus address; write coil, discrete, input or holding and a number from 0, such as "
             "holding 100, or the number of a manual, such as 40101"
         )
     if found["manual"]:
@@ -105,10 +105,10 @@ def parse(register: Register) -> Address:
         table, number = Table(found["table"].lower()), int(found["number"])
     unit = None if found["unit"] is None else int(found["unit"])
     if not 0 <= number <= MAX_ADDRESS or (unit is not None and unit > MAX_UNIT):
-        raise ValueError(f"{text!r}: numbers go from 0 to {MAX_ADDRESS}, unit ids to {MAX_UNIT}")
+        raise ValueError(f"{text!r}: the number must be from 0 to {MAX_ADDRESS}, and the unit id from 0 to {MAX_UNIT}")
     kind = register.element if found["type"] is None else element_type(found["type"])
     if kind is None:
-        raise ValueError(f"{text!r}: there is no type {found['type']!r}")
+        raise ValueError(f"{text!r}: unknown type {found['type']!r}")
     address = Address(unit, table, number, None if found["bit"] is None else int(found["bit"]), kind)
     _check(address, register, text)
     return address
@@ -118,7 +118,7 @@ def _check(address: Address, register: Register, text: str) -> None:
     """Raise ValueError if the address does not suit the register."""
     kind, table, is_bit = address.kind, address.table, register.type == "BOOL"
     if address.bit is not None and (table.of_bits or address.bit > 15):
-        raise ValueError(f"{text!r}: bits 0 to 15 are of a word in the tables input and holding")
+        raise ValueError(f"{text!r}: only a word in the tables input and holding has bits, numbered 0 to 15")
     if is_bit != (table.of_bits or address.bit is not None):
         raise ValueError(
             f"{text!r}: a BOOL needs a coil, a discrete input, or a bit of a word such as holding 100.3"
@@ -130,9 +130,9 @@ def _check(address: Address, register: Register, text: str) -> None:
     if not is_bit and kind.base != "STRING" and kind.base not in _CODES:
         raise ValueError(f"{text!r}: Modbus has no {kind.name}; it has {', '.join(_CODES)} and STRING[n]")
     if (kind.base == "STRING") != (register.element.base == "STRING"):
-        raise ValueError(f"{text!r}: a {register.type} and a {kind.name} do not fit each other")
+        raise ValueError(f"{text!r}: a {kind.name} of the device does not fit a {register.type}")
     if register.element.base != "STRING" and not is_bit and register.element.base not in _CODES:
-        raise ValueError(f"a {register.type} cannot come from a number of a device")
+        raise ValueError(f"a number of the device does not fit a {register.type}")
     if address.number + register.count * address.width - 1 > MAX_ADDRESS:
         raise ValueError(f"{text!r}: the value ends after address {MAX_ADDRESS}")
 

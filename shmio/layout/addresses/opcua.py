@@ -82,7 +82,7 @@ def parse_member(text: str) -> tuple[Address, Member]:
     """
     text = text.strip()
     if not text:
-        raise ValueError(f"its `address` is missing; {_EXAMPLE}/Objects/2:Device/2:Speed")
+        raise ValueError(f"the key `address` is missing; {_EXAMPLE}/Objects/2:Device/2:Speed")
     if text.startswith("/"):
         parts = _PATH.fullmatch(text)
         if parts is None:
@@ -90,7 +90,7 @@ def parse_member(text: str) -> tuple[Address, Member]:
         return _browse_path(parts[1]), _member(text, parts[2])
     found = _NODE.fullmatch(text)
     if found is None:
-        raise ValueError(f"{text!r} is no address of OPC UA; {_EXAMPLE}/Objects/2:Device/2:Speed")
+        raise ValueError(f"{text!r} is not an address of OPC UA; {_EXAMPLE}/Objects/2:Device/2:Speed")
     namespace: int | str = unescaped_uri(found["uri"] or "") or int(found["index"] or 0)
     if isinstance(namespace, int) and namespace > 0xFFFF:
         raise ValueError(f"{text!r}: namespaces have numbers up to 65535")
@@ -123,13 +123,13 @@ def _member(text: str, way: str | None) -> Member:
         found = _MEMBER.match(way, at)
         if found is None:
             raise ValueError(
-                f"{text!r}: the way to the member is wrong at {way[at : at + 20]!r}; write it as #Motor.Forces or "
+                f"{text!r}: the path of the member is wrong at {way[at : at + 20]!r}; write it as #Motor.Forces or "
                 "#[0].Speed, and & before one of . [ ] # & in a name"
             )
         steps.append(re.sub(r"&(.)", r"\1", found[2]) if found[2] else tuple(map(int, found[1].split(","))))
         at = found.end()
     if len(steps) > MAX_STEPS:
-        raise ValueError(f"{text[:40]!r}…: the way to a member has at most {MAX_STEPS} steps")
+        raise ValueError(f"{text[:40]!r}…: the path of a member has at most {MAX_STEPS} steps")
     return tuple(steps)
 
 
@@ -154,9 +154,9 @@ def _identifier(text: str, kind: str, identifier: str) -> int | str | uuid.UUID 
         if kind == "b":
             return base64.b64decode(identifier, validate=True)
     except (ValueError, binascii.Error):
-        raise ValueError(f"{text!r}: this is no {'GUID' if kind == 'g' else 'base64'}") from None
+        raise ValueError(f"{text!r}: the identifier is not {'a GUID' if kind == 'g' else 'base64'}") from None
     if not re.fullmatch(r"[0-9]{1,10}", identifier) or int(identifier) > 0xFFFF_FFFF:
-        raise ValueError(f"{text!r}: expected a number up to 4294967295 behind i=")
+        raise ValueError(f"{text!r}: expected a number up to 4294967295 after i=")
     return int(identifier)
 
 

@@ -59,9 +59,9 @@ class Found:
             del entry["unit"]
         heads = list(_heads(path))
         if path in self.tags:
-            return self.skip(shown, "the name is there twice")
+            return self.skip(shown, "the list has this name twice")
         if path in self._heads or any(head in self.tags for head in heads):
-            return self.skip(shown, "the name is that of a tag and of a group of tags")
+            return self.skip(shown, "a tag and a group of tags have this name")
         if len(self.tags) >= MAX_REGISTERS:
             return self.skip(shown, f"a tag table has at most {MAX_REGISTERS} registers")
         try:

@@ -7,6 +7,7 @@ from typing import Final
 from shmio.layout.importing import kepserver, node_set, simatic_ml, step7_symbols, tia_workbook, xml_tree
 from shmio.layout.importing.found import Found, ImportingError
 from shmio.layout.source.file import decode
+from shmio.wording import larger_than
 
 MAX_BYTES: Final = 32 << 20
 FORMATS: Final = (
@@ -29,7 +30,7 @@ def import_tags(data: bytes) -> Found:
 
     """
     if len(data) > MAX_BYTES:
-        raise ImportingError(f"the file is larger than {MAX_BYTES} bytes")
+        raise ImportingError(larger_than(MAX_BYTES))
     if data.startswith(b"PK"):
         return tia_workbook.read(data)
     head = decode(data[:4096]).text.lstrip("\ufeff \r\n")

@@ -29,13 +29,13 @@ def read(data: bytes) -> Found:
     try:
         header = [name.strip().lower() for name in next(reader, [])]
         if missing := [name for name in (FIRST, "address", "data type") if name not in header]:
-            raise ImportingError(f"the first row lacks the columns {', '.join(missing)} of KEPServerEX")
+            raise ImportingError(f"the first row does not have the columns {', '.join(missing)} of KEPServerEX")
         for cells in reader:
             row = {name: cell.strip() for name, cell in zip(header, cells, strict=False)}
             if row.get(FIRST):
                 _add(found, row)
     except csv.Error as error:
-        raise ImportingError(f"not an export of KEPServerEX: {error}") from None
+        raise ImportingError(f"the file is not an export of KEPServerEX: {error}") from None
     return found
 
 
@@ -86,10 +86,10 @@ def _scale(row: Mapping[str, str]) -> tuple[list[float] | None, str]:
         )
         factor = (high - low) / (raw_high - raw_low)
     except (ValueError, ZeroDivisionError):
-        raise ValueError("the limits of its scaling are not four numbers that make a line") from None
+        raise ValueError("its raw and scaled limits must be four numbers, and the raw limits must differ") from None
     offset = low - raw_low * factor
     if row.get("negate value", "").lower() in ("1", "true", "yes"):
         factor, offset = -factor, -offset
     if not math.isfinite(factor) or not math.isfinite(offset) or not factor:
-        raise ValueError("the limits of its scaling are not four numbers that make a line")
+        raise ValueError("its raw and scaled limits must be four numbers, and the raw limits must differ")
     return [factor, offset], row.get("scaled data type", "").lower()

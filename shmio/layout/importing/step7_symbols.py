@@ -57,7 +57,7 @@ def _symbols(text: str) -> Iterator[tuple[int, _Symbol]]:
                 raise ImportingError(f"row {line}: expected symbol, address, type, comment; found {len(cells)} cells")
             yield line, _stripped(*cells)
     except csv.Error as error:
-        raise ImportingError(f"not a symbol table: {error}") from None
+        raise ImportingError(f"the file is not a symbol table: {error}") from None
 
 
 def _stripped(name: str, address: str, kind: str, comment: str) -> _Symbol:

@@ -21,7 +21,7 @@ def read(data: bytes) -> Found:
     found = Found("PLC tags of TIA Portal")
     header = {name.strip().lower(): place for place, name in enumerate(rows[0][1])} if rows else {}
     if missing := [name for name in _NEEDED if name not in header]:
-        raise ImportingError(f"the sheet {SHEET!r} lacks the columns {', '.join(missing)}")
+        raise ImportingError(f"the sheet {SHEET!r} does not have the columns {', '.join(missing)}")
     for number, cells in rows[1:]:
 
         def cell(column: str, cells: list[str] = cells) -> str:

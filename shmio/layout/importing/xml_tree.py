@@ -28,7 +28,9 @@ def parse(data: bytes) -> Element:
         nonlocal depth, elements
         depth, elements = depth + 1, elements + 1
         if depth > MAX_DEPTH or elements > MAX_ELEMENTS:
-            raise ImportingError(f"expected at most {MAX_ELEMENTS} elements, {MAX_DEPTH} deep, found more")
+            raise ImportingError(
+                f"the XML has more than {MAX_ELEMENTS} elements, or is nested more than {MAX_DEPTH} deep"
+            )
         builder.start(name.rpartition("}")[2], {key.rpartition("}")[2]: value for key, value in attributes.items()})
 
     def end(name: str) -> None:
@@ -37,7 +39,9 @@ def parse(data: bytes) -> Element:
         builder.end(name.rpartition("}")[2])
 
     def refuse(*_declaration: object) -> None:
-        raise ImportingError("a document type is not allowed: such declarations can read files and never end")
+        raise ImportingError(
+            "the XML declares a document type, which is not allowed, because it could read files or never end"
+        )
 
     parser.StartElementHandler = start
     parser.EndElementHandler = end
@@ -48,4 +52,4 @@ def parse(data: bytes) -> Element:
         parser.Parse(data, True)
         return builder.close()
     except (expat.ExpatError, ValueError, LookupError, AssertionError) as error:
-        raise ImportingError(f"not XML that can be read: {error}") from None
+        raise ImportingError(f"the file is not valid XML: {error}") from None

@@ -44,8 +44,8 @@ class Area(IntEnum):
 _READ_ONLY: Final = {
     Area.PERIPHERAL: "inputs cannot be written: the controller reads them from its modules",
     Area.INPUT: "inputs cannot be written: the controller overwrites them from its modules in each cycle",
-    Area.COUNTER: "counters can only be read: let the controller's program set them",
-    Area.TIMER: "timers can only be read: let the controller's program start them",
+    Area.COUNTER: "counters can only be read; let the controller's program set them",
+    Area.TIMER: "timers can only be read; let the controller's program start them",
 }
 _LETTERS: Final = {
     "I": Area.INPUT, "E": Area.INPUT, "Q": Area.OUTPUT, "A": Area.OUTPUT, "M": Area.MARKER,
@@ -109,10 +109,15 @@ def parse(register: Register) -> Address:
     """
     text = register.address.strip()
     if not text:
-        raise ValueError("address: needed if other registers have one, such as DB201.DBW4, %IW256, %M3.7 or T5")
+        raise ValueError(
+            "address: this key is needed, because other registers have it; write, for example, DB201.DBW4, "
+            "%IW256, %M3.7 or T5"
+        )
     match = _ADDRESS.fullmatch(text)
     if match is None:
-        raise ValueError(f"address: {text[:80]!r} is none; expected one such as DB201.DBW4, %IW256, %M3.7 or T5")
+        raise ValueError(
+            f"address: {text[:80]!r} is not an S7 address; expected one such as DB201.DBW4, %IW256, %M3.7 or T5"
+        )
     start = int(match["start"])
     if start > MAX_NUMBER:
         raise ValueError(f"address: {text!r}: the largest number is {MAX_NUMBER}")
@@ -133,7 +138,9 @@ def parse(register: Register) -> Address:
     size = array_size(kind, register.shape)
     bit = _bit(text, (match["block_width"] or match["width"]).upper(), match["bit"], register, kind)
     if start + size > _AREA_BYTES:
-        raise ValueError(f"address: {text!r}: {size} bytes from byte {start} on end behind byte {_AREA_BYTES - 1}")
+        raise ValueError(
+            f"address: {text!r}: {size} bytes from byte {start} on end after byte {_AREA_BYTES - 1}, the last one"
+        )
     return Address(area, db, start, bit, kind, size)
 
 
@@ -144,7 +151,7 @@ def _of_number(text: str, match: re.Match[str], register: Register, start: int) 
     if match["bit"] or match["peripheral"] or match["type"]:
         raise ValueError(f"address: {text!r}: a timer or counter has only a number")
     if register.dims or register.type not in valid:
-        raise ValueError(f"type: that of {text!r} is one of {', '.join(sorted(valid))}, not {register.type}")
+        raise ValueError(f"type: {text!r} must have one of the types {', '.join(sorted(valid))}, not {register.type}")
     word = element_type("WORD")
     assert word is not None  # noqa: S101 - for the type checker
     return Address(area, 0, start, None, word, 2)
@@ -164,19 +171,20 @@ def _bit(text: str, letter: str, bit: str | None, register: Register, kind: Elem
     """Check width and bit of an address, and return the bit of a single BOOL."""
     if (bit is None) != (letter in _WIDTHS):
         raise ValueError(
-            f"address: {text!r}: a bit has a byte and a bit, such as DB1.DBX0.1 or %M3.7, and other values a width"
+            f"address: {text!r}: write a bit with its byte and number, such as DB1.DBX0.1 or %M3.7, and other values "
+            "with a width, such as DB1.DBW2 or %MB3"
         )
     if kind.base == "BOOL" and not register.dims:
         if bit is None:
             raise ValueError(
-                f"address: {text!r}: a BOOL is one bit; name it, such as {text.split(maxsplit=1)[0]}.0 with X"
+                f"address: {text!r}: a BOOL is one bit; add the number of the bit, such as DB1.DBX0.1 or %M3.7"
             )
         return int(bit)
     if bit is not None and int(bit):
         raise ValueError(f"address: {text!r}: {register.type} begins at a whole byte, not at bit {bit}")
     if letter in _WIDTHS and not register.dims and kind.size < _WIDTHS[letter]:
         raise ValueError(
-            f"address: {text!r} has {_WIDTHS[letter]} bytes, but {kind.name} has {kind.size}: correct one of them, "
-            f"or name the controller's type: {text!r} with a type behind it"
+            f"address: {text!r} has {_WIDTHS[letter]} bytes, but {kind.name} has {kind.size}; correct one of them, "
+            f"or name the controller's type after the address, such as {f'{text} INT'!r}"
         )
     return None

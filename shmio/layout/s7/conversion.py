@@ -131,7 +131,7 @@ class Conversion:
 
         """
         if not self.swapped:
-            raise ValueError("a bit of a converted value cannot be written: write the whole value")
+            raise ValueError("a bit of a converted value cannot be written; write the whole value")
         element, inner = divmod(byte, self.swapped)
         return element * self.swapped + self.swapped - 1 - inner
 

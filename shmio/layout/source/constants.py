@@ -190,7 +190,7 @@ class Constants:
         if number is None:
             raise BoundFault(at.error(f"expected a whole number, but the constant {name!r} is not one"))
         if depth >= _MAX_DEFINITIONS:
-            raise BoundFault(at.error(f"the constant {name!r} is defined by way of itself"))
+            raise BoundFault(at.error(f"the definition of the constant {name!r} uses itself"))
         value = number if isinstance(number, int) else scope._sum(number, depth + 1)
         scope._numbers[name.lower()] = value
         return value

@@ -20,8 +20,8 @@ _MARKS = (
 )
 _NEWLINE = re.compile(r"\r\n|\r|\n")
 _AS_WINDOWS = (
-    "not UTF-8: read as Windows-1252, so letters with accents may be wrong in names and comments; "
-    "save the file as UTF-8 to be sure"
+    "the file is not UTF-8, so shmio reads it as Windows-1252, and letters with accents may be wrong in names and "
+    "comments; save it as UTF-8 to be sure"
 )
 _INSTEAD: Final = (
     "in TIA Portal, open the context menu of the data block, choose 'Generate source from blocks', and name the "
@@ -60,7 +60,7 @@ def decode(data: bytes) -> Decoded:
     except UnicodeDecodeError as error:
         line, column = _place(data[: error.start].decode(encoding))
     if encoding != "utf-8":
-        problem = f"expected {encoding.upper()}, as the byte order mark says, found other bytes; "
+        problem = f"the file has the byte order mark of {encoding.upper()}, but other bytes follow; "
         return Decoded("", f"{problem}export the source again", line, column, fatal=True)
     try:
         text = data.decode("cp1252")
@@ -79,16 +79,16 @@ def foreign(file: str, data: bytes) -> str:
     name = file.lower()
     head = data[:HEAD_BYTES]
     if head.startswith((_ZIP, _OLD_OFFICE)) or name.endswith((".xlsx", ".xls", ".ods")):
-        return f"this is a spreadsheet or an archive, which shmio cannot read: {_INSTEAD}"
+        return f"this is a spreadsheet or an archive, which shmio cannot read; {_INSTEAD}"
     wide = head.startswith((b"\xff\xfe", b"\xfe\xff"))
     text = decode(head[: len(head) & ~1] if wide else head).text
     if _MARKUP.match(text) or name.endswith(".xml"):
-        return f"this is XML, as TIA Portal Openness exports blocks: {_CONVERT}{_INSTEAD}"
+        return f"this is XML, as TIA Portal Openness exports blocks; {_CONVERT}{_INSTEAD}"
     if name.endswith((".csv", ".sdf", ".tsv")) or _is_table(text, data):
-        return f"this is a table of tags without their places in a data block: {_CONVERT}{_INSTEAD}"
+        return f"this is a table of tags without their places in a data block; {_CONVERT}{_INSTEAD}"
     controls = len(head) - len(head.translate(None, _CONTROLS))
     if not wide and controls > max(len(head) // 20, 8):
-        return f"this is not a text file: {_INSTEAD}"
+        return f"this is not a text file; {_INSTEAD}"
     return ""
 
 

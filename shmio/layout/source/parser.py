@@ -44,7 +44,7 @@ _HEADER = (
 _NUMBERED = ("DB", "UDT", "FB", "FC", "OB", "SFB")
 _DB_NUMBER = re.compile(r"DB([1-9][0-9]{0,4})", re.IGNORECASE)
 _PROTECTED = (
-    "{!r} is know-how protected and its declaration is not in the source: remove the protection in its "
+    "{!r} is know-how protected and its declaration is not in the source; remove the protection in its "
     "properties and export it again, or write its members here"
 )
 _SPACED = "the name {!r} has spaces and no quotes (as in print, where underscores can be lost); it is kept as written"
@@ -339,7 +339,7 @@ class _Parser:
                 raise self.at.expected("STRUCT")
             body, _ = self.declare.sections()
             if not body.members and not found.errors:
-                found.add(position.warning(f"the type {name!r} has no members, so that nothing can have this type"))
+                found.add(position.warning(f"the type {name!r} has no members, so nothing can have this type"))
             self.at.accept(";")
             self.at.expect_word("END_TYPE")
         return TypeDeclaration(name, body, position, faults=(*found.errors, *found.warnings))

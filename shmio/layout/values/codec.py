@@ -318,7 +318,9 @@ class _String:
         text = _encode_text(value, self._encoding, self._name)
         actual = len(text) // self._unit
         if actual > self._length:
-            raise ValueRangeError(f"{self._name}: {actual} characters do not fit")
+            raise ValueRangeError(
+                f"{self._name}: the text has {actual} characters, but at most {self._length} are allowed"
+            )
         return (self._head.pack(self._length, actual) + text).ljust(self._size, b"\0")
 
 
@@ -341,7 +343,7 @@ class _S5Time:
             if 0 <= ms <= 999 * base and ms % base == 0:
                 return self._struct.pack(code << 12 | int(str(ms // base), 16))
         if 0 <= ms <= _MAX_S5_MS:
-            raise ValueRangeError(f"S5TIME: {ms} ms needs more than three digits of any time base")
+            raise ValueRangeError(f"S5TIME: {ms} ms cannot be stored exactly, because an S5TIME has three digits")
         raise out_of_range(value, "S5TIME", 0, _MAX_S5_MS)
 
 

@@ -47,7 +47,7 @@ class Archive:
         with self._opened() as archive:
             self.names = frozenset(archive.namelist())
             if DESCRIPTION not in self.names:
-                raise ModelError(f"it has no {DESCRIPTION}, so that it is not an FMU")
+                raise ModelError(f"it has no {DESCRIPTION}, so it is not an FMU")
             size = archive.getinfo(DESCRIPTION).file_size
             if size > MAX_DESCRIPTION_BYTES:
                 raise ModelError(f"{DESCRIPTION} has {size} bytes; expected at most {MAX_DESCRIPTION_BYTES}")
@@ -62,7 +62,7 @@ class Archive:
         """
         with self._opened() as archive:
             if archive.read(DESCRIPTION) != self.description:
-                raise ModelError("the file was changed while it was loaded: run shmio-supervisor reload")
+                raise ModelError("the file was changed while it was loaded; run shmio-supervisor reload")
             folder = Extracted()
             try:
                 archive.extractall(folder.path)
@@ -102,7 +102,7 @@ def _check(files: list[zipfile.ZipInfo]) -> None:
     for file in files:
         name = file.filename
         if name.startswith("/") or "\\" in file.orig_filename or ".." in PurePosixPath(name).parts:
-            raise ModelError(f"the file {shorten(printable(name))!r} is outside of the archive")
+            raise ModelError(f"the file {shorten(printable(name))!r} would lie outside the archive's folder")
         if file.flag_bits & _ENCRYPTED:
             raise ModelError(f"the file {shorten(printable(name))!r} is encrypted")
         if stat.S_ISLNK(file.external_attr >> 16):

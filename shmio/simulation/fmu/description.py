@@ -16,7 +16,7 @@ from shmio.logs import printable
 from shmio.simulation.fmu.archive import DESCRIPTION, Archive
 from shmio.simulation.model import Declaration, Input, Output, Parameter
 
-EXTRA: Final = "an FMU needs another library: pip install 'shmio[fmu]'"
+EXTRA: Final = "an FMU needs another library; run pip install 'shmio[fmu]'"
 MAX_STRING: Final = 254
 TYPES: Final = {
     "Real": "LREAL",

@@ -177,7 +177,7 @@ class FmuModel(Model):
                 size_s, tries, halvings = size_s / 2, 0, halvings + 1
             if tries >= MAX_REPEATS or halvings >= MAX_HALVINGS:
                 break
-        raise FmuError(f"it has discarded its step at {self._now_s:g} s again and again")
+        raise FmuError(f"it has discarded its step at {self._now_s:g} s repeatedly")
 
     def _fail(self, error: ShmioError) -> ModelError:
         self._failure = f"{error}{REMEDY}"

@@ -38,12 +38,12 @@ def segment(instance: str) -> Iterator[Segment]:
     ("text", "error"),
     [
         (None, "c.toml: No such file or directory"),
-        ("[[injection]\n", "c.toml: not TOML"),
+        ("[[injection]\n", "c.toml: the file is not valid TOML"),
         ("", "c.toml: injection: this key is needed"),
         (GOOD.replace("amplitude = 1", ""), "injection[0].amplitude: this key is needed for operation 'noise'"),
-        (GOOD.replace("cell/a", "cell/c"), "injection[0].target: cell/c: no such register in DB1"),
+        (GOOD.replace("cell/a", "cell/c"), "injection[0].target: cell/c: DB1 has no such register"),
         (GOOD + GOOD.replace('"x"', '"y"') + 'when = "a >"\n', "injection[1].when: at character 4: expected"),
-        (GOOD + "for = 1\n", "injection[0].for: unknown key; did you mean for_s?"),
+        (GOOD + "for = 1\n", "injection[0].for: unknown key; did you mean 'for_s'?"),
     ],
 )
 def test_faulty_file_injects_nothing(
@@ -83,7 +83,7 @@ def test_campaign_by_time_notes_that_time_is_paused(
     cell.clock = clock
     options = Namespace(seed=1, file=file, from_now=from_now, keep=False, for_s=None, json=False)
     assert run_campaign(cast("Cell", cell), options) == 0
-    stands = "time is paused at 3.000 s: start_s and end_s wait until shmio step moves it\n"
+    stands = "time is paused at 3.000 s; start_s and end_s wait until shmio step moves time\n"
     assert capsys.readouterr().err == (stands if clock is Still.clock and from_now else "")
 
 

@@ -94,7 +94,7 @@ def test_info_describes_a_file(file: str, segment: Segment, said: Output) -> Non
     assert main(["info", file]) == 0
     out, _ = said()
     assert out[0] == f"{file}: {found['size'] / 1e6:.2f} MB, closed"
-    assert any("press: DB1, 1 registers, 2 bytes" in line for line in out)
+    assert any("press: DB1, 1 register, 2 bytes" in line for line in out)
     assert any(f"{gap['count']} frames, 1 to {gap['last']}: overtaken" in line for line in out)
 
 
@@ -175,7 +175,9 @@ def test_cat_limits_its_output_to_the_time_range(file: str, said: Output) -> Non
     out, [line] = said()
     assert out == []
     when = r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{3}"
-    assert re.search(rf": nothing of what was asked for is in it then; it goes from {when} to {when}$", line)
+    assert re.search(
+        rf": nothing that you selected was recorded in that time; the recording goes from {when} to {when}$", line
+    )
     assert main(["cat", "--json", file, "--to", "0", "cell"]) == 0
     out, err = said()
     assert ([line["event"] for line in objects(out)], err) == ([1], [])
@@ -205,19 +207,19 @@ def test_an_end_before_its_beginning_is_refused(file: str, verb: list[str], said
 
 def test_path_without_a_register_is_refused(file: str, said: Output) -> None:
     assert main(["cat", file, "cell/cout"]) == 1
-    assert said() == ([], ["cell/cout: no such register in DB1; near: count"])
+    assert said() == ([], ["cell/cout: DB1 has no such register; did you mean 'count'?"])
     assert main(["cat", file, "cell/x*"]) == 1
-    assert said()[1] == ["cell/x*: no register of this recording has such a path"]
+    assert said()[1] == ["cell/x*: this recording has no such register"]
     assert main(["cat", file, "cell/speed"]) == 0, "only the second layout has speed"
     assert main(["cat", file, "count"]) == 1
-    assert said()[1] == ["count: 'count' is not one of the 2 sources: write cell/… or press/…"]
+    assert said()[1] == ["count: 'count' is not one of the 2 sources; begin the path with cell/… or press/…"]
 
 
 def test_cat_of_several_files_refers_to_merge(file: str, said: Output) -> None:
     assert main(["cat", file, file]) == 1
     assert said() == (
         [],
-        [f"{file} is a file, but cat prints only one: shmio-dump merge FILE… -o NEW joins them"],
+        [f"{file} is a file, but cat prints only one; join the files with shmio-dump merge FILE… -o NEW"],
     )
 
 
@@ -252,9 +254,9 @@ def test_empty_recording_is_undamaged(segment: Segment, tmp_path: Path, said: Ou
     work.close()
     path = work.output.path
     assert main(["verify", str(path)]) == 0
-    assert said() == ([f"{path}: closed; nothing is recorded in it, no damage"], [])
+    assert said() == ([f"{path}: closed; the recording is empty, no damage"], [])
     assert main(["cut", str(path), "-o", "x"]) == 1
-    assert said() == ([], [f"{path}: nothing is recorded in it"])
+    assert said() == ([], [f"{path}: the recording is empty"])
 
 
 def test_unclosed_recording_is_read_and_reported(file: str, said: Output) -> None:
@@ -265,7 +267,9 @@ def test_unclosed_recording_is_read_and_reported(file: str, said: Output) -> Non
     assert (found["closed"], found["damage"]) == (False, [])
     assert main(["info", "cut.mem"]) == 0
     told = said()[0][0].partition(" MB, ")[2]
-    assert re.fullmatch(r"not closed \(it ends within .*\): still being written, or its recorder was killed", told)
+    assert re.fullmatch(
+        r"not closed \(it ends within .*\): it is still being written, or its recorder was killed", told
+    )
     assert main(["verify", "cut.mem"]) == 0
     assert said()[0][0].startswith(f"cut.mem: {told}; "), "the same words as info"
     assert main(["cat", "cut.mem", "cell"]) == 0
@@ -458,7 +462,7 @@ def test_the_end_of_the_instance_ends_a_recording(segment: Segment) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--source", "pres"], "no source 'pres'; there are: cell, press"),
+        (["--source", "pres"], "unknown source 'pres'; did you mean 'press'?"),
         (["-o", "text"], "cannot create a recording in text: File exists"),
     ],
 )

@@ -151,7 +151,7 @@ def test_a_table_of_events(form: str, capsys: pytest.CaptureFixture[str]) -> Non
         ("noted", "", "", "", "", "0"),
     ]
     assert main(["export", "a.mem", "--events", "-o", "folder"]) == 1
-    assert "--events makes one table" in capsys.readouterr().err
+    assert "--events writes one table" in capsys.readouterr().err
 
 
 def test_events_have_the_paths_of_their_own_block(capsys: pytest.CaptureFixture[str]) -> None:

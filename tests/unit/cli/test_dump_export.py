@@ -193,9 +193,9 @@ def test_refused_export_leaves_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert main(["export", "kinds.mem", "-o", "out", "--from", "100"]) == 1
-    assert "no frames of kinds.mem are in that time" in capsys.readouterr().err
+    assert "kinds.mem has no frames in that time" in capsys.readouterr().err
     assert main(["export", "kinds.mem", "-o", "out", "--source", "x"]) == 1
-    assert capsys.readouterr().err == "no source 'x'; there are: cell\n"
+    assert capsys.readouterr().err == "unknown source 'x'; valid: cell\n"
     assert main(["export", "kinds.mem", "-o", "out"]) == 0
     before = Path("out/cell.parquet").read_bytes()
     assert main(["export", "kinds.mem", "-o", "out"]) == 1
@@ -204,7 +204,7 @@ def test_refused_export_leaves_nothing(
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     assert main(["export", "kinds.mem", "-o", "more"]) == 1
-    assert capsys.readouterr().err == "pyarrow is not installed: pip install 'shmio[analysis]'\n"
+    assert capsys.readouterr().err == "pyarrow is not installed; run pip install 'shmio[analysis]'\n"
     assert not Path("more").exists()
 
 
@@ -248,11 +248,11 @@ def test_suffix_chooses_the_format(tmp_path: Path, capsys: pytest.CaptureFixture
 
 def test_unsuitable_output_name_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", "kinds.mem", "-o", "x.csv", "--format", "parquet"]) == 1
-    message = "x.csv: the ending of its name contradicts --format parquet; change one of the two\n"
+    message = "x.csv: the ending of this name contradicts --format parquet; change one of the two\n"
     assert capsys.readouterr().err == message
     varied(tmp_path / "a.mem")
     assert main(["export", "a.mem", "-o", "x.csv"]) == 1
-    assert capsys.readouterr().err == "x.csv holds one block, and there are 2 (cell, press): name a folder\n"
+    assert capsys.readouterr().err == "x.csv can hold only one block, but there are 2 (cell, press); name a folder\n"
     assert not Path("x.csv").exists()
     assert main(["export", "a.mem", "-o", "x.csv", "--source", "press"]) == 0
 
@@ -260,10 +260,10 @@ def test_unsuitable_output_name_is_refused(tmp_path: Path, capsys: pytest.Captur
 @pytest.mark.parametrize(
     ("name", "remedy"),
     [
-        ("x.xlsx", "-o x.csv makes a file that Excel and LibreOffice open"),
-        ("run.1.ODS", "-o run.1.csv makes a file that Excel and LibreOffice open"),
+        ("x.xlsx", "-o x.csv writes a file that Excel and LibreOffice can open"),
+        ("run.1.ODS", "-o run.1.csv writes a file that Excel and LibreOffice can open"),
         ("x.mem", "shmio-dump cut FILE… -o x.mem writes a part of a recording to a new one"),
-        ("x.h5", "it writes .parquet, .csv, .mcap, by the end of the name, or into a folder by --format"),
+        ("x.h5", "choose a name that ends in one of .parquet, .csv, .mcap, or a folder and --format"),
     ],
 )
 @pytest.mark.parametrize("asked", [(), ("--format", "csv")])

@@ -72,9 +72,9 @@ def test_cut_by_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert main(["info", "part.mem"]) == 0
     assert "converted by shmio-dump cut" in capsys.readouterr().out
     assert main(["cut", str(file), "-o", "part.mem"]) == 1
-    assert capsys.readouterr().err == "part.mem exists already: choose another name, no file is overwritten\n"
+    assert capsys.readouterr().err == "part.mem: this file exists already; choose another name, or remove the file\n"
     assert main(["cut", str(file), "-o", "none.mem", "--from", "100"]) == 1
-    assert re.fullmatch(r"\S+ has nothing in that time: it was recorded from .* to .*\n", capsys.readouterr().err)
+    assert re.fullmatch(r"\S+ has nothing in that time; it goes from .* to .*\n", capsys.readouterr().err)
     assert not Path("none.mem").exists()
 
 
@@ -85,8 +85,8 @@ def test_cut_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert json.loads(capsys.readouterr().out) == {"file": "part.mem", "frames": 47, "events": 1, "damage": []}
     assert main(words) == 1
     out, err = capsys.readouterr()
-    assert json.loads(out) == {"error": "part.mem exists already: choose another name, no file is overwritten"}
-    assert err == "part.mem exists already: choose another name, no file is overwritten\n"
+    assert json.loads(out) == {"error": "part.mem: this file exists already; choose another name, or remove the file"}
+    assert err == "part.mem: this file exists already; choose another name, or remove the file\n"
 
 
 def test_cut_by_source_and_register(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -207,7 +207,7 @@ def test_recover_of_a_file_that_is_no_recording(tmp_path: Path, capsys: pytest.C
     with build(Path("x.mem")):
         pass
     assert main(["recover", "x.mem"]) == 1
-    assert capsys.readouterr().err == "x.mem: nothing is recorded in it\n"
+    assert capsys.readouterr().err == "x.mem: the recording is empty\n"
     for content, message in ((b"", "is empty"), (b"nothing", "is not a recording"), (MAGIC, "has no content")):
         Path("x.mem").write_bytes(content)
         assert main(["recover", "x.mem"]) == 1

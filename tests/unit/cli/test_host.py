@@ -212,7 +212,7 @@ def test_faulty_file_injects_nothing(segment: Segment, capsys: pytest.CaptureFix
     def test(remote: Output, local: Output, _: Plant) -> None:
         words = ("inject", "--seed", "7", "--file", str(file))
         assert remote(*words) == local(*words)
-        assert "injection[1].target: cell/stop: no such register" in remote(*words)[2]
+        assert "injection[1].target: cell/stop: DB1 has no such register" in remote(*words)[2]
         assert remote("inject") == (0, "", "")
 
     both(segment, capsys, test)
@@ -226,7 +226,7 @@ def test_unusable_host_is_reported(capsys: pytest.CaptureFixture[str], tmp_path:
     assert main(["get", "--host", "nonsense", "cell"]) == 1
     assert capsys.readouterr().err == "'nonsense' is not an address; expected host:port, such as 127.0.0.1:8089\n"
     assert main(["get", "--host", "127.0.0.1:1", "--instance", "x", "cell"]) == 1
-    assert capsys.readouterr().err == "--host already names the instance: remove -c and --instance\n"
+    assert capsys.readouterr().err == "--host already names the instance; remove -c and --instance\n"
     assert main(["get", "--host", "127.0.0.1:1", "--token-file", str(tmp_path / "none"), "cell"]) == 1
     assert capsys.readouterr().err == f"{tmp_path / 'none'}: No such file or directory\n"
 
@@ -283,7 +283,7 @@ def test_step_needs_consent_if_a_source_has_a_device(segment: Segment, capsys: p
     def test(remote: Output, local: Output, _: Plant) -> None:
         refused = remote("step")
         assert refused == local("step")
-        assert (refused[0], "cell goes on in real time; --yes steps anyway" in refused[2]) == (1, True)
+        assert (refused[0], "source cell continues in real time; to step anyway, add --yes" in refused[2]) == (1, True)
         assert remote("step", "--pause", "--yes")[0] == 0
         assert remote("step", "--pause")[0] == 0, "consent is needed only once"
 

@@ -83,7 +83,7 @@ def test_errors_name_file_line_and_column(files: tuple[str, str], capsys: pytest
     assert main([files[0], "--json"]) == 1
     captured = capsys.readouterr()
     assert json.loads(captured.out) == {"error": captured.err.rstrip()}
-    assert captured.err.startswith(f"{files[0]}:1:29: error: expected a known type, found 'T'")
+    assert captured.err.startswith(f"{files[0]}:1:29: error: unknown type 'T'")
     assert len(captured.err.splitlines()) == 1
 
 
@@ -92,7 +92,7 @@ def test_files_that_cannot_be_read(tmp_path: Path, capsys: pytest.CaptureFixture
     for name, message in (
         ("none.db", "No such file"),
         (".", "Is a directory"),
-        ("utf16.db", "utf16.db:1:1: error: expected UTF-16-LE"),
+        ("utf16.db", "utf16.db:1:1: error: the file has the byte order mark of UTF-16-LE"),
     ):
         assert main([str(tmp_path / name)]) == 1
         captured = capsys.readouterr()
@@ -153,9 +153,9 @@ def test_one_block_of_several(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert main([str(path), "--type-bytes", "TON_TIME=18", "--type-bytes", "Nope=2"]) == 0
     captured = capsys.readouterr()
     assert "Timers: 18 bytes" in captured.out
-    assert captured.err == "warning: --type-bytes: nothing has the type 'Nope'\n"
+    assert captured.err == "warning: --type-bytes: no member has the type 'Nope'\n"
     assert main([str(path), "--block", "other"]) == 1
-    assert "--block: no data block 'other'; there are: Timers, Plain" in capsys.readouterr().err
+    assert "--block: unknown data block 'other'; valid: Timers, Plain" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("size", ["TON_TIME", "=1", "TON_TIME=0", "TON_TIME=9999999", "TON_TIME=x"])

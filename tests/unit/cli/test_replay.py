@@ -92,7 +92,7 @@ def test_step_notes_a_replay_that_is_paused_or_over(
         assert main(["step", "--instance", instance, *words]) == 0
         return capsys.readouterr().out
 
-    stands = "; the replay of cell was {} and did not move: shmio replay play starts it\n"
+    stands = "; the replay of cell was {} and did not move; start it with shmio replay play\n"
     assert step().endswith(", steps of 50 ms\n")
     assert replay(instance, "pause") == 0
     assert step("--count", "2", "--dt-ms", "20").endswith("of 20 ms, step size 50 ms" + stands.format("paused"))

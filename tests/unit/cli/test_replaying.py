@@ -92,7 +92,7 @@ payload = "frames"
     told = "mqtt.topic[1].match: panel is left out: the recording has no such source"
     assert [told in warning for warning in prepared.plan.warnings].count(True) == 1
     config.write_text(f'{CONFIG}{mqtt}[[mqtt.topic]]\nmatch = "pannel"\npayload = "frames"\n')
-    with pytest.raises(ConfigError, match="'pannel': frames need the name of a whole source"):
+    with pytest.raises(ConfigError, match="'pannel' is not the name of a source"):
         prepare(config, "replay", {"file": [str(file)]})
 
 
@@ -132,12 +132,12 @@ def test_replay_source_has_the_registers_of_the_recording(
     assert main(["check"]) == 0
     assert "source cell: DB1, 2 registers, 4 bytes" in capsys.readouterr().out
     for more, error in (
-        ('layout = "db1.db"', "source[0].layout: a replay does not take this key"),
+        ('layout = "db1.db"', "source[0].layout: leave out this key in a replay"),
         ("speed = 0", "source[0].speed: "),
         ("start = 99", "source[0].start, end: there is nothing to play"),
         ('source = "none"', "source[0].source: "),
         ('injections = "some"', "source[0].injections: "),
-        ("spede = 1.0", "source[0].spede: unknown key; did you mean speed?"),
+        ("spede = 1.0", "source[0].spede: unknown key; did you mean 'speed'?"),
     ):
         config.write_text(text + more)
         assert main(["check"]) == 1

@@ -194,7 +194,7 @@ def test_block_with_types_in_other_files(order: list[str], capsys: pytest.Captur
         Path("supervisor.toml").write_text(Path("supervisor.toml").read_text().replace('# host = ""', 'host = "plc"'))
     capsys.readouterr()
     assert main(["check"]) == 0
-    assert "DB7, 1 registers, 4 bytes" in capsys.readouterr().out
+    assert "DB7, 1 register, 4 bytes" in capsys.readouterr().out
 
 
 def test_a_block_without_a_number_in_its_name(capsys: pytest.CaptureFixture[str]) -> None:
@@ -265,7 +265,7 @@ def test_an_idle_emulator_plays_all_blocks_of_its_files(example: Edit, capsys: p
     capsys.readouterr()
     assert main(["check"]) == 1
     assert (
-        "emulator[0].layout: the files contain several data blocks (DB7, DB201); choose one by block"
+        "emulator[0].layout: the files contain several data blocks (DB7, DB201); choose one with the key block"
         in capsys.readouterr().err
     )
 
@@ -312,7 +312,7 @@ def test_init_of_the_example_notes_a_name_in_use(capsys: pytest.CaptureFixture[s
     Path("new").mkdir()
     assert main(["init"]) == 0
     assert main(["init", "-c", "new/supervisor.toml"]) == 0
-    assert "is called a50, too: to run both, call this one a50-" in capsys.readouterr().out
+    assert "has the name a50, too; to run both, give this one the name a50-" in capsys.readouterr().out
 
 
 def test_init_chooses_the_block_with_the_number_in_the_properties(capsys: pytest.CaptureFixture[str]) -> None:
@@ -321,7 +321,7 @@ def test_init_chooses_the_block_with_the_number_in_the_properties(capsys: pytest
     assert main(["init", "two.db", "plc.ini"]) == 0
     assert load(Path("supervisor.toml")).source[0].block == "DB7"
     assert main(["check"]) == 0
-    assert "DB7, 1 registers, 4 bytes" in capsys.readouterr().out
+    assert "DB7, 1 register, 4 bytes" in capsys.readouterr().out
 
 
 def test_init_names_the_missing_keys_of_the_properties_file(capsys: pytest.CaptureFixture[str]) -> None:
@@ -369,7 +369,7 @@ def test_init_of_several_blocks_makes_a_source_of_each(capsys: pytest.CaptureFix
         text.replace('# host = ""', 'host = "plc"').replace("# dbNumber =", "dbNumber = 5")
     )
     assert main(["check"]) == 0
-    assert "source db9 at plc:102: DB9, 1 registers, 800 bytes" in capsys.readouterr().out
+    assert "source db9 at plc:102: DB9, 1 register, 800 bytes" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("numbered", [True, False])
@@ -387,7 +387,8 @@ def test_init_of_several_blocks_with_emulated_controllers(numbered: bool, capsys
 def test_init_asks_which_of_many_blocks(choice: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     Path("all.db").write_text("".join(block(f"DB{number}", "Int") for number in range(1, 61)))
     assert main(["init", "all.db", *choice]) == 1
-    assert re.search(r"--block: no data block 'nope'" if choice else "choose one by --block", capsys.readouterr().err)
+    wanted = r"--block: unknown data block 'nope'" if choice else "choose one by --block"
+    assert re.search(wanted, capsys.readouterr().err)
     assert main(["init", "all.db", "--block", "db44"]) == 0
     assert [source.block for source in load(Path("supervisor.toml")).source] == ["DB44"]
 
@@ -411,13 +412,13 @@ def test_faults_of_other_blocks_are_ignored(example: Edit, capsys: pytest.Captur
     assert ": DB201, 22 registers, 2180 bytes" in capsys.readouterr().out
     example('block = "DB201"\n', 'block = "Timers"\n')
     assert main(["check"]) == 1
-    assert "the system type TON_TIME is not supported" in capsys.readouterr().err
+    assert "shmio does not know the members of the system type TON_TIME" in capsys.readouterr().err
     example('block = "Timers"\n', 'block = "Timers"\ndbNumber = 5\ntype_bytes = { TON_TIME = 16, Nope = 2 }\n')
     example('writable = ["Outputs", "Robot_*/*"]', "")
     assert main(["check"]) == 0
     out = capsys.readouterr().out
-    assert "Timers, 1 registers, 16 bytes" in out
-    assert "source[0].type_bytes: nothing in Timers has the type 'Nope'" in out
+    assert "Timers, 1 register, 16 bytes" in out
+    assert "source[0].type_bytes: no member in Timers has the type 'Nope'" in out
     example("TON_TIME = 16", "TON_TIME = 0")
     assert main(["check"]) == 1
     assert "source[0].type_bytes" in capsys.readouterr().err
@@ -435,8 +436,8 @@ def test_warnings_are_shown_with_faults(example: Edit, capsys: pytest.CaptureFix
     example('kind = "s7"', 'kind = "s8"')
     assert main(["check"]) == 1
     fault, warning = capsys.readouterr().err.splitlines()
-    assert "emulator[0].kind: 's8' is unknown" in fault
-    assert warning == "supervisor.toml: warning: source[0].writable: 'Nothing' names nothing in DB201"
+    assert "emulator[0].kind: unknown kind 's8'" in fault
+    assert warning == "supervisor.toml: warning: source[0].writable: 'Nothing' matches no register of DB201"
 
 
 def test_check_prints_processes_sources_and_sizes(
@@ -534,7 +535,7 @@ def test_check_as_json(example: Edit, instance: str, capsys: pytest.CaptureFixtu
         "met": None,
     }  # fmt: skip
     [warning] = found.pop("warnings")
-    assert "'Outpts' names nothing" in warning
+    assert "'Outpts' matches no register" in warning
     found.pop("notes")  # they depend on the host: its users and the ports in use
     assert found == {
         "config": "supervisor.toml", "instance": instance, "injections": [], "replay": [], "alerts": [],
@@ -567,14 +568,14 @@ TAKEN = "is already the port of emulator[0].listen (127.0.0.1:1102); choose anot
 @pytest.mark.parametrize(
     ("old", "new", "error"),
     [
-        ("port = 1102", "prot = 1102", "source[0].prot: unknown key; did you mean port?"),
+        ("port = 1102", "prot = 1102", "source[0].prot: unknown key; did you mean 'port'?"),
         ("port = 1102", 'port = "eleven"', "source[0].port: expected a whole number, got text"),
         ("port = 1102", 'port = "1102"', "source[0].port: expected a whole number, got text"),
         ('host = "127.0.0.1"', 'host = "127.0.0.1:1102"', "source[0].host: '127.0.0.1:1102' is not a host name"),
         ('host = "127.0.0.1"  ', "# ", 'source[0].host: this key is needed (source "cell")\n'),
-        ("port = 1102", 'model = "S7_2000"', "source[0].model: 'S7_2000' is unknown; valid: S7_300, S7_400, S7_1200"),
+        ("port = 1102", 'model = "S7_2000"', "source[0].model: unknown model 'S7_2000'; did you mean 'S7_1200'?"),
         ("period_ms = 20", "options = {}", "source[0].options: unknown key"),
-        ('program = "a50"', 'program = "a50"\nblock = "b"', "emulator[0].block: no data block 'b'; there are: DB201"),
+        ('program = "a50"', 'program = "a50"\nblock = "b"', "emulator[0].block: unknown data block 'b'; valid: DB201"),
         ('connector = "s7"', 'connector = "s7"\nstale_ms = 20', "source[0].stale_ms: 20 is less than two periods"),
         ('connector = "s7"', 'connector = "s7"\nrealtime_priority = 100', "source[0].realtime_priority: expected "),
         ('name = "a50"', 'name = "a50"\ngroup = "no such"', "instance.group: this host has no group 'no such'"),
@@ -584,14 +585,14 @@ TAKEN = "is already the port of emulator[0].listen (127.0.0.1:1102); choose anot
         (
             'directory = "dumps"',
             'directory = "/proc/dumps"',
-            "recorder.directory: /proc/dumps cannot be made",
+            "recorder.directory: /proc/dumps cannot be created",
         ),
         ('directory = "dumps"', f'directory = "{"x" * 300}"', "recorder.directory: "),
         ("[grpc]", '[grpc]\ntls = {certificate = "db201.db", key = "k"}', "grpc.tls.key: "),
         ("[grpc]", '[grpc]\ntls = {certificate = "db201.db", key = "db201.db"}', "grpc.tls.certificate: "),
-        ('connector = "s7"', 'connector = "s8"', "source[0].connector: no connector 's8'; there are:"),
-        ('kind = "s7"', 'kind = "s8"', "emulator[0].kind: 's8' is unknown; valid: s7"),
-        ('program = "a50"', 'program = "a51"', "emulator[0].program: 'a51' is unknown; valid: a50"),
+        ('connector = "s7"', 'connector = "s8"', "source[0].connector: unknown connector 's8'; valid: "),
+        ('kind = "s7"', 'kind = "s8"', "emulator[0].kind: unknown kind 's8'; valid: s7"),
+        ('program = "a50"', 'program = "a51"', "emulator[0].program: unknown program 'a51'; did you mean 'a50'?"),
         ('"127.0.0.1:8090"', '"127.0.0.1:1102"', f"grpc.listen[1]: 127.0.0.1:1102 {TAKEN}"),
         ('"127.0.0.1:8090"', '"localhost:1102"', f"grpc.listen[1]: localhost:1102 {TAKEN}"),
         ('"127.0.0.1:8090"]', '"0.0.0.0:1102"]\ninsecure = true', f"grpc.listen[1]: 0.0.0.0:1102 {TAKEN}"),
@@ -604,7 +605,7 @@ TAKEN = "is already the port of emulator[0].listen (127.0.0.1:1102); choose anot
         (
             '"127.0.0.1:8090"]',
             '"a..b:1103"]\ninsecure = true',
-            "grpc.listen[1]: a..b:1103: 'a..b' cannot be resolved (it",
+            "grpc.listen[1]: a..b:1103: 'a..b' cannot be resolved (this",
         ),
         (
             '"127.0.0.1:8090"]',
@@ -657,14 +658,14 @@ def test_faults_of_a_layout_have_line_and_column(example: Edit, capsys: pytest.C
     assert "db201.db: not a regular file; name the file of a data block" in capsys.readouterr().err
 
 
-WRITABLE = '"Outputs"', '"{}"', "source[0].writable: '{}' names nothing in "
+WRITABLE = '"Outputs"', '"{}"', "source[0].writable: '{}' matches no register of "
 NONFINITE = "period_ms = 20", 'period_ms = 20\nallow_nonfinite = ["{}"]'
-UNKNOWN_NAME = *NONFINITE, "source[0].allow_nonfinite: '{}' names nothing in "
-OTHER_TYPE = *NONFINITE, "source[0].allow_nonfinite: '{}' names no REAL or LREAL in DB201"
+UNKNOWN_NAME = *NONFINITE, "source[0].allow_nonfinite: '{}' matches no register of "
+OTHER_TYPE = *NONFINITE, "source[0].allow_nonfinite: '{}' matches no REAL or LREAL of DB201"
 RECORDED = (
     'directory = "dumps"',
     'directory = "dumps"\nregisters = ["{}"]',
-    "recorder.registers: {}: no register has such a path",
+    "recorder.registers: {}: no register has this path",
 )
 
 
@@ -733,7 +734,7 @@ def test_a_broker_for_other_hosts_needs_mosquitto(
     for verb in ("check", "up"):
         assert main([verb]) == 1
         error = capsys.readouterr().err
-        assert "mqtt.listen: 0.0.0.0:1883 can be reached from other hosts" in error
+        assert "mqtt.listen: other hosts can reach 0.0.0.0:1883" in error
         assert "needs mosquitto" in error
 
 
@@ -744,12 +745,13 @@ def test_a_block_is_chosen_by_its_number_or_name(example: Edit, key: str, capsys
     assert main(["check"]) == 1
     error = capsys.readouterr().err
     assert (
-        "source[0].layout: the files contain several data blocks (DB201, DB7); choose one by block or dbNumber" in error
+        "source[0].layout: the files contain several data blocks (DB201, DB7); choose one with the key block or "
+        "dbNumber" in error
     )
     example("port = 1102", f"port = 1102\n{key}")
     example('writable = ["Outputs", "Robot_*/*"]', "")
     assert main(["check"]) == 0
-    assert ": DB7, 1 registers, 2 bytes" in capsys.readouterr().out
+    assert ": DB7, 1 register, 2 bytes" in capsys.readouterr().out
 
 
 def test_help_lists_the_arguments_of_init_and_the_modes(capsys: pytest.CaptureFixture[str]) -> None:
@@ -788,7 +790,7 @@ def test_log_mode_needs_a_recorder_section(example: Edit, capsys: pytest.Capture
     Path("supervisor.toml").write_text(Path("supervisor.toml").read_text().partition("\n[recorder]")[0])
     assert main(["up", "--mode", "log"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
-    assert "needs a [recorder] section: add one" in line
+    assert "needs a [recorder] section; add one" in line
 
 
 @pytest.mark.parametrize("arguments", [[], ["fly"], ["up", "--mode", "dead"], ["restart"], ["logs", "-n", "-1"]])
@@ -818,7 +820,7 @@ def test_verbs_report_that_no_instance_is_running(
 
 def test_down_without_an_instance_does_not_suggest_up(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["down", "--instance", instance]) == 1
-    assert capsys.readouterr().err == f"no instance {instance!r} is running: there is nothing to stop\n"
+    assert capsys.readouterr().err == f"no instance {instance!r} is running: nothing to stop\n"
 
 
 @pytest.mark.parametrize("verb", [["down"], ["restart", "cell"], ["logs"]])
@@ -1019,7 +1021,7 @@ def test_check_warns_of_what_an_emulator_cannot_serve(folder: Path, capsys: pyte
     )
     assert main(["check"]) == 0
     out = capsys.readouterr().out
-    assert "'Enabel' names nothing in DB7; did you mean Enable?\n" in out
+    assert "'Enabel' matches no register of DB7; did you mean 'Enable'?\n" in out
     assert "it reads DB7 of emulator 'plc', which serves only DB8\n" in out
     assert "the initial value NOWHERE of Enable cannot be read as INT; an emulated PLC starts it at 0\n" in out
 
@@ -1046,9 +1048,9 @@ def test_check_prints_declared_injections(example: Edit, capsys: pytest.CaptureF
     [
         ("Outputs/100", "Outputs/2000", "target: cell/Outputs: index [2000] is outside [0..1099]"),
         ("value = 7", "value = 256", "value: Outputs/100: BYTE: "),
-        ("value = 7", 'value = 7\nwhen = "cell/Nothing > 1"', "when: cell/Nothing: no such register in DB201"),
+        ("value = 7", 'value = 7\nwhen = "cell/Nothing > 1"', "when: cell/Nothing: DB201 has no such register"),
         ("value = 7", 'value = 7\nwhen = "cell/Inputs/1 >"', "when: at character 16: expected a register or a number"),
-        ("value = 7", "value = 7\nfor = 1", "for: unknown key; did you mean for_s?"),
+        ("value = 7", "value = 7\nfor = 1", "for: unknown key; did you mean 'for_s'?"),
         ("Outputs/100", "Outputs/100/in", "target: an injection toward a device needs `armed = true` in source 'cell'"),
     ],
 )
@@ -1095,21 +1097,21 @@ def test_all_faults_are_reported_together(example: Edit, capsys: pytest.CaptureF
     for verb in ("check", "up"):
         assert main([verb]) == 1
         err = capsys.readouterr().err.splitlines()
-        assert [re.split("; there|; valid", unplaced(line).removeprefix("supervisor.toml: "))[0] for line in err] == [
+        assert [re.split("; did you|; valid", unplaced(line).removeprefix("supervisor.toml: "))[0] for line in err] == [
             'source[0].host: this key is needed (source "cell")',
             (
                 "source[0].dbNumber: this key is needed, because the layout 'Cell' has no number in its name "
                 '(source "cell")'
             ),
-            'source[0].slott: unknown key; did you mean slot? (source "cell")',
-            "emulator[0].program: 'A50' is unknown",
-            "source[1].connector: no connector 'S7'",
-            "warning: source[0].writable: 'Outputs' names nothing in Cell",
-            "warning: source[0].writable: 'Robot_*/*' names nothing in Cell",
+            "source[0].slott: unknown key",
+            "emulator[0].program: unknown program 'A50'",
+            "source[1].connector: unknown connector 'S7'",
+            "warning: source[0].writable: 'Outputs' matches no register of Cell",
+            "warning: source[0].writable: 'Robot_*/*' matches no register of Cell",
         ]
         assert all(re.match(r"supervisor\.toml:([0-9]+: | warning: )", line) for line in err)
-    assert "did you mean a50?" in err[3]
-    assert "did you mean s7?" in err[4]
+    assert "did you mean 'a50'?" in err[3]
+    assert "did you mean 's7'?" in err[4]
 
 
 def test_faults_of_keys_connector_and_layout_are_reported_together(
@@ -1121,9 +1123,9 @@ def test_faults_of_keys_connector_and_layout_are_reported_together(
     Path("broken.db").write_text("DATA_BLOCK DB201 STRUCT a : Nope; b : Nope2; END_STRUCT; BEGIN END_DATA_BLOCK")
     assert main(["check"]) == 1
     err = capsys.readouterr().err.splitlines()
-    assert [re.sub(r"^.*(supervisor\.toml|broken\.db):([0-9]+):", r"\2", line)[:40] for line in err] == [
-        "11 source[0].port: expected a whole numb",
-        "12 source[0].period_ms: expected a numbe",
-        "129: error: expected a known type, found",
-        "139: error: expected a known type, found",
+    assert [re.sub(r"^.*(supervisor\.toml|broken\.db):([0-9]+):", r"\2", line)[:32] for line in err] == [
+        "11 source[0].port: expected a wh",
+        "12 source[0].period_ms: expect",
+        "129: error: unknown type 'Nope'",
+        "139: error: unknown type 'Nope2",
     ]

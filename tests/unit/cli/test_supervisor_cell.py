@@ -112,7 +112,7 @@ def test_up_status_restart_logs_and_down(cell: Cell) -> None:
     assert refused.stdout == ""
     (cell.folder / "other.toml").write_text(configured.read_text())
     refused = cell.run("up", "-c", "other.toml", status=1)
-    assert f", started from {configured}: shmio-supervisor down --instance {cell.instance} stops it; " in refused.stderr
+    assert f", started from {configured}; shmio-supervisor down --instance {cell.instance} stops it; " in refused.stderr
 
     pids = {process["name"]: process["pid"] for process in status["processes"]}
     os.kill(pids["plc"], signal.SIGKILL)
@@ -122,7 +122,7 @@ def test_up_status_restart_logs_and_down(cell: Cell) -> None:
 
     assert cell.run("restart", "cell", status=0).stdout == "cell runs again\n"
     assert cell.of("cell").pid != pids["cell"]
-    assert "there are: plc, cell, grpc, broker, mqtt, recorder" in cell.run("restart", "nobody", status=1).stderr
+    assert "valid: plc, cell, grpc, broker, mqtt, recorder" in cell.run("restart", "nobody", status=1).stderr
     file = cell.folder / "supervisor.toml"
     moved = file.rename(cell.folder / "elsewhere.toml")
     assert cell.run("logs", "--instance", cell.instance, "cell", status=0).stdout

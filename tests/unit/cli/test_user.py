@@ -90,7 +90,7 @@ def test_a_number_of_lines_is_one_or_more(count: str, capsys: pytest.CaptureFixt
             (("--dt-ms", text), f"'{text}' is not a number of ms from 0.001 to 3600000")
             for text in ("0", "-5", "4e6", "x")
         ),
-        *((("--play", text), f"'{text}' is not a number above 0, at most 1000") for text in ("0", "1001", "nan")),
+        *((("--play", text), f"'{text}' is not a number above 0 and up to 1000") for text in ("0", "1001", "nan")),
     ],
 )
 def test_step_size_and_rate_have_limits(
@@ -109,7 +109,10 @@ class Keyboard(io.StringIO):
         return True
 
 
-REAL = "the instance's time is real: a step pauses it until it is released, while cell goes on in real time"
+REAL = (
+    "the instance follows real time; a step pauses its time until shmio step --release, while source cell "
+    "continues in real time"
+)
 
 
 def mode(instance: str) -> str:
@@ -122,7 +125,7 @@ def test_script_needs_yes_to_pause_real_time_over_a_device(
     running: str, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]
 ) -> None:
     assert main(["step", "--instance", running, *words]) == 1
-    assert capsys.readouterr().err == f"{REAL}; --yes steps anyway\n"
+    assert capsys.readouterr().err == f"{REAL}; to step anyway, add --yes\n"
     assert mode(running) == "wall"
 
 
@@ -135,7 +138,7 @@ def test_real_time_over_a_device_is_paused_after_consent(
         assert main(command) == 1
         told = capsys.readouterr()
         assert json.loads(told.out) == {"error": "the clock was not changed"}
-        assert told.err == f"{REAL}. Go on? [y/N] the clock was not changed\n"
+        assert told.err == f"{REAL}. Continue? [y/N] the clock was not changed\n"
     assert mode(running) == "wall"
     monkeypatch.setattr("sys.stdin", Keyboard("y\n"))
     assert main(command) == 0
@@ -330,6 +333,6 @@ def test_watch_on_a_terminal_updates_a_table_in_place(times: Segment) -> None:
         terminal.process.send_signal(signal.SIGINT)
         assert terminal.process.wait(60) == 130
     with terminal_of("watch", "--instance", times.instance, "cell/many/0..8") as terminal:
-        terminal.until(r"cell/many/3.*… and 5 more lines: enlarge the window, or use --lines")
+        terminal.until(r"cell/many/3.*… and 5 more lines; enlarge the window, or use --lines")
     with terminal_of("watch", "--lines", "--full", "--instance", times.instance, "cell/many") as terminal:
         assert "\x1b" not in terminal.until(r"(0,){199}0\]\s")

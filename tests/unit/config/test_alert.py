@@ -57,22 +57,28 @@ def test_sound_sections(tmp_path: Path, text: str) -> None:
         (f'{WHEN}source = "cell"\n', "alert[0].when: give exactly one of"),
         (f'{WHEN}state = "fatal"\n', "alert[0].state: this key is only for an alert with process"),
         (f'{WHEN}quality = "bad"\n', "alert[0].quality: this key is only for an alert with source"),
-        ('process = "cell"\nstate = "dead"\n', "alert[0].state: 'dead' is unknown; valid: starting, running, backoff"),
-        ('process = "cell"\nstate = ["fatl"]\n', "did you mean fatal?"),
-        (f'{WHEN}severity = "high"\n', "alert[0].severity: 'high' is unknown; valid: info, warning, critical"),
+        (
+            'process = "cell"\nstate = "dead"\n',
+            "alert[0].state: unknown state 'dead'; valid: starting, running, backoff",
+        ),
+        ('process = "cell"\nstate = ["fatl"]\n', "did you mean 'fatal'?"),
+        (f'{WHEN}severity = "high"\n', "alert[0].severity: unknown severity 'high'; valid: info, warning, critical"),
         (f"{WHEN}every_s = 0\n", "alert[0].every_s: "),
         (f"{WHEN}command = []\n", "alert[0].command: must not be empty"),
         (f'{WHEN}command = "rm -rf"\n', "alert[0].command: expected"),
-        (f'{WHEN}webhok = "http://127.0.0.1/"\n', "alert[0].webhok: unknown key; did you mean webhook?"),
+        (f'{WHEN}webhok = "http://127.0.0.1/"\n', "alert[0].webhok: unknown key; did you mean 'webhook'?"),
         (f'{WHEN}webhook = "pager.lan/x"\n', "alert[0].webhook: expected a URL"),
-        (f'{WHEN}webhook = "http://127.0.0.1:99999/"\n', "alert[0].webhook: not a URL"),
+        (f'{WHEN}webhook = "http://127.0.0.1:99999/"\n', "alert[0].webhook: this is not a URL"),
         (f'{WHEN}webhook = "https://u:secret@h.example/"\n', "alert[0].webhook: the URL must not contain a password"),
-        (f'{WHEN}webhook = "http://pager.lan/"\n', "alert[0].webhook: pager.lan would get plain text"),
+        (
+            f'{WHEN}webhook = "http://pager.lan/"\n',
+            "alert[0].webhook: shmio would send plain text over the network to pager.lan",
+        ),
         (f'{WHEN}webhook = "http://127.0.0.1/"\nwebhook_ca = "ca"\n', "alert[0].webhook_ca: this key is only for"),
         (f'{WHEN}webhook_header_file = "x"\n', "alert[0].webhook_header_file: this key is only for an alert with webh"),
         (f'{WHEN}mqtt_topic = "a/#"\n', "alert[0].mqtt_topic: 'a/#' is not a topic"),
-        (f'{WHEN}mqtt_topic = "shmio/a/cell/x/out"\n', "is a topic of the bridge"),
-        (f'{WHEN}mqtt_topic = "shmio/a/status"\n', "is a topic of the bridge"),
+        (f'{WHEN}mqtt_topic = "shmio/a/cell/x/out"\n', "is a topic of the MQTT bridge"),
+        (f'{WHEN}mqtt_topic = "shmio/a/status"\n', "is a topic of the MQTT bridge"),
     ],
 )
 def test_faulty_sections_are_refused_by_key(tmp_path: Path, text: str, fault: str) -> None:
@@ -83,7 +89,9 @@ def test_faulty_sections_are_refused_by_key(tmp_path: Path, text: str, fault: st
 
 
 def test_names_are_unique_and_a_broker_is_needed(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"alert\[1\]\.name: alert\[0\] watches the same: give each a name"):
+    with pytest.raises(
+        ConfigError, match=r"alert\[1\]\.name: alert\[0\] watches the same thing; give both alerts names"
+    ):
         read(tmp_path, WHEN, WHEN)
     with pytest.raises(ConfigError, match=r"alert\[1\]\.name: 'hot' is already the name of alert\[0\]"):
         read(tmp_path, f'{WHEN}name = "hot"\n', 'process = "cell"\nname = "hot"\n')

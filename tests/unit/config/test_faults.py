@@ -66,31 +66,29 @@ def refused(folder: Path, text: str) -> list[str]:
 
 def test_all_faults_are_reported_together_with_their_lines(tmp_path: Path) -> None:
     assert refused(tmp_path, MANY) == [
-        "F:3: instance.clock: 'Wall' is unknown; valid: wall, stepped; did you mean wall?",
-        "F:4: instance.ring: unknown key; did you mean ring_mb?",
+        "F:3: instance.clock: unknown clock 'Wall'; did you mean 'wall'?",
+        "F:4: instance.ring: unknown key; did you mean 'ring_mb'?",
         'F:6: source[0].connector: this key is needed (source "cell")',
         'F:8: source[0].layout: expected text or a list in [ ], got a whole number (source "cell")',
         'F:9: source[0].period_ms: expected a number, got text (source "cell")',
-        "F:12: source[1].name: 'Model' is reserved",
+        "F:12: source[1].name: 'Model' is reserved; choose another name",
         (
-            "F:14: source[1].stale_ms: 1 is less than two periods of 20 ms: one late frame would make the source bad "
+            "F:14: source[1].stale_ms: 1 is less than two periods of 20 ms: one late frame would make the source "
+            "bad; raise stale_ms "
             '(source "Model")'
         ),
-        "F:17: emulator[0].name: 'model' is reserved",
+        "F:17: emulator[0].name: 'model' is reserved; choose another name",
         (
             "F:19: emulator[0].listen: '1102' is not an address; expected host:port, such as 127.0.0.1:8089 "
             '(emulator "model")'
         ),
         (
-            "F:23: grpc.listen[0]: 0.0.0.0:1 can be reached from other hosts in plain text; this requires a [grpc.tls] "
-            "table, or insecure = true beside it"
+            "F:23: grpc.listen[0]: other hosts can reach 0.0.0.0:1 in plain text; add a [grpc.tls] "
+            "table, or write insecure = true in the same section"
         ),
-        "F:28: grpc.token[0].roles[0]: no role 'Read'; did you mean read?",
+        "F:28: grpc.token[0].roles[0]: unknown role 'Read'; did you mean 'read'?",
         "F:30: injection[0].value: this key is needed for operation 'offset' (injection \"drift\")",
-        (
-            "F:38: injection[1].operation: 'ofset' is unknown; valid: set, offset, scale, clamp, noise, random, "
-            'freeze, delay, drop, flip; did you mean offset? (injection "drift")'
-        ),
+        ("F:38: injection[1].operation: unknown operation 'ofset'; did you mean 'offset'? (injection \"drift\")"),
     ]
 
 
@@ -103,7 +101,7 @@ def test_fault_in_a_properties_file_has_its_line(tmp_path: Path) -> None:
         prepare(file)
     place = tmp_path / "plc.ini"
     assert str(caught.value).split("\n") == [
-        f'{place}:2: hosst: unknown key; did you mean host? (source "c")',
+        f"{place}:2: hosst: unknown key; did you mean 'host'? (source \"c\")",
         f'{place}:3: port: expected a whole number, got text (source "c")',
         f'{file}:8: source[0].period_ms: expected a number >= 0.1 (source "c")',
     ]
@@ -112,12 +110,12 @@ def test_fault_in_a_properties_file_has_its_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ('log_dir = "a"\n\nname = "y"\n', "instance.name is given twice, in lines 2 and 5; keep one of them"),
-        ("[grpc]\n[instance]\n", "instance is given twice, in lines 1 and 4; keep one of them"),
+        ('log_dir = "a"\n\nname = "y"\n', "instance.name is given twice, in lines 2 and 5; remove one of them"),
+        ("[grpc]\n[instance]\n", "instance is given twice, in lines 1 and 4; remove one of them"),
         ('log_dir = "C:\\Users\\me"\n', "write a path in single quotes"),
         ('log_dir = "C:\\plc"\n', "write a path in single quotes"),
-        ('log_dir = "C:\\temp\\new"\n', "a path with backslashes is written in single quotes"),
-        ("[instanse]\n", "instanse: unknown key; did you mean instance?"),
+        ('log_dir = "C:\\temp\\new"\n', "write a path with backslashes in single quotes"),
+        ("[instanse]\n", "instanse: unknown key; did you mean 'instance'?"),
     ],
 )
 def test_common_mistake_is_reported_with_the_correction(tmp_path: Path, text: str, said: str) -> None:
@@ -167,9 +165,9 @@ def test_each_key_has_its_line() -> None:
             "grpc.token: there are 9000 sections",
         ),
         (HEAD + "[[injection]]\noperation = 'ofset'\n" * 9000, 1001, "injection: there are 9000 sections"),
-        (f'{HEAD}x = """{chr(92)}"""{chr(92) * 3}""" ' * 20_000, 1, "not TOML: "),
-        (f"{HEAD}x = {chr(34) * 300_000}", 1, "not TOML: "),
-        ("[" * 300_000, 1, "not TOML: "),
+        (f'{HEAD}x = """{chr(92)}"""{chr(92) * 3}""" ' * 20_000, 1, "not valid TOML: "),
+        (f"{HEAD}x = {chr(34) * 300_000}", 1, "not valid TOML: "),
+        ("[" * 300_000, 1, "not valid TOML: "),
         (f'[instance]\nname = "{"x" * 900_000}"\n', 1, "instance.name: expected a name"),
         (f'{HEAD}[[source]]\nname = "s"\nconnector = "{"y" * 9000}"\nstale_ms = 1\n', 1, "stale_ms"),
     ],

@@ -51,7 +51,7 @@ class Sample(msgspec.Struct, forbid_unknown_fields=True):
         (
             {"clock": "Wall"},
             "Invalid enum value 'Wall' - at `$.clock`",
-            "clock: 'Wall' is unknown; valid: wall, stepped; did you mean wall?",
+            "clock: unknown clock 'Wall'; did you mean 'wall'?",
         ),
         ([], "Expected `object`, got `array`", "expected a table, got a list in [ ]"),
     ],

@@ -38,10 +38,10 @@ def test_named_file_is_tried_where_unnamed_files_are_not_supported(
 @pytest.mark.parametrize(
     ("number", "told"),
     [
-        (errno.ENOSPC, "the disk is full: make room"),
-        (errno.EDQUOT, "the disk quota is used up: make room"),
-        (errno.EROFS, "it is mounted read-only: remount it"),
-        (errno.EACCES, "no permission: let this user write there"),
+        (errno.ENOSPC, "the disk is full; make room"),
+        (errno.EDQUOT, "the disk quota is used up; make room"),
+        (errno.EROFS, "it is mounted read-only; remount it"),
+        (errno.EACCES, "this user has no permission; let this user write there"),
         (errno.EIO, "Input/output error"),
     ],
 )
@@ -52,7 +52,7 @@ def test_obstacle_is_reported_with_a_remedy(
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(os, "open", refuse)
-    for folder, what in (("", "cannot be written"), ("/new", f"cannot be made in {tmp_path}")):
+    for folder, what in (("", "cannot be written"), ("/new", f"cannot be created in {tmp_path}")):
         found = unwritable(Path(f"{tmp_path}{folder}"))
         assert found is not None
         assert found.reason.startswith(f"{tmp_path}{folder} {what}: {told}")
@@ -61,6 +61,6 @@ def test_obstacle_is_reported_with_a_remedy(
 
 def test_file_system_without_files_is_found_even_as_root(tmp_path: Path) -> None:
     for folder in ("/proc", "/proc/logs"):
-        assert "its file system accepts no files: choose another folder" in str(unwritable(Path(folder)))
+        assert "its file system accepts no files; choose another folder" in str(unwritable(Path(folder)))
     (tmp_path / "file").touch()
     assert unwritable(tmp_path / "file/logs") == Obstacle(f"{tmp_path}/file is not a directory")

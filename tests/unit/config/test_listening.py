@@ -63,9 +63,12 @@ def test_roles_of_each_address(tmp_path: Path, text: str, expected: list[tuple[s
     [
         ("[grpc]\n", r"grpc\.listen: this key is needed"),
         ('[grpc]\nlisten = ["unix:"]\n', r"grpc\.listen\[0\]: 'unix:' is not a UNIX socket"),
-        (f'[grpc]\nlisten = ["unix:{"x" * 120}"]\n', r"grpc\.listen\[0\]: unix:x*: the path is longer than the 107"),
-        (f'[grpc]\nlisten = ["10.0.0.5:1"]\n{OLD}', r"grpc\.listen\[0\]: .*plain text; this requires a \[grpc\.tls\]"),
-        (f'[grpc]\nlisten = ["127.0.0.1:1"]\n{OLD}', r"grpc\.address\[0\]\.listen: .*plain text; this requires"),
+        (
+            f'[grpc]\nlisten = ["unix:{"x" * 120}"]\n',
+            r"grpc\.listen\[0\]: unix:x*: the path of a UNIX socket has at most 107",
+        ),
+        (f'[grpc]\nlisten = ["10.0.0.5:1"]\n{OLD}', r"grpc\.listen\[0\]: .*plain text; add a \[grpc\.tls\]"),
+        (f'[grpc]\nlisten = ["127.0.0.1:1"]\n{OLD}', r"grpc\.address\[0\]\.listen: .*plain text; add a \[grpc\.tls\]"),
         (
             f'[grpc]\nlisten = ["10.0.0.5:1"]\ninsecure = true\n{TOKEN}',
             r"grpc\.listen\[0\]: .*tokens of \[\[grpc\.token\]\].*tokens_in_plain_text = true",
@@ -77,11 +80,11 @@ def test_roles_of_each_address(tmp_path: Path, text: str, expected: list[tuple[s
         (f'[grpc]\nlisten = ["127.0.0.1:1"]\n{TLS}{CLIENT}', r"grpc\.client: .*client_ca in \[grpc\.tls\]"),
         (
             f'[grpc]\nlisten = ["127.0.0.1:1"]\n{TOKEN.replace("read", "reed")}',
-            r"grpc\.token\[0\]\.roles\[0\]: no role 'reed'; did you mean read\?",
+            r"grpc\.token\[0\]\.roles\[0\]: unknown role 'reed'; did you mean 'read'\?",
         ),
         (
             f'[grpc]\nlisten = ["127.0.0.1:1"]\n{OLD}insecure = true\nroles = ["admin"]\n',
-            r"grpc\.address\[0\]\.roles\[0\]: no role 'admin'; there are: read, write, inject, control",
+            r"grpc\.address\[0\]\.roles\[0\]: unknown role 'admin'; valid: read, write, inject, control",
         ),
         (
             f'[grpc]\nlisten = ["127.0.0.1:1"]\n{OLD}insecure = true\nroles = []\n',
@@ -95,12 +98,12 @@ def test_roles_of_each_address(tmp_path: Path, text: str, expected: list[tuple[s
         ),
         (
             '[grpc]\nlisten = ["127.0.0.1:1"]\n[[grpc.token]]\nname = "a"\nroles = ["read"]\nsha256 = "hunter2"\n',
-            r"grpc\.token\[0\]\.sha256: expected 64 digits",
+            r"grpc\.token\[0\]\.sha256: expected 64 hexadecimal digits",
         ),
         ('[grpc]\nlisten = ["127.0.0.1:1"]\n[grpc.token]\nname = "a"\n', r"grpc\.token: write \[\[grpc\.token\]\]"),
         (
             '[grpc]\nlisten = ["127.0.0.1:1"]\n[[grpc.token]]\nname = "a"\nroles = ["read"]\ntoken = "hunter2"\n',
-            r"grpc\.token\[0\]\.token: unknown key; did you mean token_file\?",
+            r"grpc\.token\[0\]\.token: unknown key; did you mean 'token_file'\?",
         ),
     ],
 )
@@ -120,5 +123,5 @@ def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
 def test_long_folder_name_makes_a_socket_path_too_long(tmp_path: Path) -> None:
     folder = tmp_path / ("x" * 100)
     folder.mkdir()
-    with pytest.raises(ConfigError, match=r"grpc\.listen\[0\]: unix:.*longer than the 107 bytes"):
+    with pytest.raises(ConfigError, match=r"grpc\.listen\[0\]: unix:.*has at most 107 bytes"):
         read(folder, '[grpc]\nlisten = ["unix:s"]\n')

@@ -91,8 +91,14 @@ def test_file_stays_toml_with_the_same_lines() -> None:
 
 def test_messages_that_quote_the_file_are_masked() -> None:
     masked = mask(f"password = {SECRET}\npwd = 'other secret'\n")
-    message = f'a.toml: not TOML: Invalid value (at line 1, column 12): password = {SECRET}; write "{SECRET}"'
-    assert masked.hide(message) == f"a.toml: not TOML: Invalid value (at line 1, column 12): password = {MASK}"
+    message = (
+        f"a.toml: the file is not valid TOML: Invalid value (at line 1, column 12): password = {SECRET}; write "
+        f'"{SECRET}"'
+    )
+    assert (
+        masked.hide(message)
+        == f"a.toml: the file is not valid TOML: Invalid value (at line 1, column 12): password = {MASK}"
+    )
     assert masked.hide("source[0].x: 'other secret' is unknown") == f"source[0].x: '{MASK}' is unknown"
     about = "a.toml:3: grpc.token[0].sha256: expected 64 hexadecimal digits"
     assert masked.hide(about) == about

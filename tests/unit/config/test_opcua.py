@@ -43,17 +43,29 @@ def test_sound_sections(tmp_path: Path, text: str) -> None:
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
-        ('listen = "0.0.0.0:4840"\n', "opcua.listen: 0.0.0.0:4840 can be reached from other hosts in plain text"),
+        ('listen = "0.0.0.0:4840"\n', "opcua.listen: other hosts can reach 0.0.0.0:4840 in plain text"),
         ('listen = "4840"\n', "opcua.listen: "),
         ('listen = "127.0.0.1:4840"\nkey = "k.pem"\n', "opcua.certificate: give both certificate and key"),
         ('listen = "127.0.0.1:4840"\ntrusted = ["ca.pem"]\n', "opcua.trusted: clients show certificates only"),
-        (f'listen = "127.0.0.1:4840"\ninsecure = true\n{KEYS}trusted = ["ca.pem"]\n', "opcua.trusted: has no effect"),
-        (f'listen = "127.0.0.1:4840"\n{KEYS}{CLIENT}', "opcua.client: clients are identified by their certificates"),
-        (f'listen = "0.0.0.0:1"\ninsecure = true\n{ACCOUNT}{SECRET}', "opcua.account: beyond loopback, passwords"),
+        (
+            f'listen = "127.0.0.1:4840"\ninsecure = true\n{KEYS}trusted = ["ca.pem"]\n',
+            "opcua.trusted: this key has no effect",
+        ),
+        (
+            f'listen = "127.0.0.1:4840"\n{KEYS}{CLIENT}',
+            "opcua.client: this section identifies clients by their certificates",
+        ),
+        (
+            f'listen = "0.0.0.0:1"\ninsecure = true\n{ACCOUNT}{SECRET}',
+            "opcua.account: other hosts would send passwords",
+        ),
         (f'listen = "127.0.0.1:1"\n{ACCOUNT}', "opcua.account[0]: give either token_file"),
-        (f'listen = "127.0.0.1:1"\n{ACCOUNT}sha256 = "12"\n', "opcua.account[0].sha256: expected 64 digits"),
+        (
+            f'listen = "127.0.0.1:1"\n{ACCOUNT}sha256 = "12"\n',
+            "opcua.account[0].sha256: expected 64 hexadecimal digits",
+        ),
         (f'listen = "127.0.0.1:1"\n{ACCOUNT}{SECRET}{ACCOUNT}{SECRET}', "opcua.account[1].name: 'panel' is already"),
-        ('listen = "127.0.0.1:1"\nanonymous = ["raed"]\n', "opcua.anonymous[0]: no role 'raed'"),
+        ('listen = "127.0.0.1:1"\nanonymous = ["raed"]\n', "opcua.anonymous[0]: unknown role 'raed'"),
         ('listen = "127.0.0.1:1"\nurl = "x"\n', "opcua.url: "),
     ],
 )

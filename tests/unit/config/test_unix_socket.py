@@ -50,7 +50,7 @@ def test_socket_that_cannot_be_removed_is_reported(tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr(Path, "unlink", unlink)
     with pytest.raises(
-        EndpointError, match=rf"unix:{path}: .* \(Operation not permitted\): ask its owner to remove it"
+        EndpointError, match=rf"unix:{path}: .* \(Operation not permitted\); ask its owner to remove it"
     ):
         clear(str(path))
 
@@ -59,10 +59,10 @@ def test_file_that_is_no_socket_is_kept(tmp_path: Path) -> None:
     for name in ("file", "link"):
         path = tmp_path / name
         path.write_text("precious") if name == "file" else path.symlink_to(tmp_path / "file")
-        with pytest.raises(EndpointError, match="not a socket: move it away"):
+        with pytest.raises(EndpointError, match="not a socket; move it away"):
             clear(str(path))
         assert path.read_text() == "precious"
-    with pytest.raises(EndpointError, match=r"there is no folder .*nowhere: create it"):
+    with pytest.raises(EndpointError, match=r"there is no folder .*nowhere; create it"):
         clear(str(tmp_path / "nowhere" / "s"))
 
 

@@ -37,7 +37,7 @@ def test_sound_sections(tmp_path: Path, text: str) -> None:
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
-        ('listen = "0.0.0.0:9464"\n', "metrics.listen: 0.0.0.0:9464 can be reached from other hosts in plain text"),
+        ('listen = "0.0.0.0:9464"\n', "metrics.listen: other hosts can reach 0.0.0.0:9464 in plain text"),
         ('listen = "9464"\n', "metrics.listen: "),
         ("", "metrics.listen: this key is needed"),
         (f'{LOOPBACK}key = "k.pem"\n', "metrics.certificate: give both certificate and key"),

@@ -85,7 +85,7 @@ def test_write_is_diverted_to_the_outermost_injection() -> None:
 
 def test_invalid_injections_are_refused() -> None:
     injections = stacked(layer(1, whole(0, 1)))
-    assert "an injection 1 already" in injections.add(layer(1, whole(0, 1)))
+    assert "injection 1 exists already" in injections.add(layer(1, whole(0, 1)))
     with pytest.raises(ValueError, match="byte 8 lies outside"):
         covering(SIZE, [whole(6, 3)])
     for number in range(2, MAX_INJECTIONS + 1):

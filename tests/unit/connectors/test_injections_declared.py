@@ -492,7 +492,7 @@ def test_the_configuration_may_change_while_the_process_runs(make: Callable[...,
 @pytest.mark.parametrize(
     ("wrong", "reason"),
     [
-        (declaration("x", "cell/speeds", "freeze"), "target: cell/speeds: no such register"),
+        (declaration("x", "cell/speeds", "freeze"), "target: cell/speeds: cell has no such register"),
         (
             declaration("x", "other/speed", "freeze"),
             "target: it names source other, but the declaration was sent to source cell",

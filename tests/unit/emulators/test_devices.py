@@ -213,8 +213,8 @@ def test_a_used_address_is_named(kind: str) -> None:
 @pytest.mark.parametrize(
     ("kind", "tag", "fault"),
     [
-        ("modbus", {"type": "INT", "address": "DB1.DBW0"}, "layout: a: .* is no Modbus address"),
-        ("opcua", {"type": "INT", "address": "holding 1"}, "layout: a: .* is no address of OPC UA"),
+        ("modbus", {"type": "INT", "address": "DB1.DBW0"}, "layout: a: .* is not a Modbus address"),
+        ("opcua", {"type": "INT", "address": "holding 1"}, "layout: a: .* is not an address of OPC UA"),
         ("opcua", {"type": "INT", "address": "ns=0;i=2258"}, "namespace 0"),
         ("opcua", {"type": "INT", "address": "ns=101;i=2258"}, "namespaces up to 100"),
     ],

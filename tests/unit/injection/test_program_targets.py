@@ -92,7 +92,7 @@ def test_a_register_named_twice_counts_once() -> None:
         (["cell/speed/1..2"], "the place of an array's last index"),
         (["cell/grid/1..2"], "the place of an array's last index"),
         (["cell/z*"], "no such register"),
-        (["model/clock"], "unknown source model"),
+        (["model/clock"], "unknown source 'model'"),
         (["cell//speed"], "empty segment"),
     ],
 )

@@ -377,7 +377,7 @@ def test_what_is_hidden_may_only_widen_the_robustness(seed: int) -> None:
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ({"formula": "x < 5"}, "expect[0].formula: it says something about the first moment only: write always"),
+        ({"formula": "x < 5"}, "expect[0].formula: this formula judges only the first moment; write always"),
         ({"formula": "always x <"}, "expect[0].formula: at character 11: expected a register or a number"),
         (
             {"formula": "always(eventually x > 1)"},
@@ -388,7 +388,7 @@ def test_what_is_hidden_may_only_widen_the_robustness(seed: int) -> None:
         ({"formula": "always[0, 1e9] x"}, "formula: at character 11: a bound is at most 1000000 s"),
         ({"formula": "always[0 1] x"}, "at character 10: expected ',', found '1'"),
         ({"formula": "always quality(x + 1) = good"}, "at character 8: quality( ) takes one register"),
-        ({"formula": "always q > 1"}, "expect[0].formula: at character 8: q: no such register in DB1"),
+        ({"formula": "always q > 1"}, "expect[0].formula: at character 8: q: DB1 has no such register"),
         ({"formula": "always true"}, "expect[0].formula: at character 1: 'always' is always the same"),
         ({"formula": "always(1 > 2 or x)"}, "at character 10: '>' is always the same here"),
         ({"never": "x and"}, "expect[0].never: at character 6"),
@@ -397,8 +397,8 @@ def test_what_is_hidden_may_only_widen_the_robustness(seed: int) -> None:
         ({"signal": "x >", "max_rate": 1}, "expect[0].signal: at character 4"),
         ({"always": "("}, "expect[0].always: at character 2"),
         ({"always": "eventually[0, 1] " * 6 + "x"}, None),
-        ({"always": "eventually[0, 1] " * 7 + "x"}, "nested too deeply: at most 6 levels"),
-        ({"formula": "once x > 1"}, "says something about the first moment only"),
+        ({"always": "eventually[0, 1] " * 7 + "x"}, "nested more than 6 levels deep"),
+        ({"formula": "once x > 1"}, "judges only the first moment"),
         ({"always": "eventually[0, 1e6] eventually[0, 1] x"}, "add up to more than 1000000 s"),
         ({"always": " + ".join(["x"] * 101)}, "more than 200 parts"),
         ({"always": "x" * 1001}, "at most 1000 characters"),

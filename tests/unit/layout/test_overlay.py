@@ -127,33 +127,36 @@ def test_where_a_name_lies(address: str, kind: str, place: tuple[str, int, int |
 REFUSED = {
     'a = "Inputs/10"': "a: Inputs: index [10] is outside [0..9]",
     'a = "Inputs/1.%X8"': "Inputs/1.%X8: BYTE has bits 0 to 7",
-    'a = "inputs/1"': "inputs/1: no such register in cell; near: Inputs/1",
+    'a = "inputs/1"': "inputs/1: cell has no such register; did you mean 'Inputs/1'",
     'a = "Inputs.%X1"': "Inputs.%X1: an array has no such part",
-    'a = "Axis"': "Axis: a structure, not a register; it contains Axis/Position",
+    'a = "Axis"': "Axis: this is a structure, not a register; it contains Axis/Position",
     'a = "DB201.DBX8.0"': "DB201.DBX8.0 is an address in the controller; a table over cell names its "
     "registers, such as Inputs/0.%X0; a table of addresses is a layout of its own, without cell",
     'a = "%I8.0"': "%I8.0 is an address in the controller",
-    'a = { type = "BOOL" }': "a: address: needed: the register of cell that it names, such as Inputs/0.%X0",
-    'a = { address = "Inputs/7", type = "REAL" }': "a: type: REAL needs 4 bytes, from Inputs/7 on there are 3",
-    'a = { address = "Inputs/7..9", type = "REAL" }': "a: type: REAL needs 4 bytes, Inputs/7..9 has 3",
-    'a = { address = "Wide", type = "INT" }': "INT needs 2 bytes, Wide has 4; name a part of it, such as Wide.%W0",
+    'a = { type = "BOOL" }': "a: address: this key is needed; name a register of cell, such as Inputs/0.%X0",
+    'a = { address = "Inputs/7", type = "REAL" }': "a: type: REAL needs 4 bytes, but from Inputs/7 on there are only 3",
+    'a = { address = "Inputs/7..9", type = "REAL" }': "a: type: REAL needs 4 bytes, but Inputs/7..9 has 3",
+    'a = { address = "Wide", type = "INT" }': "INT needs 2 bytes, but Wide has 4; name a part of it, such as Wide.%W0",
     'a = { address = "Inputs/7", type = "BOOL" }': "a: type: a BOOL needs the address of a bit, such as Inputs/7.%X0",
     'a = { address = "Inputs/7.%X0", type = "BYTE" }': "a: type: Inputs/7.%X0 is a BOOL, so it cannot be read as BYTE",
-    'a = { address = "Inputs/9.%X1", type = "ARRAY[0..7] OF BOOL" }': "8 bits are needed, Inputs/9.%X1 has 7",
-    'a = { address = "Wide.%X1", type = "ARRAY[0..7] OF BOOL" }': "a row of BOOLs lies over bytes",
+    'a = { address = "Inputs/9.%X1", type = "ARRAY[0..7] OF BOOL" }': "8 bits are needed, but Inputs/9.%X1 has 7",
+    'a = { address = "Wide.%X1", type = "ARRAY[0..7] OF BOOL" }': "an array of BOOL needs bytes and one dimension",
     'a = { address = "Level", type = "DWORD" }': "only bytes and integers can be read as another type",
-    'a = { address = "Inputs/7", type = "FLOAT" }': "a: there is no type 'FLOAT'",
-    'a = { address = "Inputs/7", initial = 3 }': "a: initial: the initial values are those of cell",
-    'a = { address = "Inputs/7", scale = 0.1 }': "a: scale: a name over a data block shows the bytes of cell as they",
+    'a = { address = "Inputs/7", type = "FLOAT" }': "a: unknown type 'FLOAT'",
+    'a = { address = "Inputs/7", initial = 3 }': "a: initial: leave out this key, because the initial values are "
+    "those of cell",
+    'a = { address = "Inputs/7", scale = 0.1 }': "a: scale: leave out this key, because a name over a data block "
+    "shows the "
+    "bytes of "
+    "cell as they",
     'a = { address = "Inputs/7", deadband = 1 }': "a: deadband: ",
-    'a = { adress = "Inputs/7" }': "a: there is no 'adress' here, only address, type, comment, unit, writable, "
-    "initial, scale, deadband; did you mean address?",
+    'a = { adress = "Inputs/7" }': "a: unknown key 'adress'; did you mean 'address'?",
     'Level = "Inputs/7"': "Level: cell has a register of this path; choose another path",
     'Axis = "Inputs/7"': "Axis: cell has a structure of this path; choose another one",
     '"Inputs/7" = "Inputs/7"': "Inputs/7: Inputs is already a register; choose another path",
     'a = "Inputs/1"\n"a/b" = "Inputs/2"': "a/b: a is already a register",
-    '"a/in" = "Inputs/1"': "a/in: the path ends in a direction",
-    'a = "b"\nb = "Inputs/1"': "a: b: no such register in cell",
+    '"a/in" = "Inputs/1"': "a/in: leave out /in or /out at the end of the path",
+    'a = "b"\nb = "Inputs/1"': "a: b: cell has no such register",
 }
 
 
@@ -165,13 +168,15 @@ def test_what_does_not_fit_is_refused_by_name_and_line(names: str) -> None:
 
 
 def test_a_table_that_is_given_without_its_block_says_so() -> None:
-    with pytest.raises(LayoutError, match=r'beside the block\'s source: layout = "cell\.db" and tags = "names\.toml"'):
+    with pytest.raises(
+        LayoutError, match=r'together with the block\'s source: layout = "cell\.db" and tags = "names\.toml"'
+    ):
         compile_sources([Source("names.toml", NAMES.encode())])
 
 
 def test_two_tables_need_a_block_and_lie_over_it_together() -> None:
     one, other = Source("one.toml", b'[registers]\na = "Inputs/1"'), Source("other.csv", b"path,address\nb,Inputs/2\n")
-    with pytest.raises(LayoutError, match="lies over a data block whose source is beside it"):
+    with pytest.raises(LayoutError, match="there are several tag tables without a data block"):
         compile_sources([one, other])
     layout = compile_sources([other, Source("cell.db", SMALL), one]).layouts[0]
     assert [register.path for register in layout.registers[-2:]] == ["b", "a"]
@@ -182,10 +187,10 @@ def test_two_tables_need_a_block_and_lie_over_it_together() -> None:
 def test_of_several_blocks_a_table_names_its_own() -> None:
     blocks = SMALL + SMALL.replace(b'"cell"', b'"other"')
     assert (
-        'names.toml:1:1: error: the sources have several data blocks (cell, other): say by block = "NAME"'
+        'names.toml:1:1: error: the sources have several data blocks (cell, other); choose one by block = "NAME"'
         in refusal('[registers]\na = "Inputs/1"', blocks)
     )
-    assert "block: no data block 'third'; there are: cell, other" in refusal(
+    assert "block: unknown data block 'third'; did you mean 'other'?" in refusal(
         'block = "third"\n[registers]\na = "Inputs/1"', blocks
     )
     first, second = compiled('block = "Other"\n[registers]\na = "Inputs/1"', blocks).layouts
@@ -195,12 +200,14 @@ def test_of_several_blocks_a_table_names_its_own() -> None:
     sources[1] = Source("names.toml", b'block = "other"\n' + sources[1].text)
     left_out = compile_sources(sources, blocks=["cell"])
     assert "a" not in left_out.layouts[0].by_path
-    assert "the table lies over other, but cell is read: its names are left out" in str(left_out.warnings[0])
+    assert "it is for other, but cell is read" in str(left_out.warnings[0])
 
 
 def test_a_path_that_differs_only_in_case_gets_a_warning() -> None:
     warnings = compiled('[registers]\nLEVEL = "Inputs/1"', SMALL).warnings
-    assert [str(one) for one in warnings] == ["names.toml:2:1: warning: LEVEL: differs only in case from Level"]
+    assert [str(one) for one in warnings] == [
+        "names.toml:2:1: warning: LEVEL: this path differs from Level only in upper and lower case"
+    ]
 
 
 def test_initial_values_are_those_of_the_block() -> None:

@@ -96,16 +96,22 @@ def test_a_sheet_says_the_same_as_toml(file: str, data: bytes) -> None:
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        ([], "1:1: error: not a tag table: its first row must name the columns path and type; it has nothing"),
-        ([["Name", "Path", "Data Type"]], "must name the columns type; it has name, path, data type"),
-        ([["path", "type", "adress"]], "there is no column 'adress'"),
-        ([["path", "type", "path"]], "the column path is there twice"),
+        (
+            [],
+            (
+                "1:1: error: the file is not a tag table: the first row must name the columns path and type, but "
+                "has nothing"
+            ),
+        ),
+        ([["Name", "Path", "Data Type"]], "must name the columns type, but has name, path, data type"),
+        ([["path", "type", "adress"]], "unknown column 'adress'"),
+        ([["path", "type", "path"]], "the header has the column path twice"),
         ([["path", "type"]], "there are no rows"),
         ([["path", "type"], ["a", ""]], "2:1: error: a: the type is missing"),
         ([["path", "type"], ["", "INT"]], "2:1: error: row: the path is missing"),
-        ([["path", "type"], ["a", "INT"], ["a", "INT"]], "3:1: error: a: given twice, first in row 2"),
+        ([["path", "type"], ["a", "INT"], ["a", "INT"]], "3:1: error: a: this path is given twice, first in row 2"),
         ([["path", "type"], ["a", "INT", "7"]], "2:1: error: a: the row has more cells than the header"),
-        ([["path", "type"], ["a", "INT"], ["b", "INTEGER"]], "3:1: error: b: there is no type 'INTEGER'"),
+        ([["path", "type"], ["a", "INT"], ["b", "INTEGER"]], "3:1: error: b: unknown type 'INTEGER'"),
         ([["path", "type", "scale"], ["a", "INT", "1,5"]], "2:1: error: a: scale: expected a number, found '1,5'"),
         ([["path", "type", "deadband"], ["a", "INT", "inf"]], "deadband: expected a number"),
         ([["path", "type", "writable"], ["a", "INT", "maybe"]], "writable: expected true or false, found 'maybe'"),

@@ -73,20 +73,20 @@ def test_name_and_byte_order_can_be_chosen() -> None:
 
 
 WRONG = {
-    'a = "INT"': "cell.toml:1:1: error: not a tag table: ",
+    'a = "INT"': "cell.toml:1:1: error: the file is not a tag table: ",
     "[registers]": "not a tag table",
     "[registers]\na = INT": "cell.toml:2:5: error: ",
-    "[registers]\n\na = 'INTEGER'": "cell.toml:3:1: error: a: there is no type 'INTEGER'",
+    "[registers]\n\na = 'INTEGER'": "cell.toml:3:1: error: a: unknown type 'INTEGER'",
     "[registers]\na = 'ARRAY[3..1] OF INT'": "2:1: error: a: expected bounds",
     "[registers]\na = 'ARRAY[0..9,0..9,0..9,0..9,0..9,0..9,0..9] OF INT'": "at most 6 dimensions",
     "[registers]\na = 'ARRAY[0..99999999] OF BOOL'": "at most 1048576 elements",
-    "[registers]\na = 'ARRAY[0..999999] OF LREAL'": "expected at most 1048576 bytes",
+    "[registers]\na = 'ARRAY[0..999999] OF LREAL'": "the registers have more than 1048576 bytes",
     "[registers]\nx = 'INT'\n'a//b' = 'INT'": "cell.toml:3:1: error: a//b: ",
-    "[registers]\n'a/b/out' = 'INT'": "the path ends in a direction",
+    "[registers]\n'a/b/out' = 'INT'": "leave out /in or /out at the end of the path",
     "[registers]\n'a/b' = 'INT'\na = 'INT'": "a is already a register",
     "[registers]\n'a.b' = 'INT'\n'a%2Eb' = 'INT'": "given twice",
     "[registers]\na = { type = 'INT', initial = 40000 }": "cell.toml:2:1: error: a: ",
-    "[registers]\na = { type = 'INT', start = 4 }": "a: there is no 'start' here, only type, initial, comment",
+    "[registers]\na = { type = 'INT', start = 4 }": "a: unknown key 'start'; valid: type, initial, comment",
     "[registers]\nb = 'INT'\na = { initial = 4 }": "cell.toml:3:1: error: a: type: this key is needed",
     f"[registers]\na = {'9' * 5000}": "cell.toml:2:1: error: a number has too many digits",
     f"[registers]\na = {{ type = 'INT', initial = 0x{'f' * 5000} }}": "2:1: error: a: initial: expected a number of",
@@ -100,14 +100,14 @@ WRONG = {
     '[registers]\nb = "INT"\n"a\\u0000b" = "INT"': r"3:1: error: a\x00b: 'a\x00b': a path must not contain control",
     '[registers]\nb = "INT"\n"a\\nb" = "INT"': r"cell.toml:3:1: error: a\nb: 'a\nb': a path must not contain control",
     "[registers]\n'a%0Ab' = 'INT'": "cell.toml:2:1: error: a%0Ab: 'a%0Ab': a path must not contain control",
-    "[registers]\na = 'INT'\nb = 'INT'\na = 'INT'": "cell.toml:4:1: error: a: given twice",
+    "[registers]\na = 'INT'\nb = 'INT'\na = 'INT'": "cell.toml:4:1: error: a: this key is given twice",
     "[registers]\n'b/c' = 'INT'\n'b/c' = { type = 'ARRAY[1..2] OF INT', initial = [\n1,\n2] }\nd = 'INT'": "cell.toml"
-    ":3:1: error: 'b/c': given twice",
-    "[registers]\na = 'INT'\na.b = 'INT'\n": "3:1: error: a.b: given twice; write a path with a dot in",
-    "[registers]\nab = 'INT'\na.b = 'INT'": "3:1: error: a: there is no 'b' here, only type, "
+    ":3:1: error: 'b/c': this key is given twice",
+    "[registers]\na = 'INT'\na.b = 'INT'\n": "3:1: error: a.b: this key is given twice; write a path with a dot in",
+    "[registers]\nab = 'INT'\na.b = 'INT'": "3:1: error: a: unknown key 'b'; valid: type, "
     'initial, comment, unit, address, scale, deadband, writable; write a path with a dot in quotes, "a.b"',
     "[registers]\na/b = 'INT'": "write a path in quotes",
-    "name = 'a'\n[registers]\nb = 'INT'\n[registers.name]\ntype = 'INTEGER'": "4:1: error: name: there is no type",
+    "name = 'a'\n[registers]\nb = 'INT'\n[registers.name]\ntype = 'INTEGER'": "4:1: error: name: unknown type",
 }
 
 
@@ -127,16 +127,16 @@ def test_paths_that_differ_in_case_only_are_warned_of() -> None:
     found = compile_sources([Source("cell.toml", text.encode())])
     assert [register.path for register in found.layouts[0].registers] == ["a/Pos", "b", "A/pos"]
     assert [str(warning) for warning in found.warnings] == [
-        "cell.toml:4:1: warning: A/pos: differs only in case from a/Pos"
+        "cell.toml:4:1: warning: A/pos: this path differs from a/Pos only in upper and lower case"
     ]
 
 
 def test_file_that_is_not_utf8_is_refused() -> None:
-    assert "cell.toml:2:1: error: it is not in UTF-8" in refusal(b"[registers]\n\xff = 'INT'")
+    assert "cell.toml:2:1: error: the file is not UTF-8" in refusal(b"[registers]\n\xff = 'INT'")
 
 
 def test_a_tag_table_needs_no_source_beside_it_but_that_of_a_data_block() -> None:
-    with pytest.raises(LayoutError, match="expected a DATA_BLOCK, found none"):
+    with pytest.raises(LayoutError, match="the files have no DATA_BLOCK"):
         compile_sources([Source("a.toml", b"[registers]\na = 'INT'"), Source("b.udt", b"")])
 
 

@@ -99,20 +99,22 @@ def test_a_path_may_end_in_a_part_of_a_register(part: str) -> None:
 
 def test_without_default_the_source_must_be_named() -> None:
     assert parse_topic("cell/a", SOURCES, None) == Topic("cell", "a", None)
-    with pytest.raises(PathError, match=r"^a/b: 'a' is not one of the 3 sources: write cell/… or sim/… or R"):
+    with pytest.raises(
+        PathError, match=r"^a/b: 'a' is not one of the 3 sources; begin the path with cell/… or sim/… or R"
+    ):
         parse_topic("a/b", SOURCES, None)
     with pytest.raises(PathError, match=r"or s3/…, …$"):
         parse_topic("a/b", [f"s{number}" for number in range(200)], None)
-    with pytest.raises(PathError, match="a: there is no source"):
+    with pytest.raises(PathError, match="a: there are no sources"):
         parse_topic("a", [], None)
-    with pytest.raises(PathError, match=r"nope://: no source of this name; there are: cell, sim, Robot"):
+    with pytest.raises(PathError, match=r"unknown source 'nope'; valid: cell, sim, Robot"):
         parse_topic("nope://a", SOURCES, "cell")
 
 
 def test_error_for_a_path_without_a_source_names_the_searched_source(layout: Layout) -> None:
-    with pytest.raises(PathError, match=r"^b: no such register in DB1; searched in source cell, because the path"):
+    with pytest.raises(PathError, match=r"^b: DB1 has no such register \(searched in source 'cell', because the path"):
         look_up(layout, parse_topic("b/out", SOURCES, "cell"))
-    with pytest.raises(PathError, match=r"^cell/b: no such register in DB1$"):
+    with pytest.raises(PathError, match=r"^cell/b: DB1 has no such register$"):
         look_up(layout, parse_topic("cell/b", SOURCES, "cell"))
     assert look_up(layout, parse_topic("Inputs/3", SOURCES, "cell")).offset == 3
 
@@ -171,16 +173,16 @@ def test_find(layout: Layout, path: str, offset: int, bit: int | None, type_: st
         ("", "names a source"),
         ("Robot", "a structure, not a register; it contains Robot/Axs1, Robot/Axs2"),
         ("Zones/1", "a structure"),
-        ("Robot/Axs3", "no such register in DB1; near: Robot/Axs2, Robot/Axs1"),
-        ("inputs", "near: Inputs"),
-        ("inputs/5", "near: Inputs/5"),
-        ("ROBOT/axs2", "near: Robot/Axs2"),
-        ("robot", "near: Robot"),
-        ("rboot/axs2", "near: Robot/Axs2, "),
-        ("cell/Robot/Axs2", "near: Robot/Axs2, "),
-        ("zones/2/Level/1", "near: Zones/2/Level/1"),
-        ("zones/7/level", "near: Zones/2/Level, Zones/1/Level"),
-        ("Robot/5", "no such register in DB1; near: Robot/Axs2, Robot/Axs1"),
+        ("Robot/Axs3", "DB1 has no such register; did you mean 'Robot/Axs2' or 'Robot/Axs1'?"),
+        ("inputs", "did you mean 'Inputs'"),
+        ("inputs/5", "did you mean 'Inputs/5'"),
+        ("ROBOT/axs2", "did you mean 'Robot/Axs2'"),
+        ("robot", "did you mean 'Robot'"),
+        ("rboot/axs2", "did you mean 'Robot/Axs2' or"),
+        ("cell/Robot/Axs2", "did you mean 'Robot/Axs2' or"),
+        ("zones/2/Level/1", "did you mean 'Zones/2/Level/1'"),
+        ("zones/7/level", "did you mean 'Zones/2/Level', 'Zones/1/Level'"),
+        ("Robot/5", "DB1 has no such register; did you mean 'Robot/Axs2' or 'Robot/Axs1'?"),
         ("Inputs/10", "outside [0..9]"),
         ("Inputs/05", "no such register"),
         ("Inputs/+5", "no such register"),
@@ -190,7 +192,7 @@ def test_find(layout: Layout, path: str, offset: int, bit: int | None, type_: st
         ("Robot/Axs1/0", "a single REAL, not an array"),
         ("5", "no such register"),
         ("Zones/7/Level", "Zones/7: the index is outside "),
-        ("Robots", "near: Robot"),
+        ("Robots", "did you mean 'Robot'"),
         ("x" * 10_000, "no such register"),
         ("Inputs" + "/1" * 5000, "no such register"),
     ],

@@ -125,7 +125,7 @@ def test_a_frame_is_a_copy_and_a_numpy_record(cell: Attachment, writer: BlockWri
     assert view.array["axis/position"][0] == 1.5
     assert view.array["counts"].tolist() == [[7, 8]]
     assert cell.frame().cycle == 13
-    with pytest.raises(PathError, match="there are: cell"):
+    with pytest.raises(PathError, match="unknown source 'press'; valid: cell"):
         cell.frame("press")
 
 

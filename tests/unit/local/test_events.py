@@ -257,7 +257,7 @@ def test_incomplete_reload_repeats_no_event(segment: Segment, cell: Attachment) 
 
 
 def test_an_unknown_source_is_refused_at_once(cell: Attachment) -> None:
-    with pytest.raises(PathError, match="no source 'nix'"):
+    with pytest.raises(PathError, match="unknown source 'nix'"):
         cell.events("cell", "nix")
 
 

@@ -352,13 +352,13 @@ def test_only_one_program_controls_time(instance: str) -> None:
         for call in (second.take_over, second.step, lambda: second.set_step_size(10 * MS)):
             with pytest.raises(
                 TimeError,
-                match=rf"moved by another program \(pid {os.getpid()}\), which is playing it: stop that program first$",
+                match=rf"moved by another program \(pid {os.getpid()}\), which is playing it; stop that program first$",
             ):
                 call()
         assert (first.read().playing, first.read().rate) == (True, 2.0)
         first.set_playing(False)
         with pytest.raises(
-            TimeError, match=rf"moved by another program \(pid {os.getpid()}\): wait until that program ends$"
+            TimeError, match=rf"moved by another program \(pid {os.getpid()}\); wait until that program ends$"
         ):
             second.take_over(HARD_S)
         first.close()

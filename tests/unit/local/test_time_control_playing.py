@@ -91,7 +91,7 @@ def test_playing_program_can_release_time(instance: str) -> None:
         Attachment(Segment.open(instance, writable=True)) as other,
     ):
         cell.play(rate=100)
-        with pytest.raises(TimeError, match="which is playing it: stop that program first"):
+        with pytest.raises(TimeError, match="which is playing it; stop that program first"):
             other.release()
         cell.release()
         assert not other.clock.virtual

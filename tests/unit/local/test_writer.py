@@ -170,7 +170,7 @@ def test_a_register_that_is_given_twice_is_refused(writer: BlockWriter, instance
         source_writer = SourceWriter(writer.block, 5)
         shadow = Shadow(source_writer, 1, Direction.OUT, writer.block.events.cursor(), lambda *_: None, keep=True)
         for write in (cell.set, cell.write, shadow.set):
-            with pytest.raises(ValueRangeError, match="count: given twice"):
+            with pytest.raises(ValueRangeError, match="count: this path is given twice"):
                 write(twice)
 
 
@@ -180,7 +180,7 @@ def test_at_most_four_guests_write_at_a_time(writer: BlockWriter, source: list[A
     try:
         for guest in guests[:4]:
             guest.write({"cell/count": 1})
-        with pytest.raises(SegmentError, match="allows only 4 programs that write: end one of pids"):
+        with pytest.raises(SegmentError, match="allows only 4 programs that write; end one of pids"):
             guests[4].write({"cell/count": 1})
         guests[0].close()
         assert guests[4].write({"cell/count": 1})[0].done

@@ -97,7 +97,7 @@ def test_a_program_runs_on_the_only_table(folder: Path) -> None:
             "layout: this key is needed: program wave runs on one of press, line",
         ),
         ((source("line", "line.toml"), "a50"), "program a50: "),
-        ((source("cell", "cell.db", "dbNumber = 7\n"), "table"), "dbNumber: leave it out: each address"),
+        ((source("cell", "cell.db", "dbNumber = 7\n"), "table"), "dbNumber: leave out this key, because each address"),
         (
             (source("cell", "cell.db", "dbNumber = 6\n"), source("line", "long.toml")),
             "needs 10 bytes of DB6, whose layout has 4",

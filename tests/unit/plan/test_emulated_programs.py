@@ -40,10 +40,10 @@ def prepared(folder: Path, *parts: str) -> Prepared:
     ("keys", "message"),
     [
         ('program = "interlock:Gate"', "layout: .*Position"),
-        ('program = "interlock:Roof"', "program: interlock has no Roof.*Door"),
+        ('program = "interlock:Roof"', "program: unknown class 'Roof' of interlock; valid: Door"),
         ('program = "gone:Door"', "program: .*gone"),
         ('program = "interlock:Door"\nparameters = { least = 1 }', "parameters.least"),
-        ('program = "idle"\nparameters = { most = 1 }', "parameters: program idle has none"),
+        ('program = "idle"\nparameters = { most = 1 }', "parameters: program idle has no parameters"),
         ('kind = "opcua"\nfaults = true', "faults: only emulators of kind s7 or modbus"),
         ('clock = "stepped"', "clock"),
     ],

@@ -119,7 +119,7 @@ def test_an_fmu_declares_its_registers_and_its_faults_are_reported(folder: Path)
         ('model = "models/bad.fmu"', f"source[0].model: {folder}/models/bad.fmu: the archive is damaged"),
         ('model = "tank2.fmu"', f"source[0].model: {folder}/tank2.fmu: No such file or directory"),
         ('model = "models/tank2.fmu"\nparameters = { area = 0 }', "source[0].parameters.area: 0 is outside"),
-        ('model = "models/tank2.fmu"\nconnections = { level = "tank/level" }', "there are: pump.inflow, pulses"),
+        ('model = "models/tank2.fmu"\nconnections = { level = "tank/level" }', "valid: pump.inflow, pulses"),
     ):
         with pytest.raises(ConfigError) as caught:
             prepare(tank(keys))
@@ -171,13 +171,13 @@ def test_remote_model_without_an_endpoint_is_a_warning(folder: Path) -> None:
     ("keys", "message"),
     [
         ("", "source[0].outputs: name the registers"),
-        ('outputs = ["axes"]', "source[0].outputs: 'axes' names no register of drive"),
+        ('outputs = ["axes"]', "source[0].outputs: 'axes' matches no register of drive"),
         ('outputs = ["axis"]\ninouts = ["axis/position"]', "source[0].inouts: axis/position is in outputs, too"),
         ('output = ["axis"]', "source[0].output: unknown key"),
         ('outputs = ["axis"]\ntimeout_ms = 20000', "source[0].timeout_ms"),
         (
             'outputs = ["axis"]\nconnections = { "axis/position" = "panel/limit" }',
-            "source[0].connections.axis/position: the model has no such input; there are: target, lamps",
+            "source[0].connections.axis/position: unknown input 'axis/position' of the model; valid: target, lamps",
         ),
         (
             'outputs = ["axis"]\nconnections = { target = "panel/lamps" }',
@@ -197,22 +197,25 @@ def test_fault_of_a_remote_model_is_named_by_its_key(folder: Path, keys: str, me
     [
         ("", "source[0].model: this key is needed"),
         ('model = "nowhere:Belt"', "source[0].model: there is no module nowhere"),
-        ('model = "line:Bolt"', "source[0].model: line has no Bolt; its models are: Belt, Gate"),
-        ('model = "line:print"', "source[0].model: line has no print"),
+        ('model = "line:Bolt"', "source[0].model: unknown class 'Bolt' of line; did you mean 'Belt'?"),
+        ('model = "line:print"', "source[0].model: unknown class 'print' of line"),
         ('model = "os:getcwd"', "source[0].model: os:getcwd is not a subclass of shmio.simulation.Model"),
         ('model = "broken:Belt"', "broken cannot be imported: ZeroDivisionError: division by zero (broken.py, line 2)"),
         ('model = "ends:Belt"', "the process that imports ends:Belt ended with status 7: no licence"),
         ('model = "line:Belt"\nspeed = 3', "source[0].speed: unknown key"),
         ('model = "line:Belt"\nseed = -1', "source[0].seed"),
-        ('model = "line:Belt"\nparameters = { weight = 3 }', "parameters.weight: model Belt has no such parameter"),
+        (
+            'model = "line:Belt"\nparameters = { weight = 3 }',
+            "parameters.weight: unknown parameter 'weight' of model Belt",
+        ),
         ('model = "line:Belt"\nlayout = "panel.toml"', "source[0].layout: model line:Belt needs a register speed"),
-        ('model = "line:Belt"\nconnections = { position = "gate/closed" }', "there are: speed"),
+        ('model = "line:Belt"\nconnections = { position = "gate/closed" }', "valid: speed"),
         (
             'model = "line:Belt"\nconnections = { speed = "gate/closed" }',
             "source[0].connections.speed: gate/closed is BOOL, which does not fit an input of LREAL",
         ),
         ('model = "line:Belt"\nconnections = { speed = "panel/lamps" }', "BOOL[], which does not fit"),
-        ('model = "line:Belt"\nconnections = { speed = "panel/limits" }', "near: limit"),
+        ('model = "line:Belt"\nconnections = { speed = "panel/limits" }', "did you mean 'limit'"),
         ('model = "line:Belt"\nconnections = { speed = "panel/limit/in" }', "leave out /in"),
         ('model = "line:Belt"\nconnections = { speed = "SIMLOG://step" }', "source[0].connections.speed: "),
     ],

@@ -353,7 +353,7 @@ def test_after_a_failed_fsync_it_continues_in_a_new_file(
     assert 10 < begin <= 22, "from the last position that fsync confirmed"
     assert (more > RING) == bool(gaps(new))
     assert main(["info", str(new)]) == 0
-    assert f" of {old.name} may be lost: the disk failed at its fsync" in capsys.readouterr().out
+    assert f" of {old.name} may be lost, because the disk failed to store it" in capsys.readouterr().out
 
 
 def test_a_failed_fsync_is_reported_until_a_new_file_is_started(segment: Segment, tmp_path: Path) -> None:

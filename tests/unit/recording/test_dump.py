@@ -159,7 +159,7 @@ def test_columns_have_the_same_values_as_frames(tmp_path: Path) -> None:
         (["cell/nothing"], "no such register"),
         (["cell/count", "press/count"], "these registers belong to cell and press"),
         (["cell/count/in"], "leave out /in"),
-        (["cell/x*"], "no register of this recording"),
+        (["cell/x*"], "this recording has no such register"),
     ],
 )
 def test_invalid_registers_are_refused(tmp_path: Path, paths: list[str], message: str) -> None:
@@ -169,9 +169,9 @@ def test_invalid_registers_are_refused(tmp_path: Path, paths: list[str], message
 
 def test_a_source_must_be_named_and_known(tmp_path: Path) -> None:
     with shmio.open_dump(varied(tmp_path / "a.mem")) as dump:
-        with pytest.raises(PathError, match="name a source; there are: cell, press"):
+        with pytest.raises(PathError, match="name one of them: cell, press"):
             next(dump.frames())
-        with pytest.raises(PathError, match="no source 'pres'; there are: cell, press"):
+        with pytest.raises(PathError, match="unknown source 'pres'; did you mean 'press'"):
             next(dump.items(["cell", "pres"]))
 
 
@@ -371,9 +371,9 @@ def test_arrow_tables_and_missing_libraries(tmp_path: Path, monkeypatch: pytest.
     for name in ("pandas", "polars", "pyarrow"):
         monkeypatch.setitem(__import__("sys").modules, name, None)
     for convert, remedy in (
-        (columns.to_pandas, r"pandas is not installed: pip install 'shmio\[analysis\]'"),
-        (columns.to_polars, r"polars is not installed: pip install 'shmio\[analysis\]'"),
-        (columns.to_arrow, r"pyarrow is not installed: pip install 'shmio\[analysis\]'"),
+        (columns.to_pandas, r"pandas is not installed; run pip install 'shmio\[analysis\]'"),
+        (columns.to_polars, r"polars is not installed; run pip install 'shmio\[analysis\]'"),
+        (columns.to_arrow, r"pyarrow is not installed; run pip install 'shmio\[analysis\]'"),
     ):
         with pytest.raises(MissingLibraryError, match=remedy):
             convert()

@@ -97,9 +97,9 @@ def test_shmio_dump_record_with_chosen_registers(
 ) -> None:
     record = ["record", "--instance", segment.instance, "-o", str(tmp_path), "--for", "0.01"]
     assert main([*record, "--register", "cell/speed", "cell/nothing"]) == 1
-    assert "cell/nothing: no register has such a path" in capsys.readouterr().err
+    assert "cell/nothing: no register has this path" in capsys.readouterr().err
     assert main([*record, "--register", "cell/sped"]) == 1
-    assert capsys.readouterr().err == "cell/sped: no register has such a path; near: cell/speed\n"
+    assert capsys.readouterr().err == "cell/sped: no register has this path; did you mean 'cell/speed'?\n"
     assert list(tmp_path.iterdir()) == []
     publish(segment.writer("cell"), 1)
     assert main([*record, "--register", "cell/speed"]) == 0

@@ -159,8 +159,8 @@ def test_patterns_choose_inputs_and_outputs() -> None:
 @pytest.mark.parametrize(
     ("outputs", "inouts", "message"),
     [
-        (["axis", "axes"], [], "outputs: 'axes' names no register of DRIVE"),
-        (["axis"], ["lamps/3"], "inouts: 'lamps/3' names no register of DRIVE; only whole registers are allowed"),
+        (["axis", "axes"], [], "outputs: 'axes' matches no register of DRIVE"),
+        (["axis"], ["lamps/3"], "inouts: 'lamps/3' matches no register of DRIVE; only whole registers are allowed"),
         ([""], [], "outputs: "),
         (["axis"], ["axis/moving"], "inouts: axis/moving is in outputs, too"),
     ],

@@ -140,7 +140,7 @@ def test_an_instance_of_another_configuration_is_refused_with_both_paths(
     own, other = (tmp_path / folder / "supervisor.toml" for folder in ("own", "other"))
     with Segment.create(instance, [], [], config=own if known else None) as segment:
         started = str(own) if known else "an unknown file"
-        with pytest.raises(WrongInstanceError, match=rf"{started}.* not from {other}: .*--instance {instance}"):
+        with pytest.raises(WrongInstanceError, match=rf"{started}.* not from {other}; .*--instance {instance}"):
             Segment.open(instance, config=other)
         segment.unlink()
 

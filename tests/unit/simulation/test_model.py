@@ -74,20 +74,20 @@ def test_a_subclass_has_the_registers_of_the_class_above() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Input("RAEL"), "speed: there is no type 'RAEL'"),
+        (lambda: Input("RAEL"), "speed: unknown type 'RAEL'"),
         (lambda: Output("ARRAY[3..1] OF INT"), "speed: expected bounds as in"),
         (lambda: Output("INT", 70_000), "speed: INT: 70000 is out of range"),
         (lambda: Output("INT", "fast"), "speed: INT: expected a literal such as 0, found 'fast'"),
         (lambda: Output("ARRAY[0..1] OF INT", [1, 2, 3]), "speed: initial: expected at most 2 values, found more"),
-        (lambda: Input("INT", path="axis/in"), "axis/in: the path ends in a direction"),
-        (lambda: Input("INT", path="a//b"), "a//b: empty segment in the path"),
+        (lambda: Input("INT", path="axis/in"), "axis/in: leave out /in or /out at the end of the path"),
+        (lambda: Input("INT", path="a//b"), "a//b: the path has an empty segment"),
         (lambda: Input("INT", path="first"), "speed: the path 'first' is used twice"),
         (lambda: Input("INT", path="first/second"), "first/second: first is already a register"),
         (lambda: Input({"a": "INT"}, {"b": 1}), "speed: initial: expected a dict with some of a, found {'b': 1}"),
         (lambda: InOut("JointTrajectory[6]"), "speed: expected JointTrajectory[joints, points] with at most 64 joints"),
-        (lambda: Parameter("RAEL"), "speed: there is no type 'RAEL'"),
-        (lambda: Input("RAEL", limits=(0, 1)), "speed: there is no type 'RAEL'"),
-        (lambda: Output("INT", limits=(0, 1)), "speed: limits: an output has none"),
+        (lambda: Parameter("RAEL"), "speed: unknown type 'RAEL'"),
+        (lambda: Input("RAEL", limits=(0, 1)), "speed: unknown type 'RAEL'"),
+        (lambda: Output("INT", limits=(0, 1)), "speed: limits: an output has no limits"),
         (lambda: Input("BOOL", limits=(0, 1)), "speed: limits: only a number or an array of numbers"),
         (lambda: InOut({"a": "INT"}, limits=(0, 1)), "speed: limits: only a number or an array of numbers"),
         (lambda: Input("INT", limits=(2, 1)), "speed: limits: expected the lowest and the highest value"),
@@ -102,7 +102,7 @@ def test_an_invalid_declaration_is_refused_and_named(make: Callable[[], Declarat
 
 
 def test_several_faults_are_reported_together() -> None:
-    with pytest.raises(ModelError, match=r"model Wrong: a: there is no type 'X'.*; b: there is no type 'Y'"):
+    with pytest.raises(ModelError, match=r"model Wrong: a: unknown type 'X'.*; b: unknown type 'Y'"):
         type("Wrong", (Still,), {"a": Input("X"), "b": Input("Y")})
 
 

@@ -44,7 +44,7 @@ def test_a_model_of_the_folder_is_found(folder: Path) -> None:
 
 def test_an_installed_module_comes_first(folder: Path) -> None:
     (folder / "json.py").write_text(BELT)
-    with pytest.raises(ConfigError, match="json has no Belt"):
+    with pytest.raises(ConfigError, match="unknown class 'Belt' of json"):
         load("json:Belt", folder)
 
 
@@ -59,7 +59,7 @@ def test_invalid_names_are_refused(text: str) -> None:
 @pytest.mark.parametrize(
     ("source", "text", "message"),
     [
-        (BELT, "plant_m:Blet", "plant_m has no Blet; its models are: Belt"),
+        (BELT, "plant_m:Blet", "unknown class 'Blet' of plant_m; did you mean 'Belt'?"),
         (BELT, "plant_n:Belt", "there is no module plant_n that is installed or in "),
         (BELT, "plant_m.deeper:Belt", "there is no module plant_m.deeper that is installed or in "),
         (BELT, "plant_m:Output", "plant_m:Output is not a subclass of shmio.simulation.Model"),
@@ -74,7 +74,7 @@ def test_invalid_names_are_refused(text: str) -> None:
         (
             BELT.replace("LREAL", "LRAEL"),
             "plant_m:Belt",
-            r"cannot be imported: model Belt: position: there is no type .*line 3",
+            r"cannot be imported: model Belt: position: unknown type .*line 3",
         ),
         (
             BELT.replace("def step", "def stop"),

@@ -163,5 +163,5 @@ def test_an_in_out_that_is_missing_in_the_configuration_is_named() -> None:
 
 
 def test_parameters_are_checked() -> None:
-    with pytest.raises(ConfigError, match=r"parameters\.weight: model Belt has no such parameter"):
+    with pytest.raises(ConfigError, match=r"parameters\.weight: unknown parameter 'weight' of model Belt"):
         ServedModel(Belt, {"weight": 3})

@@ -126,7 +126,7 @@ def test_a_process_that_does_not_report_in_time_has_crashed(world: World) -> Non
     assert world.passes(0.001) is Event.ELAPSED
     assert (world.state(), world.last_action()) == (State.HUNG, Action.KILL)
     world.happens(Event.EXIT, "killed by SIGKILL")
-    assert world.life.note == "not running 20 s after its start, killed by SIGKILL"
+    assert world.life.note == "not ready 20 s after its start, killed by SIGKILL"
     assert world.life.crashes == 1
 
 
@@ -211,7 +211,7 @@ def test_a_stuck_process_that_ends_is_reported_with_the_reason_of_its_hang(world
         else:
             started(world)
             world.passes(0, quiet_s=LIMITS.hang_s)
-        why = "not running 20 s after its start" if late else "no heartbeat for 5 s"
+        why = "not ready 20 s after its start" if late else "no heartbeat for 5 s"
         assert (world.state(), world.life.note) == (State.HUNG, why)
         world.now_ns += round(LIMITS.kill_s * S)
         world.happens(Event.ELAPSED, "pid 7 lives on")

@@ -56,7 +56,7 @@ class MTConnectOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, 
         if not valid or not self.url.isascii() or not self.url.isprintable() or " " in self.url:
             raise ValueError(f"url: {self.url[:80]!r} is not the address of an agent, such as http://192.168.0.20:5000")
         if parts.query or parts.fragment or parts.username is not None:
-            raise ValueError("url: remove the user and everything from ? or # on: expected http://HOST:PORT/PATH")
+            raise ValueError("url: remove the user and everything from ? or # on; expected http://HOST:PORT/PATH")
 
 
 class MTConnectConnector(Connector):
@@ -83,7 +83,7 @@ class MTConnectConnector(Connector):
         behind = self._follower.behind if self._follower is not None else 0
         if behind <= self._options.count:
             return ""
-        return f"the stream is {behind} observations behind the agent: raise count, or reduce interval"
+        return f"the stream is {behind} observations behind the agent; raise count, or reduce interval"
 
     def describe(self) -> str:
         """Return the peer and how it is read, for the log."""
@@ -147,7 +147,7 @@ class MTConnectConnector(Connector):
         for index, (register, address) in enumerate(zip(self._layout.registers, self._addresses, strict=True)):
             if time.monotonic() > deadline:
                 raise ConnectorError(
-                    f"finding the data items takes longer than {self._options.timeout} ms: "
+                    f"finding the data items takes longer than {self._options.timeout} ms; "
                     "use dataItemIds as addresses, or raise timeout"
                 )
             item, code, why = find(address, by_name.get(address.parts[-1], []))

@@ -57,7 +57,7 @@ def parse(register: Register) -> Address:
     if equals and (register.type != "BOOL" or register.dims):
         raise ConfigError(f"layout: {register.path}: an address with = needs the type BOOL")
     if register.type != "BOOL" and register.type not in NUMBERS and not register.type.startswith(("STRING", "WSTRING")):
-        raise ConfigError(f"layout: {register.path}: {register.type} is not supported: use BOOL, a number or a string")
+        raise ConfigError(f"layout: {register.path}: {register.type} is not supported; use BOOL, a number or a string")
     return Address(parts, text.strip() if equals else None)
 
 
@@ -77,7 +77,7 @@ def find(address: Address, items: Sequence[DataItem]) -> tuple[DataItem | None, 
     name = "/".join(address.parts)[:80]
     if found:
         paths = ", ".join(f"{item.path} ({item.id})" for item in found[:3])
-        return None, BAD_CONFIGURATION_ERROR, f"{name} may be {paths}: name more components, or the dataItemId"
+        return None, BAD_CONFIGURATION_ERROR, f"{name} may be {paths}; name more components, or the dataItemId"
     return None, BAD_NODE_ID_UNKNOWN, f"the agent has no data item {name}"
 
 

@@ -213,14 +213,14 @@ class ListenerAccess:
         if not self._takes_tokens:
             raise DeniedError(
                 grpc.StatusCode.UNAUTHENTICATED,
-                "this address is plain text, which others can read, so it accepts no tokens: use the address with TLS, "
+                "this address is plain text, which others can read, so it accepts no tokens; use the address with TLS, "
                 "and have this token replaced, because others may know it now",
             )
         secret = self.keys.secret(shown)
         if secret is None:
             raise DeniedError(
                 grpc.StatusCode.UNAUTHENTICATED,
-                "the token is not in [[grpc.token]]: send authorization: Bearer TOKEN with a token that is; after a "
+                "the token is not in [[grpc.token]]; send authorization: Bearer TOKEN with a token that is; after a "
                 "change of a token's file, run shmio-supervisor reload",
             )
         return secret
@@ -237,7 +237,7 @@ class ListenerAccess:
             gives = f"gives {_listed(self.anonymous)}" if self.anonymous else "gives nothing"
             return DeniedError(
                 grpc.StatusCode.UNAUTHENTICATED,
-                f"{call} needs the role {needed}, and this address {gives} without a token: send "
+                f"{call} needs the role {needed}, and this address {gives} without a token; send "
                 "authorization: Bearer TOKEN with a token of [[grpc.token]]",
             )
         elif shown.names:
@@ -246,7 +246,7 @@ class ListenerAccess:
             who, roles, where = "this address", self.anonymous, "the roles of the address in [[grpc.address]]"
         return DeniedError(
             grpc.StatusCode.PERMISSION_DENIED,
-            f"{call} needs the role {needed}; {who} has {_listed(roles)}: add the role to {where}",
+            f"{call} needs the role {needed}; {who} has {_listed(roles)}; add the role to {where}",
         )
 
 

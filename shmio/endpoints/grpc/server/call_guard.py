@@ -207,13 +207,13 @@ class OpenCalls:
         if count >= limits.calls:
             raise DeniedError(
                 grpc.StatusCode.RESOURCE_EXHAUSTED,
-                f"{limits.calls} calls are open, the maximum: try again when others have ended",
+                f"{limits.calls} calls are open, which is the maximum; try again when others have ended",
             )
         if count >= limits.calls - limits.reserve and self._by_client[client] >= limits.share:
             raise DeniedError(
                 grpc.StatusCode.RESOURCE_EXHAUSTED,
                 f"this client has {self._by_client[client]} calls open, and the last {limits.reserve} of {limits.calls}"
-                f" calls are for clients with fewer than {limits.share}: use SimlogAPI version 2 (one stream for all "
+                f" calls are for clients with fewer than {limits.share}; use SimlogAPI version 2 (one stream for all "
                 "topics)",
             )
 
@@ -359,8 +359,8 @@ def check_version() -> None:
     ]
     if missing:
         raise EndpointError(
-            f"grpcio {grpc.__version__} lacks {', '.join(missing)}, without which unknown calls could stop the "
-            "endpoint: install another version (tested: 1.84.0 to 1.85.1)"
+            f"grpcio {grpc.__version__} does not have {', '.join(missing)}, without which unknown calls could stop the "
+            "endpoint; install another version (tested: 1.84.0 to 1.85.1)"
         )
 
 

@@ -25,7 +25,8 @@ def shortage(connections: int, wanted: int) -> str:
         return ""
     files = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     return (
-        f"it serves at most {connections} connections at once, not {wanted}: the hard limit of open files is {files}; "
+        f"the endpoint serves at most {connections} connections at once, not {wanted}: the hard limit of open "
+        f"files is {files}; "
         f"raise it to {OWN + EACH * wanted} where the supervisor is started (ulimit -n, or LimitNOFILE= of its "
         "service), and start the instance again"
     )

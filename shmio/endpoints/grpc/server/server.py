@@ -20,6 +20,7 @@ from shmio.endpoints.grpc.server.call_guard import CallGuard, CoreServer, OpenCa
 from shmio.endpoints.grpc.server.health import Health
 from shmio.endpoints.grpc.server.limits import room, shortage
 from shmio.errors import EndpointError
+from shmio.wording import IN_USE
 
 MAX_REQUEST_BYTES = 1 << 20
 GRACE_S: Final = 0.2
@@ -143,10 +144,7 @@ class Server:
                 with file.binding() as place:
                     port = server.add_insecure_port(f"unix:{quote(place)}")
         except RuntimeError:
-            raise EndpointError(
-                f"grpc: cannot listen on {address}: another program has it (ss -ltnp shows which), or this host has no "
-                "such address"
-            ) from None
+            raise EndpointError(f"grpc: cannot listen on {address}: {IN_USE}") from None
         return int(port)
 
     def _server(self, gate: CallGuard) -> CoreServer:

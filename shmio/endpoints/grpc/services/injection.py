@@ -289,7 +289,7 @@ class Injection(InjectionFollower):
 
     def lifted(self, reason: str) -> None:
         """Handle an end of the injection that this endpoint did not request."""
-        self._finish(f"it was lifted: {reason}" if reason != "lifted" else "somebody has lifted it")
+        self._finish(f"it was lifted: {reason}" if reason != "lifted" else "another program has lifted it")
 
     def fail(self, reason: str) -> None:
         """End the streams of originals with an error, because events were missed."""
@@ -362,7 +362,9 @@ class Shadows:
         if injection is None:
             feed = self._topics.feed(target.source)
             if sum(other.feed is feed for other in self._users) >= MAX_INJECTIONS:
-                raise EndpointError(f"{MAX_INJECTIONS} injections cover {target.source} already, the maximum: end one")
+                raise EndpointError(
+                    f"{MAX_INJECTIONS} injections cover {target.source} already, which is the maximum; end one first"
+                )
             injection = Injection(target, shape, feed, f"{shorten(next(iter(kinds)), 60)} of {shorten(peer, 40)}")
             self._named |= {self._topics.name(path): Shadow(injection, kind) for path, kind in kinds.items()}
             self._users[injection] = set()
@@ -427,7 +429,7 @@ class Shadows:
             shadow = self._named.get(name)
             if name in _TIME_TOPICS or (shadow and (shadow.injection.target != target or shadow.kind is not kind)):
                 use = f"the shadow of {shadow.injection.target}" if shadow else "served by shmio"
-                raise ConflictError(f"{shorten(path)} is {use}: name another path")
+                raise ConflictError(f"{shorten(path)} is {use}; name another path")
             found = shadow.injection if shadow else found
         return found
 

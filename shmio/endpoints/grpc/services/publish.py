@@ -288,7 +288,8 @@ class Publisher:
         values = await _read(request, found)
         if len(values) > MAX_VALUES:
             raise ValueRangeError(
-                f"{shorten(request.path)}: {len(values)} registers are too many for one value, at most {MAX_VALUES}"
+                f"{shorten(request.path)}: {len(values)} registers are too many for one value; at most "
+                f"{MAX_VALUES} are allowed"
             )
         commands = self._topics.feed(topic.source).commands
         return _Destination(partial(commands.send, values), commands.ready(values))

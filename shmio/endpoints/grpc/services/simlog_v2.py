@@ -118,7 +118,7 @@ def encoder(found: Shape, layout: Layout) -> Callable[[BlockImage], EncodedMessa
     members, elements = len(found.registers), found.elements
     if members > MAX_MEMBERS or elements > MAX_ELEMENTS:
         raise ValueRangeError(
-            f"{shorten(found.path)}: {members} registers with {elements} elements are too many for one value, "
+            f"{shorten(found.path)}: {members} registers with {elements} elements are too many for one value; "
             f"at most {MAX_MEMBERS} with {MAX_ELEMENTS} are allowed; use its members as topics"
         )
     head = wire.SimlogMessage(type=value_type(found)).SerializeToString() + b"\x1a"
@@ -477,7 +477,7 @@ class Subscribers:
             raise ValueRangeError(f"name and uuid must have at most {MAX_NAME} characters")
         before = self._open.get(uuid)
         if before is not None and before.holder != holder:
-            raise ConflictError(f"uuid {shorten(uuid)!r} belongs to another client: choose a random one")
+            raise ConflictError(f"uuid {shorten(uuid)!r} belongs to another client; choose a random one")
         if before is not None:
             del self._open[uuid]
             before.replaced = True
@@ -487,7 +487,8 @@ class Subscribers:
             log.info("subscriber %s connected again; its earlier stream ends", shorten(name), extra=fields(uuid=uuid))
         elif len(self._open) >= MAX_SUBSCRIBERS:
             raise EndpointError(
-                f"there are {MAX_SUBSCRIBERS} subscribers already, the maximum: one stream serves many topics"
+                f"there are {MAX_SUBSCRIBERS} subscribers already, which is the maximum; one stream can serve "
+                "many topics"
             )
         subscriber = self._open[uuid] = Subscriber(self._topics, self._shadows, self._time_topics, name, outbox, holder)
         self._arrived.set()
@@ -516,7 +517,7 @@ class Subscribers:
         subscriber = self._open.get(uuid)
         if subscriber is None or subscriber.holder != holder:
             raise PathError(
-                f"subscriberUUID {shorten(uuid)!r}: there is no such subscriber; keep CreateSubscriber's stream open"
+                f"subscriberUUID {shorten(uuid)!r}: unknown subscriber; keep CreateSubscriber's stream open"
             )
         if len(subscriber) >= MAX_TOPICS or sum(map(len, self._open.values())) >= MAX_ALL_TOPICS:
             raise EndpointError(

@@ -179,7 +179,10 @@ class TimeCalls:
             RESOURCE_EXHAUSTED: There are too many WatchClock calls.
         """
         if len(self._watchers) >= MAX_WATCHERS:
-            await refuse(context, EndpointError(f"{MAX_WATCHERS} calls of WatchClock are open, the maximum"))
+            await refuse(
+                context,
+                EndpointError(f"{MAX_WATCHERS} calls of WatchClock are open, which is the maximum; end one first"),
+            )
         change = asyncio.Event()
         self._watchers.add(change)
         try:

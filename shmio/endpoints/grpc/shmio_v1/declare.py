@@ -63,7 +63,7 @@ class DeclareCall:
         """
         if len(request.declarations) > MAX_DECLARATIONS:  # checked first, as parsing blocks the event loop
             raise ValueRangeError(
-                f"{len(request.declarations)} injections are declared, at most {MAX_DECLARATIONS} are allowed"
+                f"{len(request.declarations)} injections are declared, but at most {MAX_DECLARATIONS} are allowed"
             )
         tables = [declaration_from_wire(one, f"injection[{index}]") for index, one in enumerate(request.declarations)]
         if not tables:
@@ -198,8 +198,8 @@ def _check(
                 matches += max((len(one.layout.registers) for one in looked_at), default=0)
     if matches > MAX_MATCHES:
         raise ValueRangeError(
-            f"the targets that do not name a register exactly need more than {MAX_MATCHES} comparisons with registers: "
-            "declare fewer at once"
+            f"the targets that do not name a register exactly need more than {MAX_MATCHES} comparisons with registers; "
+            "declare fewer injections at once"
         )
     return compile_declarations(declarations, blocks, wanted)
 

@@ -15,13 +15,13 @@ from shmio.endpoints.grpc.server.error_status import Context, refuse
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.endpoints.grpc.wakeups import BatchReader, Callback, WakeUps
 from shmio.errors import EndpointError, PathError, ShmioError, ValueRangeError
-from shmio.layout.topic import shorten
 from shmio.local.events import EventReader
 from shmio.messages import event_to_wire
 from shmio.model.event import Event
 from shmio.segment import Block, Segment
 from shmio.segment.events import EVENT_SLOTS
 from shmio.wire import shmio_v1_pb2 as wire
+from shmio.wording import unknown
 
 MAX_CALLS: Final = 256
 """Maximum number of open Events calls."""
@@ -214,11 +214,11 @@ class EventsCall:
         """
         if len(sources) > MAX_SOURCES:
             raise ValueRangeError(
-                f"{len(sources)} sources are named, at most {MAX_SOURCES} are allowed: name none to follow all"
+                f"{len(sources)} sources are named, but at most {MAX_SOURCES} are allowed; name none to follow all"
             )
         for source in sources:
             if source not in feeds:
-                raise PathError(f"no source {shorten(source)!r}; there are: {', '.join(feeds)}")
+                raise PathError(unknown("source", source, feeds))
         self._feeds = feeds
         self._logs = logs
         self._instance = instance
@@ -340,7 +340,7 @@ class EventCalls:
         try:
             if len(self._open) >= MAX_CALLS:
                 raise EndpointError(
-                    f"{MAX_CALLS} calls of Events are open, the maximum: one call can follow many sources"
+                    f"{MAX_CALLS} calls of Events are open, which is the maximum; one call can follow many sources"
                 )
             call = EventsCall(self._feeds, self._logs, self._instance, request.sources)
             self._open.add(call)

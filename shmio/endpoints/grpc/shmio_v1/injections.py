@@ -62,16 +62,16 @@ def target_of(topics: Topics, options: wire.Lay) -> InjectTarget:
 
     """
     if not (options.patterns or options.ranges):
-        raise ValueRangeError("no pattern and no range is given: name the registers to inject into")
+        raise ValueRangeError("no pattern and no range is given; name the registers to inject into")
     for name, given in (("patterns", len(options.patterns)), ("ranges", len(options.ranges))):
         if given > MAX_PATTERNS:
             raise ValueRangeError(
-                f"{given} {name} are given, at most {MAX_PATTERNS} are allowed: use stars or structures"
+                f"{given} {name} are given, but at most {MAX_PATTERNS} are allowed; use stars or structures"
             )
     found = tuple(dict.fromkeys(topics.topic(pattern) for pattern in options.patterns))
     places = {SourceDirection(topic.source, topic.direction == "in") for topic in found}
     if len({place.source for place in places}) > 1:
-        raise PathError("an injection covers one source: create one for each source, each with its own stream")
+        raise PathError("an injection covers one source; create one for each source, each with its own stream")
     if len(places) > 1:
         raise PathError(f"{shorten(options.patterns[0])}, …: an injection covers /out or /in, not both")
     if options.direction not in wire.Direction.values():
@@ -165,7 +165,7 @@ def raw_writes(pieces: Collection[wire.Piece], bits: bytes) -> list[Write]:
     """
     if len(pieces) > MAX_VALUES:
         raise ValueRangeError(
-            f"pieces: the message has {len(pieces)}, but at most {MAX_VALUES} are allowed: join adjacent pieces, or "
+            f"pieces: the message has {len(pieces)}, but at most {MAX_VALUES} are allowed; join adjacent pieces, or "
             "send them in several messages"
         )
     cover = np.frombuffer(bits, np.uint8)
@@ -439,7 +439,7 @@ class InjectCall(InjectionFollower):
     def lifted(self, reason: str) -> None:
         """Handle an end of the injection that this call did not request."""
         self._lifted = True
-        self.over = f"it was lifted: {reason}" if reason != "lifted" else "somebody has lifted it"
+        self.over = f"it was lifted: {reason}" if reason != "lifted" else "another program has lifted it"
         self._wake.set()
 
     def fail(self, reason: str) -> None:
@@ -547,7 +547,9 @@ class InjectionCalls:
     def _check_room(self) -> None:
         """Raise EndpointError if there are too many calls."""
         if len(self._open) >= MAX_INJECTIONS:
-            raise EndpointError(f"{MAX_INJECTIONS} calls of Inject and Declare are open, the maximum")
+            raise EndpointError(
+                f"{MAX_INJECTIONS} calls of Inject and Declare are open, which is the maximum; end one first"
+            )
 
     async def _close(self, one: InjectCall | DeclareCall, opening: asyncio.Task[bytes]) -> None:
         try:

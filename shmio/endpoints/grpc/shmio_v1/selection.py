@@ -69,11 +69,11 @@ class Selections:
         """
         if not patterns:
             raise ValueRangeError(
-                "no pattern is given: name a path, a structure, a glob, or a source for all of its registers"
+                "no pattern is given; name a path, a structure, a glob, or a source for all of its registers"
             )
         if len(patterns) > MAX_PATTERNS:
             raise ValueRangeError(
-                f"{len(patterns)} patterns are given, at most {MAX_PATTERNS} are allowed: use stars or structures"
+                f"{len(patterns)} patterns are given, but at most {MAX_PATTERNS} are allowed; use stars or structures"
             )
         wanted: dict[SourceDirection, dict[Topic, None]] = {}
         for pattern in patterns:
@@ -154,7 +154,8 @@ class Selections:
             self._kept.clear()
         if self._elements + view.elements > MAX_ALL_ELEMENTS:
             raise EndpointError(
-                f"all clients together have {self._elements} elements open, at most {MAX_ALL_ELEMENTS} are allowed: "
+                f"all clients together have {self._elements} elements open, but at most {MAX_ALL_ELEMENTS} are "
+                "allowed; "
                 "select fewer registers, or subscribe to raw frames"
             )
         return view
@@ -180,8 +181,9 @@ class _Budget:
         """Raise ValueRangeError if there are too many registers or elements."""
         if registers > self.registers or elements > self.elements:
             raise ValueRangeError(
-                f"the patterns name more than {MAX_REGISTERS} registers or {MAX_ELEMENTS} elements, the maximum of one "
-                "call: select fewer registers, make several calls, or use raw frames"
+                f"the patterns name more than {MAX_REGISTERS} registers or {MAX_ELEMENTS} elements, which is the "
+                "maximum of one "
+                "call; select fewer registers, make several calls, or use raw frames"
             )
 
     def match(self, registers: int) -> None:
@@ -194,7 +196,7 @@ class _Budget:
         self.matches -= registers
         if self.matches < 0:
             raise ValueRangeError(
-                f"the patterns with stars need more than {MAX_MATCHES} comparisons: use fewer stars, or name structures"
+                f"the patterns with stars need more than {MAX_MATCHES} comparisons; use fewer stars, or name structures"
             )
 
 
@@ -206,7 +208,7 @@ def _select(number: int, block: Block, topics: Sequence[Topic], budget: _Budget,
             budget.match(len(block.layout.registers))
         found = named(block.layout, topic)
         if not found:
-            raise PathError(f"{shorten(str(topic))}: no register of {block.source} has such a path")
+            raise PathError(f"{shorten(str(topic))}: source {block.source!r} has no such register")
         for register in found:
             if register.path not in chosen:
                 chosen[register.path] = register

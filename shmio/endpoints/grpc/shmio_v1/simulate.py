@@ -31,6 +31,7 @@ from shmio.model.values import Column
 from shmio.segment import Block, Segment
 from shmio.segment.model_channel import MAX_NAME_BYTES, ModelChannel, ModelRequest, model_ports
 from shmio.wire import shmio_v1_pb2 as wire
+from shmio.wording import unknown
 
 
 class OutputEncoder:
@@ -60,7 +61,7 @@ class OutputEncoder:
                 raise ValueRangeError(f"{name}: {len(part.values)} values are given for {len(slots)} slots")
             if len(slots) > max(1, most):  # otherwise one message could delay all clients
                 raise ValueRangeError(
-                    f"{name}: {len(slots)} values are given, but the table has {most}: give each value once"
+                    f"{name}: {len(slots)} values are given, but the table has {most}; give each value once"
                 )
             if len(wrong := np.flatnonzero(slots >= most)):
                 raise ValueRangeError(f"{name}: the table has no slot {slots[wrong[0]]}")
@@ -80,11 +81,11 @@ class OutputEncoder:
         """
         if len(assignments) > (most := self._selection.elements):
             raise ValueRangeError(
-                f"assignments: {len(assignments)} values are given, but the table has {most}: give each value once"
+                f"assignments: {len(assignments)} values are given, but the table has {most}; give each value once"
             )
         if len(assignments) > MAX_VALUES:  # because each is encoded by itself
             raise ValueRangeError(
-                f"assignments: {len(assignments)} values are given by path, at most {MAX_VALUES} are allowed: use slots"
+                f"assignments: {len(assignments)} values are given by path, at most {MAX_VALUES} are allowed; use slots"
             )
         order = self._selection.block.layout.byte_order
         async for assignment in time_sliced(assignments):
@@ -123,7 +124,7 @@ class OutputEncoder:
             raise PathError(f"{shorten(text)}: {topic.source} is reserved; begin the path with {block.source}")
         register = find(block.layout, topic.path)
         if self._by_path.keys().isdisjoint(holders(register.path)) or topic.direction == "in":
-            raise PathError(f"{shorten(text)}: it is not an output of {block.source}")
+            raise PathError(f"{shorten(text)}: this is not an output of {block.source}")
         return register
 
 
@@ -208,7 +209,7 @@ class SimulateCalls:
 
     def _block(self, source: str) -> Block:
         if source not in self._feeds:
-            raise PathError(f"no source {shorten(source)!r}; there are: {', '.join(self._feeds)}")
+            raise PathError(unknown("source", source, self._feeds))
         block = self._feeds[source].block
         if block.model_channel is None:
             can = (
@@ -238,7 +239,7 @@ class SimulateCalls:
         for simulation in self._open.values():
             if simulation.block.retired:
                 source = simulation.block.source
-                simulation.end(SegmentError(f"{source}: a reload changed or removed this source: join again"))
+                simulation.end(SegmentError(f"{source}: a reload changed or removed this source; join again"))
 
 
 class SimulateCall:
@@ -413,8 +414,9 @@ def _tables(block: Block) -> tuple[Selection, Selection]:
     for table in tables:
         if len(table.registers) > MAX_REGISTERS or table.elements > MAX_ELEMENTS:
             raise ValueRangeError(
-                f"{block.source} has more than {MAX_REGISTERS} registers or {MAX_ELEMENTS} elements, the maximum of a "
-                "model: split it into several sources"
+                f"{block.source} has more than {MAX_REGISTERS} registers or {MAX_ELEMENTS} elements, which is "
+                "the maximum of a "
+                "model; split the source into several"
             )
         _ = table.table
     return tables
@@ -422,6 +424,6 @@ def _tables(block: Block) -> tuple[Selection, Selection]:
 
 def _taken(block: Block, name: str, who: str) -> str:
     return (
-        f"{block.source}: model {name!r} ({who}) is connected already, and a source takes only one: end it first, or "
+        f"{block.source}: model {name!r} ({who}) is connected already, and a source takes only one; end it first, or "
         "name another source"
     )

@@ -240,7 +240,7 @@ class SubscribeCall:
         self._request = request
         self._wanted = selections.resolve(request.patterns, inward=True)
         if request.format == wire.FORMAT_FRAMES and any(place.inward for place in self._wanted):
-            raise ValueRangeError("written values have no raw frames: leave out /in, or choose the format VALUES")
+            raise ValueRangeError("written values have no raw frames; leave out /in, or choose the format VALUES")
         self._blocks: dict[SourceDirection, BlockUpdates] = {}
         self._inward: dict[SourceDirection, WriteFollower] = {}
         self._rings: dict[SourceDirection, Callback] = {}  # the blocks' wake-up callbacks
@@ -490,7 +490,7 @@ class SubscribeCalls:
         try:
             if len(self._open) >= MAX_STREAMS:
                 raise EndpointError(
-                    f"{MAX_STREAMS} calls of Subscribe are open, the maximum: one call can have many patterns"
+                    f"{MAX_STREAMS} calls of Subscribe are open, which is the maximum; one call can have many patterns"
                 )
             subscription = SubscribeCall(self._selections, self._wake_ups, self._virtual_time, request)
         except ShmioError as error:

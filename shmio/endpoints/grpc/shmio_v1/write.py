@@ -90,7 +90,8 @@ async def decode_assignments(assignments: Any, topics: Topics) -> tuple[str, dic
     """
     if len(assignments) > MAX_VALUES:  # checked before any value is read
         raise ValueRangeError(
-            f"{len(assignments)} values are given, at most {MAX_VALUES} are allowed: write whole arrays or fewer values"
+            f"{len(assignments)} values are given, but at most {MAX_VALUES} are allowed; write whole arrays or "
+            "fewer values"
         )
     values: dict[str, object] = {}
     sources: dict[str, None] = {}
@@ -138,7 +139,7 @@ def packed(values: wire.Values, selection: Selection) -> dict[str, object]:
         if len(slots) != len(part.values):
             raise ValueRangeError(f"{name}: {len(part.values)} values are given for {len(slots)} slots")
         if len(found) + len(slots) > MAX_VALUES:
-            raise ValueRangeError(f"more than {MAX_VALUES} values are given: send fewer at once")
+            raise ValueRangeError(f"more than {MAX_VALUES} values are given; send fewer at once")
         for slot, value in zip(slots, part.values, strict=True):
             found[_path(selection, column, slot)] = value
     return found

@@ -163,7 +163,7 @@ class Player:
             except ShmioError as error:
                 last, reason = reason, str(error)
                 if reason != last:
-                    log.warning("playing: %s", reason)
+                    log.warning("a step failed while time is playing: %s", reason)
             dt_s = (self.dt_ns or self._step_size_ns()) / 1e9
             due_s = max(due_s + dt_s / self.rate, self._loop.time() - LATE_S)
             with suppress(TimeoutError):  # the wait lets other tasks run, even if playing is late
@@ -360,7 +360,7 @@ class Stepper:
         if peer:
             await self._settle(peer)
         if self._player.on:
-            raise TimeError("time is playing: pause it before you step it")
+            raise TimeError("time is playing; pause it before you step it")
         return await self._make(dt_ns)
 
     async def _make(self, dt_ns: int | None) -> Step:

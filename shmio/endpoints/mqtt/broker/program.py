@@ -56,9 +56,9 @@ def choose_broker(settings: Mqtt) -> str | None:
         raise ConfigError(MISSING)
     for demand in _only_mosquitto(settings):
         raise ConfigError(
-            f"{demand}, which needs mosquitto, but that is not installed: {INSTALL}; aMQTT is for development: "
-            'it listens only on loopback, and everybody may do everything (one [[mqtt.account]], roles = ["read", '
-            '"write"], no name)'
+            f"{demand}, which needs mosquitto, but mosquitto is not installed; {INSTALL}, or use the broker aMQTT, "
+            "which is for development: it listens only on loopback, and everybody may do everything (one "
+            '[[mqtt.account]] with roles = ["read", "write"] and no name)'
         )
     check_installed()
     return None
@@ -78,10 +78,10 @@ def check_installed() -> None:
 def _only_mosquitto(settings: Mqtt) -> Iterator[str]:
     """Yield each setting that aMQTT does not support, as text with its key and meaning."""
     if not Address.parse(str(settings.listen)).loopback:
-        yield f"mqtt.listen: {settings.listen} can be reached from other hosts"
+        yield f"mqtt.listen: other hosts can reach {settings.listen}"
     if settings.tls is not None:
-        yield "mqtt.tls: the broker encrypts"
+        yield "mqtt.tls: the broker must encrypt its connections"
     if settings.password_file is not None:
-        yield "mqtt.password_file: clients have accounts"
+        yield "mqtt.password_file: clients must log in"
     if not any(account.name is None and set(account.roles) >= EVERYBODY for account in settings.account):
         yield "mqtt.account: not everybody may read and write"

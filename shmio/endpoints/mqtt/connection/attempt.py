@@ -185,11 +185,13 @@ def close_socket(client: Client) -> None:
 def refusal(code: ReasonCode, policy: ReconnectPolicy) -> str:
     """Describe the reason code with which a broker refuses a connection."""
     if code.value in _WHO:
-        return f"it refuses our login ({code}): check mqtt.username, mqtt.password_file and the broker's own accounts"
+        return (
+            f"it refuses shmio's login ({code}); check mqtt.username, mqtt.password_file and the broker's own accounts"
+        )
     if code.value in _BUSY:
         return f"it accepts no more connections at present ({code})"
     if code.value == _TAKEN_OVER:
-        return f"another client has connected as {policy.client_id}: give one of them another mqtt.client_id"
+        return f"another client has connected as {policy.client_id}; give one of them another mqtt.client_id"
     return f"it refuses: {code}"
 
 
@@ -228,9 +230,9 @@ def _why(error: Exception, target: Target, *, tls: bool) -> str:
 
 def _tls(error: ssl.SSLError) -> str:
     if isinstance(error, ssl.SSLCertVerificationError):
-        return f"its certificate is not trusted ({error.verify_message}): check mqtt.tls.ca, and the host's name"
+        return f"its certificate is not trusted ({error.verify_message}); check mqtt.tls.ca, and the host's name"
     if "_ALERT_" in (error.reason or ""):
-        return f"it refuses our TLS ({error.reason}): check mqtt.tls.certificate and key, which it may require"
+        return f"it refuses TLS with shmio ({error.reason}); check mqtt.tls.certificate and key, which it may require"
     return (
-        f"the TLS handshake failed ({error.reason or 'the broker ended the connection'}): check mqtt.tls, and the port"
+        f"the TLS handshake failed ({error.reason or 'the broker ended the connection'}); check mqtt.tls, and the port"
     )

@@ -338,7 +338,7 @@ class BrokerConnection:
         self.subscribed = True
         if refused := [code for code in codes if code.is_failure]:
             self.problems.subscription_refused(
-                f"broker {self._target} refuses our subscription, so no command can arrive: {refused[0]}"
+                f"broker {self._target} refuses shmio's subscription, so no command can arrive: {refused[0]}"
             )
 
     # ---- dropping the connection -------------------------------------------------------------------------------------

@@ -39,6 +39,7 @@ from shmio.layout.values.write import elements
 from shmio.local.reading import holds_none
 from shmio.segment import Quality
 from shmio.wire import sparkplug_b_pb2 as wire
+from shmio.wording import unknown
 
 NAMESPACE: Final = "spBv1.0"
 REBIRTH: Final = "Node Control/Rebirth"
@@ -336,7 +337,7 @@ class EdgeNode:
             return Command(rebirth=True)
         device = topic.rpartition("/")[2]
         if device not in self.metrics or topic != self._topic("DCMD", device):
-            raise PathError(f"{topic}: there is no such device; there are: {', '.join(self.metrics)}")
+            raise PathError(f"{topic}: {unknown('device', device, self.metrics)}")
         values: dict[str, Any] = {}
         for found in payload.metrics:
             metric = self._metric(device, found)
@@ -362,8 +363,7 @@ class EdgeNode:
         # Some hosts send an empty name with an alias.
         metric = metrics.get(found.name) if found.name else self._by_alias.get(found.alias)
         if metric is None or metrics.get(metric.name) is not metric:
-            what = repr(found.name[:100]) if found.name else f"alias {found.alias}"
-            raise PathError(f"{device}: there is no metric {what}")
+            raise PathError(f"{device}: {unknown('metric', found.name or f'alias {found.alias}', metrics)}")
         return metric
 
     def _fill(self, found: wire.Metric, sample: Sample) -> None:

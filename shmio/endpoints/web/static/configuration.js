@@ -34,7 +34,7 @@ export class ConfigurationTab {
     this.changes = element("div", { class: "changes", "aria-live": "polite" }, "The supervisor checks the file …");
     this.button = element(
       "button",
-      { type: "button", disabled: true, title: controls ? null : "your roles do not allow to reload", click: () => this.ask() },
+      { type: "button", disabled: true, title: controls ? null : "your roles do not allow you to reload", click: () => this.ask() },
       "Reload …",
     );
     this.result = element("ul", { class: "messages", role: "status" });

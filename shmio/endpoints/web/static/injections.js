@@ -32,7 +32,7 @@ export class InjectionsTab {
   constructor(context) {
     this.context = context;
     const injects = context.may("inject");
-    const why = injects ? null : "your roles do not allow to inject";
+    const why = injects ? null : "your roles do not allow you to inject";
     /** @type {SourceEvent[]} */
     this.events = [];
     this.body = element("tbody", {}, element("tr", {}, element("td", { class: "dim" }, "none")));

@@ -121,7 +121,7 @@ export class Lanes {
     swatch.style.background = this.color(path);
     const entry = element(
       "li",
-      { draggable: "true", "data-path": path, title: "Drag it onto another plot to join them" },
+      { draggable: "true", "data-path": path, title: "Drag this name onto another plot to join the two" },
       swatch,
       element("span", { class: "name" }, path),
       element("output", { class: "value" }),
@@ -385,7 +385,7 @@ export class Lanes {
       rows.push([new Date(1000 * time).toISOString(), ...cells].join(","));
     }
     if (all.some(({ series }) => series.reduced)) {
-      notify("The table has what is drawn of the recording, not each frame. Zoom in, or use shmio-dump export.");
+      notify("The table has the values that the plot draws, not every frame of the recording. Zoom in, or use shmio-dump export.");
     }
     this.save(new Blob([`${rows.join("\r\n")}\r\n`], { type: "text/csv" }), "csv");
   }

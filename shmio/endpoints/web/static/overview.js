@@ -120,7 +120,7 @@ export class OverviewTab {
       const allowed = this.context.may("control");
       button = element(
         "button",
-        { type: "button", "aria-label": `Restart ${name}`, disabled: !allowed, title: allowed ? null : "your roles do not allow to restart a process", click: () => this.restart(name) },
+        { type: "button", "aria-label": `Restart ${name}`, disabled: !allowed, title: allowed ? null : "your roles do not allow you to restart a process", click: () => this.restart(name) },
         "Restart",
       );
       this.buttons.set(name, button);

@@ -133,7 +133,7 @@ export class RecordingsTab {
     const text = JSON.stringify([found, this.name]);
     if (text === this.rows) return; // keeps the user's selection
     this.rows = text;
-    setText(this.folder, found.folder ?? "this instance has no recorder: add [recorder] to its configuration");
+    setText(this.folder, found.folder ?? "this instance has no recorder; add [recorder] to its configuration");
     const rows = found.files.map((file) => {
       const length = file.begin_s && file.end_s ? duration(file.end_s - file.begin_s) : "";
       const name = element("button", { type: "button", click: () => this.choose(file.name) }, file.name);
@@ -188,7 +188,7 @@ export class RecordingsTab {
     const { beside, instead } = found.replay;
     replace(
       this.commands,
-      element("p", {}, "This page starts and stops no cell. To replay the recording beside this instance, with a page of its own, run on this instance's host:"),
+      element("p", {}, "This page cannot start or stop a cell. To replay the recording beside this instance, with a page of its own, run on this instance's host:"),
       this.command(beside.replace("PORT", String(Number(location.port || 8080) + 1))),
       element("p", {}, "To replay it in place of this instance, with all its interfaces:"),
       this.command(instead),
@@ -203,7 +203,7 @@ export class RecordingsTab {
         await navigator.clipboard.writeText(text);
         notify("copied");
       } catch {
-        notify("The browser copies only over https or on the same host: select the text.", "problem");
+        notify("The browser lets a page copy only over https or on the same host. Select the text and copy it yourself.", "problem");
       }
     };
     return element("div", { class: "command" }, element("pre", {}, text), element("button", { type: "button", click: copy }, "Copy"));

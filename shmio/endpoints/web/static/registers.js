@@ -189,7 +189,7 @@ export class RegistersTab {
     };
     const writable = row.writable && context.may("write");
     const injects = context.may("inject");
-    const reason = row.writable ? "your roles do not allow to write" : "the configuration's writable does not name this register";
+    const reason = row.writable ? "your roles do not allow you to write" : "the configuration's writable does not name this register";
     const write = element("button", { type: "submit", disabled: !writable, title: writable ? "Write to the device" : reason }, "Write");
     this.detail.onsubmit = () => writable && act("set", { path: row.path, value: value.value });
     replace(
@@ -200,7 +200,7 @@ export class RegistersTab {
       write,
       element(
         "button",
-        { type: "button", disabled: !injects, title: "Show this value to all consumers until it is lifted", click: () => act("override", { path: row.path, value: value.value }) },
+        { type: "button", disabled: !injects, title: "Show this value to all consumers until you lift the override", click: () => act("override", { path: row.path, value: value.value }) },
         "Override",
       ),
       element("button", { type: "button", disabled: !injects, click: () => act("lift", { path: row.path }) }, "Lift"),

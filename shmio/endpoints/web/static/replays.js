@@ -65,7 +65,7 @@ class Replay {
     this.wanted = null;
     this.moving = false;
     const controls = context.may("control");
-    const why = controls ? null : "your roles do not allow to control replays";
+    const why = controls ? null : "your roles do not allow you to control replays";
     const lock = { disabled: !controls, title: why };
     this.play = element("button", { type: "button", ...lock, click: () => this.change({ paused: !this.paused }) }, "Play");
     this.slider = element("input", { type: "range", min: 0, max: playing[0].length_s, step: "any", "aria-label": "Position", ...lock });

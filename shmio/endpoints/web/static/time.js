@@ -15,7 +15,7 @@ export class TimeTab {
   constructor(context) {
     this.context = context;
     const controls = context.may("control");
-    const why = controls ? null : "your roles do not allow to control time";
+    const why = controls ? null : "your roles do not allow you to control time";
     this.mode = element("dd");
     this.time = element("dd");
     this.step = element("dd");

@@ -114,7 +114,7 @@ class Injections(FollowedTab):
         """Start a campaign: all of its injections or none."""
         self._campaigns = [one for one in self._campaigns if self._runs(one)]
         if len(self._campaigns) >= MAX_CAMPAIGNS:
-            raise CommandError(f"a page may run at most {MAX_CAMPAIGNS} campaigns at a time: lift one first")
+            raise CommandError(f"a page may run at most {MAX_CAMPAIGNS} campaigns at a time; lift one first")
         declarations = _parse(given.text)
         cell = self.page.served.cell
         campaign = await run_in_threadpool(lambda: cell.declare(declarations, keep=given.keep))
@@ -201,7 +201,7 @@ def _parse(text: str) -> list[Declaration]:
     try:
         tables = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise ConfigError(f"this is no TOML: {error}") from None
+        raise ConfigError(f"the text is not valid TOML: {error}") from None
     return parse_campaign(tables)
 
 

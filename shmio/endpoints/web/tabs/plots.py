@@ -128,7 +128,7 @@ class Plots(Tab):
             paths = list(dict.fromkeys(given.paths))
             others = sum(len(feed.registers) for source, feed in self._feeds.items() if source != given.source)
             if others + len(paths) > MAX_SIGNALS:
-                raise PathError(f"a page plots at most {MAX_SIGNALS} registers: remove some first")
+                raise PathError(f"a page plots at most {MAX_SIGNALS} registers; remove some first")
             self._leave(given.source)
             if not paths:
                 return None

@@ -248,7 +248,7 @@ class RecordingsTab(Tab):
 
     def _start(self, work: Work[Any]) -> int:
         if len(self._works) >= MAX_WORKS:
-            raise CommandError(f"a page may read at most {MAX_WORKS} recordings at a time: stop one first")
+            raise CommandError(f"a page may read at most {MAX_WORKS} recordings at a time; stop one first")
         self._number += 1
         self._works[self._number] = work
         return self._number

@@ -116,7 +116,7 @@ class Registers(Tab):
         shadow = self._overrides.get(path)
         if shadow is None:
             if len(self._overrides) >= MAX_OVERRIDES:
-                raise CommandError(f"a page may override at most {MAX_OVERRIDES} registers at a time: lift one first")
+                raise CommandError(f"a page may override at most {MAX_OVERRIDES} registers at a time; lift one first")
             name = f"page {self.page.user.name}".strip()
             shadow = await run_in_threadpool(lambda: self._cell.inject(path, name=name))
             self._overrides[path] = shadow

@@ -187,7 +187,7 @@ def test_steps_fail_at_once_until_a_model_joins(instance: str) -> None:
     with built(instance) as segment, Running(segment, "sim", remote()) as sim:
         begin = sim.next()
         assert (begin.cycle, begin.quality) == (0, Quality.BAD)
-        assert begin.reason.startswith(f'{NOBODY}: connect one with simulate("sim", …)')
+        assert begin.reason.startswith(f'{NOBODY}; connect one with simulate("sim", …)')
         coordinator = Coordinator(segment)
         for number in (1, 2):
             with pytest.raises(TimeError, match=f"^step {number}: sim: {NOBODY}"):
@@ -238,7 +238,7 @@ def test_late_answer_is_not_used_for_another_step(instance: str) -> None:
         with Model(instance, slow) as model:
             good(sim)
             coordinator = Coordinator(segment)
-            with pytest.raises(TimeError, match="sim: model 'adder' did not answer within 50 ms: check whether"):
+            with pytest.raises(TimeError, match="sim: model 'adder' did not answer within 50 ms; check whether"):
                 coordinator.step()
             hold.set()
             assert late.wait(PATIENCE_S)
@@ -365,7 +365,7 @@ def test_model_is_asked_once_a_period_in_wall_time(instance: str) -> None:
     ("options", "message"),
     [
         ({}, "outputs: name the registers"),
-        ({"outputs": ["total"]}, "outputs: 'total' names no register of model"),
+        ({"outputs": ["total"]}, "outputs: 'total' matches no register of model"),
         ({"outputs": ["sum"], "timeout_ms": 0}, "timeout_ms"),
         ({"outputs": ["sum"], "timeout_ms": 10_000}, "timeout_ms"),
         ({"outputs": "sum"}, "outputs"),

@@ -533,7 +533,7 @@ def test_removed_source_of_an_input_is_named(instance: str) -> None:
         frame = latest(segment, "a")
         assert (frame.quality, frame.reason) == (
             Quality.UNCERTAIN,
-            "input other: there is no source 'cell' any more",
+            "input other: source 'cell' no longer exists",
         )
 
 

@@ -69,15 +69,15 @@ def make(tags: dict[str, Any], **options: Any) -> None:
     ("tags", "options", "words"),
     [
         ({"a": ("INT", "a/+")}, {}, "layout: a: 'a/\\+'"),
-        ({"a": ("ARRAY[1..2] OF INT", "a")}, {}, r"an array is read from JSON: write a \$"),
+        ({"a": ("ARRAY[1..2] OF INT", "a")}, {}, r"an array is read from JSON; write a \$"),
         ({"a": ("DATE", "a")}, {}, "a DATE cannot be read"),
         (
             {"a": {"type": "INT", "address": "a $.b", "writable": True}},
             {},
             "append the topic on which to publish writes",
         ),
-        ({"a": ("INT", "a")}, {"max_age_ms": None}, "max_age_ms: a would stay good for ever"),
-        ({"a": ("INT", "a")}, {"max_age_ms": {"b/**": 5}}, "max_age_ms: a would stay good for ever"),
+        ({"a": ("INT", "a")}, {"max_age_ms": None}, "max_age_ms: a would stay good forever"),
+        ({"a": ("INT", "a")}, {"max_age_ms": {"b/**": 5}}, "max_age_ms: a would stay good forever"),
         ({"a": ("INT", "a")}, {"max_age_ms": {"a//b": 5}}, "max_age_ms: .*pattern"),
         ({"a": ("INT", "a")}, {"will": "b/#"}, "will: .*one topic"),
         ({"a": ("INT", "a")}, {"will": [{"topic": "b", "match": "x/**"}]}, r"will: no register matches"),

@@ -30,7 +30,7 @@ b
         on  BOOL  b/state $.axes[0].on
     list  ARRAY[0..2] OF LREAL  b/state $.list
     my.name  STRING  b/state $['my.name']
-    none  (it is null, so that its type is unknown)
+    none  (it is null, so its type is unknown)
 Line 1
   cell
     robot

@@ -151,7 +151,7 @@ def remaining(size: int) -> bytes:
 @pytest.mark.parametrize(
     ("then", "words"),
     [
-        (b"\x30" + remaining(MAX_PACKET_BYTES + 1), "more than the"),
+        (b"\x30" + remaining(MAX_PACKET_BYTES + 1), "but at most"),
         (b"\x34\x07\0\x01a\0\x01\0x", "QoS 2"),
         (b"\x36\x07\0\x01a\0\x01\0x", "lost|protocol|read"),
         (b"\x30\x03\0\xffa", "lost|protocol|read"),

@@ -59,7 +59,7 @@ def test_the_tree(server: Device, capsys: pytest.CaptureFixture[str]) -> None:
     shown = capsys.readouterr().out
     assert [line.split()[0] for line in shown.splitlines()] == ["Device", "open", "Axis", "speed/now"]
     assert browse(server.url, "Device/nothing") == 1
-    assert "nothing found that fits" in capsys.readouterr().err
+    assert "the device offers nothing that matches the patterns" in capsys.readouterr().err
 
 
 def test_a_tag_table_is_a_layout_at_once(server: Device, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -92,12 +92,12 @@ def test_the_search_is_bounded(server: Device, capsys: pytest.CaptureFixture[str
     assert browse(server.url, "--limit", 3) == 1
     said = capsys.readouterr()
     assert len(said.out.splitlines()) == 2
-    assert "this is not all: the server has more than 3 nodes: name a part of it by a PATTERN" in said.err
+    assert "this list is incomplete: the server has more than 3 nodes; name a part of it by a PATTERN" in said.err
     assert browse(server.url, "--depth", 2) == 1
     said = capsys.readouterr()
     assert "Axis" in said.out
     assert "speed" not in said.out
-    assert "Device/Axis/speed/now is deeper than 2 levels: set --depth" in said.err
+    assert "Device/Axis/speed/now is deeper than 2 levels; set --depth" in said.err
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +111,7 @@ def test_a_server_with_a_million_nodes(hostile: Device, capsys: pytest.CaptureFi
     assert browse(hostile.url, "--limit", 3000) == 1
     said = capsys.readouterr()
     assert len(said.out.splitlines()) == 2999
-    assert "this is not all: the server has more than 3000 nodes" in said.err
+    assert "this list is incomplete: the server has more than 3000 nodes" in said.err
     sent, open_points = hostile.ask("effort")
     assert sent <= 3000 + 20 * 500, "the rest is not asked for"
     assert open_points == 0, "the server need not remember where the search has ended"
@@ -130,7 +130,7 @@ def test_nodes_that_refer_to_each_other_without_end(hostile: Device, capsys: pyt
     assert browse(hostile.url, "--limit", 1000) == 1
     said = capsys.readouterr()
     assert len(said.out.splitlines()) == 201
-    assert "this is not all: the server sends more references than 1000 nodes need" in said.err
+    assert "this list is incomplete: the server sends more references than 1000 nodes need" in said.err
     sent, open_points = hostile.ask("effort")
     assert sent <= 1000 * browsing.REFERENCES_PER_NODE + 20 * 500
     assert open_points == 0
@@ -144,20 +144,23 @@ def test_long_names_take_no_more_memory_than_allowed(
     assert browse(hostile.url, "--limit", 3000) == 1
     said = capsys.readouterr()
     assert len(said.out.splitlines()) < (1 << 20) / 5000 + 2
-    assert "this is not all: the names of the server's nodes are too long" in said.err
+    assert "this list is incomplete: the names of the server's nodes are too long" in said.err
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["http://localhost"], "cannot be browsed; those with these can: opc.tcp://HOST:PORT"),
+        (["http://localhost"], "cannot browse a device with this kind of URL; valid: opc.tcp://HOST:PORT"),
         (["opc.tcp://user@localhost"], "without a user"),
-        (["opc.tcp://127.0.0.1:1", "--set", "timeuot=3"], "no such key of connector opcua"),
+        (
+            ["opc.tcp://127.0.0.1:1", "--set", "timeuot=3"],
+            "unknown key 'timeuot' of connector opcua; did you mean 'timeout'?",
+        ),
         (["opc.tcp://127.0.0.1:1", "--set", "timeout"], "expected KEY=VALUE"),
         (["opc.tcp://127.0.0.1:1", "--set", "timeout=soon"], "timeout: expected a whole number"),
         (["opc.tcp://127.0.0.1:1", "--set", "security=Sign"], "certificate: this key is needed"),
-        (["opc.tcp://127.0.0.1:1", "a//b"], "empty segment in the pattern"),
-        (["opc.tcp://127.0.0.1:1", "-o", "tags.csv"], "have its name end in .toml"),
+        (["opc.tcp://127.0.0.1:1", "a//b"], "the pattern has an empty segment"),
+        (["opc.tcp://127.0.0.1:1", "-o", "tags.csv"], "choose a name that ends in .toml"),
         (["opc.tcp://127.0.0.1:1"], "connection refused by 127.0.0.1:1"),
     ],
 )

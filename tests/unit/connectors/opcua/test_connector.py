@@ -166,7 +166,9 @@ def test_a_type_that_does_not_fit_is_bad_alone(device: Device, caplog: pytest.Lo
             assert found == dict.fromkeys(tags, BAD_TYPE_MISMATCH) | {"raw": GOOD}
     told = sorted(record.getMessage() for record in caplog.records)
     assert len(told) == len(tags) - 1
-    assert told[0] == ("array: the node is Int16[3], but the register is INT[4]: correct its type in the layout")
+    assert told[0] == (
+        "array: the node is Int16[3], but the register is INT[4]; correct the register's type in the layout"
+    )
 
 
 @MODES

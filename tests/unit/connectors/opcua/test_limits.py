@@ -36,7 +36,7 @@ def test_calls_and_subscriptions_are_as_large_as_the_server_takes(limited: Devic
 def test_a_refused_subscription_is_named(limited: Device) -> None:
     limited.ask("refuse_subscriptions", 0x80770000)
     try:
-        with pytest.raises(ConnectorError, match=r"no more room \(BadTooManySubscriptions "):
+        with pytest.raises(ConnectorError, match=r"no free resources \(BadTooManySubscriptions "):
             Source(limited.url, {"mode": "INT"}).connector.connect()
     finally:
         limited.ask("refuse_subscriptions", 0)

@@ -117,7 +117,7 @@ def test_another_definition_makes_members_bad_by_name(server: Device, caplog: py
     said = {record.getMessage().partition(":")[0]: record.getMessage() for record in caplog.records}
     assert "Axis has no member Speed; it has Position, Name, Homed" in said["gone"]
     assert "Int32" in said["wrong"]
-    assert "the structure Axis: give the address of a member" in said["group"]
+    assert "the structure Axis; give the address of a member" in said["group"]
     assert "Count is a Int32, which has no member Low" in said["inside"]
     assert "no element [0]" in said["single"]
     assert "count" not in said
@@ -220,7 +220,7 @@ def test_a_union_has_one_member(server: Device) -> None:
     ("tag", "words"),
     [
         ({"address": "ns=2;s=a#B", "deadband": 1}, "no dead-band"),
-        ({"address": "ns=2;s=a#B..C"}, "the way to the member is wrong at '..C'"),
+        ({"address": "ns=2;s=a#B..C"}, "the path of the member is wrong at '..C'"),
         ({"address": "ns=2;s=a#"}, "## for a # of the identifier"),
     ],
 )

@@ -76,7 +76,7 @@ def test_search_for_an_event_needs_a_single_recording(tmp_path: Path, instance: 
         Playing(segment, files[1], "two", source="cell"),
         attach(instance, writable=True) as attachment,
     ):
-        with pytest.raises(CommandError, match=r"several recordings are playing: .* \(one, two\)"):
+        with pytest.raises(CommandError, match=r"several recordings are playing; .* \(one, two\)"):
             attachment.replay.to_event("accepted", jump=True)
         assert [status.position_s for status in attachment.replay.status()] == [0.0, 0.0]
 
@@ -226,5 +226,5 @@ def test_a_recording_of_more_sources_than_an_instance_may_have_is_refused(tmp_pa
         work.frame(1, image(1), f"s{number}")
     work.writer.finish()
     assert work.output.close(30)
-    with pytest.raises(RecordingError, match=r"has 257 sources, but an instance has at most 256: copy some"):
+    with pytest.raises(RecordingError, match=r"has 257 sources, but an instance has at most 256; copy some"):
         Recording([file])

@@ -69,7 +69,7 @@ def test_recording_without_frames_is_refused(tmp_path: Path, instance: str) -> N
     with recorded(tmp_path, instance):
         pass
     [file] = tmp_path.glob("*.mem")
-    with pytest.raises(ConfigError, match=f"file: {file} has no frames: there is nothing to play"):
+    with pytest.raises(ConfigError, match=f"file: {file} has no frames, so it cannot be played"):
         Replay(Replay.Options(file=str(file)), "cell")
 
 

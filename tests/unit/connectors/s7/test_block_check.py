@@ -83,7 +83,7 @@ def test_a_block_that_is_too_short_names_itself_both_lengths_and_what_is_missing
     ):
         connector.read()
     assert str(caught.value) == (
-        'DB1 "Press" has 60 bytes, not 100 as in its layout (item code 0x05): export the layout again; beyond the '
+        'DB1 "Press" has 60 bytes, not 100 as in its layout (item code 0x05); export the layout again; beyond the '
         "end of the block: Counts, "
         "Door, Mode"
     )
@@ -112,7 +112,7 @@ def test_a_block_that_becomes_longer_is_uncertain(
         pass_a_minute()
         for _ in range(3):
             connector.read()
-        doubt = 'DB1 "Press" was changed in the controller: it had 100 bytes and has 104, its layout has 100'
+        doubt = 'DB1 "Press" was changed in the controller: it had 100 bytes and now has 104, but its layout has 100'
         assert connector.doubt == doubt
         server.cpu_state = snap7.server.CPUState.STOP
         again(connector)
@@ -127,8 +127,8 @@ def test_a_block_that_becomes_longer_is_uncertain(
     found = [record.getMessage() for record in caplog.records]
     assert len(found) == 2
     assert found[0].startswith('DB1 "Press" was changed in the controller since 20')
-    assert found[0].endswith(" UTC: it had 100 bytes and has 104, its layout has 100; compare its layout")
-    assert found[1].endswith(" UTC: it had 104 bytes and has 100, as in its layout; compare its layout")
+    assert found[0].endswith(" UTC: it had 100 bytes and now has 104, but its layout has 100; compare its layout")
+    assert found[1].endswith(" UTC: it had 104 bytes and now has 100, as in its layout; compare its layout")
 
 
 @pytest.mark.parametrize("layout", [press(), table({"x": {"type": "INT", "address": "DB1.DBW4"}})])
@@ -197,7 +197,7 @@ def test_of_a_tag_table_only_the_registers_beyond_the_end_are_bad(
         (said,) = [record.getMessage() for record in caplog.records]
         assert said.startswith("DB1 was changed in the controller since 20")
         assert said.endswith(
-            "UTC: it had 20 bytes and has 12, its registers need 20; beyond its end: r12 (%DB1.DBW12), "
+            "UTC: it had 20 bytes and now has 12, but its registers need 20; beyond its end: r12 (%DB1.DBW12), "
             "r14 (%DB1.DBW14), r16 (%DB1.DBW16) and 1 more; compare its layout"
         )
         assert connector.doubt == ""
@@ -219,7 +219,7 @@ def test_a_table_that_never_fitted_is_reported_once(plc: S7Server, caplog: pytes
     assert codes(layout, raw) == [GOOD] * 9 + [BAD_OUT_OF_RANGE] + [GOOD] * 2
     (said,) = [record.getMessage() for record in caplog.records if "in the controller," in record.getMessage()]
     assert said == (
-        "DB1 has 18 bytes in the controller, its registers need 20; beyond its end: r18 (%DB1.DBW18); compare its "
+        "DB1 has 18 bytes in the controller, but its registers need 20; beyond its end: r18 (%DB1.DBW18); compare its "
         "layout"
     )
 
@@ -263,7 +263,7 @@ def test_python_snap7s_server_tells_the_length(caplog: pytest.LogCaptureFixture)
         again(connector)
         for _ in range(5):
             connector.read()
-        assert "it had 100 bytes and has 120, its layout has 100" in connector.doubt
+        assert "it had 100 bytes and now has 120, but its layout has 100" in connector.doubt
 
 
 def test_python_snap7s_client_reads_the_emulators_information() -> None:

@@ -18,8 +18,8 @@ from tests.unit.connectors.s7.harness import SIZE, MakePlc, Plc
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        (ServerOptions(fault=Fault.PUT_GET_OFF), r"\(error 0x8104\): enable 'Permit access with PUT/GET"),
-        (ServerOptions(fault=Fault.PROTECTED), r"DB201: access denied \(item code 0x03\): .*'Full access'"),
+        (ServerOptions(fault=Fault.PUT_GET_OFF), r"\(error 0x8104\); enable 'Permit access with PUT/GET"),
+        (ServerOptions(fault=Fault.PROTECTED), r"DB201: access denied \(item code 0x03\).*'Full access'"),
         (
             ServerOptions(fault=Fault.OPTIMIZED),
             r"DB201 has no byte that can be addressed.*clear 'Optimized block",

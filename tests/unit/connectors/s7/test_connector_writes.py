@@ -288,7 +288,7 @@ def test_duration_of_a_batch_is_bounded(make_plc: MakePlc, clock: Clock, timeout
     plc = make_plc(ServerOptions(max_jobs=1))
     client = plc.connected(timeout=1000 * timeout_s)
     clock.slow_down(plc, 4)
-    with pytest.raises(ConnectorError, match=f"has not answered all writes of a cycle within {most_s} s: write fewer"):
+    with pytest.raises(ConnectorError, match=f"has not answered all writes of a cycle within {most_s} s; write fewer"):
         client.write([Write(2 * place, 1, b"\1") for place in range(180)])  # nine jobs
     assert_recovers(plc, client)
 

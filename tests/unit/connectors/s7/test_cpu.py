@@ -255,7 +255,7 @@ def test_values_of_the_cpu_cannot_be_written() -> None:
     [
         (
             {"type": "INT", "address": "cpu.stat"},
-            r"address: 'cpu\.stat' is not a value of the CPU; its values are cpu.state, .*did you mean cpu.state",
+            r"address: unknown value 'cpu\.stat' of the CPU; did you mean 'cpu.state'",
         ),
         ({"type": "REAL", "address": "cpu.state"}, r"type: .*STRING\[9\] or longer, not REAL"),
         ({"type": "STRING[8]", "address": "cpu.state"}, r"type: .*STRING\[9\]"),

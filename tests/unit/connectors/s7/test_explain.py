@@ -16,11 +16,11 @@ from shmio.segment._atomics import REASON_SIZE
     [
         (0x0A, r"^DB201: the block does not exist \(item code 0x0A\).*dbNumber.*optimized"),
         (0x05, r"^DB201 does not have 2180 bytes \(item code 0x05\).*export it again.*Optimized"),
-        (0x03, r"access denied \(item code 0x03\): enable.*PUT/GET.*Full access"),
+        (0x03, r"access denied \(item code 0x03\); enable.*PUT/GET.*Full access"),
         (0x06, "type or length"),
         (0x07, "type or length"),
         (0x01, "Hardware error"),
-        (0x77, "no text known"),
+        (0x77, "unknown error"),
     ],
 )
 def test_refused_reads(code: int, text: str) -> None:
@@ -34,17 +34,17 @@ def test_refused_writes() -> None:
 
 def test_wrong_block_sizes() -> None:
     assert re.search(r"not have 2180 bytes but 100 bytes .*export it again$", explain.explain_size(201, 2180, 100))
-    assert re.search("optimized: clear 'Optimized block access'", explain.explain_size(201, 2180, 0))
+    assert re.search("optimized, clear 'Optimized block access'", explain.explain_size(201, 2180, 0))
 
 
 @pytest.mark.parametrize(
     ("error", "text"),
     [
-        (0x8104, r"\(error 0x8104\): enable .*PUT/GET"),
+        (0x8104, r"\(error 0x8104\); enable .*PUT/GET"),
         (0x8304, "PUT/GET"),
         (0xD241, "protection level.*Full access"),
         (0x8500, "0x8500"),
-        (0xEEEE, "no text known"),
+        (0xEEEE, "unknown error"),
     ],
 )
 def test_refused_jobs(error: int, text: str) -> None:

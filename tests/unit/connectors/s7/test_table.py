@@ -270,7 +270,7 @@ def test_many_registers_in_several_jobs(pdu_size: int) -> None:
     ("tag", "reason"),
     [
         ({"type": "BOOL", "address": "%I0.0", "writable": True}, "x: writable: inputs cannot be written"),
-        ({"type": "INT"}, "x: address: needed"),
+        ({"type": "INT"}, "x: address: this key is needed"),
     ],
 )
 def test_a_wrong_table_is_a_fault_of_the_configuration(tag: object, reason: str) -> None:

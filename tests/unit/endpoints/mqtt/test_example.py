@@ -62,4 +62,4 @@ def test_a_killed_broker_is_reported(broker: Mosquitto) -> None:
 
 def test_a_broker_that_needs_an_account_is_reported(make_broker: Callable[..., Mosquitto]) -> None:
     broker = make_broker("allow_anonymous false")
-    assert fails(broker.address, PATH) == f"{broker.address}: the broker refuses us: Not authorized\n"
+    assert fails(broker.address, PATH) == f"{broker.address}: the broker refuses this client: Not authorized\n"

@@ -229,7 +229,7 @@ def test_a_wrong_password_is_reported_until_the_file_has_the_right_one(
     file = secret(tmp_path, "wrong\n")
     with bridge(segment, broker.address, username="cell", password_file=file) as running:
         running.until(lambda: "mqtt.password_file" in running.bridge.problem)
-        assert "refuses our login" in running.bridge.problem
+        assert "refuses shmio's login" in running.bridge.problem
         assert "right" not in running.bridge.problem
         secret(tmp_path, "right\n")
         running.until(lambda: running.bridge.connection.up)
@@ -273,7 +273,7 @@ class Answers:
         (b"HTTP/1.1 400 Bad Request\r\n\r\n", "the connection was lost"),
         (b"\x20\xff\xff\xff\xff\xff\xff", "the connection was lost"),
         (b"\x30\x05\x00\x09ab", "the connection was lost"),
-        (b"\x20\x02\x00\x05", "refuses our login"),
+        (b"\x20\x02\x00\x05", "refuses shmio's login"),
     ],
 )
 def test_the_brokers_answer_is_reported(segment: Segment, answer: bytes, told: str) -> None:

@@ -204,7 +204,7 @@ def test_figures_need_the_role_read(segment: Segment) -> None:
     ("text", "error"),
     [
         ("{", "malformed"),
-        ('{"id": 7, "call": "nothing"}', "there is no call 'nothing'"),
+        ('{"id": 7, "call": "nothing"}', "unknown call 'nothing'"),
         ('{"id": 7, "call": "overview.follow", "with": {"x": 1}}', "malformed"),
         (f'{{"id": 7, "call": {"[" * 5000}', "malformed"),
     ],

@@ -31,8 +31,8 @@ def test_addresses(text: str, expected: object) -> None:
     ("text", "words"),
     [
         ("", "is missing"),
-        ("Speed", "no address of OPC UA"),
-        ("ns=3;Speed", "no address of OPC UA"),
+        ("Speed", "is not an address of OPC UA"),
+        ("ns=3;Speed", "is not an address of OPC UA"),
         ("ns=70000;s=x", "65535"),
         ("i=4294967296", "4294967295"),
         ("i=-1", "4294967295"),

@@ -195,7 +195,7 @@ def test_a_workbook_of_tia_portal() -> None:
     ]
     assert found.tags["Motor.Speed"] == {"type": "Int", "address": "%IW64", "comment": "actual speed"}
     assert found.tags["Door%2FClosed"] == {"type": "Bool", "address": "%I0.0", "writable": True}
-    assert reasons(found) == {"a PLC data type": ["Axis"], "there is no type 'Widget'": ["level"]}
+    assert reasons(found) == {"a PLC data type": ["Axis"], "unknown type 'Widget'": ["level"]}
 
 
 def test_a_symbol_table_of_step_7_as_sdf() -> None:
@@ -303,12 +303,12 @@ def test_variables_of_a_node_set() -> None:
         (b"<a/>", "XML with the root 'a'"),
         (b"<Document><SW.Blocks.FC/></Document>", "expected a PLC tag table or a global data block, found SW"),
         (b"<UANodeSet/>", "expected nodes below UANodeSet"),
-        (b"<UANodeSet>", "not XML that can be read"),
-        (b'<!DOCTYPE x [<!ENTITY a "b">]><UANodeSet>&a;</UANodeSet>', "a document type is not allowed"),
-        (b'<!DOCTYPE x SYSTEM "file:///etc/passwd"><UANodeSet/>', "a document type is not allowed"),
+        (b"<UANodeSet>", "the file is not valid XML"),
+        (b'<!DOCTYPE x [<!ENTITY a "b">]><UANodeSet>&a;</UANodeSet>', "declares a document type, which is not allowed"),
+        (b'<!DOCTYPE x SYSTEM "file:///etc/passwd"><UANodeSet/>', "declares a document type, which is not allowed"),
         (b"<a>" * 201, "200 deep"),
-        (b"<a>" + b"<b/>" * 500_000, "at most 500000 elements"),
-        (b"Tag Name,Address\r\n", "lacks the columns data type"),
+        (b"<a>" + b"<b/>" * 500_000, "more than 500000 elements"),
+        (b"Tag Name,Address\r\n", "does not have the columns data type"),
         (b'"a","b"\r\n', "expected symbol, address, type, comment; found 2 cells"),
         (b"126,a\r\nb\r\n", "line 2: expected 126, at its start"),
         (bytes((32 << 20) + 1), "larger than"),

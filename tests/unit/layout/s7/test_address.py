@@ -53,22 +53,22 @@ def test_an_address_is_understood(kind: str, address: str, expected: object) -> 
 @pytest.mark.parametrize(
     ("kind", "address", "reason"),
     [
-        ("INT", "", "address: needed"),
+        ("INT", "", "address: this key is needed"),
         ("INT", "DB0.DBW0", "numbered 1 to"),
         ("INT", "DB70000.DBW0", "numbered 1 to"),
         ("INT", "DB1.DBW70000", "the largest number"),
-        ("INT", "DB1.DBW65535", "end behind byte 65535"),
+        ("INT", "DB1.DBW65535", "end after byte 65535"),
         ("INT", "DB1.DBD0", "4 bytes, but INT has 2"),
         ("BOOL", "DB1.DBB0", "is one bit"),
         ("INT", "DB1.DBX0.1", "whole byte"),
-        ("INT", "%MW3.1", "a bit has a byte"),
-        ("INT", "%M3", "a bit has a byte"),
+        ("INT", "%MW3.1", "write a bit with its byte"),
+        ("INT", "%M3", "write a bit with its byte"),
         ("BYTE", "%QB4:P", "leave out ':P'"),
         ("REAL", "T5", "S5TIME"),
         ("WORD", "T5.1", "only a number"),
         ("BOOL", "%M0.0 INT", "only numbers"),
-        ("WORD", "%MW٣", "is none"),
-        ("WORD", "40001", "is none"),
+        ("WORD", "%MW٣", "is not an S7 address"),
+        ("WORD", "40001", "is not an S7 address"),
     ],
 )
 def test_a_wrong_address_is_named(kind: str, address: str, reason: str) -> None:

@@ -93,8 +93,8 @@ def test_other_encodings_are_read_as_windows_1252_with_a_warning(encoding: str) 
     compiled = compile_bytes(TEXT.encode(encoding))
     assert compiled.layouts[0].registers[0].comment == "für É"
     (warning,) = compiled.warnings
-    assert str(warning).startswith("x.db:1:15: warning: not UTF-8: read as Windows-1252")
-    assert "save the file as UTF-8" in warning.message
+    assert str(warning).startswith("x.db:1:15: warning: the file is not UTF-8, so shmio reads it as Windows-1252")
+    assert "save it as UTF-8" in warning.message
 
 
 def test_characters_that_only_windows_1252_has() -> None:
@@ -108,9 +108,11 @@ def test_bytes_without_a_character_in_windows_1252_are_kept() -> None:
 
 @pytest.mark.parametrize("data", [codecs.BOM_UTF16_LE + b"a\0\n\0\x00\xdc", codecs.BOM_UTF16_BE + b"\0a\0\n\0"])
 def test_wrong_utf16_byte_order_mark_is_refused_with_a_remedy(data: bytes) -> None:
-    with pytest.raises(LayoutError, match=r"^x\.db:2:1: error: expected UTF-16-.E, .* export the source again"):
+    with pytest.raises(
+        LayoutError, match=r"^x\.db:2:1: error: .* byte order mark of UTF-16-.E, .* export the source again"
+    ):
         compile_bytes(data)
 
 
 def test_wrong_utf8_byte_order_mark_is_read_as_windows_1252() -> None:
-    assert "read as Windows-1252" in compile_bytes(codecs.BOM_UTF8 + TEXT.encode("cp1252")).warnings[0].message
+    assert "reads it as Windows-1252" in compile_bytes(codecs.BOM_UTF8 + TEXT.encode("cp1252")).warnings[0].message

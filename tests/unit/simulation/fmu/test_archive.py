@@ -36,10 +36,10 @@ def link() -> zipfile.ZipInfo:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("../evil", "outside of the archive"),
-        ("resources/../../evil", "outside of the archive"),
-        ("/etc/evil", "outside of the archive"),
-        ("resources\\..\\evil", "outside of the archive"),
+        ("../evil", "outside the archive's folder"),
+        ("resources/../../evil", "outside the archive's folder"),
+        ("/etc/evil", "outside the archive's folder"),
+        ("resources\\..\\evil", "outside the archive's folder"),
         (link(), "is a link"),
     ],
 )

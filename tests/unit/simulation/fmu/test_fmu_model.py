@@ -249,7 +249,7 @@ def test_the_ranges_of_inputs_and_parameters_are_checked(run: Runner) -> None:
     assert value(runner, "pulses", runner.step(20 * MS, 20 * MS)) == 100
     for parameters, message in (
         ({"area": 0.0}, r"^parameters\.area: 0 is outside the limits of 0\.1 to inf"),
-        ({"aera": 1.0}, r"^parameters\.aera: .*there are: area, label"),
+        ({"aera": 1.0}, r"^parameters\.aera: unknown parameter 'aera' of .*; did you mean 'area'"),
         ({"area": "x"}, r"^parameters\.area: "),
     ):
         with pytest.raises(ConfigError, match=message):

@@ -74,7 +74,7 @@ def test_a_token_has_exactly_its_roles(segment: Segment, caplog: pytest.LogCaptu
             told, message = await refusal(call(channel, GET))
             assert told is UNKNOWN
             assert message == (
-                "GetTopic needs the role read, and this address gives nothing without a token: send "
+                "GetTopic needs the role read, and this address gives nothing without a token; send "
                 "authorization: Bearer TOKEN with a token of [[grpc.token]]"
             )
             told, message = await refusal(call(channel, GET, secret="guessed-0123456789abcdef"))
@@ -82,7 +82,7 @@ def test_a_token_has_exactly_its_roles(segment: Segment, caplog: pytest.LogCaptu
             told, message = await refusal(call(channel, PUBLISH, b"", READER))
             assert told is DENIED
             assert message == (
-                "Publish needs the role write; token 'reader' has read: add the role to its roles in [[grpc.token]]"
+                "Publish needs the role write; token 'reader' has read; add the role to its roles in [[grpc.token]]"
             )
             get: Any = channel.unary_unary(GET)
             basic = [("authorization", f"Basic {READER}")]
@@ -170,7 +170,7 @@ def test_an_address_gives_its_roles_to_clients_without_a_token(segment: Segment)
             async with grpc.aio.insecure_channel(f"127.0.0.1:{ports[1]}") as channel:
                 assert await call(channel, GET)
                 told, message = await refusal(call(channel, PUBLISH, b""))
-                assert (told, "this address has read: add the role to the roles of the address" in message) == (
+                assert (told, "this address has read; add the role to the roles of the address" in message) == (
                     DENIED,
                     True,
                 )

@@ -102,14 +102,14 @@ def test_one_client_cannot_take_all_calls_and_their_total_is_limited(segment: Se
         greedy, other, last = clients
         await greedy.open(8)
         assert await greedy.refused() == (
-            "this client has 8 calls open, and the last 4 of 12 calls are for clients with fewer than 2: use SimlogAPI "
+            "this client has 8 calls open, and the last 4 of 12 calls are for clients with fewer than 2; use SimlogAPI "
             "version 2 (one stream for all topics)"
         )
         await other.open(2)
         assert "this client has 2 calls open" in await other.refused()
         await last.open(2)
         extra = Another(served)
-        assert await extra.refused() == "12 calls are open, the maximum: try again when others have ended"
+        assert await extra.refused() == "12 calls are open, which is the maximum; try again when others have ended"
         assert served.server.calls.refusals.count == 3
         served.publish(image(step=2))
         assert [await value(stream) for stream in (*other.streams, *last.streams)] == ["1"] * 4

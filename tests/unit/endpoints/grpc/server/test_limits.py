@@ -51,7 +51,7 @@ def test_a_shortage_of_connections_is_reported(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(resource, "getrlimit", lambda _: (64, 64))
     told = shortage(1, 2048)
     assert told.startswith(
-        "it serves at most 1 connections at once, not 2048: the hard limit of open files is 64; raise"
+        "the endpoint serves at most 1 connections at once, not 2048: the hard limit of open files is 64; raise"
     )
     assert shortage(FEW, 2048) == ""
     assert shortage(2, 2) == ""

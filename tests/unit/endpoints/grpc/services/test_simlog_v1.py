@@ -149,7 +149,7 @@ def test_a_shadow_in_use_for_another_target_is_refused(segment: Segment) -> None
         originals = await laid(served, "cell/step/in", "s")
         for target in ("cell/step/out", "cell/running/in"):
             status, text = await refusal(inject(served, target, "/s").read())
-            assert (status, text) == (Status.ALREADY_EXISTS, "/s is the shadow of cell/step/in: name another path")
+            assert (status, text) == (Status.ALREADY_EXISTS, "/s is the shadow of cell/step/in; name another path")
         assert len(present_injections(served)) == 1
         originals.cancel()
         await lifted(served)
@@ -310,7 +310,7 @@ def test_the_stream_ends_with_a_reason_when_another_client_lifts_it(segment: Seg
             await asyncio.to_thread(SourceWriter(segment.blocks["cell"], GUEST).lift, one.number)
             while (got := await _end(originals)) is None:
                 pass
-            assert got == (Status.ABORTED, f"{target}: somebody has lifted it")
+            assert got == (Status.ABORTED, f"{target}: another program has lifted it")
 
     with_plant(segment, test)
 

@@ -186,7 +186,7 @@ REFUSED = [
     (request("cell/inputs", [1, None]), Status.INVALID_ARGUMENT, "found none"),
     (request("cell/running", 2), Status.INVALID_ARGUMENT, "expected true or false"),
     (request("cell/name", 5), Status.INVALID_ARGUMENT, "expected text"),
-    (request("cell/name", "longer than eight"), Status.INVALID_ARGUMENT, "do not fit"),
+    (request("cell/name", "longer than eight"), Status.INVALID_ARGUMENT, "at most 8 are allowed"),
 ]
 
 

@@ -168,7 +168,7 @@ def test_an_unknown_subscriber_is_not_found(segment: Segment, monkeypatch: pytes
         for uuid in ("", "nobody", "x" * 10_000):
             status, text = await refusal(served.add(uuid, "cell/step"))
             assert status is Status.NOT_FOUND
-            assert "no such subscriber" in text
+            assert "unknown subscriber" in text
             assert len(text) < 300
         stream.cancel()
         await served.until(lambda: left(served))
@@ -422,7 +422,7 @@ def test_a_uuid_belongs_to_its_client(segment: Segment) -> None:
         assert (status, "belongs to another client" in text) == (Status.ALREADY_EXISTS, True)
         for metadata in (other, ()):
             status, text = await refusal(served.v2.Subscribe(topic, metadata=metadata, timeout=TIMEOUT_S))
-            assert (status, "no such subscriber" in text) == (Status.NOT_FOUND, True)
+            assert (status, "unknown subscriber" in text) == (Status.NOT_FOUND, True)
         await served.v2.Subscribe(topic, metadata=first, timeout=TIMEOUT_S)
         assert await message(stream) == ("cell/step", 1)
         again = served.v2.CreateSubscriber(subscriber, metadata=first, timeout=TIMEOUT_S)

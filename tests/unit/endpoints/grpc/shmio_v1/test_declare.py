@@ -139,7 +139,11 @@ def test_a_campaign_ends_when_all_its_injections_are_over(segment: Segment) -> N
 @pytest.mark.parametrize(
     ("wrong", "error", "message"),
     [
-        ({"target": "cell/nothing"}, ValueRangeError, r"injection\[1\]\.target: cell/nothing: no such register in DB1"),
+        (
+            {"target": "cell/nothing"},
+            ValueRangeError,
+            r"injection\[1\]\.target: cell/nothing: DB1 has no such register",
+        ),
         ({"target": "cell/name"}, ValueRangeError, r"injection\[1\]\.target: cell/name is STRING\[8\]"),
         ({"when": "cell/step >"}, ValueRangeError, r"injection\[1\]\.when: at character 12"),
         ({"end_s": 0.0}, ValueRangeError, r"injection\[1\]\.end_s"),
@@ -148,7 +152,7 @@ def test_a_campaign_ends_when_all_its_injections_are_over(segment: Segment) -> N
         ({"value": "x"}, ValueRangeError, r"injection\[1\]\.value: expected a number"),
         ({"value": None}, ValueRangeError, r"injection\[1\]\.value: this key is needed"),
         ({"amplitude": 1.0}, ValueRangeError, r"injection\[1\]\.amplitude: operation 'offset' has no such key"),
-        ({"operation": "explode"}, ValueRangeError, r"injection\[1\]\.operation: 'explode' is unknown"),
+        ({"operation": "explode"}, ValueRangeError, r"injection\[1\]\.operation: unknown operation 'explode'"),
         ({"times": -1}, ValueRangeError, r"injection\[1\]"),
         ({"target": "cell/secret/in"}, CommandError, "not writable"),
     ],
@@ -224,7 +228,7 @@ def test_too_many_declarations_are_refused_before_any_is_checked(segment: Segmen
     async def test(served: Endpoint, _: Plant) -> None:
         call = stub(served).Declare(wire.DeclareRequest(declarations=[wire.Declaration()] * 257), timeout=TIMEOUT_S)
         code, text = await refusal(call.read())
-        assert (code, text) == (Status.INVALID_ARGUMENT, "257 injections are declared, at most 256 are allowed")
+        assert (code, text) == (Status.INVALID_ARGUMENT, "257 injections are declared, but at most 256 are allowed")
 
     with_plant(segment, test)
 

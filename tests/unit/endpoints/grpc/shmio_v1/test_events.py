@@ -266,8 +266,8 @@ def test_a_source_that_a_reload_removes_is_told_once(segment: Segment) -> None:
 @pytest.mark.parametrize(
     ("sources", "status", "words"),
     [
-        (["nix"], Status.NOT_FOUND, "no source 'nix'"),
-        (["cell", "x" * 9999], Status.NOT_FOUND, "no source"),
+        (["nix"], Status.NOT_FOUND, "unknown source 'nix'"),
+        (["cell", "x" * 9999], Status.NOT_FOUND, "unknown source"),
         (["cell"] * 257, Status.INVALID_ARGUMENT, "at most 256"),
     ],
 )
@@ -393,7 +393,7 @@ def test_a_client_closes_it(segment: Segment, connects: Connect) -> None:
             asyncio.get_running_loop().call_later(0.05, events.close)
             with pytest.raises(StopAsyncIteration):
                 await waiting
-            with pytest.raises(PathError, match="no source 'nix'"):
+            with pytest.raises(PathError, match="unknown source 'nix'"):
                 await cell.events("nix")
             with pytest.raises(ValueRangeError, match="at most 256"):
                 await cell.events(*map(str, range(257)))

@@ -168,9 +168,9 @@ def test_lift_all_ends_the_streams_of_all(segment: Segment) -> None:
         assert {one.number for one in lifted} == {shadow.number for shadow in shadows}
         assert cell.injections() == []
         for shadow in shadows:
-            with pytest.raises(RemoteError, match="somebody has lifted it"):
+            with pytest.raises(RemoteError, match="another program has lifted it"):
                 drain(shadow)
-            with pytest.raises(RemoteError, match="somebody has lifted it"):
+            with pytest.raises(RemoteError, match="another program has lifted it"):
                 shadow.set({"cell/axis/position": 1.0})
             shadow.close()
         assert cell.lift_all() == []
@@ -260,9 +260,9 @@ def test_both_clients_give_values_and_read_originals(segment: Segment, connects:
                 await shadow.send({"cell/axis/position": 3.0})
                 (one,) = await cell.injections()
                 await cell.lift("cell", one.number)
-                with pytest.raises(RemoteError, match="somebody has lifted it"):
+                with pytest.raises(RemoteError, match="another program has lifted it"):
                     await drain_aio(shadow)
-                with pytest.raises(RemoteError, match="somebody has lifted it"):
+                with pytest.raises(RemoteError, match="another program has lifted it"):
                     await shadow.set({"cell/axis/position": 2.0})
             assert [one.kind for one in await cell.write({"cell/step": 3})] == ["written"]
             assert device.memory[13] == 3

@@ -132,7 +132,7 @@ def test_injected_registers_are_marked_and_have_their_originals(segment: Segment
     [
         ((), Status.INVALID_ARGUMENT, "no pattern is given"),
         (("cell/nothing",), Status.NOT_FOUND, "no such register"),
-        (("cell/x*",), Status.NOT_FOUND, "cell/x*: no register of cell has such a path"),
+        (("cell/x*",), Status.NOT_FOUND, "cell/x*: source 'cell' has no such register"),
         (("other/x",), Status.NOT_FOUND, "no such register"),
         (("cell/axis/position/in",), Status.NOT_FOUND, "leave out /in"),
         (("cell/inputs/0..2",), Status.NOT_FOUND, "outside"),
@@ -142,7 +142,7 @@ def test_injected_registers_are_marked_and_have_their_originals(segment: Segment
         (("cell/" + "a" * 20_000,), Status.NOT_FOUND, "at most"),
         (("cell/*" + "a" * 2_000,), Status.NOT_FOUND, "at most"),
         (("SIMLOG://step",), Status.NOT_FOUND, "SIMLOG://step: clients can only subscribe to this topic"),
-        (("cell/axis",) * 257, Status.INVALID_ARGUMENT, "257 patterns are given, at most 256"),
+        (("cell/axis",) * 257, Status.INVALID_ARGUMENT, "257 patterns are given, but at most 256"),
     ],
 )
 def test_invalid_reads_are_refused_with_the_reason(
@@ -202,7 +202,7 @@ def test_get_layouts(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
         )  # a small request must not cause an answer of a million parts
         assert [part async for part in stub(served).GetLayouts(often, timeout=TIMEOUT_S)] == parts
         call = stub(served).GetLayouts(wire.GetLayoutsRequest(sources=["cell", "x"]), timeout=TIMEOUT_S)
-        with pytest.raises(grpc.aio.AioRpcError, match="no source 'x'; there are: cell"):
+        with pytest.raises(grpc.aio.AioRpcError, match="unknown source 'x'; valid: cell"):
             _ = [part async for part in call]
 
     serve(segment, test)

@@ -28,7 +28,7 @@ def test_the_number_of_values_by_path_is_limited(instance: str) -> None:
             asyncio.run(fill.decode_assignments(given, image))
             assert image[4 * 4095 : 4 * 4096] == (4095).to_bytes(4, "big")
             with pytest.raises(
-                ValueRangeError, match=r"4097 values are given by path, at most 4096 are allowed: use slots"
+                ValueRangeError, match=r"4097 values are given by path, at most 4096 are allowed; use slots"
             ):
                 asyncio.run(fill.decode_assignments([*given, given[0]], image))
         finally:

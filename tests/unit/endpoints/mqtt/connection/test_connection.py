@@ -151,7 +151,7 @@ def test_a_brokers_refusal_is_reported_as_long_as_it_lasts(monkeypatch: pytest.M
             connection.push()
             broker.hear(0x80)
             broker.say("90 05 00 04 00 01 87", lambda: bool(connection.problem))
-            told = "refuses our subscription, so no command can arrive: Not authorized"
+            told = "refuses shmio's subscription, so no command can arrive: Not authorized"
             assert told in connection.problem
             publish("open")
             broker.say("40 02 00 05", lambda: not connection.in_flight)

@@ -207,10 +207,15 @@ def test_commands_use_names_or_aliases() -> None:
 @pytest.mark.parametrize(
     ("device", "fields", "error", "message"),
     [
-        ("axis", {"name": "positron", "float_value": 1}, PathError, "no metric 'positron'"),
-        ("axis", {"alias": 1, "float_value": 1}, PathError, "no metric alias 1"),  # an alias of another device
-        ("axis", {"float_value": 1}, PathError, "no metric alias 0"),
-        ("axle", {"name": "position", "float_value": 1}, PathError, "no such device; there are: cell, axis"),
+        (
+            "axis",
+            {"name": "positron", "float_value": 1},
+            PathError,
+            "unknown metric 'positron'; did you mean 'position'?",
+        ),
+        ("axis", {"alias": 1, "float_value": 1}, PathError, "unknown metric 'alias 1'"),  # an alias of another device
+        ("axis", {"float_value": 1}, PathError, "unknown metric 'alias 0'"),
+        ("axle", {"name": "position", "float_value": 1}, PathError, "unknown device 'axle'; "),
         ("axis", {"name": "position"}, ValueRangeError, "there is no value"),
         ("axis", {"name": "position", "is_null": True, "float_value": 1}, ValueRangeError, "there is no value"),
         (

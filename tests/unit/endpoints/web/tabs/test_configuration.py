@@ -89,7 +89,7 @@ def test_file_is_masked_and_messages_are_at_their_lines(instance: str, tmp_path:
     with supervised(instance, tmp_path) as (segment, supervisor):
         faults = [
             f"{file}:6: source[0].period_ms: expected a number >= 0.1",
-            f"{file}: not TOML: Invalid value (at line 5, column 12): password = hunter2-hunter2",
+            f"{file}: the file is not valid TOML: Invalid value (at line 5, column 12): password = hunter2-hunter2",
             "/other/db201.db:3:1: error: wrong 'hunter2-hunter2'",
         ]
         supervisor.dry = {"faults": faults, "warnings": [f"{file}: warning: source[0].name: odd"]}
@@ -101,7 +101,7 @@ def test_file_is_masked_and_messages_are_at_their_lines(instance: str, tmp_path:
     assert found["changes"] is None
     assert [(one["kind"], one["line"], one["text"]) for one in found["messages"]] == [
         ("fault", 6, "source[0].period_ms: expected a number >= 0.1"),
-        ("fault", 5, "not TOML: Invalid value (at line 5, column 12): password = •••"),
+        ("fault", 5, "the file is not valid TOML: Invalid value (at line 5, column 12): password = •••"),
         ("fault", 0, "/other/db201.db:3:1: error: wrong '•••'"),
         ("warning", 4, "source[0].name: odd"),
     ]

@@ -45,11 +45,11 @@ def test_check_says_what_a_campaign_would_inject(segment: Segment) -> None:
 @pytest.mark.parametrize(
     ("text", "error"),
     [
-        ("[[injection]", "this is no TOML"),
+        ("[[injection]", "the text is not valid TOML"),
         ("", "injection: this key is needed"),
         (CAMPAIGN.replace("position", "nothing"), "injection[0].target"),
         (CAMPAIGN.replace("> 3", ">"), "injection[0].when"),
-        ("x = " + "[" * 5000, "this is no TOML"),
+        ("x = " + "[" * 5000, "the text is not valid TOML"),
         ("#" * 61_000, "malformed"),
     ],
 )

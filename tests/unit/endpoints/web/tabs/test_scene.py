@@ -13,7 +13,7 @@ SCENE: dict[str, Any] = {"bodies": [], "floor": None, "camera": None}
 def test_tab_is_absent_without_a_scene(segment: Segment) -> None:
     with pages(segment) as server, server.open() as browser:
         assert "scene" not in json.loads(server.request("GET", "/session")[2])["tabs"]
-        assert "no call" in said(browser, "scene.get")["error"]
+        assert "unknown call" in said(browser, "scene.get")["error"]
 
 
 def test_page_gets_the_scene_and_follows_its_registers(segment: Segment) -> None:

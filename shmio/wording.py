@@ -1,0 +1,83 @@
+"""Phrases that messages share, so that the same fault reads the same everywhere."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+MAX_HINTED: Final = 100
+"""Maximum length in characters of an unknown word for which a similar word is suggested."""
+MAX_WORD: Final = 80
+MAX_NAMES: Final = 30
+"""Maximum number of valid words that a message lists."""
+
+
+def near(word: str, names: Iterable[str]) -> list[str]:
+    """Return a list with only the name most similar to ``word``, ignoring case; empty if none is similar."""
+    folded = {name.lower(): name for name in names}
+    found = difflib.get_close_matches(word.lower(), folded, 1) if len(word) <= MAX_HINTED else []
+    return [folded[found[0]]] if found else []
+
+
+def did_you_mean(names: Sequence[str]) -> str:
+    """Return ``did you mean 'a', 'b' or 'c'?``; empty if there are no names."""
+    *first, last = map(repr, names) if names else [""]
+    return f"did you mean {', '.join(first)}{' or ' if first else ''}{last}?" if names else ""
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return ``valid: a, b, c`` with at most ``MAX_NAMES`` names; ``there are none`` without names."""
+    known = list(names)
+    if not known:
+        return "there are none"
+    return f"valid: {', '.join(known[:MAX_NAMES])}{', …' if len(known) > MAX_NAMES else ''}"
+
+
+def unknown(what: str, word: object, names: Iterable[str], of: str = "") -> str:
+    """Return ``unknown WHAT 'word'; did you mean 'name'?``; if no name is similar, all valid names instead.
+
+    Args:
+        what: The kind of thing, such as ``source``.
+        word: The word that the user wrote.
+        names: All valid names.
+        of: What has these names, if the message does not say this before.
+
+    """
+    known = list(names)
+    text = str(word)
+    shown = repr(text if len(text) <= MAX_WORD else f"{text[: MAX_WORD - 1]}…")
+    return f"unknown {what} {shown}{f' of {of}' if of else ''}; {did_you_mean(near(text, known)) or listed(known)}"
+
+
+def already_named(name: str, first: str) -> str:
+    """Return the message about a name that is given twice; ``first`` is the key of the section that has it."""
+    return f"{name!r} is already the name of {first}; choose another name"
+
+
+EXISTS: Final = "this file exists already; choose another name, or remove the file"
+IN_USE: Final = "another program uses this address (ss -ltnp shows which), or this host does not have it"
+NOT_TOML: Final = "a tag table is TOML; choose a name that ends in .toml"
+EMPTY: Final = "the recording is empty"
+PLAIN_REMEDY: Final = "give certificate and key, or write insecure = true in the same section"
+"""The remedy against plain text in the sections that have a certificate of their own."""
+
+
+def larger_than(most_bytes: int) -> str:
+    """Return the message about a file that is too large."""
+    return f"the file is larger than {most_bytes} bytes, which is the maximum"
+
+
+def plain_text(address: object, remedy: str) -> str:
+    """Return the message about an address that is open to other hosts without encryption."""
+    return f"other hosts can reach {address} in plain text; {remedy}"
+
+
+def name_one(what: str, names: Iterable[str]) -> str:
+    """Return the message about a name that is missing although there is not exactly one thing of this kind."""
+    known = list(names)
+    return (
+        f"there are several {what}s; name one of them: {', '.join(known[:MAX_NAMES])}"
+        if known
+        else f"there is no {what}"
+    )
