@@ -17,6 +17,7 @@ from shmio.layout.values.typed import read_value
 from shmio.logs import printable
 from shmio.model.cell import Cell
 from shmio.model.values import WRITE_MIN_PERIODS, WRITE_TIMEOUT_S, Outcome, OutcomeKind
+from shmio.wording import unknown
 
 MATCHES = 3
 """Number of matching registers that the error about a pattern names."""

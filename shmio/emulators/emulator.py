@@ -105,7 +105,7 @@ class Emulator:
 
         """
         if self._server.cpu_state != CPUState.RUN:
-            raise SnapshotError("its CPU is not in RUN: start it first")
+            raise SnapshotError("its CPU is not in RUN; start it first")
         with self._server.lock:
             memory = [bytes(area) for area in self._memory.values()]
             return msgspec.msgpack.encode((bytes(self._frame), memory, self._program.save()))
@@ -118,7 +118,7 @@ class Emulator:
 
         """
         if self._server.cpu_state != CPUState.RUN:
-            raise SnapshotError("its CPU is not in RUN: start it first")
+            raise SnapshotError("its CPU is not in RUN; start it first")
         try:
             frame, memory, program_state = msgspec.msgpack.decode(data, type=tuple[bytes, list[bytes], bytes])
         except msgspec.MsgspecError as error:

@@ -12,6 +12,7 @@ import msgspec
 from shmio.errors import ConfigError, ModelError, SnapshotError
 from shmio.layout.model import NUMBERS, Layout
 from shmio.layout.values.codec import Value, codec
+from shmio.wording import unknown
 
 # numpy and the models are imported where they are used: most emulators need neither, and start faster without.
 if TYPE_CHECKING:

@@ -48,7 +48,7 @@ class DeviceKeeper:
 
         """
         if self._disturbed():
-            raise SnapshotError("a command disturbs its answers: end that first: shmio-supervisor emulator … ok")
+            raise SnapshotError("a command disturbs its answers; end that first with shmio-supervisor emulator … ok")
         cycle = self._device.cycle
         with cycle.held():
             state = DeviceState(self._kind, self._program, self._time.place, cycle.position, self._device.save())

@@ -53,7 +53,7 @@ class SnapshotHead(msgspec.Struct, forbid_unknown_fields=True):
 def check_name(name: str) -> None:
     """Raise SnapshotError if a snapshot cannot have this name."""
     if not _NAME.fullmatch(name):
-        raise SnapshotError(f"{name!r:.80} cannot be a snapshot's name: use up to 63 letters, digits, '_', '-' and '.'")
+        raise SnapshotError(f"{name!r:.80} cannot be a snapshot's name; use up to 63 letters, digits, '_', '-' and '.'")
 
 
 def file_of(folder: Path, name: str) -> Path:

@@ -202,7 +202,7 @@ def snapshot_folder(segment: Segment) -> Path:
     try:
         return Path(answer["snapshot_dir"])
     except KeyError:
-        raise ControlError("the supervisor is of an older version of shmio: restart the instance") from None
+        raise ControlError("the supervisor is of an older version of shmio; restart the instance") from None
 
 
 class ProcessStates:

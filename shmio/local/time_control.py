@@ -469,7 +469,7 @@ class Timekeeper:
         """
         self._segment.require_running()
         if self._player is not None:
-            raise TimeError("time is playing: pause it first")
+            raise TimeError("time is playing; pause it first")
         check_virtual(self._segment.clock.read())
         owned = self._coordinator.owns
         self._take_over()

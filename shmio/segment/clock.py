@@ -48,7 +48,7 @@ _NOTE_SIZE: Final = 167
 _PLAYING: Final = 1
 _STEPPING: Final = 2
 _ATTEMPTS: Final = 4
-_INVALID: Final = "the clock page is invalid: restart the instance with shmio-supervisor down and up"
+_INVALID: Final = "the clock page is invalid; restart the instance with shmio-supervisor down and up"
 
 
 _REQUEST: Final = struct.Struct("<QI4x32s64s")

@@ -32,6 +32,7 @@ from shmio.simulation.model import (
     place_declarations,
 )
 from shmio.simulation.state import decode_state, encode_state
+from shmio.wording import unknown
 
 NOTHING: Final[Mapping[str, object]] = MappingProxyType({})
 

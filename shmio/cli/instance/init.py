@@ -69,7 +69,7 @@ def init(arguments: argparse.Namespace) -> int:
     text, missing = None, dict[Path, list[str]]()
     left_out: list[str] = []
     if arguments.files and arguments.demo:
-        raise ConfigError("--demo writes the A50 example: give no files with it")
+        raise ConfigError("--demo writes the A50 example; give no files with it")
     if arguments.files:
         text, missing, warnings = new_config(file, arguments.files, arguments.block, emulated=arguments.emulated)
         for line in warnings:

@@ -1125,7 +1125,7 @@ def test_faults_of_keys_connector_and_layout_are_reported_together(
     err = capsys.readouterr().err.splitlines()
     assert [re.sub(r"^.*(supervisor\.toml|broken\.db):([0-9]+):", r"\2", line)[:32] for line in err] == [
         "11 source[0].port: expected a wh",
-        "12 source[0].period_ms: expect",
-        "129: error: unknown type 'Nope'",
-        "139: error: unknown type 'Nope2",
+        "12 source[0].period_ms: expected",
+        "129: error: unknown type 'Nope';",
+        "139: error: unknown type 'Nope2'",
     ]

@@ -418,7 +418,7 @@ class Stepper:
 
     async def _while_still(self, work: Callable[[Coordinator], _Result]) -> _Result:
         if self._player.on:
-            raise TimeError("time is playing: pause it first")
+            raise TimeError("time is playing; pause it first")
         check_virtual(self._segment.clock.read())
         async with self._moved():
             return await asyncio.to_thread(work, self._coordinator)
