@@ -116,7 +116,7 @@ def test_user_examines_a_recording(cell: Cell, page: Any) -> None:
     search.fill("cell/nothing")
     search.press("Enter")
     expect(
-        page.get_by_text("no register of this recording has such a path").or_(page.get_by_text("cell/nothing"))
+        page.get_by_text("this recording has no such register").or_(page.get_by_text("cell/nothing"))
     ).to_be_visible()
     expect(page.locator(".lane")).to_have_count(0)
     search.fill(AXIS)
@@ -289,7 +289,7 @@ def test_user_reloads_the_configuration(cell: Cell, page: Any) -> None:
 
     edit(cell, "period_ms = -1", "period_ms = 50")
     edit(cell, 'writable = ["Outputs"]', 'writable = ["Outpts"]')
-    expect(file.locator(".message")).to_contain_text("warning: source[0].writable: 'Outpts' names nothing")
+    expect(file.locator(".message")).to_contain_text("warning: source[0].writable: 'Outpts' matches no register")
     expect(changes.locator(".diff")).to_contain_text("± keep the connection of cell")
     expect(changes.locator(".diff")).to_contain_text("period_ms: 50 instead of 20")
     keep(page, "configuration")
