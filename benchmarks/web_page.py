@@ -7,13 +7,6 @@ In the row with silent WebSockets, 500 others are opened beside the page, and ag
 
 ``paint``: in headless Chromium, from a frame's publication to the end of the browser frame in which the plot with it
 was drawn. ``fps``: how often the plots were drawn in a second. Chromium draws on the same cores, without a GPU.
-
-Then a source with 100,000 registers: the time until Chromium first paints the page, from a click on the tab of the
-registers until the values of the first rows are there, and from a text in the search until its first row is there.
-
-The last table is of clients of gRPC and MQTT that follow one register of the same source: the time from the frame's
-publication to the client, alone, beside 500 silent WebSockets, and beside ten pages with 20 signals. The situations
-take turns, and all parties are separate processes.
 """
 
 from __future__ import annotations
@@ -21,39 +14,26 @@ from __future__ import annotations
 import asyncio
 import json
 import shutil
-import statistics
 import struct
-import tempfile
 import time
-from collections.abc import AsyncIterator, Sequence
-from contextlib import ExitStack, asynccontextmanager, suppress
-from pathlib import Path
-from typing import NamedTuple
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
 
-from common import HERE, Child, begin, quantiles, table
-from instance import Instance, Polled, instance, started
+from common import begin, quantiles, table
+from instance import Instance, instance
 from scaling import Usage
 from websockets.asyncio.client import ClientConnection, connect
 
-from shmio.config.address import Address
 from shmio.testing.ports import reserved_port
 
 PERIOD_MS = 20
 SILENT = 500
 PAINT_S = 15.0
-STAMP = "cell/Stamp"
-SITUATIONS: dict[str, Sequence[object]] = {
-    "alone": (),
-    f"{SILENT} silent WebSockets": ("--silent", SILENT),
-    "10 pages, 20 signals": ("--pages", 10),
-}
 _HEAD = struct.Struct("<IId")
 _UPGRADE = (
     "GET /socket HTTP/1.1\r\nHost: {}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
     "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
 )
-_PAINT = "performance.getEntriesByName('first-contentful-paint')[0]?.startTime ?? null"
-_VALUES = "[...document.querySelectorAll('.tree-rows .value')].some(value => value.textContent)"
 _WATCH = """paths => {
   sessionStorage.setItem("plots", JSON.stringify(paths.map(path => [path])));
   location.hash = "plots";
@@ -190,108 +170,6 @@ def paint(running: Instance, address: str, signals: int, duration_s: float) -> l
     ]  # fmt: skip
 
 
-def tree(rounds: int) -> list[list[str]]:
-    """Return the rows of the table of a tree with 100,000 registers."""
-    from playwright.sync_api import sync_playwright  # noqa: PLC0415  it need not be installed
-
-    steps = ("first paint", "registers are opened", "a search is answered")
-    found: dict[str, list[float]] = {step: [] for step in steps}
-    with ExitStack() as stack:
-        address = stack.enter_context(reserved_port())
-        tags = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "tags.toml"
-        paths = (
-            f"l{line:02}/u{unit:02}/v{value:02}" for line in range(100) for unit in range(50) for value in range(20)
-        )
-        tags.write_text("[registers]\n" + "".join(f'"{path}" = {{ type = "REAL" }}\n' for path in paths))
-        source = f'[[source]]\nname = "big"\nconnector = "memory"\ntags = "{tags}"\nperiod_ms = 200\n'
-        stack.enter_context(instance(PERIOD_MS, more=f'{source}[web]\nlisten = "{address}"\n'))
-        driver = stack.enter_context(sync_playwright())
-        browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
-        for _ in range(rounds):
-            page = browser.new_context(viewport={"width": 1280, "height": 800}).new_page()
-            page.goto(f"http://{address}/")
-            while (paint := page.evaluate(_PAINT)) is None:  # the page forbids wait_for_function, which needs eval
-                page.wait_for_timeout(20)
-            found["first paint"].append(paint)
-            begun_s = time.monotonic()
-            page.get_by_role("tab", name="Registers").click()
-            while not page.evaluate(_VALUES):
-                page.wait_for_timeout(20)
-            found["registers are opened"].append(1000 * (time.monotonic() - begun_s))
-            begun_s = time.monotonic()
-            page.get_by_label("Search").fill("l99/u49/v19")
-            page.wait_for_selector('.tree-row[data-path="big/l99/u49/v19"]')
-            found["a search is answered"].append(1000 * (time.monotonic() - begun_s))
-            page.context.close()
-        browser.close()
-    return [
-        [step, f"{min(times):.0f}", f"{statistics.median(times):.0f}", f"{max(times):.0f}"]
-        for step, times in found.items()
-    ]
-
-
-def beside(running: Instance, web: Address, broker: Address, load: Sequence[object], duration_s: float) -> Beside:
-    """Return the latencies of a gRPC client and an MQTT client, and the overruns, beside a load of the web page."""
-    slot = running.segment.processes.find("cell")
-    with ExitStack() as stack:
-        if load:
-            stack.enter_context(Child("web_load.py", web, *load))
-        by_grpc = stack.enter_context(Child("subscriber.py", running.grpc, STAMP, "--stamps"))
-        by_mqtt = stack.enter_context(Child("mqtt_stamps.py", broker, f"bench/{STAMP}/out"))
-        time.sleep(1)
-        begun_ns, overruns = time.monotonic_ns(), slot.counters["overruns"]
-        time.sleep(duration_s)
-        overruns = slot.counters["overruns"] - overruns
-        received = by_mqtt.finish()
-        stamps = by_grpc.finish()["stamps"][0]
-    started_ns = running.segment.header.started_ns
-    published_ns = {stamp: started_ns + clock_ns for stamp, clock_ns, _ in stamps}
-    return Beside(
-        [(at_ns - started_ns - clock_ns) / 1e6 for _, clock_ns, at_ns in stamps if at_ns > begun_ns],
-        [(at_ns - published_ns[one]) / 1e6 for one, at_ns in received if at_ns > begun_ns and one in published_ns],
-        overruns,
-    )
-
-
-class Beside(NamedTuple):
-    """Latencies in ms of the clients of two endpoints, and the overruns of their source."""
-
-    grpc: list[float]
-    mqtt: list[float]
-    overruns: int
-
-
-def neighbours(*, quick: bool) -> None:
-    """Print the table of other clients beside loads of the web page."""
-    rounds, duration_s = (1, 2.0) if quick else (5, 10.0)
-    found: dict[str, list[Beside]] = {name: [] for name in SITUATIONS}
-    with (
-        Child("plc.py", "--stamp-ms", 5) as plc,
-        reserved_port() as web,
-        reserved_port() as broker,
-        started(
-            [Polled("cell", Address.parse(plc.hello), PERIOD_MS, HERE / "stamped.db")],
-            more=f'[web]\nlisten = "{web}"\n[mqtt]\nlisten = "{broker}"\nprefix = "bench"\n',
-        ) as running,
-    ):
-        for _ in range(rounds):
-            for name, load in SITUATIONS.items():
-                found[name].append(beside(running, web, broker, load, duration_s))
-    rows = []
-    for endpoint in ("grpc", "mqtt"):
-        samples = {name: [ms for run in runs for ms in getattr(run, endpoint)] for name, runs in found.items()}
-        alone = quantiles(samples["alone"])
-        for name, values in samples.items():
-            cuts = quantiles(values)
-            ratios = ["" if name == "alone" else f"{cut / base:.2f}" for cut, base in zip(cuts, alone, strict=True)]
-            overruns = sum(one.overruns for one in found[name])
-            rows.append(
-                [f"{endpoint}, {name}", f"{cuts[0]:.2f}", ratios[0], f"{cuts[1]:.2f}", ratios[1], f"{cuts[2]:.2f}",
-                 ratios[2], str(overruns)]
-            )  # fmt: skip
-    table(["frame to client, ms", "median", "ratio", "p90", "ratio", "p99", "ratio", "overruns"], rows)
-
-
 def main() -> None:
     quick = begin("Plots of the web page at 50 Hz: CPU, bytes and delay")
     titles = ["", "web, % of a core", "kB/s a page", "frame to page, ms", "p99", "overruns", "others, % of a core"]
@@ -311,8 +189,6 @@ def main() -> None:
             painted = [paint(running, str(address), signals, 2.0 if quick else PAINT_S) for signals in (20, 200)]
     if painted:
         table(["", "web, % of a core", "paint, ms", "p99", "fps", "overruns", "others, % of a core"], painted)
-        table(["100,000 registers, ms", "least", "median", "most"], tree(1 if quick else 5))
-    neighbours(quick=quick)
 
 
 if __name__ == "__main__":

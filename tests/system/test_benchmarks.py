@@ -260,6 +260,21 @@ def test_benchmark_of_the_web_page() -> None:
         assert len(re.findall(r"^Chromium, (?:20|200) signals +\d+\.\d +[1-9]", found, re.MULTILINE)) == 2, found
 
 
+def test_benchmark_of_clients_beside_the_web_page() -> None:
+    pytest.importorskip("uvicorn")
+    found = printed("web_neighbours")
+    row = r"^(?:grpc|mqtt), (?:alone|500 silent WebSockets|10 pages, 20 signals) +\d+\.\d\d +\d+\.\d\d .* \d+$"
+    assert len(re.findall(row, found, re.MULTILINE)) == 6, found
+
+
+def test_benchmark_of_a_large_tree() -> None:
+    pytest.importorskip("uvicorn")
+    if shutil.which("chromium") is None:
+        pytest.skip("chromium is not installed")
+    found = printed("web_tree")
+    assert len(re.findall(r"^(?:first|registers|a search).*(?: +\d+){3}$", found, re.MULTILINE)) == 3, found
+
+
 def test_benchmark_of_serving_opc_ua() -> None:
     pytest.importorskip("asyncua")
     found = printed("opcua_server")

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
+import urllib.request
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 
-from shmio.testing.cell import CONFIG, PATIENCE_S, Cell, until
+from shmio.testing.cell import BIN, CONFIG, PATIENCE_S, Cell, until
 from shmio.testing.ports import reserved_port
 
 pytest.importorskip("uvicorn")
@@ -69,3 +71,17 @@ def test_page_writes_a_register_and_overrides_it_until_it_is_closed(make_cell: C
             assert said("registers.override", "7")["outcome"] == "shadowed"
             until(lambda: present() == (7, "injected"), "the override")
         until(lambda: present() == (42, "live"), "the end of the override")
+
+
+def test_up_says_where_the_page_is_when_the_page_answers(make_cell: Callable[..., Cell]) -> None:
+    with reserved_port() as address:
+        cell = make_cell(config=f'{CONFIG}[web]\nlisten = "{address}"\n')
+        with subprocess.Popen(
+            [BIN / "shmio-supervisor", "up"], cwd=cell.folder, stdout=subprocess.PIPE, text=True
+        ) as up:
+            assert up.stdout is not None
+            url = next(line.split()[1] for line in up.stdout if line.startswith("open http"))
+            with urllib.request.urlopen(url, timeout=PATIENCE_S) as answer:
+                assert answer.status == 200
+            up.send_signal(signal.SIGINT)
+            up.communicate(timeout=PATIENCE_S)
