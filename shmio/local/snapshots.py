@@ -39,6 +39,7 @@ PATIENCE_S: Final = 30.0
 ASK_S: Final = 2.0
 _TURN_NS: Final = 100_000_000
 _PARTIAL: Final = "; --partial saves the rest"
+_UNKNOWN: Final = "it could not write its state or its reason: is the disk full?"
 
 Refusals = dict[str, str]
 """Why processes have refused, by name."""
@@ -278,8 +279,8 @@ class ProcessStates:
             if rest_ns <= 0:
                 raise SnapshotError(f"{waiting[0].name} did not answer within {PATIENCE_S:g} s")
             clock.delivered_bell.wait(seen, min(rest_ns, _TURN_NS))  # a process that dies rings no doorbell
-        return {one: self._read(work / f"{one}{REFUSAL}").decode(errors="replace") for one in names
-                if (work / f"{one}{REFUSAL}").exists()}  # fmt: skip
+        refused = [one for one in names if (work / f"{one}{REFUSAL}").exists()]
+        return {one: self._read(work / f"{one}{REFUSAL}").decode(errors="replace") or _UNKNOWN for one in refused}
 
     @staticmethod
     def _read(file: Path) -> bytes:

@@ -36,4 +36,4 @@ def soon_stale(instance: str) -> Iterator[Segment]:
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Prevent commands from expiring because the host is busy."""
-    monkeypatch.setattr("shmio.local.writer.TIMEOUT_S", TIMEOUT_S)
+    monkeypatch.setattr("shmio.local.writer.WRITE_TIMEOUT_S", TIMEOUT_S)

@@ -338,13 +338,15 @@ def test_commands_for_an_earlier_process_of_the_source_are_never_done(
 def test_a_source_that_does_not_answer_delays_publishers_only_briefly(
     segment: Segment, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("shmio.local.writer.TIMEOUT_S", 0)
+    monkeypatch.setattr("shmio.local.writer.WRITE_TIMEOUT_S", 0)
 
     async def run() -> None:
         async with endpoint(segment) as served:
             await publish(served, [message("cell/step", str(n)) for n in range(3000)])
             assert counted(served) == (0, 3000)
-            monkeypatch.setattr("shmio.local.writer.TIMEOUT_S", TIMEOUT_S)  # from now on the source has time to answer
+            monkeypatch.setattr(
+                "shmio.local.writer.WRITE_TIMEOUT_S", TIMEOUT_S
+            )  # from now on the source has time to answer
             served.writer = segment.writer("cell")
             async with plant(served) as device:
                 await publish(served, [message("cell/step", "3")])

@@ -438,13 +438,13 @@ def test_a_value_published_to_the_shadow_before_the_injection_is_laid_counts(seg
 def test_an_injection_that_the_source_does_not_answer_is_never_laid(
     segment: Segment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("shmio.local.writer.TIMEOUT_S", 0)
+    monkeypatch.setattr("shmio.local.writer.WRITE_TIMEOUT_S", 0)
 
     async def test(served: Endpoint) -> None:
         status, text = await refusal(inject(served, "cell/step/in", "s").read())
         assert status is Status.FAILED_PRECONDITION
         assert "gave no answer in time" in text
-        monkeypatch.setattr("shmio.local.writer.TIMEOUT_S", TIMEOUT_S)
+        monkeypatch.setattr("shmio.local.writer.WRITE_TIMEOUT_S", TIMEOUT_S)
         device = Plant(served.writer)
         try:
             device.cycle()

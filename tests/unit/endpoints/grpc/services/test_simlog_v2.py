@@ -245,7 +245,7 @@ def test_a_source_that_is_not_connected_refuses_a_write_at_once(segment: Segment
 def test_a_source_that_does_not_answer_leaves_a_write_unknown(
     segment: Segment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("shmio.local.writer.TIMEOUT_S", 0)
+    monkeypatch.setattr("shmio.local.writer.WRITE_TIMEOUT_S", 0)
 
     async def test(served: Endpoint) -> None:
         status, text = await refusal(served.v2.Write(request("cell/step", 1), timeout=TIMEOUT_S))
