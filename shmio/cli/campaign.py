@@ -115,7 +115,7 @@ def _falsify(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--jobs", type=at_least(1), default=1, metavar="N", help="trials at once (default: 1)")
     verb.add_argument("--seed", type=seed_number, metavar="N", help="the same seed gives the same trials (default: 0)")
     verb.add_argument("--all", action="store_true", help="go on after the first failure")
-    verb.add_argument("--resume", action="store_true", help="go on with an interrupted search")
+    verb.add_argument("--resume", action="store_true", help="continue an interrupted search")
     verb.add_argument(
         "-o", dest="output", type=Path, metavar="FOLDER", help="where to store it (default: NAME-falsify)"
     )

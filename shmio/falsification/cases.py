@@ -89,7 +89,8 @@ def store(
     except OSError as error:
         shutil.rmtree(place, ignore_errors=True)
         raise RecordingError(
-            f"{error.filename or place}: {error.strerror}: the case is not stored; make room, and go on with --resume"
+            f"{error.filename or place}: {error.strerror}: the case is not stored; make room, and continue with "
+            "--resume"
         ) from None
     except RecordingError:
         shutil.rmtree(place, ignore_errors=True)

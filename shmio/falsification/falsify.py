@@ -263,5 +263,5 @@ def check_space(space: Space) -> None:
     """
     if not space.dimensions:
         raise ConfigError(
-            "it has no ranges to search: write a value as { from = 0, to = 5 }, or run it with shmio-campaign run"
+            "it has no ranges to search; write a value as { from = 0, to = 5 }, or run it with shmio-campaign run"
         )

@@ -87,7 +87,7 @@ class Journal:
         self.file = folder / NAME
         try:
             if resume and not self.file.exists():
-                raise ConfigError(f"--resume: {self.file} does not exist: there is no search to go on with")
+                raise ConfigError(f"--resume: {self.file} does not exist: there is no search to continue")
             folder.mkdir(parents=True, exist_ok=True)
             if not self.file.exists() and any(folder.iterdir()):
                 raise ConfigError(f"-o {folder}: this folder has other files; give a new or an empty folder")
@@ -114,7 +114,7 @@ class Journal:
         first = next(lines, b"")
         if first and not resume:
             raise ConfigError(
-                f"{self.file}: there is a search already: go on with --resume, or give another folder with -o"
+                f"{self.file}: this file has a search already; continue with --resume, or give another folder with -o"
             )
         if not first:
             self._append(msgspec.json.encode(beginning))
@@ -166,7 +166,7 @@ class Journal:
                 data = data[os.write(self._fd, data) :]
         except OSError as error:
             raise RecordingError(
-                f"{self.file}: {error.strerror}: the search stops here; make room, and go on with --resume"
+                f"{self.file}: {error.strerror}: the search stops here; make room, and continue with --resume"
             ) from None
 
     def close(self) -> None:

@@ -25,6 +25,7 @@ import msgspec
 from shmio.errors import SnapshotError
 from shmio.local.state_requests import WORK, read_bounded, write_new
 from shmio.model.snapshot import SnapshotInfo
+from shmio.wording import unknown
 
 SUFFIX: Final = ".snapshot"
 VERSION: Final = 1
@@ -204,8 +205,8 @@ def _info(file: Path, head: SnapshotHead, size: int) -> SnapshotInfo:
 def _unreadable(file: Path, error: OSError) -> SnapshotError:
     if isinstance(error, FileNotFoundError):
         name = file.name.removesuffix(SUFFIX)
-        there = ", ".join(one.name for one in list_snapshots(file.parent)[:20]) or "none"
-        return SnapshotError(f"there is no snapshot {name!r} in {file.parent}; there are: {there}")
+        names = [one.name for one in list_snapshots(file.parent)]
+        return SnapshotError(f"{file.parent}: {unknown('snapshot', name, names)}")
     return SnapshotError(f"{file}: {error.strerror}")
 
 

@@ -227,11 +227,11 @@ class ProcessStates:
             if slot.kind not in ("source", "emulator"):
                 continue
             if block is not None and not block.attributes.stepped:
-                left_out[slot.name] = "its device goes on in real time"
+                left_out[slot.name] = "its device continues in real time"
             elif block is not None and block.attributes.remote:
                 left_out[slot.name] = "another program computes it"
             elif block is None and self._segment.clock.delivered(slot.index) is None:
-                left_out[slot.name] = 'the emulator goes on in real time, unless it has clock = "instance"'
+                left_out[slot.name] = 'the emulator continues in real time, unless it has clock = "instance"'
             elif not slot.alive():
                 raise SnapshotError(f"{slot.name}: its process does not run")
             else:

@@ -146,7 +146,7 @@ def test_a_search_goes_on_as_if_it_had_not_been_interrupted(
     (folder / "cut/case-001/campaign.toml").touch()
     (folder / "cut/trials.jsonl").write_bytes(b"".join(lines[:2]) + lines[2][:20])
     assert main([*words, "-o", "cut", "--resume"]) == 1
-    assert "1 trials and 0 cases are there already" in capsys.readouterr().err
+    assert "1 trials and 0 cases exist already" in capsys.readouterr().err
     assert trials(folder / "cut") == trials(folder / "whole")
     assert names(folder / "cut") == names(folder / "whole")
     assert main([*words, "-o", "cut", "--resume"]) == 1, "nothing is left to do"
@@ -169,7 +169,7 @@ def test_ctrl_c_and_kill(folder: Path) -> None:
             while any(Path(f"/proc/{pid}/exe").exists() for pid in workers):
                 time.sleep(0.01)
         assert one.returncode == (-9 if sign == signal.SIGKILL else 3), rest
-    assert "interrupted; go on with --resume" in rest
+    assert "interrupted; continue with --resume" in rest
     assert len(trials(folder / "out")) >= 2
 
 
@@ -196,7 +196,7 @@ def test_statuses_and_refusals(
         (CAMPAIGN.replace('lift/height"\noperation = "offset', 'lift/high"\noperation = "offset'), [], "lift/high"),
         (CAMPAIGN, [*values, "--set=parameters.lift.gain=1"], "no ranges to search"),
         (CAMPAIGN, ["--set", "push.valu=1"], "did you mean push.value"),
-        (CAMPAIGN, ["--resume"], "no search to go on with"),
+        (CAMPAIGN, ["--resume"], "no search to continue"),
         (CAMPAIGN, ["--trials", "9000000"], "at most 1000000"),
         (CAMPAIGN.replace("duration_s = 0.4", ""), [], "duration_s: this key is needed"),
         (CAMPAIGN.replace('config = "supervisor.toml"', ""), [], "name the configuration with -c"),

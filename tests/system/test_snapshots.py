@@ -159,7 +159,7 @@ class Tap:
 def test_the_remainder_is_the_same_from_random_moments(cell: Cell) -> None:
     moments = random.Random(3)
     with shmio.attach(cell.instance, writable=True) as attached:
-        with pytest.raises(SnapshotError, match=r"plc-line: its device goes on in real time.*--partial"):
+        with pytest.raises(SnapshotError, match=r"plc-line: its device continues in real time.*--partial"):
             attached.save_snapshot("here")
         for _ in range(3):
             Tap(attached).step(moments.randrange(1, 9))
@@ -193,7 +193,7 @@ def test_commands_and_other_hosts_save_and_restore(cell: Cell) -> None:
         assert (update.cycle, update.clock_ns) == (10, 200_000_000), "subscribers get the restored values"
         clock = remote.step(0.02, 30)
         assert (clock.step, clock.time_ns) == (40, 800_000_000)
-        with pytest.raises(SnapshotError, match="no snapshot 'x'"):
+        with pytest.raises(SnapshotError, match="unknown snapshot 'x'"):
             remote.restore_snapshot("x")
     assert cell.output("shmio", "get", "walk", "tank/level") == after
     assert snapshot("list", *host) == [saved]

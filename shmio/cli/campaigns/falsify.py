@@ -151,7 +151,7 @@ class _Command:
 
     def _resume(self, falsifier: Falsifier, trials: int) -> None:
         unshrunk, self._cases = falsifier.replay(self._journal.lines(), trials)
-        say(f"{self._output}: {self._tally.done} trials and {len(self._cases)} cases are there already", sys.stderr)
+        say(f"{self._output}: {self._tally.done} trials and {len(self._cases)} cases exist already", sys.stderr)
         self._progress.begin(self._tally.done, self._tally.simulated_s)
         for line in unshrunk:
             if line.point is not None and line.result is not None:
@@ -233,7 +233,7 @@ class _Command:
         if unclear is not None:
             say(f"trial {unclear.number} was {unclear.status}: {_reason(unclear)}", sys.stderr)
         if interrupted:
-            say(f"the search was interrupted; go on with --resume (and -o {self._output})", sys.stderr)
+            say(f"the search was interrupted; continue with --resume (and -o {self._output})", sys.stderr)
         return status
 
 

@@ -207,7 +207,7 @@ def _told(arguments: argparse.Namespace, campaign: Campaign, plan: Plan, instanc
         (laid.seed for laid, one in zip(plan.injections, campaign.injection, strict=True) if one.seed is None), None
     )
     if seed is not None:
-        say(f"seed {seed}: --seed {seed} does the same again", sys.stderr)
+        say(f"seed {seed}: --seed {seed} repeats this run", sys.stderr)
 
 
 def _command(arguments: argparse.Namespace, seed: int, duration_s: float, work: LiveRun) -> str:

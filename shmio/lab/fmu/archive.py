@@ -56,7 +56,7 @@ def export_fmu(config: Path, file: Path, patterns: Sequence[str]) -> Exported:
     """
     machine = _PLATFORMS.get(platform.machine())
     if machine is None:
-        raise ConfigError(f"FMI 2.0 has no name for Linux on {platform.machine()}: export on x86_64")
+        raise ConfigError(f"FMI 2.0 has no name for Linux on {platform.machine()}; export on x86_64")
     with tempfile.TemporaryDirectory(prefix="shmio-export-") as folder:
         work = Path(folder)
         _copy(config.resolve().parent, work / CONFIG)
@@ -66,7 +66,7 @@ def export_fmu(config: Path, file: Path, patterns: Sequence[str]) -> Exported:
             prepare_laboratory(config)  # raises the same error if it is not for the lack of a file
             raise ConfigError(
                 f"{error}; the FMU contains only files of {config.resolve().parent} with the endings "
-                f"{', '.join(sorted(SUFFIXES))}: put the others there"
+                f"{', '.join(sorted(SUFFIXES))}; put the others there"
             ) from None
         with Laboratory(plan) as lab, lab.attach() as cell:
             groups, left_out = groups_of(lab, patterns)
@@ -101,7 +101,7 @@ def _copy(source: Path, target: Path) -> None:
                 size += file.stat().st_size
                 if size > MAX_BYTES:
                     raise ConfigError(
-                        f"the files of {source} have more than {MAX_BYTES >> 20} MB: give the instance its own folder"
+                        f"the files of {source} have more than {MAX_BYTES >> 20} MB; give the instance its own folder"
                     )
                 copy = target / file.relative_to(source)
                 copy.parent.mkdir(parents=True, exist_ok=True)
@@ -125,7 +125,7 @@ def _compile(work: Path, guid: str) -> Path:
             [*command, "-o", library, source], capture_output=True, text=True, check=False, timeout=120
         )
     except FileNotFoundError:
-        raise ConfigError("the export needs a C compiler: install one (Debian: apt install gcc libc6-dev)") from None
+        raise ConfigError("the export needs a C compiler; install one (Debian: apt install gcc libc6-dev)") from None
     if done.returncode:
         raise ConfigError(f"the C compiler cannot build the FMU's library: {done.stderr.strip()[-800:]}")
     return library

@@ -78,7 +78,7 @@ def groups_of(lab: Laboratory, patterns: Sequence[str]) -> tuple[list[Group], li
     if sum(counts.values()) > MAX_VARIABLES:
         raise ConfigError(
             f"the FMU would have {sum(counts.values())} variables, more than {MAX_VARIABLES}: "
-            "name registers with --only"
+            "select registers with --only"
         )
     return found, left_out
 

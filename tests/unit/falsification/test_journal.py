@@ -60,7 +60,7 @@ def test_another_beginning_is_refused_by_name(tmp_path: Path, change: dict[str, 
 
 
 def test_one_search_in_a_folder(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="no search to go on with"):
+    with pytest.raises(ConfigError, match="no search to continue"):
         Journal(tmp_path / "none", BEGINNING, resume=True)
     with Journal(tmp_path, BEGINNING, resume=False), pytest.raises(ConfigError, match="another search is using"):
         Journal(tmp_path, BEGINNING, resume=True)

@@ -187,7 +187,7 @@ def test_another_laboratory_continues_with_the_same_bytes(plan: Callable[..., Pl
         assert {"often", "late", "configured"} <= names, "they stay, although their client has ended"
         cell.delete_snapshot("warm")
         assert cell.snapshots() == []
-        with pytest.raises(SnapshotError, match=r"no snapshot 'warm'.*none"):
+        with pytest.raises(SnapshotError, match=r"unknown snapshot 'warm'.*none"):
             cell.restore_snapshot("warm")
 
 
@@ -273,5 +273,5 @@ def test_a_campaign_starts_from_a_snapshot(plan: Callable[..., Plan], tmp_path: 
         (one.item.clock_ns, one.item.raw, one.item.effective) for one in second
     ]
     assert first[-1].item.clock_ns == 1_100_000_000
-    with Laboratory(prepared) as lab, pytest.raises(SnapshotError, match="no snapshot 'none'"):
+    with Laboratory(prepared) as lab, pytest.raises(SnapshotError, match="unknown snapshot 'none'"):
         lab.run(RunPlan([], [limit], 0.5, start="none"))

@@ -46,7 +46,7 @@ def test_a_snapshot_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert [one.name for one in file.parent.iterdir()] == ["warm.snapshot"]
     assert (file.stat().st_mode & 0o777, file.parent.stat().st_mode & 0o777) == (0o600, 0o700)
     delete_snapshot(file)
-    with pytest.raises(SnapshotError, match=r"no snapshot 'warm'.*none"):
+    with pytest.raises(SnapshotError, match=r"unknown snapshot 'warm'.*none"):
         read_snapshot(file)
 
 
