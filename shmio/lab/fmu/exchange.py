@@ -77,7 +77,7 @@ def groups_of(lab: Laboratory, patterns: Sequence[str]) -> tuple[list[Group], li
         raise ConfigError("the instance has no register that an FMU can have")
     if sum(counts.values()) > MAX_VARIABLES:
         raise ConfigError(
-            f"the FMU would have {sum(counts.values())} variables, more than {MAX_VARIABLES}: "
+            f"the FMU would have {sum(counts.values())} variables, more than {MAX_VARIABLES}; "
             "select registers with --only"
         )
     return found, left_out
