@@ -164,4 +164,4 @@ class TestModbusSerial(TableConformance):
         ) as process:
             assert process.stdout is not None
             yield ModbusTable(Address("127.0.0.1", int(process.stdout.readline())))
-            process.communicate(timeout=20)
+            process.communicate(timeout=60)

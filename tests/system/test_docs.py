@@ -42,6 +42,6 @@ def test_the_readme_runs_as_shown() -> None:
                     assert printed(commands, ROOT).strip(), f"printed nothing:\n{commands}"
         finally:
             cell.send_signal(signal.SIGINT)
-            cell.communicate(timeout=30)
+            cell.communicate(timeout=60)
     assert cell.returncode == 0
     assert "a50" not in instances()

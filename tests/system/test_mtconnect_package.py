@@ -27,7 +27,7 @@ def agent() -> Iterator[tuple[str, subprocess.Popen[str]]]:
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         yield process.stdout.readline().strip(), process
-        process.communicate(timeout=20)
+        process.communicate(timeout=60)
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node")

@@ -37,7 +37,7 @@ def test_the_example_reads_a_machine(make_cell: Callable[..., Cell]) -> None:
             cell.up()
             until(lambda: cell.processes()["cnc"]["quality"] == "good", "good quality")
             shown = json.loads(cell.output("shmio", "get", "--json", "cnc"))
-            server.communicate(timeout=20)
+            server.communicate(timeout=60)
     found = {path.removeprefix("cnc/"): one["value"] for path, one in shown.items() if one["quality"] == "good"}
     assert found == {
         "Identification/Manufacturer": "Maker",

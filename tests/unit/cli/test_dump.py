@@ -435,7 +435,7 @@ def test_signal_closes_the_files_of_concurrent_recorders(segment: Segment, sign:
         until(all_have_some, "frames in both files")
         for process in recorders:
             process.send_signal(sign)
-        errors = [process.communicate(timeout=30)[1] for process in recorders]
+        errors = [process.communicate(timeout=60)[1] for process in recorders]
     finally:
         for process in recorders:
             process.kill()
@@ -454,7 +454,7 @@ def test_the_end_of_the_instance_ends_a_recording(segment: Segment) -> None:
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         until(lambda: any(Path("dumps").glob("*.mem")), "a file")
         segment.unlink()
-        errors = process.communicate(timeout=30)[1]
+        errors = process.communicate(timeout=60)[1]
     assert process.returncode == 0
     assert f"instance {segment.instance!r} has stopped" in errors
 

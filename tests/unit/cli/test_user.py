@@ -184,7 +184,7 @@ def test_watch_prints_each_change_of_a_local_source(instance: str) -> None:
                 assert "cell/a  7" in watch.stdout.readline()
                 for cycle, value in enumerate((8, 7), 2):  # watch may read only after the second
                     writer.publish(bytes((0, value)), cycle=cycle, source_ns=1)
-                out, _ = watch.communicate(timeout=20)
+                out, _ = watch.communicate(timeout=60)
             finally:
                 watch.kill()
         segment.unlink()
@@ -207,7 +207,7 @@ def test_watch_continues_with_the_block_of_a_reload(instance: str) -> None:
                 while "cell/a  8" not in (line := watch.stdout.readline()):
                     assert "no data yet" in line, "watch may read before the first frame"
                 watch.send_signal(signal.SIGINT)
-                _, err = watch.communicate(timeout=20)
+                _, err = watch.communicate(timeout=60)
             finally:
                 watch.kill()
         segment.unlink()
@@ -223,7 +223,7 @@ def test_watch_ends_when_a_reload_removes_its_register(instance: str) -> None:
             assert watch.stdout is not None
             assert "cell/a  7" in watch.stdout.readline()
             segment.change(add=[BlockSpec("cell", other, 20_000_000, 3600 * 10**9, 1 << 16)], retire=["cell"])
-            _, err = watch.communicate(timeout=20)
+            _, err = watch.communicate(timeout=60)
         segment.unlink()
     assert watch.returncode == 1
     assert "no such register" in err
@@ -247,7 +247,7 @@ def test_watch_ends_when_a_reload_removes_its_source(instance: str, patterns: tu
             assert watch.stdout is not None
             seen = {watch.stdout.readline().split()[1] for _ in patterns}
             segment.change(retire=["press", "robot"])
-            out, err = watch.communicate(timeout=20)
+            out, err = watch.communicate(timeout=60)
         segment.unlink()
     assert seen == set(patterns)
     assert (watch.returncode, out) == (1, "")

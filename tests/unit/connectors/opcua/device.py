@@ -34,7 +34,7 @@ class Device:
     ) -> None:
         with self._stack:
             self._process.send_signal(signal.SIGCONT)
-            self._process.communicate(timeout=20)
+            self._process.communicate(timeout=60)
 
     def _start(self) -> None:
         command = [sys.executable, str(PROGRAM), str(self.address.port), *map(str, self._certificate)]
@@ -46,7 +46,7 @@ class Device:
     def kill(self) -> None:
         """End the process at once."""
         self._process.kill()
-        self._process.communicate(timeout=20)
+        self._process.communicate(timeout=60)
 
     def restart(self) -> None:
         """Start the process again."""

@@ -52,7 +52,7 @@ class NodeServer:
     ) -> None:
         with self._stack:
             try:
-                self._process.communicate(timeout=20)
+                self._process.communicate(timeout=60)
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.communicate()

@@ -38,7 +38,7 @@ class Bridge:
     ) -> None:
         with self._stack:
             self._process.send_signal(signal.SIGCONT)
-            self._process.communicate(timeout=20)
+            self._process.communicate(timeout=60)
 
     def start(self) -> None:
         """Start the process, for the first time or again."""
@@ -50,7 +50,7 @@ class Bridge:
 
     def kill(self) -> None:
         self._process.kill()
-        self._process.communicate(timeout=20)
+        self._process.communicate(timeout=60)
 
     def freeze(self) -> None:
         """Stop the process (SIGSTOP). Its connections stay open."""

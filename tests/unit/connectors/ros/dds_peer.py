@@ -37,7 +37,7 @@ class Peer:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._process.send_signal(signal.SIGCONT)
-        self._process.communicate(timeout=20)
+        self._process.communicate(timeout=60)
 
     def start(self) -> None:
         """Start the process, for the first time or again."""
@@ -47,7 +47,7 @@ class Peer:
 
     def kill(self) -> None:
         self._process.kill()
-        self._process.communicate(timeout=20)
+        self._process.communicate(timeout=60)
 
     def freeze(self) -> None:
         self._process.send_signal(signal.SIGSTOP)

@@ -218,7 +218,7 @@ def plc() -> Iterator[Plc]:
 @contextlib.contextmanager
 def connector_of(plc: Plc) -> Iterator[Connector]:
     address = plc.proxy.address
-    options = S7Options(host=address.host, port=address.port, timeout=25)
+    options = S7Options(host=address.host, port=address.port, timeout=250)  # long enough for a busy host
     with closing(S7Connector.for_layout(LAYOUT)(options, LAYOUT)) as connector:
         yield connector
 
