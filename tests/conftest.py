@@ -47,14 +47,24 @@ ONE_AFTER_THE_OTHER = (
         "tests/system/test_docs.py",
         "tests/unit/cli/test_supervisor_cell.py::test_configuration_from_init_runs",
     ),
-    # all tests of such a module use one instance or one browser
+    # all tests of such a module use one instance, browser or server, which takes seconds to start
+    ("tests/conformance/test_opcua.py",),
+    ("tests/native/test_reader.py",),
+    ("tests/system/test_bits.py",),
     ("tests/system/test_inject.py",),
     ("tests/system/test_inject_grpc.py",),
+    ("tests/system/test_one_name.py",),
+    ("tests/system/test_overlay.py",),
     ("tests/system/test_running.py",),
     ("tests/system/test_step.py",),
     ("tests/system/test_web_browser.py",),
     ("tests/system/test_web_page_changes.py",),
     ("tests/system/test_write.py",),
+    ("tests/unit/connectors/opcua/test_browse.py",),
+    ("tests/unit/connectors/opcua/test_limits.py",),
+    ("tests/unit/connectors/opcua/test_security.py",),
+    ("tests/unit/connectors/opcua/test_siemens.py",),
+    ("tests/unit/connectors/opcua/test_structures.py",),
 )
 """Beginnings of the names of tests that share something; one xdist worker runs each group."""
 

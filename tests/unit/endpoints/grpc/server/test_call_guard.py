@@ -179,21 +179,23 @@ def test_a_call_that_sends_no_message_is_ended(segment: Segment) -> None:
 PUBLISHES = [method for method in NEEDS if method.endswith("/Publish")]
 
 
-@pytest.mark.parametrize("method", [method for method in NEEDS if method not in PUBLISHES])
-def test_undecodable_bytes_are_refused_without_a_log_line(
-    segment: Segment, method: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_undecodable_bytes_are_refused_without_a_log_line(segment: Segment, caplog: pytest.LogCaptureFixture) -> None:
     """Publish is not tested here, because it skips such messages. Its own tests check that."""
+    methods = [method for method in NEEDS if method not in PUBLISHES]
 
     async def test(served: Endpoint) -> None:
-        call: Any = served.channel.unary_unary(method)
-        told, message = await refusal(call(b"\xff" * 7, timeout=TIMEOUT_S))
-        if told is not grpc.StatusCode.UNIMPLEMENTED:  # it takes no message, or is not served yet
-            assert (told, message) == (
-                grpc.StatusCode.INVALID_ARGUMENT,
-                f"{method}: 7 bytes are not a valid message of this call",
-            )
-        await until_calls(served, 0)
+        refused = 0
+        for method in methods:
+            call: Any = served.channel.unary_unary(method)
+            told, message = await refusal(call(b"\xff" * 7, timeout=TIMEOUT_S))
+            if told is not grpc.StatusCode.UNIMPLEMENTED:  # it takes no message, or is not served yet
+                assert (told, message) == (
+                    grpc.StatusCode.INVALID_ARGUMENT,
+                    f"{method}: 7 bytes are not a valid message of this call",
+                )
+                refused += 1
+            await until_calls(served, 0)
+        assert refused > len(methods) / 2
 
     with caplog.at_level(logging.ERROR):
         serve(segment, test)
