@@ -171,15 +171,9 @@ def read_campaign(file: Path) -> list[Declaration]:
     """
     tables = read_tables(file)
     try:
-        found = _parse(tables, "injection")
-        if found.parameters:
-            raise ConfigError(
-                "parameters: a running instance cannot change the parameters of its models; "
-                "use shmio-campaign run --lab"
-            )
+        return parse_campaign(tables)
     except ConfigError as error:
         raise ConfigError(f"{file}: {named(str(error), tables)}") from None
-    return found.injection
 
 
 def parse_campaign(tables: dict[str, Any]) -> list[Declaration]:
@@ -189,7 +183,12 @@ def parse_campaign(tables: dict[str, Any]) -> list[Declaration]:
         ConfigError: A table is invalid; the message begins with its key.
 
     """
-    return _parse(tables, "injection").injection
+    found = _parse(tables, "injection")
+    if found.parameters:
+        raise ConfigError(
+            "parameters: a running instance cannot change the parameters of its models; use shmio-campaign run --lab"
+        )
+    return found.injection
 
 
 def campaign_of(tables: dict[str, Any]) -> Campaign:

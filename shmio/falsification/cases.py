@@ -14,6 +14,7 @@ from typing import Any, Final, NamedTuple
 
 from shmio.config.campaign import campaign_text
 from shmio.errors import RecordingError
+from shmio.falsification.pool import START_S
 from shmio.falsification.trial import Result
 
 CAMPAIGN: Final = "campaign.toml"
@@ -107,7 +108,9 @@ def store(
 def _run(file: Path, limit_s: float, *options: str | Path) -> dict[str, Any]:
     command = [sys.executable, "-m", "shmio.cli.campaign", "run", str(file), "--lab", "--json", *map(str, options)]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=limit_s + 10, check=False)
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=limit_s + START_S, check=False, process_group=0
+        )  # in a group of its own, so that Ctrl-C does not cut the run short
     except subprocess.TimeoutExpired:
         raise RecordingError(f"{file}: it took longer than {limit_s:g} s (--limit)") from None
     try:

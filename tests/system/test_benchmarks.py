@@ -292,3 +292,10 @@ def test_benchmark_of_the_audit_log() -> None:
     found = printed("audit")
     row = r"^a (?:client of shmio.v1|program on the host), (?:audit log|none)(?: +\d+\.\d{3}){3}(?: +\d+){3}$"
     assert len(re.findall(row, found, re.MULTILINE)) == 4, found
+
+
+def test_benchmark_of_falsification() -> None:
+    pytest.importorskip("optuna")
+    found = printed("falsify")
+    assert len(re.findall(r"^[12] +\d+\.\d\d +\d+$", found, re.MULTILINE)) == 2, found
+    assert len(re.findall(r"^(?:tpe|cmaes|random|grid) +[01] of 1 +(?:\d+|over 10)$", found, re.MULTILINE)) == 4, found
