@@ -174,7 +174,8 @@ class Remote(Computed):
                 raise ConnectorError(STOPPED)
             if gone:
                 raise ConnectorError(
-                    f"model {model.name!r} disconnected before it answered; the next step works once one is connected"
+                    f"model {model.name!r} disconnected before it answered; the next step works once a model is "
+                    "connected"
                 )
             rest_ns = until_ns - time.monotonic_ns()
             if rest_ns <= 0:

@@ -140,7 +140,8 @@ class _Search:
                 self._add(node, one)
         if left_out or self._references >= self._wanted.nodes * REFERENCES_PER_NODE:
             self._stop(
-                f"the server sends more references than {self._wanted.nodes} nodes need; name a part of it by a "
+                f"the server sends more references than {self._wanted.nodes} nodes need; select a part of the "
+                "server by a "
                 "PATTERN, or set --limit"
             )
 
@@ -158,12 +159,13 @@ class _Search:
             return
         if len(self._seen) >= self._wanted.nodes:
             self._stop(
-                f"the server has more than {self._wanted.nodes} nodes; name a part of it by a PATTERN, or set --limit"
+                f"the server has more than {self._wanted.nodes} nodes; select a part of the server by a PATTERN, "
+                "or set --limit"
             )
             return
         self._count(name, key.Identifier)
         if self._characters > MAX_CHARACTERS:
-            self._stop("the names of the server's nodes are too long; name a part of it by a PATTERN")
+            self._stop("the names of the server's nodes are too long; select a part of the server by a PATTERN")
             return
         self._seen.add(key)
         parent.children.append(_Node(key, names, reference.NodeClass == ua.NodeClass.Variable))
@@ -235,7 +237,7 @@ class _Search:
             columns = {"address": f"{address}{member_text(one.member)}"}
             self._count(*names, columns["address"])
             if self._characters > MAX_CHARACTERS:
-                self._stop("the names of the server's members are too long; name a part of it by a PATTERN")
+                self._stop("the names of the server's members are too long; select a part of the server by a PATTERN")
                 return
             self._found.offers.append(Offer(names, kind, columns, refused))
 

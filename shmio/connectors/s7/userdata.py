@@ -125,7 +125,7 @@ def szl_records(data: bytes, szl: int) -> list[bytes]:
 
     """
     if len(data) < _SZL_HEAD.size:
-        raise ConnectorError(f"the controller's answer to '{READ_SZL.name}' has no head")
+        raise ConnectorError(f"the controller's answer to '{READ_SZL.name}' has no header")
     found, _, size, count = _SZL_HEAD.unpack_from(data)
     if found != szl:
         raise ConnectorError(

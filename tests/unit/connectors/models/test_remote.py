@@ -259,7 +259,7 @@ def test_model_that_leaves_within_a_step_fails_the_step(instance: str) -> None:
             assert model.reached.wait(PATIENCE_S)
         thread.join()
         assert errors == [
-            "step 1: sim: model 'adder' disconnected before it answered; the next step works once one is connected"
+            "step 1: sim: model 'adder' disconnected before it answered; the next step works once a model is connected"
         ]
         with Model(instance):
             good(sim)

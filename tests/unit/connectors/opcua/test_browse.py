@@ -92,7 +92,10 @@ def test_the_search_is_bounded(server: Device, capsys: pytest.CaptureFixture[str
     assert browse(server.url, "--limit", 3) == 1
     said = capsys.readouterr()
     assert len(said.out.splitlines()) == 2
-    assert "this list is incomplete: the server has more than 3 nodes; name a part of it by a PATTERN" in said.err
+    assert (
+        "this list is incomplete: the server has more than 3 nodes; select a part of the server by a PATTERN"
+        in said.err
+    )
     assert browse(server.url, "--depth", 2) == 1
     said = capsys.readouterr()
     assert "Axis" in said.out
