@@ -100,8 +100,7 @@ def _check_opcua(opcua: OpcUa) -> Iterator[str]:
     if identity is not None and application_uri(identity[0]) is None:
         yield (
             f"opcua.certificate: {opcua.certificate}: this certificate has no application URI (a URI among its "
-            "subject alternative "
-            "names); many clients refuse such a certificate"
+            "subject alternative names); many clients refuse such a certificate"
         )
 
 

@@ -114,8 +114,7 @@ class Header(msgspec.Struct, frozen=True):
         if abi != ABI_VERSION:
             raise FormatError(
                 f"{name} has segment ABI {abi} (written by shmio {text(version)}), but this shmio {__version__} "
-                "knows only "
-                f"ABI {ABI_VERSION}; use the same version of shmio as the instance"
+                f"knows only ABI {ABI_VERSION}; use the same version of shmio as the instance"
             )
         sound = (
             header_size == HEADER_SIZE

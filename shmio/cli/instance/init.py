@@ -283,8 +283,7 @@ def _refuse_table(path: Path, file: Path) -> None:
         url = f"{match[1]}://{text[match.end() :]}"
         raise ConfigError(
             f"{url}: init takes files, not URLs; shmio-supervisor browse {url} -o tags.toml writes a tag table "
-            "of what an OPC UA "
-            f"server offers; {_in_source(file, 'tags.toml')}"
+            f"of what an OPC UA server offers; {_in_source(file, 'tags.toml')}"
         )
     suffix = path.suffix.lower()
     table, others = f"if this is a tag table, {_in_source(file, path.name)}", f"shmio-layout import {path} -o tags.toml"

@@ -141,8 +141,7 @@ class _Search:
         if left_out or self._references >= self._wanted.nodes * REFERENCES_PER_NODE:
             self._stop(
                 f"the server sends more references than {self._wanted.nodes} nodes need; select a part of the "
-                "server by a "
-                "PATTERN, or set --limit"
+                "server by a PATTERN, or set --limit"
             )
 
     def _add(self, parent: _Node, reference: Any) -> None:

@@ -245,8 +245,7 @@ def test_source_without_its_device_rejects_the_values(device: Device, capsys: py
     assert out.splitlines() == ["cell/count  rejected", "cell/run    rejected"]
     assert err == (
         "cell/count: not written, because the source did not accept the command: the source is not connected: no "
-        "answer from 10.0.0.1; "
-        "see shmio-supervisor status (and 1 more)\n"
+        "answer from 10.0.0.1; see shmio-supervisor status (and 1 more)\n"
     )
 
 
@@ -267,8 +266,7 @@ def test_command_for_a_restarted_source_can_be_repeated(
         replacing.join()
         assert capsys.readouterr().err == (
             "other/count: not written, because the source did not accept the command: the source was restarted "
-            "after the "
-            "command was sent; send it again; see shmio-supervisor status\n"
+            "after the command was sent; send it again; see shmio-supervisor status\n"
         )
         assert main(["set", "other/count", "1"]) == 0, "the remedy works"
 

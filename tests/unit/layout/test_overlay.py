@@ -146,9 +146,7 @@ REFUSED = {
     'a = { address = "Inputs/7", initial = 3 }': "a: initial: leave out this key, because the initial values are "
     "those of cell",
     'a = { address = "Inputs/7", scale = 0.1 }': "a: scale: leave out this key, because a name over a data block "
-    "shows the "
-    "bytes of "
-    "cell as they",
+    "shows the bytes of cell as they",
     'a = { address = "Inputs/7", deadband = 1 }': "a: deadband: ",
     'a = { adress = "Inputs/7" }': "a: unknown key 'adress'; did you mean 'address'?",
     'Level = "Inputs/7"': "Level: cell has a register of this path; choose another path",

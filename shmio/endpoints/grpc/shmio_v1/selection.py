@@ -155,8 +155,7 @@ class Selections:
         if self._elements + view.elements > MAX_ALL_ELEMENTS:
             raise EndpointError(
                 f"all clients together have {self._elements} elements open, but at most {MAX_ALL_ELEMENTS} are "
-                "allowed; "
-                "select fewer registers, or subscribe to raw frames"
+                "allowed; select fewer registers, or subscribe to raw frames"
             )
         return view
 
@@ -182,8 +181,7 @@ class _Budget:
         if registers > self.registers or elements > self.elements:
             raise ValueRangeError(
                 f"the patterns name more than {MAX_REGISTERS} registers or {MAX_ELEMENTS} elements, which is the "
-                "maximum of one "
-                "call; select fewer registers, make several calls, or use raw frames"
+                "maximum of one call; select fewer registers, make several calls, or use raw frames"
             )
 
     def match(self, registers: int) -> None:

@@ -415,8 +415,7 @@ def _tables(block: Block) -> tuple[Selection, Selection]:
         if len(table.registers) > MAX_REGISTERS or table.elements > MAX_ELEMENTS:
             raise ValueRangeError(
                 f"{block.source} has more than {MAX_REGISTERS} registers or {MAX_ELEMENTS} elements, which is "
-                "the maximum of a "
-                "model; split the source into several"
+                "the maximum of a model; split the source into several"
             )
         _ = table.table
     return tables

@@ -241,8 +241,7 @@ class RecordingsTab(Tab):
             f'[instance]\nname = "{name}"\n'
             f"[recorder]\ndirectory = {msgspec.json.encode(str(path.parent)).decode()}\n"
             '[web]\nlisten = "127.0.0.1:PORT"\n'
-            "END\n"
-            f"shmio-supervisor up -c {name}/supervisor.toml {replay}",
+            f"END\nshmio-supervisor up -c {name}/supervisor.toml {replay}",
             "instead": f"shmio-supervisor down {config}\nshmio-supervisor up {config} {replay}",
         }
 
