@@ -6,8 +6,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from typing import Final
 
-from snap7.type import SrvArea
-
 from shmio.errors import ConfigError, ValueRangeError
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
@@ -17,16 +15,8 @@ from shmio.layout.s7.conversion import Conversion
 Place = tuple[Area, int]
 """An area, and the number of the data block; 0 for other areas."""
 
-AREAS: Final[Mapping[Area, SrvArea]] = {
-    Area.INPUT: SrvArea.PE,
-    Area.OUTPUT: SrvArea.PA,
-    Area.MARKER: SrvArea.MK,
-    Area.TIMER: SrvArea.TM,
-    Area.COUNTER: SrvArea.CT,
-}
-"""The areas that are not data blocks, with python-snap7's names."""
 _LETTERS: Final = {Area.INPUT: "%I", Area.OUTPUT: "%Q", Area.MARKER: "%M", Area.TIMER: "%T", Area.COUNTER: "%C"}
-_LEAST: Final = dict.fromkeys(AREAS, 1024) | {Area.TIMER: 512, Area.COUNTER: 512}
+_LEAST: Final = dict.fromkeys(_LETTERS, 1024) | {Area.TIMER: 512, Area.COUNTER: 512}
 """Minimum sizes of these areas in bytes, about those of an S7-300."""
 
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
-from typing import Self
+from typing import Final, Self
 
 import msgspec
 from snap7.server import CPUState
+from snap7.type import SrvArea
 
 from shmio.config.address import Address
-from shmio.emulators.areas import AREAS, Place, TableMemory, is_table, place_name
+from shmio.emulators.areas import Place, TableMemory, is_table, place_name
 from shmio.emulators.cycle import Cycle
 from shmio.emulators.programs import BUILT_IN, Idle, UserCode, program
 from shmio.emulators.s7 import S7Server, ServerOptions
@@ -18,6 +19,15 @@ from shmio.errors import ConfigError, SnapshotError
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
 from shmio.layout.s7.address import Area
+
+AREAS: Final[Mapping[Area, SrvArea]] = {
+    Area.INPUT: SrvArea.PE,
+    Area.OUTPUT: SrvArea.PA,
+    Area.MARKER: SrvArea.MK,
+    Area.TIMER: SrvArea.TM,
+    Area.COUNTER: SrvArea.CT,
+}
+"""The areas that are not data blocks, with python-snap7's names."""
 
 
 class Emulator:

@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 from shmio.config import Address
 from shmio.connectors.base import Connector
 from shmio.connectors.s7.connector import S7Connector, S7Options
-from shmio.emulators.areas import AREAS, Place, TableMemory
+from shmio.emulators.areas import Place, TableMemory
+from shmio.emulators.emulator import AREAS
 from shmio.emulators.s7 import S7Server, ServerOptions
 from shmio.errors import ConnectorError
 from shmio.layout.s7.address import Area
