@@ -7,6 +7,7 @@ in a temporary folder, or reads it there.
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
@@ -265,7 +266,7 @@ class ProcessStates:
         clock = self._segment.clock
         slots = [self._segment.processes.find(one) for one in names]
         number = clock.state_request().number + 1
-        clock.request_state(StateRequest(number, action, work.name, name))
+        clock.request_state(StateRequest(number, action, work.name, name, os.getpid()))
         for slot in slots:
             clock.slot_bell(slot.index).ring()
         until_ns = time.monotonic_ns() + round(PATIENCE_S * 1e9)

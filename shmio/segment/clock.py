@@ -51,7 +51,7 @@ _ATTEMPTS: Final = 4
 _INVALID: Final = "the clock page is invalid; restart the instance with shmio-supervisor down and up"
 
 
-_REQUEST: Final = struct.Struct("<QI4x32s64s")
+_REQUEST: Final = struct.Struct("<QII32s64s")
 _REQUEST_COPY: Final = 128
 
 
@@ -69,13 +69,14 @@ class StateRequest(NamedTuple):
     """A request of the owner of time to all processes that take part in snapshots.
 
     ``folder`` is the name of the folder with their states, inside the instance's snapshot folder.
-    ``name`` is the snapshot's name.
+    ``name`` is the snapshot's name, ``pid`` the process that asks.
     """
 
     number: int = 0
     action: StateAction = StateAction.NONE
     folder: str = ""
     name: str = ""
+    pid: int = 0
 
 
 _ACTIONS: Final = frozenset(StateAction)
@@ -265,9 +266,9 @@ class ClockPage:
         Raises:
             SegmentError: The page is corrupt.
         """
-        number, action, folder, name = _REQUEST.unpack(self._request.read(_REQUEST.size))
+        number, action, pid, folder, name = _REQUEST.unpack(self._request.read(_REQUEST.size))
         known = action if action in _ACTIONS else StateAction.NONE
-        return StateRequest(number, StateAction(known), text(folder), text(name))
+        return StateRequest(number, StateAction(known), text(folder), text(name), pid)
 
     def request_state(self, request: StateRequest) -> None:
         """Ask processes to save or restore their state. Only the owner of time may call this.
@@ -275,7 +276,7 @@ class ClockPage:
         The caller then rings the doorbells of these processes.
         """
         folder, name = request.folder.encode(), request.name.encode()
-        self._request.write(_REQUEST.pack(request.number, request.action, folder, name))
+        self._request.write(_REQUEST.pack(request.number, request.action, request.pid, folder, name))
 
     def state_answer(self, index: int) -> int:
         """Return the number of the last request that the process in a slot has answered; 0: none."""

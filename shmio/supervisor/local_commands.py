@@ -296,14 +296,15 @@ class TimeChanges:
         if now == before and not snapshot:
             return
         self._before = now
+        if snapshot and not self._programs.is_own(asked.pid):
+            who = self._programs.actor(asked.pid)
+            trail.record(_SNAPSHOTS[asked.action], {"snapshot": asked.name}, "requested", who=who)
+        if snapshot and asked.action is StateAction.RESTORE:
+            before = now._replace(owner=before.owner)  # the jump is no step
         pid = now.owner or before.owner
         if not pid or self._programs.is_own(pid):
             return
         who = self._programs.actor(pid)
-        if snapshot:
-            trail.record(_SNAPSHOTS[asked.action], {"snapshot": asked.name}, "requested", who=who)
-            if asked.action is StateAction.RESTORE:
-                before = now
         for action, what in _changes(before, now):
             count = now.step - before.step if action == "step" else 1
             trail.record(action, what, "done", who=who, count=count)
