@@ -236,6 +236,13 @@ def test_benchmark_of_reading_mqtt() -> None:
     assert len(re.findall(r"^(?:shmio|paho) +[1-9]\d* +\d+\.\d+", found, re.MULTILINE)) == 2, found
 
 
+def test_benchmark_of_a_reload() -> None:
+    pytest.importorskip("asyncua")
+    pytest.importorskip("pymodbus")
+    found = printed("reload")
+    assert len(re.findall(r"^(?:modbus|opcua) +[1-9]\d* +[1-9]\d* +\d+\.\d$", found, re.MULTILINE)) == 2, found
+
+
 def test_benchmark_of_reading_mtconnect() -> None:
     found = printed("mtconnect_read")
     assert re.search(r"^shmio +[1-9]\d* +\d+\.\d+$", found, re.MULTILINE), found
