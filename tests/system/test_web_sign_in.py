@@ -66,7 +66,7 @@ def test_nothing_is_seen_without_a_token(open_page: Callable[..., Any]) -> None:
     page = open_page("")
     expect(page.get_by_role("dialog", name="Sign in")).to_be_visible()
     sign_in(page, "a wrong token")
-    expect(page.get_by_role("alert")).to_contain_text("no token")
+    expect(page.get_by_role("alert")).to_contain_text("grpc.token")
     expect(page.get_by_role("tab", name="Registers")).to_be_visible()
     assert not page.locator("#sources").count()
     sign_in(page, token("viewer"))
@@ -104,3 +104,12 @@ def test_roles_change_with_the_token(open_page: Callable[..., Any]) -> None:
     search.fill("Outputs")
     row.click()
     expect(page.get_by_role("button", name="Write")).to_be_disabled()
+
+    page.get_by_role("tab", name="Injections").click()
+    lift = page.get_by_role("button", name="Lift all injections")
+    expect(lift).to_be_disabled()
+    page.get_by_role("button", name="Sign in").click()
+    sign_in(page, token("operator"))
+    expect(lift).to_be_enabled()  # the tab that is open has the new roles
+    sign_out(page)
+    expect(lift).to_be_disabled()
