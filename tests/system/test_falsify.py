@@ -195,11 +195,11 @@ def test_statuses_and_refusals(
     for text, words, error in (
         (CAMPAIGN.replace('lift/height"\noperation = "offset', 'lift/high"\noperation = "offset'), [], "lift/high"),
         (CAMPAIGN, [*values, "--set=parameters.lift.gain=1"], "no ranges to search"),
-        (CAMPAIGN, ["--set", "push.valu=1"], "did you mean push.value"),
+        (CAMPAIGN, ["--set", "push.valu=1"], "unknown range 'push.valu'; did you mean"),
         (CAMPAIGN, ["--resume"], "no search to continue"),
         (CAMPAIGN, ["--trials", "9000000"], "at most 1000000"),
-        (CAMPAIGN.replace("duration_s = 0.4", ""), [], "duration_s: this key is needed"),
-        (CAMPAIGN.replace('config = "supervisor.toml"', ""), [], "name the configuration with -c"),
+        (CAMPAIGN.replace("duration_s = 0.4", ""), [], "campaign.toml: duration_s: "),
+        (CAMPAIGN.replace('config = "supervisor.toml"', ""), [], " -c FILE"),
         (CAMPAIGN.replace("lift/height < 5", "lift/height <"), [], "always: at character"),
     ):
         file.write_text(text)
