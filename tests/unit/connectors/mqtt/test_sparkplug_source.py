@@ -201,7 +201,7 @@ def test_a_reload_keeps_what_is_known_of_nodes_and_asks_for_a_birth_if_metrics_w
         source.until(lambda: source.value("axis/pos") == 2.5)
         source.reload(TAGS)
         edge.send("DDATA", "other", {"name": "n", "type": "Int16", "value": 5})  # of a device whose birth was missed
-        edge.send("DDATA", "robot", {"alias": 10, "type": "Double", "value": 3.5}, {"alias": 11})
+        edge.send("DDATA", "robot", {"alias": 10, "type": "Double", "value": 3.5}, {"alias": 11, "type": "Int16"})
         source.until(lambda: source.value("axis/pos") == 3.5)
         kept = {"axis/pos", "axis/on"}
         assert {path for path in TAGS if source.code(path) == 0} == kept
