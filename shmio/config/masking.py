@@ -80,10 +80,9 @@ def mask_value(key: str, value: Any) -> Any:
         return {name: mask_value(name, item) for name, item in value.items()}
     if isinstance(value, list | tuple):
         items = list(value)
-        hidden = [False, *(is_secret_option(item) for item in items[:-1])]
         return [
-            MASK if secret and isinstance(item, str) else mask_value(key, item)
-            for item, secret in zip(items, hidden, strict=True)
+            MASK if isinstance(item, str) and is_secret_option(before) else mask_value(key, item)
+            for item, before in zip(items, ("", *items), strict=False)
         ]
     if is_secret(key) and not _is_key_file(key, str(value)):
         return MASK

@@ -105,6 +105,7 @@ def test_messages_that_quote_the_file_are_masked() -> None:
 
 
 def test_values_are_masked_by_their_keys() -> None:
+    assert mask_value("writable", []) == []
     given = {"url": "mqtt://u:p@h", "options": {"api_key": 5, "host": "h"}, "key": "a.pem", "token": [{"name": "n"}]}
     assert mask_value("", given) == {
         "url": f"mqtt://{MASK}@h",
