@@ -275,3 +275,32 @@ def test_a_campaign_starts_from_a_snapshot(plan: Callable[..., Plan], tmp_path: 
     assert first[-1].item.clock_ns == 1_100_000_000
     with Laboratory(prepared) as lab, pytest.raises(SnapshotError, match="unknown snapshot 'none'"):
         lab.run(RunPlan([], [limit], 0.5, start="none"))
+
+
+def test_edges_across_a_snapshot_are_noticed(plan: Callable[..., Plan]) -> None:
+    prepared = plan()
+    edges = {
+        "injection": [
+            {"name": "edge", "target": "cell/NCAchse1_Pos", "operation": "offset", "value": 5,
+             "when": "rising(panel/Go)"},
+            {"name": "again", "target": "cell/NCAchse2_Pos", "operation": "offset", "value": 5, "when": "panel/N > 0",
+             "for_s": 0.04},
+        ]
+    }  # fmt: skip
+
+    def runs(cell: Attachment) -> dict[str, int]:
+        return {one.name: one.running.runs for one in cell.injections("cell") if one.running is not None}
+
+    with Laboratory(prepared) as lab, lab.attach() as cell:
+        cell.declare(parse_campaign(edges))
+        cell.write({"panel/N": 1})
+        cell.step(0.02, 5)
+        cell.write({"panel/N": 0})
+        cell.step(0.02, 2)
+        assert runs(cell) == {"edge": 0, "again": 1}
+        cell.save_snapshot("before")
+    with Laboratory(prepared) as lab, lab.attach() as cell:
+        cell.restore_snapshot("before")
+        cell.write({"panel/N": 1, "panel/Go": True})
+        cell.step(0.02, 2)
+        assert runs(cell) == {"edge": 1, "again": 2}
