@@ -113,7 +113,7 @@ class LiveRun:
         self._blocks: dict[str, Block] = {source: blocks[source] for source in self.judge.sources}
 
     def run(self, over: threading.Event, begun: Callable[[], None] = lambda: None) -> None:
-        """Run until the end, the first failure, or until ``over`` is set.
+        """Run until the end or until ``over`` is set; with the plan's ``stop``, also until the first failure.
 
         Args:
             over: Ends the run when it is set.
@@ -121,7 +121,7 @@ class LiveRun:
 
         Raises:
             ConfigError: An injection is invalid, or the instance does not allow the plan's
-                ``step_s`` or ``real_time``.
+                ``step_s``, ``real_time`` or ``start``.
             CommandError: A source refuses an injection.
             RecordingError: The file of the recording cannot be created.
             SnapshotError: The snapshot cannot be restored.

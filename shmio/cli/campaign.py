@@ -46,7 +46,8 @@ def _status_of(error: Exception) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=PROGRAM,
-        description="Judge what a campaign file expects of signals.",
+        description="Check signals against the expectations of a campaign file: in a recording, in a run, "
+        "or in a search for values that fail.",
         epilog="Exit status: 0: all expectations passed; 1: one failed; 2: wrong usage or campaign; 3: inconclusive.",
     )
     parser.add_argument("--version", action="version", version=f"shmio {__version__}")

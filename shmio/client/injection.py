@@ -77,9 +77,9 @@ class ShadowState:
     def request(
         self, values: Mapping[str, object], arrays: Arrays | None, raw: Raw, *, answered: bool
     ) -> tuple[int, bytes]:
-        """Return the sequence number of a message with values, and the message.
+        """Build a message that sets values. Return its sequence number, and the message.
 
-        The sequence number is 0 if the endpoint need not answer the message.
+        The sequence number is 0 unless ``answered`` asks the endpoint to answer.
 
         Raises:
             ValueRangeError: A value is wrong.

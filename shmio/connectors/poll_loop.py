@@ -423,7 +423,7 @@ class SourceLoop:
                 until_ns = time.monotonic_ns() + round(self._connector.timeout_s * 1e9)
                 self._call(lambda: self.commands.confirm(lambda: self._connector.confirm(until_ns)))
         except ConnectorError as error:
-            log.warning("the connection cannot be kept: %s", error)
+            log.warning("the connection cannot be kept over the reload: %s", error)
             self.unkept = str(error)
             return False
         if self._in_flight or self.commands.unconfirmed:

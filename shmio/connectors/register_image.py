@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from shmio.errors import ValueRangeError
+from shmio.errors import ConnectorError, ValueRangeError
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
 from shmio.layout.values.codec import Value, codec
@@ -32,6 +32,11 @@ class Copy(NamedTuple):
     sources: npt.NDArray[np.intp]
     targets: npt.NDArray[np.intp]
     indices: frozenset[int]
+
+
+def no_status_area() -> ConnectorError:
+    """Return the error of a connector with ``register_quality`` whose layout has no status area."""
+    return ConnectorError("this is a fault in shmio, please report it: the layout has no status area")
 
 
 class RegisterImage:

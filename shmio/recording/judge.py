@@ -103,9 +103,9 @@ class GoldenRecordings:
             sources[source].add(frames)
             if sum(one.frames * len(one.signals) for one in sources.values()) > MAX_GOLDEN:
                 raise ConfigError(f"{name} is too long: it has more than {MAX_GOLDEN} values of these signals")
+        if empty := [source for source, one in sources.items() if one.origin_ns is None]:
+            raise ConfigError(f"{name} has no frame of {', '.join(empty)}")
         begins = [one.origin_ns for one in sources.values() if one.origin_ns is not None]
-        if len(begins) < len(sources):
-            raise ConfigError(f"{name} has no frame of a source")
         begin_ns, end_ns = max(begins), max(one.newest_ns for one in sources.values()) + 1
         for one in sources.values():
             one.turn(begin_ns, end_ns)

@@ -58,7 +58,7 @@ class LogFolder:
 
 
 class Notifier:
-    """Notifies the service manager that the environment names, if any (sd_notify(3)).
+    """Sends notifications to the service manager if ``$NOTIFY_SOCKET`` names one; see sd_notify(3).
 
     No method fails or blocks, with or without a service manager.
     """

@@ -169,7 +169,7 @@ class Supervisor:
 
     def _on_signal(self, number: int) -> None:
         name = signal.Signals(number).name
-        log.info("%s", name)
+        log.info("received %s", name)
         trail.record("down", {}, "accepted", who=Acting(Actor("signal", name), SUPERVISOR))
         if self._stopping and number != signal.SIGHUP:  # shell and kernel may each send a SIGHUP
             self._hasten()

@@ -144,8 +144,8 @@ class TableConformance:
             assert not any(source.write(values))
             source.until(values, dict.fromkeys(values, GOOD))
 
-    def test_a_lost_device_leaves_no_thread_that_writes(self, table: TableRig) -> None:
-        """After a close, a write fails, and no part of it is sent later."""
+    def test_a_write_after_close_raises_connector_error(self, table: TableRig) -> None:
+        """A closed connector refuses a write with ConnectorError."""
         path, tag = next(iter(table.types.items()))
         with connected(table, table.types) as source:
             source.connector.close()

@@ -544,7 +544,7 @@ class Subscription(AsyncIterator[Update]):
 
 
 class Steps(AsyncIterator[Stepped]):
-    """Steps of time on one stream, which is cheaper than one call for each step.
+    """Steps time on one stream; this is cheaper than one call for each step.
 
     Use it in one task, and close it, or use ``async with``. Iterate over the steps that
     :meth:`Client.steps` requested. A step arrives when all streams have its changes; meanwhile, the

@@ -543,7 +543,7 @@ class Subscription(Iterator[Update]):
 
 
 class Steps(Iterator[Stepped]):
-    """Steps of time on one stream, which is cheaper than one call for each step.
+    """Steps time on one stream; this is cheaper than one call for each step.
 
     Use it in one thread, and close it, or use ``with``. Iterate over the steps that
     :meth:`Client.steps` requested. A step arrives when all streams have its changes; meanwhile, the

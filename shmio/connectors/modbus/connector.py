@@ -16,7 +16,7 @@ from shmio.connectors.base import Connector, Lost, WriteLostError
 from shmio.connectors.modbus import client
 from shmio.connectors.modbus.client import MAX_WRITE_BITS, MAX_WRITE_WORDS, ModbusClient, RefusedError, SilentError
 from shmio.connectors.modbus.plan import MAX_PROBES, Element, Limits, ReadRequest, Refusals
-from shmio.connectors.register_image import Copy, RegisterImage
+from shmio.connectors.register_image import Copy, RegisterImage, no_status_area
 from shmio.connectors.request_count import CycleRequests, Requests, counted
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.addresses.modbus import Address, Order, Table, WordCodec, parse
@@ -220,7 +220,7 @@ class ModbusConnector(Connector):
     def read(self) -> bytes:
         """Read all registers. Raise ConnectorError if the connection is lost."""
         if self._image is None:
-            raise ConnectorError("the layout has no status area")
+            raise no_status_area()
         self._client.begin()
         now_ns = time.monotonic_ns()
         values: dict[int, list[Any]] = {}

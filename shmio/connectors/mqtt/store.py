@@ -17,9 +17,9 @@ from shmio.connectors.mqtt.sparkplug import Device, Host
 from shmio.connectors.mqtt.topic import Message, Origin, Topic
 from shmio.connectors.mqtt.values import ValueConverter, decode_json
 from shmio.connectors.mqtt.watch import Watch
-from shmio.connectors.register_image import RegisterImage
+from shmio.connectors.register_image import RegisterImage, no_status_area
 from shmio.connectors.request_count import counted
-from shmio.errors import ConfigError, ConnectorError, PathError, ValueRangeError
+from shmio.errors import ConfigError, PathError, ValueRangeError
 from shmio.layout.glob import Glob
 from shmio.layout.model import Layout
 from shmio.layout.values.codec import Value
@@ -235,7 +235,7 @@ class Store:
         """Return the image of the newest messages at ``now_ns``, a time of CLOCK_MONOTONIC."""
         image = self._image
         if image is None:
-            raise ConnectorError("the layout has no status area")
+            raise no_status_area()
         with self._changed:
             groups: Iterable[Group] = self._changed_groups
             if self._all_changed or now_ns >= self._expiry_ns:

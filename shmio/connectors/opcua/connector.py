@@ -25,7 +25,7 @@ from shmio.connectors.opcua.decode import Sample
 from shmio.connectors.opcua.options import Credentials, OpcUaOptions
 from shmio.connectors.opcua.structures import AbsentError, ChangedValue, find, read_value
 from shmio.connectors.opcua.values import MismatchError, ValueConverter
-from shmio.connectors.register_image import RegisterImage
+from shmio.connectors.register_image import RegisterImage, no_status_area
 from shmio.connectors.request_count import CycleRequests, Requests, counted
 from shmio.errors import ConfigError, ConnectorError, ValueRangeError
 from shmio.layout.addresses import siemens
@@ -256,7 +256,7 @@ class OpcUaConnector(Connector):
     def _forget(self) -> None:
         """Let all registers wait for their first values."""
         if self._image is None:
-            raise ConnectorError("the layout has no status area")
+            raise no_status_area()
         with self._lock:
             self._latest.clear()
             for index in range(len(self._layout.registers)):
@@ -473,9 +473,12 @@ class OpcUaConnector(Connector):
             changed.set(member, converter.sample(one.value, now))
             return
         part = converter.elements(one.value, now)
-        if now.dims is None or one.first + one.size > len(now.value):
-            raise ValueError("it has no such elements at present")
-        values = [*now.value[: one.first], *part.value, *now.value[one.first + one.size :]]
+        end = one.first + one.size
+        if now.dims is None:
+            raise ValueError("the server's value is not an array at present")
+        if end > len(now.value):
+            raise ValueError(f"the server's array has {len(now.value)} elements at present; the write needs {end}")
+        values = [*now.value[: one.first], *part.value, *now.value[end:]]
         changed.set(member, now._replace(value=values))
 
     def _path(self, step: _NodeWrite) -> str:

@@ -285,7 +285,10 @@ def _walk(found: Found, member: Member) -> Found:
                 raise MismatchError(f"the structure {found.structure.name} has no member {step}; {_there(found)}")
             inner = found.values[step]
             if inner is None:
-                raise AbsentError("it has no such member at present")
+                raise AbsentError(
+                    f"the structure {found.structure.name} has no member {step} at present "
+                    "(optional, or another alternative of the union)"
+                )
             found = inner
         elif isinstance(found, Members) or found.dims is None or len(found.dims) != len(step):
             raise MismatchError(f"{here} is {_named(found)}, which has no element [{','.join(map(str, step))}]")
@@ -301,11 +304,12 @@ def _walk(found: Found, member: Member) -> Found:
 
 
 def _index(step: Sequence[int], dims: Sequence[int]) -> int:
-    """Return the place of an element in the flat list of an array. Raise AbsentError if it has no such element."""
+    """Return the place of an element in the flat list of an array. Raise AbsentError if the array is too short."""
     index = 0
     for one, size in zip(step, dims, strict=True):
         if one >= size:
-            raise AbsentError("it has no such element at present")
+            there, wanted = ",".join(map(str, dims)), ",".join(map(str, step))
+            raise AbsentError(f"the array [{there}] has no element [{wanted}] at present")
         index = index * size + one
     return index
 

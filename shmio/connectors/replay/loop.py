@@ -18,6 +18,7 @@ from shmio.connectors.output import Image, Output
 from shmio.connectors.poll_loop import Counters
 from shmio.connectors.replay.recording import MAX_NS, Entry, RecordedSource
 from shmio.connectors.replay.source import Replay, ReplayStart, as_others, stamp
+from shmio.connectors.request_count import counted
 from shmio.errors import PathError, SegmentError, ValueRangeError
 from shmio.layout.topic import find
 from shmio.layout.values.write import Write, bits_of
@@ -528,7 +529,8 @@ class ReplayLoop:
         left_out = behind_ns // self._source.recorded.block.period_ns
         self.counters.overruns += left_out
         if too_late:  # otherwise the speed is too high, and the message would repeat in each round
-            log.warning("%d frames were skipped: this process was delayed by %.1f s", left_out, late_ns / 1e9)
+            skipped = counted(left_out, "frame")
+            log.warning("skipped %s: this process was delayed by %.1f s", skipped, late_ns / 1e9)
         if play.wraps:
             self._keep(play.settled(clock_ns))
         self._player.show(min(self._play.at_ns(clock_ns), play.end_ns - 1), self._stamp)

@@ -6,12 +6,12 @@ import logging
 from collections.abc import Iterable
 from typing import Any, Final
 
-from shmio.connectors.register_image import RegisterImage
+from shmio.connectors.register_image import RegisterImage, no_status_area
 from shmio.connectors.ros.addresses import Address, FieldError, extract, leaf_type, parse
 from shmio.connectors.ros.messages import plain
 from shmio.connectors.ros.options import TopicOptions
 from shmio.connectors.ros.values import ValueConverter
-from shmio.errors import ConfigError, ConnectorError, ValueRangeError
+from shmio.errors import ConfigError, ValueRangeError
 from shmio.layout.model import Layout
 from shmio.model.statuses import (
     BAD_DECODING_ERROR,
@@ -143,7 +143,7 @@ class Topics:
 
         """
         if self._image is None:
-            raise ConnectorError("the layout has no status area")
+            raise no_status_area()
         for topic in self.by_name.values():
             fault = topic.fault or self._fault(topic, now_ns)
             if fault != GOOD:

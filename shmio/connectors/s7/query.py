@@ -1,8 +1,9 @@
 """A question about the controller itself, which the session asks between reads of data. No I/O.
 
 Only one question is open at a time, and its request is sent after those of a read. A controller may
-refuse a question, or may close the connection without an answer. So a question may end the
-connection only a few times. After that, the session never asks it again.
+refuse a question, or close the connection without an answer. After ``PATIENCE`` connections that
+were lost while a question was open that was never answered, or ``PATIENCE`` malformed answers in a
+row, no session asks it again.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from shmio.connectors.s7.userdata import Service, next_request, parse_answer, re
 from shmio.errors import ConnectorError
 
 PATIENCE: Final = 2
-"""Number of connections without a proper answer to a question after which it is not asked again."""
+"""Number of lost connections, or of malformed answers in a row, after which a question is not asked again."""
 MAX_PARTS: Final = 64
 MAX_ANSWER_BYTES: Final = 16_384
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
 from shmio.connectors.base import Connector
-from shmio.connectors.register_image import RegisterImage
+from shmio.connectors.register_image import RegisterImage, no_status_area
 from shmio.connectors.request_count import CycleRequests, counted
 from shmio.connectors.s7 import cpu, pdu
 from shmio.connectors.s7.block_check import BlockChangeMonitor, ExpectedBlock
@@ -35,7 +35,7 @@ from shmio.connectors.s7.plan import Field, Job, Piece, Range, merge, most_bytes
 from shmio.connectors.s7.request_count import NOTE, by_pdu_size
 from shmio.connectors.s7.session import MAX_DEPTH, REGISTER_OPTIONS, Read, S7Options, S7Session
 from shmio.connectors.s7.tag import Tag
-from shmio.errors import ConfigError, ConnectorError, PathError
+from shmio.errors import ConfigError, PathError
 from shmio.layout.glob import Glob
 from shmio.layout.model import Layout, Register, bit_positions
 from shmio.layout.s7.address import Area, is_of_cpu, parse
@@ -435,7 +435,7 @@ class S7TableConnector(S7Session, Connector):
 
     def _reads(self) -> list[Read]:
         if self._image is None:
-            raise ConnectorError("the layout has no status area")
+            raise no_status_area()
         self._cpu.begin()
         self._planner.use(self._used(self.pdu_size))
         requests = max(1, self._planner.count)

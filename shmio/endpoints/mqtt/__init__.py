@@ -11,5 +11,6 @@
 - ``steps`` delivers the steps of virtual time; ``sparkplug`` publishes the same sources as
   Sparkplug B.
 
-"We" and "our" stand for this instance.
+In the comments of this package, "we" and "our" mean this instance, as opposed to the broker and its
+other clients.
 """

@@ -53,7 +53,7 @@ def _run_bridge(worker: Worker) -> None:
             worker.report_readers(bridge.readers)
     bridge.close()
     worker.report(bridge.counters, note="")
-    log.info("%d messages", bridge.outbox.sent)
+    log.info("stopped; %d messages were sent to the broker", bridge.outbox.sent)
 
 
 def run_broker(worker: Worker) -> None:

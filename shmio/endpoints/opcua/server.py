@@ -118,7 +118,8 @@ class InternalServer(LibraryInternalServer):
         """Return the user with these credentials, or None."""
         user = self.access.identify(username, password, certificate)
         if user is None:
-            log.warning("a client was refused: %s", "wrong name or password" if username else "no role for it")
+            nameless = "it has no account and no certificate with a role, and opcua.anonymous is empty"
+            log.warning("a client was refused: %s", "wrong name or password" if username else nameless)
         return user
 
     def decrypt_user_token(self, isession: Any, token: ua.UserNameIdentityToken) -> tuple[str, str]:

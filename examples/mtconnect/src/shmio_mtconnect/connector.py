@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 import msgspec
 
 from shmio.connectors.base import Connector
-from shmio.connectors.register_image import RegisterImage
+from shmio.connectors.register_image import RegisterImage, no_status_area
 from shmio.connectors.request_count import CycleRequests, counted
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout
@@ -104,7 +104,7 @@ class MTConnectConnector(Connector):
         """
         self.close()
         if self._image is None:
-            raise ConnectorError("the layout has no status area")
+            raise no_status_area()
         for index in range(len(self._addresses)):
             self._image.fail(index, BAD_WAITING_FOR_INITIAL_DATA)
         self._follower = _Follower(self._options, self._image, self._lock, self._targets(self._image))

@@ -231,7 +231,7 @@ def test_a_member_is_changed_without_the_other_bytes() -> None:
     changed.set(("v",), Sample(decode.INT16, [1, 2], (2,), 0, 0))
     whole = b"\2\0\0\0ab", b"\6\0\0\0longer"
     assert changed.sample.value.body == BODY.replace(*whole).replace(b"\x06\7\0\0\0", b"\x84\2\0\0\0\1\0\2\0")
-    for member, words in ((("many", (1,), "m4"), "NodeId"), (("u", "m1"), "no such member"), (("many",), "address")):
+    for member, words in ((("many", (1,), "m4"), "NodeId"), (("u", "m1"), "no member m1"), (("many",), "address")):
         with pytest.raises(ValueError, match=words):
             changed.set(member, Sample(decode.STRING, "x", None, 0, 0))
 
