@@ -11,6 +11,7 @@ from typing import Any
 
 from shmio.cli.common import dumps
 from shmio.cli.recordings.common import Progress, not_closed
+from shmio.connectors.request_count import counted
 from shmio.errors import RecordingError
 from shmio.logs import printable
 from shmio.recording.check import check
@@ -48,11 +49,12 @@ def _lines(found: dict[str, Any]) -> list[str]:
     for block in found["blocks"]:
         hertz = f" at {block['rate_hz']:.1f} Hz" if block["rate_hz"] else ""
         lines.append(
-            f"  {block['source']}: {block['layout']}, {block['registers']} registers, {block['size']} bytes, "
-            f"layout {block['layout_hash'][:12]}: {block['frames']} frames{hertz}, {block['events']} events"
+            f"  {block['source']}: {block['layout']}, {counted(block['registers'], 'register')}, "
+            f"{counted(block['size'], 'byte')}, layout {block['layout_hash'][:12]}: "
+            f"{counted(block['frames'], 'frame')}{hertz}, {counted(block['events'], 'event')}"
         )
-    missed = f"{found['missed_frames']} frames and {found['missed_events']} events missed"
-    lines.append(f"  {missed} in {found['gap_count']} gaps" if found["gap_count"] else "  nothing missed")
+    missed = f"{counted(found['missed_frames'], 'frame')} and {counted(found['missed_events'], 'event')} missed"
+    lines.append(f"  {missed} in {counted(found['gap_count'], 'gap')}" if found["gap_count"] else "  nothing missed")
     lines += [f"    {_gap(gap)}" for gap in found["gaps"][:10]]
     return lines + [f"  damage: {text}" for text in found["damage"]]
 

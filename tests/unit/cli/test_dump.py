@@ -116,7 +116,7 @@ def test_info_folds_equal_lines(segment: Segment, tmp_path: Path, said: Output) 
     assert main(["info", str(work.output.path)]) == 0
     out, _ = said()
     [line] = [line for line in out if "  cell: " in line]
-    assert line.endswith(": 1 frames, 1 events (3 of these)")
+    assert line.endswith(": 1 frame, 1 event (3 of these)")
 
 
 def test_cat_prints_a_line_for_each_change(file: str, said: Output) -> None:

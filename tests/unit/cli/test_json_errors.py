@@ -22,6 +22,7 @@ FAILING: dict[Main, dict[str, list[str]]] = {
         "inject": NOT_THERE,
         "step": NOT_THERE,
         "replay": NOT_THERE,
+        "snapshot": [*NOT_THERE, "list"],
     },
     dump.main: {
         "record": NOT_THERE,

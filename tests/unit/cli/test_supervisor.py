@@ -932,7 +932,7 @@ def test_status_has_the_documented_keys_in_order(instance: str, capsys: pytest.C
         segment.unlink()
     told = json.loads(capsys.readouterr().out)
     assert list(told) == documented(page, "One object, with all of these keys, in this order:")
-    of_process, of_source = documented(page, "Each process:"), documented(page, "A source also:")
+    of_process, of_source = documented(page, "Each process has these keys:"), documented(page, "A source also has:")
     counters = page.partition("| kind | counters |\n")[2].partition("\n\n")[0].splitlines()[1:]
     for process, row in zip(told["processes"], counters, strict=True):
         kind, *names = re.findall(r"`(\w+)`", row)

@@ -135,7 +135,7 @@ def test_replay_refuses_writes(tmp_path: Path, instance: str) -> None:
     with built(instance) as segment, Playing(segment, file) as cell:
         cell.next()  # the process accepts commands now
         source_writer = SourceWriter(segment.blocks["cell"], GUEST)
-        assert outcome_of_write(source_writer, 5) == "refused: source cell replays a recording: it cannot be written"
+        assert outcome_of_write(source_writer, 5) == "refused: source cell replays a recording, so it cannot be written"
         kinds = [event.kind for event in cell.happened()]
     assert kinds == [EventKind.ACCEPTED, EventKind.REFUSED]
 

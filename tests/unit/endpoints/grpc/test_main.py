@@ -83,6 +83,7 @@ def test_the_heartbeat_continues_while_layouts_are_read(
             log=logging.getLogger("test"),
             running=lambda: None,
             report=report,
+            report_readers=lambda readers: None,
         )
         run(worker)
     assert len(beats) >= 3
@@ -136,6 +137,7 @@ def test_a_stop_with_open_streams_leaves_no_traceback(
             log=logging.getLogger("test"),
             running=begin,
             report=report,
+            report_readers=lambda readers: None,
         )
         run(worker)
         over.set()

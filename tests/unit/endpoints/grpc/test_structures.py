@@ -161,7 +161,7 @@ def test_fields_missing_in_the_message_keep_their_value_and_short_lists_are_fill
         (request("safetyzones/Z1", "1.0"), "safetyzones/Z1: expected a safety_zone, found a text"),
         (request("safetyzones/Z1", point=wire.Point(x=1)), "safetyzones/Z1: expected a safety_zone, found a point"),
         (request("safetyzones/Z1", timeStamp=wire.Header()), "expected a safety_zone, found a timeStamp"),
-        (request("safetyzones/Z1", safety_zone=wire.SafetyZone(zone="Z" * 81)), "at most 8 are allowed"),
+        (request("safetyzones/Z1", safety_zone=wire.SafetyZone(zone="Z" * 81)), "at most 80 are allowed"),
         (
             request("known/JointTrajectoryPoint", joint_trajectory_point=wire.JointTrajectoryPoint(effort=[1] * 4)),
             "known/JointTrajectoryPoint/effort: expected at most 3 elements, found 4",
