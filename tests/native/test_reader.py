@@ -258,7 +258,7 @@ def test_an_unfinished_segment_is_an_error(reader: Path, instance: str) -> None:
         (bytes(1 << 20), early),
         (b"SHMIOSEG" + struct.pack("<II", 9, 4096) + bytes(8192), f"/dev/shm/shmio-{instance} has ABI 9"),
         (b"\x7fELF" * 4096, f"/dev/shm/shmio-{instance} is no segment of shmio\n"),
-        (b"SHMIOSEG" + struct.pack("<II", 1, 4096) + bytes(4080), "the section table is not sound\n"),
+        (b"SHMIOSEG" + struct.pack("<II", 2, 4096) + bytes(4080), "the section table is not sound\n"),
     ):
         file.write_bytes(content)
         status, output, errors = run(reader, instance, "device/on", "1")
