@@ -40,7 +40,9 @@ PATIENCE_S: Final = 30.0
 ASK_S: Final = 2.0
 _TURN_NS: Final = 100_000_000
 _PARTIAL: Final = "; --partial saves the rest"
-_UNKNOWN: Final = "it could not write its state or its reason: is the disk full?"
+_UNKNOWN: Final = (
+    "it could not use the folder of snapshots; check whether the disk is full, and run shmio as the instance's user"
+)
 
 Refusals = dict[str, str]
 """Why processes have refused, by name."""
@@ -137,7 +139,13 @@ class Snapshots:
             coordinator.jump(
                 Clock(step=head.step, done=head.done, time_ns=head.time_ns, step_size_ns=head.step_size_ns)
             )
-            refusals = self._states.restore(name, wanted, work)
+            try:
+                refusals = self._states.restore(name, wanted, work)
+            except SnapshotError as error:
+                coordinator.announce()
+                raise SnapshotError(
+                    f"the snapshot {name} was restored only in part: {error}; restore it again"
+                ) from None
             coordinator.announce()
             _refuse_any(refusals, f"the snapshot {name} was not restored", "; the data of this source are bad")
         return found
@@ -272,7 +280,7 @@ class ProcessStates:
         until_ns = time.monotonic_ns() + round(PATIENCE_S * 1e9)
         while True:
             seen = clock.delivered_bell.value()
-            waiting = [slot for slot in slots if clock.state_answer(slot.index) != number]
+            waiting = [slot for slot in slots if clock.state_answer(slot.index)[0] != number]
             if not waiting:
                 break
             _check_alive(waiting)
@@ -280,8 +288,8 @@ class ProcessStates:
             if rest_ns <= 0:
                 raise SnapshotError(f"{waiting[0].name} did not answer within {PATIENCE_S:g} s")
             clock.delivered_bell.wait(seen, min(rest_ns, _TURN_NS))  # a process that dies rings no doorbell
-        refused = [one for one in names if (work / f"{one}{REFUSAL}").exists()]
-        return {one: self._read(work / f"{one}{REFUSAL}").decode(errors="replace") or _UNKNOWN for one in refused}
+        refused = [one for one, slot in zip(names, slots, strict=True) if not clock.state_answer(slot.index)[1]]
+        return {one: _reason(work / f"{one}{REFUSAL}") for one in refused}
 
     @staticmethod
     def _read(file: Path) -> bytes:
@@ -289,6 +297,14 @@ class ProcessStates:
             return read_bounded(file, MAX_PART_BYTES)
         except OSError as error:
             raise SnapshotError(f"{file}: {error.strerror}") from None
+
+
+def _reason(file: Path) -> str:
+    """Return the reason that a process has written for its refusal."""
+    try:
+        return read_bounded(file, MAX_PART_BYTES).decode(errors="replace") or _UNKNOWN
+    except OSError:
+        return _UNKNOWN
 
 
 def _check_alive(slots: list[ProcessSlot]) -> None:

@@ -55,11 +55,11 @@ class StateRequests:
         if request.number == self._answered:
             return
         self._answered = request.number
-        if WORK.fullmatch(request.folder):
-            self._carry_out(request, self._folder / request.folder)
-        self._page.answer_state(self._slot, request.number)
+        done = bool(WORK.fullmatch(request.folder)) and self._carry_out(request, self._folder / request.folder)
+        self._page.answer_state(self._slot, request.number, done=done)
 
-    def _carry_out(self, request: StateRequest, folder: Path) -> None:
+    def _carry_out(self, request: StateRequest, folder: Path) -> bool:
+        """Carry out a request. Return whether that worked; if not, write the reason to a file."""
         part = folder / f"{self._name}{PART}"
         try:
             match request.action:
@@ -76,6 +76,9 @@ class StateRequests:
         except Exception as error:
             log.exception("a request about the state failed")
             _refuse(folder / f"{self._name}{REFUSAL}", f"{type(error).__name__}: {error}")
+        else:
+            return True
+        return False
 
 
 def _refuse(file: Path, reason: str) -> None:

@@ -53,6 +53,7 @@ _INVALID: Final = "the clock page is invalid; restart the instance with shmio-su
 
 _REQUEST: Final = struct.Struct("<QII32s64s")
 _REQUEST_COPY: Final = 128
+_REFUSED: Final = 1 << 63
 
 
 class StateAction(IntEnum):
@@ -278,13 +279,17 @@ class ClockPage:
         folder, name = request.folder.encode(), request.name.encode()
         self._request.write(_REQUEST.pack(request.number, request.action, request.pid, folder, name))
 
-    def state_answer(self, index: int) -> int:
-        """Return the number of the last request that the process in a slot has answered; 0: none."""
-        return _atomics.load64(self._memory, self._answers_at + 8 * index)
+    def state_answer(self, index: int) -> tuple[int, bool]:
+        """Return the last request that the process in a slot has answered, and whether it was carried out.
 
-    def answer_state(self, index: int, number: int) -> None:
+        The number of the request is 0 if there is none.
+        """
+        answer = _atomics.load64(self._memory, self._answers_at + 8 * index)
+        return answer & ~_REFUSED, not answer & _REFUSED
+
+    def answer_state(self, index: int, number: int, *, done: bool) -> None:
         """Record that the process in a slot has answered a request. Only that process may call this."""
-        _atomics.store64(self._memory, self._answers_at + 8 * index, number)
+        _atomics.store64(self._memory, self._answers_at + 8 * index, number if done else number | _REFUSED)
         self.delivered_bell.ring()
 
     def _entry(self, index: int) -> int:

@@ -76,7 +76,8 @@ class Session:
             here_s = clock_s + self._begun_s
             if abs(first - here_s) > 1e-6:
                 raise CommandError(f"the step begins at {first:g} s, but the instance is at {here_s:g} s")
-            self._cell.step(second)
+            end_ns = round((first + second - self._begun_s) * _NS)
+            self._cell.step((end_ns - self._cell.clock.time_ns) / _NS)  # so that rounding to ns does not add up
         images = {source: image_of(self._cell, source) for source in self._sources}
         found = self.values.encode(images)
         self._now = self.values.decode(found)
