@@ -123,7 +123,7 @@ class LiveRun:
             ConfigError: An injection is invalid, or the instance does not allow the plan's
                 ``step_s``, ``real_time`` or ``start``.
             CommandError: A source refuses an injection.
-            RecordingError: The file of the recording cannot be created.
+            RecordingError: The file of the recording cannot be created or completed.
             SnapshotError: The snapshot cannot be restored.
         """
         plan = self._plan

@@ -71,7 +71,7 @@ def store(
         limit_s: Maximum duration of a run in s.
 
     Raises:
-        RecordingError: A file cannot be written, or the campaign does not run.
+        RecordingError: A file cannot be written, or the campaign does not run or takes too long.
 
     """
     place = folder / name

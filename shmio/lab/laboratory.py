@@ -77,8 +77,8 @@ class Laboratory:
 
         Args:
             plan: The plan from :func:`prepare_laboratory`.
-            parameters: Parameters of models in place of those of the configuration, by source and
-                name.
+            parameters: Parameters of models, by source and name. They override those of the
+                configuration.
 
         Raises:
             ConfigError: A model cannot be created, or a parameter does not exist.
@@ -187,9 +187,10 @@ class Laboratory:
             The run, with its verdicts.
 
         Raises:
-            ConfigError: An expectation or an injection is invalid.
+            ConfigError: An expectation or an injection is invalid, or the plan's ``real_time`` is true.
             CommandError: A source refuses an injection.
-            RecordingError: The file of the recording cannot be created.
+            RecordingError: The file of the recording cannot be created or completed.
+            SnapshotError: The snapshot cannot be restored.
 
         """
         work = self.prepare(plan)

@@ -200,7 +200,7 @@ def _read_members(value: WireValue, path: str, by_path: Mapping[str, Register], 
         elif any(other.startswith(f"{inner}/") for other in by_path):
             _read_members(member, inner, by_path, values)
         else:
-            raise ValueRangeError(f"{shorten(inner)}: the structure has no such member")
+            raise ValueRangeError(f"{shorten(inner)}: the structure has no member {shorten(name)}")
 
 
 def _read(value: WireValue, register: Register) -> object:
