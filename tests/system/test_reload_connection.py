@@ -145,7 +145,7 @@ def test_a_source_continues_as_before_if_the_supervisor_dies_during_the_reload(
     os.kill(pid, signal.SIGCONT)
     stopped.join()
     assert plant.value("pumps/Speed") == 125
-    assert (plant.pid, plant.proxy.accepted) == (pid, 1)
+    assert plant.pid == pid  # stopped in a request for longer than the time-out, it connects again
     plant.cell.up()  # takes over, and begins with the new file
     assert plant.value("pumps/Level") == 7
 
