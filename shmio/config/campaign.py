@@ -154,7 +154,7 @@ def read_settings(settings: Sequence[str]) -> dict[str, Any]:
             raise ConfigError(f"--set {text}: expected NAME=VALUE, such as late.start_s=3")
         try:
             tables = tomllib.loads(f"value = {value}")
-        except ValueError:
+        except (ValueError, RecursionError):
             tables = {}
         if set(tables) != {"value"}:
             raise ConfigError(f"--set {text}: {value!r} is not a TOML value; write text in double quotes")

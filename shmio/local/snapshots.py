@@ -124,7 +124,7 @@ class Snapshots:
 
         Raises:
             SnapshotError: There is no such snapshot, it is damaged, or it does not fit; nothing has
-                been changed. Or a process could not restore its state; then its data are bad.
+                been changed. Or a process could not restore its state; then it still has the old one, or bad data.
             TimeError: Time is real, or another program owns it.
         """
         folder = self._folder()
@@ -147,7 +147,7 @@ class Snapshots:
                     f"the snapshot {name} was restored only in part: {error}; restore it again"
                 ) from None
             coordinator.announce()
-            _refuse_any(refusals, f"the snapshot {name} was not restored", "; the data of this source are bad")
+            _refuse_any(refusals, f"the snapshot {name} was restored only in part", "; restore it again")
         return found
 
     def all(self) -> list[SnapshotInfo]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -14,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any, Final, NamedTuple
-from xml.sax.saxutils import quoteattr
+from xml.sax.saxutils import quoteattr as _quoteattr
 
 import msgspec
 
@@ -26,10 +27,18 @@ from shmio.version import __version__
 
 IDENTIFIER: Final = "shmio_cell"
 MAX_BYTES: Final = 64 << 20
+COMPILE_S: Final = 120
+"""Maximum time in s of the C compiler."""
 SUFFIXES: Final = frozenset({".toml", ".db", ".udt", ".scl", ".csv", ".xlsx", ".ini", ".py", ".fmu", ".npy", ".json"})
 """Files of the configuration's folder that the FMU contains."""
 _SKIPPED: Final = frozenset({"__pycache__", "node_modules", "logs", "dumps", "snapshots", "build", "dist"})
+_NOT_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 _PLATFORMS: Final = {"x86_64": "linux64"}
+
+
+def quoteattr(text: str) -> str:
+    """Return text as an attribute's value. Characters that XML 1.0 cannot contain become escape sequences."""
+    return _quoteattr(_NOT_XML.sub(lambda match: f"\\u{ord(match[0]):04x}", text))
 
 
 class Exported(NamedTuple):
@@ -122,10 +131,12 @@ def _compile(work: Path, guid: str) -> Path:
     command = ["cc", "-std=c11", "-O2", "-shared", "-fPIC", "-fvisibility=hidden", f'-DSHMIO_GUID="{guid}"']
     try:
         done = subprocess.run(
-            [*command, "-o", library, source], capture_output=True, text=True, check=False, timeout=120
+            [*command, "-o", library, source], capture_output=True, text=True, check=False, timeout=COMPILE_S
         )
     except FileNotFoundError:
         raise ConfigError("the export needs a C compiler; install one (Debian: apt install gcc libc6-dev)") from None
+    except subprocess.TimeoutExpired:
+        raise ConfigError(f"the C compiler did not build the FMU's library within {COMPILE_S} s") from None
     if done.returncode:
         raise ConfigError(f"the C compiler cannot build the FMU's library: {done.stderr.strip()[-800:]}")
     return library

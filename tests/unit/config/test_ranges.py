@@ -132,7 +132,7 @@ def test_a_range_is_refused_where_nothing_searches_it(tmp_path: Path) -> None:
         read_campaign(file)
     with pytest.raises(ConfigError, match="value: this is a range"):
         parse_campaign(tomllib.loads(INJECTION + "value = { from = 0, to = 5 }\n"))
-    for text in ("late.value", "late.value=oh", "late.value=1\nx=2", "=1"):
+    for text in ("late.value", "late.value=oh", "late.value=1\nx=2", "=1", "late.value=" + "[" * 100_000):
         with pytest.raises(ConfigError, match="--set"):
             read_settings([text])
 
