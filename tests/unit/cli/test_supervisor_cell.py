@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 
+from shmio.cli.instance.init import comment_out
 from shmio.local.status import InstanceStatus, ProcessStatus, SourceStatus, read_status
 from shmio.segment import instances
 from shmio.testing.cell import until
@@ -45,7 +46,7 @@ class Cell:
         file = folder / "supervisor.toml"
         text = file.read_text().replace('"a50"  ', f'"{instance}"').replace("1102", str(free_port()))
         text = text.replace("127.0.0.1:8089", "127.0.0.1:0").replace("127.0.0.1:8090", "127.0.0.1:0")
-        file.write_text(text.replace("1883", str(free_port())))
+        file.write_text(comment_out(text.replace("1883", str(free_port())), "web"))
 
     def command(self, *arguments: str) -> list[str]:
         return [sys.executable, "-m", "shmio.cli.supervisor", *arguments]

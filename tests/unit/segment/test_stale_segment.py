@@ -121,7 +121,7 @@ def test_a_process_that_does_not_end_is_named_and_keeps_the_segment(
             with pytest.raises(SegmentError) as caught:
                 clear(instance)
         assert str(caught.value) == (
-            f"instance {instance!r} has processes that do not end: cell: pid {orphan} was killed and still runs: "
+            f"instance {instance!r} has processes that do not end: cell: pid {orphan} was killed and still runs; "
             "remove the cause, or restart the host; then try again"
         )
         assert instance in instances()

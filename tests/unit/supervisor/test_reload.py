@@ -275,7 +275,7 @@ def test_a_new_process_that_does_not_run_is_reported_and_the_rest_continues(laun
     assert cell.status().state == "degraded"
     assert {name: pid for name, pid in cell.pids().items() if name != "press"} == before
     answer = cell.reload([*CELL, PRESS])
-    assert answer["done"] == ["press: started again, as it was not running"]
+    assert answer["done"] == ["press: started again, because it was not running"]
     assert cell.of("press").state == "running"
 
 

@@ -13,7 +13,7 @@ from shmio.errors import ControlError
 from shmio.segment import Segment, instances
 from tests.unit.supervisor.harness import CELL, Launch, Launched, until
 
-STUCK = "pid {pid} was killed and still runs: remove the cause, or restart the host"
+STUCK = "pid {pid} was killed and still runs; remove the cause, or restart the host"
 
 
 def held(launch: Launch, name: str) -> tuple[Launched, int, str]:
@@ -31,7 +31,7 @@ def test_a_restart_names_a_stuck_process_and_continues_after_its_end(launch: Lau
     for _ in range(2):
         with pytest.raises(ControlError) as caught:
             cell.request(Restart("cell"))
-        assert str(caught.value) == f"{stuck}; it starts again as soon as it has ended"
+        assert str(caught.value) == f"{stuck}; it starts again as soon as the old process has ended"
     told = cell.of("cell")
     assert (told.pid, told.note) == (pid, STUCK.format(pid=pid))
     assert cell.status().state == "degraded"
@@ -59,7 +59,7 @@ def test_a_reload_names_a_stuck_process_and_continues_after_its_end(launch: Laun
     cell, pid, stuck = held(launch, "cell")
     with pytest.raises(ControlError) as caught:
         cell.reload([*CELL[:1], *CELL[2:]])
-    assert str(caught.value) == f"{stuck}; the reload continues as soon as it has ended"
+    assert str(caught.value) == f"{stuck}; the reload continues as soon as that process has ended"
     assert cell.of("cell").note == STUCK.format(pid=pid)
     with pytest.raises(ControlError, match=f"in progress and waits for a process that does not end: {stuck}"):
         cell.request(Reload())
@@ -71,7 +71,7 @@ def test_a_reload_names_a_stuck_process_and_continues_after_its_end(launch: Laun
 def test_a_stop_names_a_stuck_process_and_stops_all_others(launch: Launch) -> None:
     cell, pid, stuck = held(launch, "cell")
     others = [os.pidfd_open(cell.pid(name)) for name in ("plc", "grpc")]
-    answer = f"all other processes are stopped, but {stuck}; the stop continues as soon as it has ended"
+    answer = f"all other processes are stopped, but {stuck}; the stop continues as soon as that process has ended"
 
     def refused() -> str:
         with pytest.raises(ControlError) as caught:
