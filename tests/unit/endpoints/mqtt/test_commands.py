@@ -194,8 +194,9 @@ def test_a_json_register_accepts_a_value_or_an_object_with_one(segment: Segment,
             assert "as JSON" in listener.json("cell/axis/position/in/result")["reason"]
 
 
-def test_a_flood_of_commands_is_bounded_and_answered(segment: Segment, broker: Mosquitto) -> None:
-    with running(segment, broker) as (_, listener):
+def test_a_flood_of_commands_is_bounded_and_answered(segment: Segment, make_broker: Callable[..., Mosquitto]) -> None:
+    """By default, mosquitto queues 1000 messages for a slow client, and drops later ones, such as the last result."""
+    with running(segment, make_broker("allow_anonymous true", "max_queued_messages 0")) as (_, listener):
         for number in range(5000):
             listener.client.publish(f"{PREFIX}/cell/step/in", str(number % 1000), 0)
         listener.publish("cell/axis/speed/in", "1.5")
