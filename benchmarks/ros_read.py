@@ -134,7 +134,7 @@ def sampler(client: Make, robot: Child, arms: int, duration_s: float, costs: lis
             newest = client(stack, robot.hello, arms)
             end_s = time.monotonic() + PATIENCE_S
             robot.ask(-1)
-            while not reaches(newest, -1, 0.5):  # the robot has not found the client yet
+            while not reaches(newest, -1, 0.5):  # until the robot has found the client
                 if time.monotonic() > end_s:
                     raise SystemExit("the client does not get the robot's messages")
                 robot.ask(-1)

@@ -2,11 +2,11 @@
 
 The arm goes through the path of the door. So the interlock has two rules. The arm stops while the
 door moves, unless it has passed the last point at which it can still stop. The door starts to move
-only if the arm has not passed this point.
+only while the arm can still stop.
 
 The program has a fault, as it happens where two controllers exchange signals: the door's
-controller sees the arm's signal ``scans_late`` scans late. If the door is told to move within these
-40 ms after the arm has passed the point, both move.
+controller sees the arm's signal ``scans_late`` scans late. If the door gets the command to move
+within these 40 ms after the arm has passed the point, both move.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from typing import Final
 import msgspec
 
 LOCK_S: Final = 2.0
-"""How long to wait for another process's lock on the file, in s. Each lock is brief."""
+"""Maximum time in s to wait for the lock of another process on the file. Each lock is brief."""
 _LOCK_TURN_S: Final = 0.002
 
 

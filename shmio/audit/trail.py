@@ -54,7 +54,7 @@ MAX_MERGED: Final = 1000
 RETRY_S: Final = 1.0
 """Pause before a failed write is repeated, in s."""
 CLOSE_S: Final = 2.0
-"""How long a process that ends waits until its last entries are written, in s."""
+"""Maximum time in s for which a process that ends waits until its last entries are written."""
 
 log = logging.getLogger("shmio.audit")
 

@@ -109,7 +109,7 @@ class LiveRun:
         self.start: SnapshotInfo | None = None
         """The snapshot in which the run has begun; None if there is none."""
         self.problem: ShmioError | None = None
-        """What ended the run early; None if nothing did."""
+        """The error that ended the run early; None if there was no such error."""
         self._blocks: dict[str, Block] = {source: blocks[source] for source in self.judge.sources}
 
     def run(self, over: threading.Event, begun: Callable[[], None] = lambda: None) -> None:

@@ -58,7 +58,7 @@ def alert_faults(config: Config) -> Iterator[str]:
 
 
 def resolve_alert(alert: Alert, config: Config) -> None:
-    """Make the paths of an alert absolute. A program's name without a slash stays as it is."""
+    """Make the paths of an alert absolute. The name of a program without a slash is not changed."""
     if alert.command and "/" in alert.command[0]:
         alert.command = [str(config.path(alert.command[0])), *alert.command[1:]]
     for field in ("webhook_header_file", "webhook_ca"):

@@ -89,7 +89,7 @@ class Range:
 
 @dataclass(frozen=True)
 class Choice:
-    """One of several values, of any type.
+    """A parameter that has one of several given values, of any type.
 
     Attributes:
         name: Name for users.
