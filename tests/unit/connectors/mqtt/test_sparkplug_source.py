@@ -59,10 +59,17 @@ class Edge:
     def session(self, number: int | None = None) -> dict[str, Any]:
         return {"name": "bdSeq", "type": "UInt64", "value": self.bd_seq if number is None else number}
 
-    def asked(self) -> Any:
-        """Wait for a command to the edge node, and return the command's metrics."""
-        message = self.peer.ask("next", f"{GROUP}/NCMD/cell")
-        assert (message["qos"], message["retain"]) == (0, False)
+    def asked(self, source: Source) -> Any:
+        """Read images until the source has sent a command to the edge node; return the command's metrics."""
+        heard: list[Any] = []
+
+        def commanded() -> bool:
+            heard.extend(self.peer.ask("heard"))
+            return bool(heard)
+
+        source.until(commanded)  # a source asks again only a while after its last question
+        (message,) = heard
+        assert (message["topic"], message["qos"], message["retain"]) == (f"{GROUP}/NCMD/cell", 0, False)
         return self.peer.ask("decode_sparkplug", message["hex"])["metrics"]
 
 
@@ -78,7 +85,7 @@ WAITING, DEAD = "BadWaitingForInitialData", "BadNoCommunication"
 
 
 def born(source: Source, edge: Edge) -> None:
-    assert [(one["name"], one["value"]) for one in edge.asked()] == [("Node Control/Rebirth", True)]
+    assert [(one["name"], one["value"]) for one in edge.asked(source)] == [("Node Control/Rebirth", True)]
     edge.birth()
     source.until(lambda: source.code("axis/pos") == 0)
 
