@@ -97,6 +97,7 @@ def test_user_sees_the_registers_of_dropped_files(cell: Cell, page: Any) -> None
 def test_user_writes_a_register_and_overrides_it(cell: Cell, page: Any) -> None:
     open_tab(page, "Registers")
     page.get_by_label("Search").fill("Outputs")
+    expect(page.get_by_text("1 row", exact=True)).to_be_visible()  # a click on a row of the table before would be lost
     page.locator('.tree-row[data-path="cell/Outputs"]').click()
     expect(page.get_by_role("button", name="Write")).to_be_enabled()
     size = len(reading(cell, "cell/Outputs")[0])

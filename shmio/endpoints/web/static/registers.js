@@ -105,7 +105,7 @@ export class RegistersTab {
 
   draw() {
     this.virtual.show(this.first, this.total, this.rows.map((row) => this.makeRow(row)));
-    setText(this.count, `${this.total} rows`);
+    setText(this.count, this.total === 1 ? "1 row" : `${this.total} rows`);
     this.fill();
   }
 
