@@ -152,21 +152,21 @@ export class PlotsTab {
     const old = this.pasts.get(source);
     if (from >= until || (old !== undefined && paths.every((path) => old.series.has(path)) && old.serves(from, until))) return;
     const margin = (until - from) / 2;
-    const course = new SignalHistory(paths, from - margin, until === this.lanes.to ? until + margin : until);
-    const given = { source, paths, from_s: Math.max(0, course.from), to_s: course.to, columns: 2 * this.lanes.columns };
-    this.wanted.set(source, course);
+    const past = new SignalHistory(paths, from - margin, until === this.lanes.to ? until + margin : until);
+    const given = { source, paths, from_s: Math.max(0, past.from), to_s: past.to, columns: 2 * this.lanes.columns };
+    this.wanted.set(source, past);
     try {
       setText(this.pastState, "reading the recording…");
       const numbers = await this.context.connection.call("plots.past", given);
       for (const number of numbers) {
-        await course.read(this.context.connection, "plots.more", number, () => this.wanted.get(source) === course);
+        await past.read(this.context.connection, "plots.more", number, () => this.wanted.get(source) === past);
       }
-      if (this.wanted.get(source) !== course) return;
-      this.pasts.set(source, course);
+      if (this.wanted.get(source) !== past) return;
+      this.pasts.set(source, past);
       setText(this.pastState, numbers.length ? "" : "there is no recording of this time");
       this.lanes.request();
     } catch (error) {
-      if (this.wanted.get(source) === course) setText(this.pastState, String(/** @type {Error} */ (error).message));
+      if (this.wanted.get(source) === past) setText(this.pastState, String(/** @type {Error} */ (error).message));
     }
   }
 

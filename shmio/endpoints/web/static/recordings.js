@@ -242,9 +242,9 @@ export class RecordingsTab {
     const { paths } = this.lanes;
     if (!paths.length) return true;
     this.detail = null;
-    return this.read("overview", { paths }, (course) => {
-      this.overview = course;
-      this.lanes.showRange(course.from, course.to);
+    return this.read("overview", { paths }, (history) => {
+      this.overview = history;
+      this.lanes.showRange(history.from, history.to);
     });
   }
 
@@ -259,8 +259,8 @@ export class RecordingsTab {
       if (first >= last || (detail !== null && detail.serves(first, last))) return;
       const margin = (to - from) / 2;
       const given = { paths: this.lanes.paths, from_s: Math.max(0, first - margin), to_s: last + margin };
-      this.read("detail", given, (course) => {
-        this.detail = course;
+      this.read("detail", given, (history) => {
+        this.detail = history;
       });
     }, SETTLE_MS);
   }
@@ -270,7 +270,7 @@ export class RecordingsTab {
    *
    * @param {string} kind
    * @param {{ paths: string[], from_s?: number, to_s?: number }} given
-   * @param {(course: SignalHistory) => void} begin
+   * @param {(history: SignalHistory) => void} begin
    * @returns {Promise<boolean>} False if the server refused it.
    */
   async read(kind, given, begin) {
@@ -286,16 +286,16 @@ export class RecordingsTab {
       this.stop(kind);
       this.works.set(kind, plot.number);
       for (const signal of plot.signals) this.signals.set(signal.path, signal);
-      const course = new SignalHistory(given.paths, plot.from_s, plot.to_s);
-      begin(course);
-      await course.read(this.context.connection, "recordings.more", plot.number, () => {
-        setText(this.progress, course.share < 1 ? `${Math.floor(100 * course.share)} % read` : "");
+      const history = new SignalHistory(given.paths, plot.from_s, plot.to_s);
+      begin(history);
+      await history.read(this.context.connection, "recordings.more", plot.number, () => {
+        setText(this.progress, history.share < 1 ? `${Math.floor(100 * history.share)} % read` : "");
         this.lanes.request();
         return this.works.get(kind) === plot.number;
       });
       if (this.works.get(kind) !== plot.number) return true;
-      course.whole = true;
-      if (course.damage.length) this.showDamage(course.damage);
+      history.whole = true;
+      if (history.damage.length) this.showDamage(history.damage);
       setText(this.progress, "");
       this.lanes.request();
       this.works.delete(kind);
