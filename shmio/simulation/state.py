@@ -85,7 +85,7 @@ class _Encoder:
         self._modules = modules
         self._seen: dict[int, int] = {}
         self._kept: list[object] = []  # so that no id is used twice
-        self._memory: dict[int, str] = {}  # by the id of an array that owns memory: where it is used
+        self._memory: dict[int, str] = {}  # by the id of an object that owns memory: where it is used
 
     def node(self, value: object, where: str, depth: int) -> object:
         """Return the encoded form of a value; ``where`` names the value in messages."""
@@ -124,6 +124,7 @@ class _Encoder:
         if kind is deque:
             return ["deque", value.maxlen, self._items(value, where, depth)]
         if kind is bytearray:
+            self._claim(value, where)
             return ["bytearray", bytes(value)]
         if kind is dict:
             return ["dict", self._pairs(value, where, depth)]
@@ -150,16 +151,24 @@ class _Encoder:
 
     def _array(self, value: np.ndarray[Any, Any], where: str) -> list[object]:
         self._check_dtype(value.dtype, where)
-        owner: Any = value
-        while isinstance(owner.base, np.ndarray):
-            owner = owner.base
-        other = self._memory.setdefault(id(owner), where)
-        if other != where:
-            raise SnapshotError(f"the arrays {other} and {where} share memory, which a snapshot cannot restore{_HOOKS}")
+        self._claim(value, where)
         order: Literal["C", "F"] = (
             "F" if value.flags.f_contiguous and not value.flags.c_contiguous else "C"
         )  # sums depend on it
         return ["array", value.dtype.str, list(value.shape), order, value.tobytes(order)]
+
+    def _claim(self, value: object, where: str) -> None:
+        """Raise SnapshotError if an array or a bytearray that was encoded before has the same memory."""
+        owner: Any = value
+        while isinstance(owner, np.ndarray | memoryview):
+            base = owner.obj if isinstance(owner, memoryview) else owner.base
+            if base is None or isinstance(base, bytes):  # nothing can change the memory of bytes
+                break
+            owner = base
+        if id(owner) in self._memory:
+            other = self._memory[id(owner)]
+            raise SnapshotError(f"the arrays {other} and {where} share memory, which a snapshot cannot restore{_HOOKS}")
+        self._memory[id(owner)] = where
 
     def _check_dtype(self, dtype: np.dtype[Any], where: str) -> None:
         if dtype.kind not in _ARRAY_KINDS:

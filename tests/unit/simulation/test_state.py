@@ -115,6 +115,15 @@ def test_arrays_that_share_memory_are_refused() -> None:
     whole = np.zeros(4)
     with pytest.raises(SnapshotError, match=r"whole and .*part share memory"):
         encode_state({"whole": whole, "part": whole[:2]}, None, HERE)
+    with pytest.raises(SnapshotError, match="share memory"):
+        encode_state({"a": {"b": whole}, "a.b": whole[:2]}, None, HERE)
+    memory = bytearray(16)
+    one, other = np.frombuffer(memory, "<f8"), np.frombuffer(memoryview(memory), np.uint8)
+    for owners in ((one, other), (one, memory), (memory, other)):
+        with pytest.raises(SnapshotError, match="share memory"):
+            encode_state(list(owners), None, HERE)
+    constant = bytes(16)
+    assert encode_state([np.frombuffer(constant), np.frombuffer(constant), constant], None, HERE)
 
 
 @pytest.mark.parametrize(
