@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import heapq
 import os
 import re
 import secrets
@@ -23,7 +24,7 @@ from typing import Final
 import msgspec
 
 from shmio.errors import SnapshotError
-from shmio.local.state_requests import WORK, read_bounded, write_new
+from shmio.local.state_requests import WORK, open_file, read_bounded, write_new
 from shmio.model.snapshot import SnapshotInfo
 from shmio.wording import unknown
 
@@ -67,11 +68,13 @@ def file_of(folder: Path, name: str) -> Path:
 def work_folder(folder: Path) -> Iterator[Path]:
     """Create a folder for the states, inside the folder of snapshots, and remove it at the end.
 
-    Also remove those of programs that were killed.
+    Also remove those of programs that were killed. If this creates the folder of snapshots and no
+    snapshot is saved, remove it again, because it may belong to another user than the instance.
 
     Raises:
         SnapshotError: The folder cannot be created.
     """
+    new = not folder.exists()
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         _tidy(folder)
@@ -86,6 +89,9 @@ def work_folder(folder: Path) -> Iterator[Path]:
     finally:
         shutil.rmtree(work, ignore_errors=True)
         os.close(lock)
+        if new:
+            with suppress(OSError):
+                folder.rmdir()
 
 
 def _tidy(folder: Path) -> None:
@@ -145,16 +151,18 @@ def read_snapshot(file: Path) -> tuple[SnapshotInfo, SnapshotHead, dict[str, byt
 
 
 def list_snapshots(folder: Path) -> list[SnapshotInfo]:
-    """Return the snapshots of a folder, the oldest first. A damaged description is reported, not raised.
+    """Return the snapshots of a folder, the oldest first; if there are too many, only the newest files.
+
+    A damaged description is reported, not raised.
 
     Raises:
         SnapshotError: The folder cannot be read.
     """
     try:
-        files = sorted(folder.glob(f"*{SUFFIX}"))[:MAX_LISTED]
+        files = [file for file in folder.glob(f"*{SUFFIX}") if _NAME.fullmatch(file.stem)]
     except OSError as error:
         raise SnapshotError(f"{folder}: {error.strerror}") from None
-    return sorted(map(_listed, (file for file in files if _NAME.fullmatch(file.stem))), key=lambda one: one.saved_s)
+    return sorted(map(_listed, heapq.nlargest(MAX_LISTED, files, _changed_ns)), key=lambda one: (one.saved_s, one.name))
 
 
 def delete_snapshot(file: Path) -> None:
@@ -165,16 +173,25 @@ def delete_snapshot(file: Path) -> None:
         raise _unreadable(file, error) from None
 
 
+def _changed_ns(file: Path) -> int:
+    try:
+        return file.stat().st_mtime_ns
+    except OSError:
+        return 0
+
+
 def _listed(file: Path) -> SnapshotInfo:
     try:
-        with file.open("rb") as stream:
+        with open_file(file) as stream:
             head_size, body_size, _ = _sizes(file, stream.read(_HEADER.size))
             head = _head(file, stream.read(head_size))
             size = os.fstat(stream.fileno()).st_size
         if size != _HEADER.size + head_size + body_size:
             raise SnapshotError(f"{file} is damaged: it has {size} bytes")
         return _info(file, head, size)
-    except (OSError, SnapshotError) as error:
+    except OSError as error:
+        return SnapshotInfo(file.stem, problem=f"{file}: {error.strerror}")
+    except SnapshotError as error:
         return SnapshotInfo(file.stem, problem=str(error))
 
 

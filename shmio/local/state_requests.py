@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import re
+import stat
 from pathlib import Path
-from typing import Final, Protocol
+from typing import BinaryIO, Final, Protocol
 
 from shmio.errors import ShmioError, SnapshotError
 from shmio.segment.clock import ClockPage, StateAction, StateRequest
@@ -98,6 +100,15 @@ def write_new(file: Path, *data: bytes, sync: bool = False) -> None:
             os.fsync(stream.fileno())
 
 
+def open_file(file: Path) -> BinaryIO:
+    """Open a regular file to read it. Raise OSError for any other, without waiting for a FIFO's writer."""
+    stream = open(file, "rb", opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK))  # noqa: SIM115
+    if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+        stream.close()
+        raise OSError(errno.EINVAL, "not a regular file")
+    return stream
+
+
 def read_bounded(file: Path, most: int) -> bytes:
     """Return the content of a file.
 
@@ -105,7 +116,7 @@ def read_bounded(file: Path, most: int) -> bytes:
         SnapshotError: The file has more than ``most`` bytes.
         OSError: The file cannot be read.
     """
-    with file.open("rb") as stream:
+    with open_file(file) as stream:
         data = stream.read(most + 1)
     if len(data) > most:
         raise SnapshotError(f"{file} has more than {most} bytes")

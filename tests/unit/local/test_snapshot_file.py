@@ -140,3 +140,21 @@ def test_a_folder_that_is_a_file_is_named(tmp_path: Path) -> None:
     with suppress(SnapshotError):
         list_snapshots(tmp_path / "file")
     assert list_snapshots(tmp_path / "none") == []
+
+
+def test_a_list_has_the_newest_and_does_not_wait_for_a_fifo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for age, name in enumerate(("c", "b", "a")):
+        os.utime(write(tmp_path, name=name), (age, age))
+    monkeypatch.setattr(snapshot_file, "MAX_LISTED", 2)
+    assert [one.name for one in list_snapshots(tmp_path)] == ["a", "b"]
+    os.mkfifo(tmp_path / "pipe.snapshot")
+    (found,) = [one for one in list_snapshots(tmp_path) if one.name == "pipe"]
+    assert found.problem == f"{tmp_path / 'pipe.snapshot'}: not a regular file"
+    with pytest.raises(SnapshotError, match="not a regular file"):
+        read_snapshot(tmp_path / "pipe.snapshot")
+
+
+def test_a_new_folder_without_a_snapshot_is_removed(tmp_path: Path) -> None:
+    with work_folder(tmp_path / "new") as work:
+        assert work.exists()
+    assert not list(tmp_path.iterdir())
