@@ -33,7 +33,7 @@ from shmio.connectors.injection_layers import (
 )
 from shmio.connectors.injection_state import LayerState, check_configured, make_layer, save_layer
 from shmio.connectors.output import Image, LayerPublisher, Output, in_parts, layer_event, lost, pieces
-from shmio.errors import ConfigError, SegmentError
+from shmio.errors import ConfigError, SegmentError, SnapshotError
 from shmio.injection import Program, compile_program
 from shmio.injection.activation import State
 from shmio.injection.language import Number
@@ -503,7 +503,10 @@ class InjectionProcessor:
             for layer in layers:
                 layer.keep = layer.keep or self._owner_of(layer.owner.writer) != layer.owner
             self.injections.now = now
-            self._publisher.replace(layers, base)
+            try:
+                self._publisher.replace(layers, base)
+            except ValueError as error:
+                raise SnapshotError(str(error)) from None
             self.declared.restored()
             return list(self._changes(before, {layer.id: layer for layer in layers}))
 
