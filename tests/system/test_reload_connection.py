@@ -24,7 +24,8 @@ name = "pumps"
 connector = "modbus"
 layout = "pump.toml"
 period_ms = 20
-timeout = 500
+timeout = TIMEOUT
+stale_ms = STALE
 host = "127.0.0.1"
 port = PORT
 [grpc]
@@ -63,10 +64,13 @@ class Plant:
 
 
 @pytest.fixture
-def plant(make_cell: Callable[..., Cell]) -> Iterator[Plant]:
+def plant(make_cell: Callable[..., Cell], request: pytest.FixtureRequest) -> Iterator[Plant]:
+    """The instance. A parameter is the time-out and stale_ms of its source, in ms."""
+    patience_ms = getattr(request, "param", 500)
     with Device() as device, FaultProxy(device.address, framing=None) as proxy:
         device.set("holding", 100, [125, 7])
-        plant = Plant(make_cell(config=CONFIG.replace("PORT", str(proxy.address.port))), device, proxy)
+        config = CONFIG.replace("TIMEOUT", str(patience_ms)).replace("STALE", str(patience_ms))
+        plant = Plant(make_cell(config=config.replace("PORT", str(proxy.address.port))), device, proxy)
         plant.table(SPEED)
         plant.cell.up()
         plant.good()
@@ -136,6 +140,7 @@ def test_a_process_killed_during_the_reload_starts_with_the_new_registers(
     assert plant.pid != pid
 
 
+@pytest.mark.parametrize("plant", [60_000], indirect=True)  # it may be stopped while it waits for an answer
 def test_a_source_continues_as_before_if_the_supervisor_dies_during_the_reload(
     plant: Plant, stopped: threading.Thread
 ) -> None:
@@ -144,8 +149,9 @@ def test_a_source_continues_as_before_if_the_supervisor_dies_during_the_reload(
         kill(segment.supervisor[0])
     os.kill(pid, signal.SIGCONT)
     stopped.join()
-    assert plant.value("pumps/Speed") == 125
-    assert plant.pid == pid  # stopped in a request for longer than the time-out, it connects again
+    plant.device.set("holding", 100, [126])
+    until(lambda: plant.value("pumps/Speed") == 126, "the source reads on")
+    assert (plant.pid, plant.proxy.accepted) == (pid, 1)
     plant.cell.up()  # takes over, and begins with the new file
     assert plant.value("pumps/Level") == 7
 
