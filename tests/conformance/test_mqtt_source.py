@@ -21,7 +21,8 @@ from shmio.testing.ports import reserved_port
 from shmio.testing.proxy import FaultProxy
 from shmio.testing.table_conformance import TableConformance, Tags
 from shmio.testing.write_conformance import SPARE, WriteConformance, Writer, WriteRig
-from tests.unit.connectors.mqtt.peer import Peer, framing, layout_of
+from tests.unit.connectors.mqtt.peer import Peer, framing
+from tests.unit.connectors.source import layout_of
 
 COUNTS = 20
 

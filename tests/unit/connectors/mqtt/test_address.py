@@ -12,7 +12,7 @@ from shmio.connectors.mqtt.connector import MqttConnector
 from shmio.connectors.mqtt.json_path import assign
 from shmio.connectors.mqtt.options import MqttOptions
 from shmio.errors import ConfigError
-from tests.unit.connectors.mqtt.peer import layout_of
+from tests.unit.connectors.source import layout_of
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,8 @@ from shmio.layout.compiler import Source as SourceFile
 from shmio.layout.compiler import compile_sources
 from shmio.model.statuses import GOOD
 from tests.unit.connectors.mqtt.conftest import Plant
-from tests.unit.connectors.mqtt.peer import Peer, Source
+from tests.unit.connectors.mqtt.peer import Peer
+from tests.unit.connectors.source import Source
 
 TREE = """\
 b

@@ -32,7 +32,7 @@ from shmio.model.statuses import (
 )
 from shmio.model.values import Quality
 from shmio.wire import sparkplug_b_pb2 as wire
-from tests.unit.connectors.mqtt.peer import layout_of
+from tests.unit.connectors.source import layout_of
 
 KINDS: Final = ("BOOL", "SINT", "UDINT", "ULINT", "REAL", "LREAL", "STRING[5]", "WSTRING[5]")
 TEXTS = st.one_of(

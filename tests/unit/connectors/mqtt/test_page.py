@@ -10,7 +10,7 @@ import msgspec
 
 from shmio.connectors.mqtt.options import MqttOptions
 from shmio.connectors.mqtt.store import Store
-from tests.unit.connectors.mqtt.peer import layout_of
+from tests.unit.connectors.source import layout_of
 
 PAGE = Path(__file__).parents[4] / "docs/how-to/read-mqtt-topics.md"
 COMMON = {"name", "connector", "layout", "period_ms"}

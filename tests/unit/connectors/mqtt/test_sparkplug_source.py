@@ -14,7 +14,8 @@ from shmio.layout.tags import place_tags
 from shmio.model import statuses
 from shmio.model.statuses import describe
 from tests.unit.connectors.mqtt.conftest import Plant
-from tests.unit.connectors.mqtt.peer import Peer, Source, connected
+from tests.unit.connectors.mqtt.peer import Peer, connected
+from tests.unit.connectors.source import Source
 
 GROUP = "spBv1.0/Line 1"
 TAGS: dict[str, Any] = {

@@ -19,7 +19,7 @@ from shmio.connectors.ros.messages import DEFINITIONS, default
 from shmio.errors import ConfigError, ConnectorError
 from shmio.model import statuses
 from tests.unit.connectors.ros.dds_peer import DOMAIN, Peer
-from tests.unit.connectors.ros.harness import Source, layout_of
+from tests.unit.connectors.source import Source, layout_of
 
 STATE = "sensor_msgs/msg/JointState "
 

@@ -19,7 +19,7 @@ from shmio.connectors.ros.rosbridge import RosbridgeConnector, RosbridgeOptions
 from shmio.errors import ConnectorError
 from shmio.model.statuses import GOOD, StatusArea
 from tests.unit.connectors import hostile
-from tests.unit.connectors.ros.harness import layout_of
+from tests.unit.connectors.source import layout_of
 
 TIMEOUT_MS = 400
 NEVER = threading.Event()

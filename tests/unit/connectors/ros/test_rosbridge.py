@@ -15,7 +15,8 @@ from shmio.layout.values.write import encode
 from shmio.model import statuses
 from shmio.testing.write_conformance import write
 from tests.unit.connectors.ros.bridge import Bridge
-from tests.unit.connectors.ros.harness import connected, layout_of
+from tests.unit.connectors.ros.harness import connected
+from tests.unit.connectors.source import layout_of
 
 STATES = "/joint_states sensor_msgs/JointState "
 JOINTS = {
