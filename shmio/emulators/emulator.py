@@ -19,6 +19,7 @@ from shmio.errors import ConfigError, SnapshotError
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
 from shmio.layout.s7.address import Area
+from shmio.model.snapshot import decode_part
 
 AREAS: Final[Mapping[Area, SrvArea]] = {
     Area.INPUT: SrvArea.PE,
@@ -129,10 +130,7 @@ class Emulator:
         """
         if self._server.cpu_state != CPUState.RUN:
             raise SnapshotError("its CPU is not in RUN; start it first")
-        try:
-            frame, memory, program_state = msgspec.msgpack.decode(data, type=tuple[bytes, list[bytes], bytes])
-        except msgspec.MsgspecError as error:
-            raise SnapshotError(f"its state is damaged: {error}") from None
+        frame, memory, program_state = decode_part(data, tuple[bytes, list[bytes], bytes])
         areas = list(self._memory.values())
         if len(frame) != len(self._frame) or list(map(len, memory)) != list(map(len, areas)):
             raise SnapshotError("its memory has other areas")

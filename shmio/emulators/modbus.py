@@ -26,6 +26,7 @@ from shmio.layout.addresses.modbus import Address as Place
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout, Register
 from shmio.layout.values.codec import codec, flatten, nest
+from shmio.model.snapshot import decode_part
 from shmio.wording import IN_USE
 
 if TYPE_CHECKING:
@@ -43,7 +44,13 @@ Words = dict[tuple[int, Table], list[int]]
 """The entries of each unit's tables: bits as 0 and 1, and words."""
 
 
-_State = tuple[bytes, bool, list[list[Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)]]], bytes]
+class _State(msgspec.Struct, array_like=True, forbid_unknown_fields=True):
+    """The state of a device in a snapshot: its image, whether clients wrote, its tables, and its program."""
+
+    frame: bytes
+    written: bool
+    words: list[list[Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)]]]
+    program: bytes
 
 
 class _Place:
@@ -192,25 +199,22 @@ class ModbusEmulator:
         """Return the state of the tables and the program, for a snapshot."""
         with self._lock:
             words = list(self._words.values())
-            return msgspec.msgpack.encode((bytes(self._frame), self._store.written, words, self._program.save()))
+            return msgspec.msgpack.encode(_State(bytes(self._frame), self._store.written, words, self._program.save()))
 
     def prepare_restore(self, data: bytes) -> Callable[[], None]:
         """Check a state, and return the function that restores it."""
-        try:
-            frame, written, words, program_state = msgspec.msgpack.decode(data, type=_State)
-        except msgspec.MsgspecError as error:
-            raise SnapshotError(f"its state is damaged: {error}") from None
+        state = decode_part(data, _State)
         tables = list(self._words.values())
-        if len(frame) != len(self._frame) or list(map(len, words)) != list(map(len, tables)):
+        if len(state.frame) != len(self._frame) or list(map(len, state.words)) != list(map(len, tables)):
             raise SnapshotError("its tables have other sizes")
-        restore_program = self._program.prepare_restore(program_state)
+        restore_program = self._program.prepare_restore(state.program)
 
         def restore() -> None:
             with self._lock:
                 restore_program()
-                self._frame[:] = frame
-                self._store.written = written
-                for table, entries in zip(tables, words, strict=True):
+                self._frame[:] = state.frame
+                self._store.written = state.written
+                for table, entries in zip(tables, state.words, strict=True):
                     table[:] = entries
 
         return restore

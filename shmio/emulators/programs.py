@@ -12,6 +12,7 @@ import msgspec
 from shmio.errors import ConfigError, ModelError, SnapshotError
 from shmio.layout.model import NUMBERS, Layout
 from shmio.layout.values.codec import Value, codec
+from shmio.model.snapshot import decode_part
 from shmio.wording import unknown
 
 # numpy and the models are imported where they are used: most emulators need neither, and start faster without.
@@ -212,10 +213,7 @@ class UserProgram:
 
     def prepare_restore(self, data: bytes) -> Callable[[], None]:
         """Check a state, and return the function that restores it."""
-        try:
-            time_ns, own = msgspec.msgpack.decode(data, type=tuple[int, bytes])
-        except msgspec.MsgspecError as error:
-            raise SnapshotError(f"the state of the program is damaged: {error}") from None
+        time_ns, own = decode_part(data, tuple[int, bytes], "the state of the program")
         restore_own = self._runner.prepare_restore(own)
 
         def restore() -> None:

@@ -9,6 +9,7 @@ import msgspec
 from shmio.emulators.device import Device
 from shmio.emulators.stepping import InstanceTime
 from shmio.errors import SnapshotError
+from shmio.model.snapshot import decode_part
 
 
 class DeviceState(msgspec.Struct, array_like=True, forbid_unknown_fields=True):
@@ -78,10 +79,7 @@ class DeviceKeeper:
         self._time.jump(*state.place)
 
     def _prepare(self, data: bytes) -> tuple[DeviceState, Callable[[], None]]:
-        try:
-            state = msgspec.msgpack.decode(data, type=DeviceState)
-        except msgspec.MsgspecError as error:
-            raise SnapshotError(f"its state is damaged: {error}") from None
+        state = decode_part(data, DeviceState)
         if (state.kind, state.program) != (self._kind, self._program):
             raise SnapshotError(
                 f"the snapshot is of an emulator of kind {state.kind} with program {state.program}, but this one is "

@@ -1,9 +1,16 @@
-"""What programs learn of a snapshot."""
+"""Snapshots: what programs learn of one, and the decoding of its parts."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TypeVar
+
+import msgspec
+
+from shmio.errors import SnapshotError
+
+Part = TypeVar("Part")
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,3 +36,21 @@ class SnapshotInfo:
     size_bytes: int = 0
     left_out: Mapping[str, str] = field(default_factory=dict)
     problem: str = ""
+
+
+def decode_part(data: bytes, kind: type[Part], what: str = "its state") -> Part:
+    """Decode a part of a snapshot, which is MessagePack.
+
+    Args:
+        data: The encoded part.
+        kind: The type of the part.
+        what: The part, as the message names it.
+
+    Raises:
+        SnapshotError: The data do not have this type.
+
+    """
+    try:
+        return msgspec.msgpack.decode(data, type=kind)
+    except msgspec.MsgspecError as error:
+        raise SnapshotError(f"{what} is damaged: {error}") from None

@@ -18,6 +18,7 @@ from shmio.layout.model import Layout, Register
 from shmio.layout.topic import find
 from shmio.layout.values.codec import codec
 from shmio.layout.values.write import Write, bits_of
+from shmio.model.snapshot import decode_part
 from shmio.simulation.images import Ends, Images, Port, RegisterPort, port_of
 from shmio.simulation.model import (
     Declaration,
@@ -215,10 +216,7 @@ class ModelRunner:
                 it.
 
         """
-        try:
-            saved = msgspec.msgpack.decode(data, type=_Saved)
-        except msgspec.MsgspecError as error:
-            raise SnapshotError(f"model {self.name}: the state is damaged: {error}") from None
+        saved = decode_part(data, _Saved, f"model {self.name}: the state")
         if saved.model != self.name:
             raise SnapshotError(f"the snapshot has the state of model {saved.model}, but the model is {self.name}")
         if saved.version != self._version:

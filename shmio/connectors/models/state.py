@@ -11,6 +11,7 @@ from shmio.connectors.injection_layers import CycleImage
 from shmio.connectors.injection_state import LayerState
 from shmio.connectors.output import Image
 from shmio.errors import SnapshotError
+from shmio.model.snapshot import decode_part
 from shmio.segment import EventKind, Provenance, Quality, Record
 
 if TYPE_CHECKING:
@@ -42,8 +43,8 @@ class SourceState(msgspec.Struct, array_like=True, forbid_unknown_fields=True):
     raw: bytes
     cycle: int
     source_ns: int
-    quality: int
-    provenance: int
+    quality: Quality
+    provenance: Provenance
     reason: str
     seen: tuple[int, int, bytes]
     layers: list[LayerState]
@@ -71,7 +72,7 @@ def save_source(
         now = output.injections.now
         saved = SourceState(
             step, writer.block.clock.present_ns(), writer.block.clock.utc_ns(at_ns), computed_ns, image.raw,
-            image.cycle, image.source_ns, int(image.quality), int(image.provenance), image.reason,
+            image.cycle, image.source_ns, image.quality, image.provenance, image.reason,
             (now.cycle, now.time_ns, now.raw), commands.injections.save(), own,
         )  # fmt: skip
     writer.event(Record(EventKind.SAVED, name))
@@ -88,11 +89,7 @@ class PreparedSource:
             SnapshotError: The state is damaged, or does not fit the source.
 
         """
-        try:
-            self.saved = saved = msgspec.msgpack.decode(data, type=SourceState)
-            self.quality, self._provenance = Quality(saved.quality), Provenance(saved.provenance)
-        except (msgspec.MsgspecError, ValueError) as error:
-            raise SnapshotError(f"its state is damaged: {error}") from None
+        self.saved = saved = decode_part(data, SourceState)
         size = output.writer.block.layout.size
         if len(saved.raw) != size or len(saved.seen[2]) not in (0, size):
             raise SnapshotError("its image has another size")
@@ -113,7 +110,7 @@ class PreparedSource:
         saved = self.saved
         shift_ns = writer.block.clock.utc_ns(writer.now_ns()) - saved.utc_ns  # 0 if time is always virtual
         image = Image(
-            saved.raw, saved.cycle, saved.source_ns and saved.source_ns + shift_ns, self.quality, self._provenance,
+            saved.raw, saved.cycle, saved.source_ns and saved.source_ns + shift_ns, saved.quality, saved.provenance,
             saved.reason, writer.now_ns(),
         )  # fmt: skip
         with self._output.lock:

@@ -399,7 +399,7 @@ class SteppedLoop:
         except ShmioError as error:
             self._fail(saved.step, f"the snapshot {name} was not restored: {error}")
             raise
-        self._quality_log.update(prepared.quality, saved.reason, saved.step)
+        self._quality_log.update(saved.quality, saved.reason, saved.step)
 
     # ---- wall time and virtual time ------------------------------------------------------------------------------
 
