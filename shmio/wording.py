@@ -13,6 +13,11 @@ MAX_NAMES: Final = 30
 """Maximum number of valid words that a message lists."""
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a number with its noun, such as ``1 node`` or ``7 nodes``."""
+    return f"{count} {noun}{'s' * (count != 1)}"
+
+
 def near(word: str, names: Iterable[str]) -> list[str]:
     """Return a list with only the name most similar to ``word``, ignoring case; empty if none is similar."""
     folded = {name.lower(): name for name in names}

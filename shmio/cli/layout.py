@@ -16,7 +16,7 @@ from shmio.layout.model import MAX_BLOCK_BYTES, Layout, Register
 from shmio.layout.source.lexer import MAX_SOURCE_BYTES
 from shmio.logs import printable
 from shmio.version import __version__
-from shmio.wording import unknown
+from shmio.wording import counted, unknown
 
 _HEADINGS = ("offset", "size", "type", "path", "over", "initial", "comment")
 
@@ -118,7 +118,7 @@ def _table(layout: Layout) -> list[str]:
     number = f", DB{layout.number}" if layout.number is not None else ""
     access = "optimized access" if layout.optimized else "standard access"
     count = len(layout.registers)
-    title = f"{layout.name}{number}: {layout.size} bytes, {count} register{'s' * (count != 1)}, {access}"
+    title = f"{layout.name}{number}: {layout.size} bytes, {counted(count, 'register')}, {access}"
     rows = [_HEADINGS, *(_row(register) for register in layout.registers)]
     used = [i for i in range(len(_HEADINGS)) if i < 4 or any(row[i] for row in rows[1:])]
     widths = {i: max(len(row[i]) for row in rows) for i in used}

@@ -5,11 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 
-def counted(count: int, noun: str) -> str:
-    """Return a number with its noun, such as ``1 node`` or ``7 nodes``."""
-    return f"{count} {noun}{'s' * (count != 1)}"
-
-
 @dataclass(frozen=True)
 class Requests:
     """The number of requests in a cycle, under an assumption about the device."""

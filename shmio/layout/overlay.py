@@ -13,6 +13,7 @@ from typing import Final
 from shmio.layout.model import INTEGERS, Dims, ElementType, Layout, Register, array_size, shape_of
 from shmio.layout.topic import find, holder, holders, names_part, shorten
 from shmio.layout.values.write import bits_of, chosen, covering
+from shmio.wording import counted
 
 _PARTS: Final = {1: "B", 2: "W", 4: "D"}
 
@@ -57,7 +58,7 @@ def overlay_register(base: Layout, path: str, over: str, kind: tuple[ElementType
     room = _room(base, named, over)
     exact = names_part(over) or not (named.dims or _is_element(base, named))
     if size > room or (exact and size != room):
-        needs = f"type: {_written(element.name, dims)} needs {size} byte{'s' * (size != 1)}"
+        needs = f"type: {_written(element.name, dims)} needs {counted(size, 'byte')}"
         raise ValueError(f"{needs}, {_has(over, room, exact)}")
     return Register(path, element.name, dims, named.offset, None, size, count, over=over)
 

@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 from shmio.cli.common import dumps
 from shmio.cli.target import config_file
 from shmio.config import Address, Alert, Source
-from shmio.connectors.request_count import Requests, counted
+from shmio.connectors.request_count import Requests
 from shmio.errors import ConfigError, ShmioError
 from shmio.layout.topic import shorten
 from shmio.logs import printable
@@ -21,6 +21,7 @@ from shmio.plan.prepare import Prepared, peer, prepare
 from shmio.plan.processes import Plan
 from shmio.plan.request_count import source_requests, writable_registers
 from shmio.segment import PREFIX, BlockSpec, Segment
+from shmio.wording import counted
 
 MAX_PATTERNS: Final = 200
 """Largest number of characters that a line shows of a source's patterns."""
@@ -91,7 +92,7 @@ def _unserved(prepared: Prepared) -> list[str]:
 
 def _lines(found: dict[str, Any], *, would_fail: bool) -> list[str]:
     count, processes = len(found["warnings"]), len(found["processes"])
-    warnings = f"{count} warning{'s' * (count != 1)}"
+    warnings = counted(count, "warning")
     end = f"usable, with {warnings}" if count else "no faults found"
     if would_fail:
         end = f"no faults{f', {warnings}' if count else ''} in the configuration; up would fail at present"

@@ -22,6 +22,7 @@ from shmio.local.status import (
 )
 from shmio.logs import printable
 from shmio.segment import Segment, instances
+from shmio.wording import counted
 
 _HEADINGS = ("NAME", "KIND", "STATE", "PID", "RESTARTS", "UPTIME", "")
 _LIST_HEADINGS = ("NAME", "STATE", "FILE", "LISTENS ON")
@@ -72,14 +73,14 @@ def _row(process: ProcessStatus) -> tuple[str, ...]:
         details.append(f"{process.quality}: {process.reason}" if process.reason else process.quality)
         if process.cycle is not None:
             rate = f"{process.rate_hz:.1f}" if process.rate_hz else "-"
-            overruns = f"{process.overruns} overrun{'s' * (process.overruns != 1)}"
+            overruns = counted(process.overruns, "overrun")
             details.append(f"cycle {process.cycle}, {rate} Hz, {overruns}")
         if process.readers and (slowest := process.readers[0]).lag_s >= LATE_S:
             details.append(f"{slowest.process} is {slowest.frames} frames ({slowest.lag_s:.1f} s) behind")
     if process.note and not _said(process):
         details.append(process.note)
     if process.kind == "mqtt" and (missed := process.counters.get("missed")):
-        details.append(f"{missed} frame{'s' * (missed != 1)} missed")
+        details.append(f"{counted(missed, 'frame')} missed")
     pid = "-" if process.pid is None else str(process.pid)
     uptime = _duration(process.uptime_s)
     return process.name, process.kind, process.state, pid, str(process.restarts), uptime, "; ".join(details)

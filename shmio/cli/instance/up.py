@@ -20,7 +20,6 @@ from shmio.cli.common import say
 from shmio.cli.instance.detach import Configured, Failed, Started, StartMessage, headline, replay_keys
 from shmio.cli.target import config_file
 from shmio.config import Address
-from shmio.connectors.request_count import counted
 from shmio.errors import ShmioError
 from shmio.logs import printable
 from shmio.plan.prepare import Prepared, peer, prepare
@@ -28,6 +27,7 @@ from shmio.plan.processes import BROKER, Job, Plan
 from shmio.segment import State, instances
 from shmio.supervisor.main import Supervisor
 from shmio.supervisor.start import check_startable, hold_log_folder
+from shmio.wording import counted
 
 
 def up(arguments: argparse.Namespace) -> int:

@@ -11,7 +11,6 @@ from typing import Any
 
 from shmio.cli.common import dumps
 from shmio.cli.recordings.common import Progress, not_closed
-from shmio.connectors.request_count import counted
 from shmio.errors import RecordingError
 from shmio.logs import printable
 from shmio.recording.check import check
@@ -19,7 +18,7 @@ from shmio.recording.description import describe
 from shmio.recording.format.encoding import SUPERVISED
 from shmio.recording.reading.reader import Reader
 from shmio.recording.times import local
-from shmio.wording import EMPTY
+from shmio.wording import EMPTY, counted
 
 
 def info(arguments: argparse.Namespace) -> int:

@@ -17,7 +17,7 @@ from shmio.connectors.modbus import client
 from shmio.connectors.modbus.client import MAX_WRITE_BITS, MAX_WRITE_WORDS, ModbusClient, RefusedError, SilentError
 from shmio.connectors.modbus.plan import MAX_PROBES, Element, Limits, ReadRequest, Refusals
 from shmio.connectors.register_image import Copy, RegisterImage, no_status_area
-from shmio.connectors.request_count import CycleRequests, Requests, counted
+from shmio.connectors.request_count import CycleRequests, Requests
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.addresses.modbus import Address, Order, Table, WordCodec, parse
 from shmio.layout.model import Layout, Register, bit_positions
@@ -32,6 +32,7 @@ from shmio.model.statuses import (
     BAD_RESOURCE_UNAVAILABLE,
     BAD_TIMEOUT,
 )
+from shmio.wording import counted
 
 GATEWAY_RETRY_NS: Final = 1_000_000_000
 """First pause before a silent unit is asked again; it doubles with each further attempt."""

@@ -22,10 +22,11 @@ from shmio.connectors.mqtt.commands import Command, plan
 from shmio.connectors.mqtt.link import Link, Publication, UnsupportedVersionError, version_of
 from shmio.connectors.mqtt.options import MqttOptions
 from shmio.connectors.mqtt.store import Store
-from shmio.connectors.request_count import CycleRequests, counted
+from shmio.connectors.request_count import CycleRequests
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.model import Layout
 from shmio.layout.values.write import Write
+from shmio.wording import counted
 
 TIMEOUTS: Final = 4
 """The longest time that connecting may take, as a multiple of the option ``timeout``."""

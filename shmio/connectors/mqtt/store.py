@@ -18,7 +18,6 @@ from shmio.connectors.mqtt.topic import Message, Origin, Topic
 from shmio.connectors.mqtt.values import ValueConverter, decode_json
 from shmio.connectors.mqtt.watch import Watch
 from shmio.connectors.register_image import RegisterImage, no_status_area
-from shmio.connectors.request_count import counted
 from shmio.errors import ConfigError, PathError, ValueRangeError
 from shmio.layout.glob import Glob
 from shmio.layout.model import Layout
@@ -33,6 +32,7 @@ from shmio.model.statuses import (
     quality_of,
 )
 from shmio.model.values import Quality
+from shmio.wording import counted
 
 log = logging.getLogger("shmio.source.mqtt")
 

@@ -26,7 +26,7 @@ from shmio.connectors.opcua.options import Credentials, OpcUaOptions
 from shmio.connectors.opcua.structures import AbsentError, ChangedValue, find, read_value
 from shmio.connectors.opcua.values import MismatchError, ValueConverter
 from shmio.connectors.register_image import RegisterImage, no_status_area
-from shmio.connectors.request_count import CycleRequests, Requests, counted
+from shmio.connectors.request_count import CycleRequests, Requests
 from shmio.errors import ConfigError, ConnectorError, ValueRangeError
 from shmio.layout.addresses import siemens
 from shmio.layout.addresses.opcua import Address, Member, parse_member
@@ -44,6 +44,7 @@ from shmio.model.statuses import (
     quality_of,
 )
 from shmio.model.values import Quality
+from shmio.wording import counted
 
 if TYPE_CHECKING:
     from shmio.connectors.opcua.session import Item, Session

@@ -18,7 +18,6 @@ from shmio.connectors.output import Image, Output
 from shmio.connectors.poll_loop import Counters
 from shmio.connectors.replay.recording import MAX_NS, Entry, RecordedSource
 from shmio.connectors.replay.source import Replay, ReplayStart, as_others, stamp
-from shmio.connectors.request_count import counted
 from shmio.errors import PathError, SegmentError, ValueRangeError
 from shmio.layout.topic import find
 from shmio.layout.values.write import Write, bits_of
@@ -35,7 +34,7 @@ from shmio.segment.playhead import (
     PlayState,
     with_answer,
 )
-from shmio.wording import unknown
+from shmio.wording import counted, unknown
 
 OVER: Final = f"{OWN_WORDS}the recording is over"
 STOPPED: Final = f"{OWN_WORDS}the source was stopped"

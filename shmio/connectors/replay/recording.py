@@ -16,6 +16,7 @@ from shmio.recording.format.records import Damage
 from shmio.recording.reading.part import DumpBlock
 from shmio.segment import Event, Frame
 from shmio.segment.header import MAX_PROCESSES
+from shmio.wording import counted
 
 Moment = float | str
 """A time in a recording: seconds from its beginning, or a date and time."""
@@ -116,7 +117,7 @@ class RecordedSource:
         position_ns = gap.after_ns - self._utc_ns + self.block.period_ns if gap.after_ns else at_ns
         if gap.before_ns:
             position_ns = min(position_ns, gap.before_ns - self._utc_ns)
-        count = f"{gap.count} frame{'s' * (gap.count != 1)}"
+        count = counted(gap.count, "frame")
         return Entry(position_ns, MissingFrames(f"not in the recording: {count} ({gap.reason})"))
 
 

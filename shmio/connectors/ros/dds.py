@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import msgspec
 
 from shmio.connectors.base import Connector, Lost, UnconfirmedError, WriteLostError
-from shmio.connectors.request_count import CycleRequests, counted
+from shmio.connectors.request_count import CycleRequests
 from shmio.connectors.ros.commands import Publication, Sending, plan, stamped
 from shmio.connectors.ros.options import REGISTER_OPTIONS, TopicOptions
 from shmio.connectors.ros.topics import Topics
@@ -19,6 +19,7 @@ from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.model import Layout
 from shmio.layout.values.write import Write
 from shmio.model.statuses import BAD_NO_COMMUNICATION, GOOD
+from shmio.wording import counted
 
 if TYPE_CHECKING:
     from shmio.connectors.ros.participant import Participant

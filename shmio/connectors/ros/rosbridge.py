@@ -13,7 +13,7 @@ import msgspec
 
 from shmio.config import Address
 from shmio.connectors.base import Connector, Lost, WriteLostError
-from shmio.connectors.request_count import CycleRequests, counted
+from shmio.connectors.request_count import CycleRequests
 from shmio.connectors.ros.commands import Publication, Sending, plan, stamped
 from shmio.connectors.ros.messages import finite
 from shmio.connectors.ros.options import REGISTER_OPTIONS, TopicOptions
@@ -22,6 +22,7 @@ from shmio.connectors.ros.websocket import Link, decode
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.model import Layout
 from shmio.layout.values.write import Write
+from shmio.wording import counted
 
 DEFAULT_PORT: Final = 9090
 FIRST_S: Final = 0.1

@@ -16,7 +16,7 @@ from typing import Final
 
 from shmio.connectors.base import Connector
 from shmio.connectors.register_image import RegisterImage, no_status_area
-from shmio.connectors.request_count import CycleRequests, counted
+from shmio.connectors.request_count import CycleRequests
 from shmio.connectors.s7 import cpu, pdu
 from shmio.connectors.s7.block_check import BlockChangeMonitor, ExpectedBlock
 from shmio.connectors.s7.blocks import ITEM_OVERHEAD, JOB_OVERHEAD, BlockWrite, WriteItem, bit_item, byte_item, touches
@@ -51,6 +51,7 @@ from shmio.model.statuses import (
     GOOD,
     UNCERTAIN,
 )
+from shmio.wording import counted
 
 RETRY_NS: Final = 10_000_000_000
 """Time in ns after which a refused register is tried again."""

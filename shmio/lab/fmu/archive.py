@@ -75,7 +75,8 @@ def export_fmu(config: Path, file: Path, patterns: Sequence[str]) -> Exported:
             prepare_laboratory(config)  # raises the same error if it is not for the lack of a file
             raise ConfigError(
                 f"{error}; the FMU contains only files of {config.resolve().parent} with the endings "
-                f"{', '.join(sorted(SUFFIXES))}; put the others there"
+                f"{', '.join(sorted(SUFFIXES))}; move the files that the instance needs "
+                "into this folder, and give them one of these endings"
             ) from None
         with Laboratory(plan) as lab, lab.attach() as cell:
             groups, left_out = groups_of(lab, patterns)

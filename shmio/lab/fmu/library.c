@@ -225,7 +225,7 @@ static Status start(Cell *cell, const char *url)
     int ends[2];
     if (socketpair(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, ends))
         return fail(cell, ERROR, "no socket for the process of the instance: %s", strerror(errno));
-    char *words[] = {python, "-m", "shmio.lab.fmu.process", resources, NULL};
+    char *words[] = {python, "-P", "-m", "shmio.lab.fmu.process", resources, NULL};
     cell->child = fork();
     if (!cell->child) { /* only calls that are allowed after fork() in a process with threads */
         if (ends[1] == CHILD_FD ? fcntl(CHILD_FD, F_SETFD, 0) < 0 : dup2(ends[1], CHILD_FD) < 0) _exit(127);

@@ -12,6 +12,7 @@ from shmio.layout.model import MAX_REGISTERS
 from shmio.layout.tags import place_tags
 from shmio.layout.topic import canonical_path, encode_segment, shorten
 from shmio.logs import printable
+from shmio.wording import counted
 
 MAX_TEXT: Final = 1000
 _NAMES_SHOWN: Final = 5
@@ -84,7 +85,7 @@ class Found:
 
     def report(self) -> Iterator[str]:
         """Yield lines for the user: the number of tags, the skipped items with reasons, the remarks."""
-        yield f"imported {len(self.tags)} tag{'s' * (len(self.tags) != 1)} from {self.kind}"
+        yield f"imported {counted(len(self.tags), 'tag')} from {self.kind}"
         for why, names in self._skipped.items():
             shown = ", ".join(shorten(name, 60) for name in names[:_NAMES_SHOWN])
             more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""

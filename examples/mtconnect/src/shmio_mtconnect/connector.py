@@ -13,10 +13,11 @@ import msgspec
 
 from shmio.connectors.base import Connector
 from shmio.connectors.register_image import RegisterImage, no_status_area
-from shmio.connectors.request_count import CycleRequests, counted
+from shmio.connectors.request_count import CycleRequests
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout
 from shmio.model.statuses import BAD_WAITING_FOR_INITIAL_DATA
+from shmio.wording import counted
 from shmio_mtconnect.documents import DataItem, DevicesDocument, Streams, StreamsDocument
 from shmio_mtconnect.http import Exchange
 from shmio_mtconnect.values import Target, find, parse
