@@ -292,4 +292,7 @@ def test_the_page_runs_as_shown(make_cell: Callable[..., Cell], tmp_path: Path, 
         finally:
             model.kill()
     until(lambda: cell.processes()["drive"]["quality"] == "bad", "a bad quality")
-    assert "step 4: drive: no model is connected" in cell.run("shmio", "step").stderr
+    assert (
+        'step 4: drive: no model is connected; connect one with simulate("drive", …)'
+        in cell.run("shmio", "step").stderr
+    )

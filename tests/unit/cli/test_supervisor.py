@@ -1123,9 +1123,9 @@ def test_faults_of_keys_connector_and_layout_are_reported_together(
     Path("broken.db").write_text("DATA_BLOCK DB201 STRUCT a : Nope; b : Nope2; END_STRUCT; BEGIN END_DATA_BLOCK")
     assert main(["check"]) == 1
     err = capsys.readouterr().err.splitlines()
-    assert [re.sub(r"^.*(supervisor\.toml|broken\.db):([0-9]+):", r"\2", line)[:32] for line in err] == [
-        "11 source[0].port: expected a wh",
-        "12 source[0].period_ms: expected",
-        "129: error: unknown type 'Nope';",
-        "139: error: unknown type 'Nope2'",
+    assert [re.sub(r"^.*(supervisor\.toml|broken\.db):([0-9]+):", r"\2", line)[:40] for line in err] == [
+        "11 source[0].port: expected a whole numb",
+        "12 source[0].period_ms: expected a numbe",
+        "129: error: unknown type 'Nope'; if it i",
+        "139: error: unknown type 'Nope2'; if it ",
     ]

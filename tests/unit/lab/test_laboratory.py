@@ -176,9 +176,9 @@ def test_a_campaign_repeats_and_leaves_nothing(prepare: Callable[..., Plan], tmp
 
 def test_parameters_are_those_of_models(prepare: Callable[..., Plan]) -> None:
     plan = prepare()
-    with pytest.raises(ConfigError, match=r"unknown source 'crane'"):
+    with pytest.raises(ConfigError, match=r"unknown source 'crane'; did you mean 'panel'\?$"):
         Laboratory(plan, {"crane": {}})
-    with pytest.raises(ConfigError, match=r"unknown parameter 'topp'"):
+    with pytest.raises(ConfigError, match=r"unknown parameter 'topp' of model Lift; did you mean 'top'\?$"):
         Laboratory(plan, {"lift": {"topp": 1}})
     assert all("commands of" not in one.name for one in threading.enumerate())
 

@@ -198,7 +198,7 @@ def test_of_several_blocks_a_table_names_its_own() -> None:
     sources[1] = Source("names.toml", b'block = "other"\n' + sources[1].text)
     left_out = compile_sources(sources, blocks=["cell"])
     assert "a" not in left_out.layouts[0].by_path
-    assert "it is for other, but cell is read" in str(left_out.warnings[0])
+    assert "the names of this table are left out: it is for other, but cell is read" in str(left_out.warnings[0])
 
 
 def test_a_path_that_differs_only_in_case_gets_a_warning() -> None:

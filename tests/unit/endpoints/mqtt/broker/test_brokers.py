@@ -171,9 +171,12 @@ OPEN: dict[str, Any] = {"listen": "127.0.0.1:1883", "account": [EVERYBODY]}
         ({"broker": "mosquitto"}, r'mqtt\.broker: "mosquitto" is not on this machine; install'),
         (
             {"listen": "0.0.0.0:1883", "insecure": True},
-            r"mqtt\.listen: other hosts can reach 0\.0\.0\.0:1883.*needs mosquitto",
+            r"mqtt\.listen: other hosts can reach 0\.0\.0\.0:1883, .*needs mosquitto",
         ),
-        ({"listen": "cell.lan:1883", "insecure": True}, r"mqtt\.listen: .*cell\.lan:1883.*needs mosquitto"),
+        (
+            {"listen": "cell.lan:1883", "insecure": True},
+            r"mqtt\.listen: other hosts can reach cell\.lan:1883, .*needs mosquitto",
+        ),
         ({"tls": {"certificate": "c.pem", "key": "k.pem"}}, r"mqtt\.tls: .*needs mosquitto"),
         ({"password_file": "accounts"}, r"mqtt\.password_file: .*needs mosquitto"),
         ({"account": []}, r"mqtt\.account: .*needs mosquitto"),
