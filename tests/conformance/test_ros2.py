@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import random
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import nullcontext
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 
@@ -19,9 +19,10 @@ from shmio.errors import ConnectorError
 from shmio.layout.model import Layout
 from shmio.layout.tags import place_tags
 from shmio.layout.values.codec import codec
-from shmio.model.statuses import BAD_TIMEOUT, StatusArea
+from shmio.model.statuses import BAD_TIMEOUT, GOOD, StatusArea
 from shmio.segment import Frame, Write
 from shmio.testing.conformance import Rig, Run
+from shmio.testing.table_conformance import TableConformance, Tags, connected, value_of
 from shmio.testing.write_conformance import SPARE, WriteConformance, Writer, WriteRig, write
 from tests.unit.connectors.ros.dds_peer import Peer
 
@@ -109,13 +110,80 @@ class Ros2Rig:
         return self.area.get(frame.raw, self._at).code == 0
 
 
+_TYPES = {
+    "BOOL": "Bool", "SINT": "Int8", "INT": "Int16", "DINT": "Int32", "LINT": "Int64", "USINT": "UInt8",
+    "UINT": "UInt16", "UDINT": "UInt32", "ULINT": "UInt64", "BYTE": "UInt8", "WORD": "UInt16", "DWORD": "UInt32",
+    "LWORD": "UInt64", "REAL": "Float32", "LREAL": "Float64", "STRING[20]": "String",
+}  # fmt: skip
+MANY, EACH = 40, 5
+
+
+class Ros2Table:
+    """Topics with all types of ``std_msgs``, to which the node subscribes."""
+
+    unknown: ClassVar[Mapping[str, object]] = {"type": "INT", "address": "/nowhere std_msgs/Int16 data"}
+
+    def __init__(self, peer: Peer) -> None:
+        self.peer = peer
+        self.kinds = {f"one_{kind[:6]}": name for kind, name in _TYPES.items()}
+        self.kinds |= {f"all_{kind[:6]}": f"{_TYPES[kind]}MultiArray" for kind in _TYPES if self._has_arrays(kind)}
+        self.types: Tags = {
+            topic: {
+                "type": f"ARRAY[1..3] OF {kind}" if name.endswith("MultiArray") else kind,
+                "address": peer.address(topic, f"std_msgs/msg/{name} data"), "writable": True,
+            }
+            for kind in _TYPES
+            for topic in (f"one_{kind[:6]}", f"all_{kind[:6]}")
+            if (name := self.kinds.get(topic))
+        }  # fmt: skip
+        self.many: Tags = {
+            f"v{at}_{place}": {
+                "type": "INT", "address": peer.address(f"many{at}", f"std_msgs/Int16MultiArray data[{place}]"),
+                "writable": True,
+            }
+            for at in range(MANY)
+            for place in range(EACH)
+        }  # fmt: skip
+
+    @staticmethod
+    def _has_arrays(kind: str) -> bool:
+        return kind not in ("BOOL", "STRING[20]")
+
+    def connector(self, layout: Layout) -> Connector:
+        return Ros2Connector(Ros2Options(domain=self.peer.domain, timeout=5000), layout)
+
+
+@pytest.fixture(scope="module")
+def wide() -> Iterator[Ros2Table]:
+    """A node with many topics, whose discovery would delay the other tests."""
+    with Peer() as peer:
+        table = Ros2Table(peer)
+        peer.ask("open", table.kinds | {f"many{at}": "Int16MultiArray" for at in range(MANY)})
+        yield table
+
+
 @pytest.fixture(scope="module")
 def peer() -> Iterator[Peer]:
     with Peer() as peer:
         yield peer
 
 
-class TestRos2(WriteConformance):
+class TestRos2(TableConformance, WriteConformance):
+    @pytest.fixture
+    def table(self, wide: Ros2Table) -> Ros2Table:
+        return wide
+
+    def test_the_node_has_the_values_and_sends_others(self, wide: Ros2Table) -> None:
+        """A node with types of its own receives what is written, and its values arrive."""
+        with connected(wide, wide.types) as source:
+            written = {path: value_of(tag, 0) for path, tag in wide.types.items()}
+            assert not any(source.write(written))
+            assert {path: wide.peer.ask("received_data", path) for path in written} == written
+            sent = {path: value_of(tag, 1) for path, tag in wide.types.items()}
+            for path, value in sent.items():
+                wide.peer.ask("send_data", path, value)
+            source.until(sent, dict.fromkeys(sent, GOOD))
+
     @pytest.fixture
     def rig(self, request: pytest.FixtureRequest, peer: Peer) -> Iterator[Ros2Rig]:
         own = Peer() if request.node.name == "test_reset" else None  # which ends the node's process

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from base64 import b64decode
+from collections.abc import Iterator, Mapping
+from typing import ClassVar
 
 import pytest
 
@@ -11,9 +13,11 @@ from shmio.connectors.ros.rosbridge import RosbridgeConnector, RosbridgeOptions
 from shmio.layout.model import Layout
 from shmio.layout.tags import place_tags
 from shmio.layout.values.codec import codec
+from shmio.model.statuses import GOOD
 from shmio.segment import EventKind, Write
 from shmio.testing.conformance import Rig, Run
 from shmio.testing.proxy import FaultProxy
+from shmio.testing.table_conformance import TableConformance, Tags, connected, value_of
 from shmio.testing.write_conformance import SPARE, WriteConformance, Writer, WriteRig
 from tests.unit.connectors.ros.bridge import Bridge, framing
 
@@ -63,6 +67,43 @@ class RosbridgeRig:
         return int(numbers.pop())
 
 
+_TYPES = {
+    "BOOL": "Bool", "SINT": "Int8", "INT": "Int16", "DINT": "Int32", "LINT": "Int64", "USINT": "UInt8",
+    "UINT": "UInt16", "UDINT": "UInt32", "ULINT": "UInt64", "BYTE": "UInt8", "WORD": "UInt16", "DWORD": "UInt32",
+    "LWORD": "UInt64", "REAL": "Float32", "LREAL": "Float64", "STRING[20]": "String",
+}  # fmt: skip
+MANY = 200
+
+
+class RosbridgeTable:
+    """Topics with all types of ``std_msgs``."""
+
+    unknown: ClassVar[Mapping[str, object]] = {"type": "INT", "address": "/nowhere std_msgs/Int16 data"}
+    types: ClassVar[Tags] = {
+        **{
+            f"one/{kind[:6]}": {"type": kind, "address": f"/one/{kind[:6]} std_msgs/{name} data", "writable": True}
+            for kind, name in _TYPES.items()
+        },
+        **{
+            f"all/{kind[:6]}": {
+                "type": f"ARRAY[1..3] OF {kind}", "address": f"/all/{kind[:6]} std_msgs/{name}MultiArray data",
+                "writable": True,
+            }
+            for kind, name in _TYPES.items()
+            if name not in ("Bool", "String")
+        },
+    }  # fmt: skip
+    many: ClassVar[Tags] = {
+        f"v{at}": {"type": "INT", "address": f"/many{at} std_msgs/Int16 data", "writable": True} for at in range(MANY)
+    }
+
+    def __init__(self, bridge: Bridge) -> None:
+        self.bridge = bridge
+
+    def connector(self, layout: Layout) -> Connector:
+        return RosbridgeConnector(RosbridgeOptions(url=self.bridge.url), layout)
+
+
 @pytest.fixture(scope="module")
 def bridge() -> Iterator[Bridge]:
     with Bridge() as bridge:
@@ -73,7 +114,24 @@ def bridge() -> Iterator[Bridge]:
         yield bridge
 
 
-class TestRosbridge(WriteConformance):
+class TestRosbridge(TableConformance, WriteConformance):
+    @pytest.fixture
+    def table(self, bridge: Bridge) -> RosbridgeTable:
+        return RosbridgeTable(bridge)
+
+    def test_the_server_has_the_values_and_sends_others(self, table: RosbridgeTable) -> None:
+        """The server receives what is written, and the values that others publish arrive."""
+        with connected(table, table.types) as source:
+            written = {path: value_of(tag, 0) for path, tag in table.types.items()}
+            assert not any(source.write(written))
+            for path, value in written.items():
+                data = table.bridge.ask("last", f"/{path}")["data"]
+                assert (list(b64decode(data)) if isinstance(data, str) and isinstance(value, list) else data) == value
+            sent = {path: value_of(tag, 1) for path, tag in table.types.items()}
+            for path, value in sent.items():
+                table.bridge.ask("publish", f"/{path}", {"data": value})
+            source.until(sent, dict.fromkeys(sent, GOOD))
+
     @pytest.fixture
     def rig(self, bridge: Bridge) -> Iterator[RosbridgeRig]:
         bridge.ask("publish", "/spare", ARRAY | {"data": [0] * SPARE})

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 POLL_S: Final = 0.005
 """Period in s at which the connector looks for a first publisher while it connects."""
 
+DISCOVERY_S: Final = 1.0
+"""Time in s, from the creation of readers and writers, for which a write waits until a subscriber is discovered."""
+
 log = logging.getLogger("shmio.source")
 
 
@@ -74,6 +77,8 @@ class Ros2Connector(Connector):
         self._participant: Participant | None = None
         self._sending = Sending([], [], 0.0)
         self._incompatible: set[str] = set()
+        self._discovered_s = 0.0
+        """When all present subscribers should have been discovered, s of CLOCK_MONOTONIC."""
 
     @property
     def timeout_s(self) -> float:
@@ -138,6 +143,7 @@ class Ros2Connector(Connector):
 
         """
         options = self._options
+        self._discovered_s = time.monotonic() + DISCOVERY_S
         while not self._met(joined):
             if time.monotonic() > end_s:
                 self.close()
@@ -229,13 +235,19 @@ class Ros2Connector(Connector):
     def _publish(self, joined: Participant, publication: Publication, until_s: float) -> str | None:
         """Publish a message, if this was not done yet, and wait until all subscribers have received it.
 
+        A subscriber may not be discovered yet, shortly after this participant has joined the domain.
+
         Returns:
             "" if they have, or why the message is refused; None if they have not by ``until_s``.
 
         """
         name, message = publication.topic.name, publication.message
         if not publication.begun:
+            while not joined.subscribers(name) and time.monotonic() < min(self._discovered_s, until_s):
+                time.sleep(POLL_S)
             if not joined.subscribers(name):
+                if until_s < min(self._discovered_s, self._sending.until_s):
+                    return None
                 return f"no node subscribes to {name}: nobody would receive the message"
             if "header" in message and not stamped(self._topics, publication.topic):
                 message["header"]["stamp"] = _time(time.time_ns())

@@ -6,6 +6,7 @@ A type is ``package/Name``. The type of a field is a primitive, ``string`` or an
 
 from __future__ import annotations
 
+import base64
 import math
 import re
 from collections.abc import Mapping
@@ -39,7 +40,11 @@ DEFINITIONS: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType({
     "std_msgs/MultiArrayLayout": {"dim": "std_msgs/MultiArrayDimension[]", "data_offset": "uint32"},
     **{
         f"std_msgs/{name.capitalize()}MultiArray": {"layout": "std_msgs/MultiArrayLayout", "data": f"{name}[]"}
-        for name in (*FLOATS, "int16", "int32", "int64")
+        for name in (*FLOATS, "int8", "int16", "int32", "int64")
+    },
+    **{
+        f"std_msgs/UInt{bits}MultiArray": {"layout": "std_msgs/MultiArrayLayout", "data": f"uint{bits}[]"}
+        for bits in (8, 16, 32, 64)
     },
     "geometry_msgs/Vector3": _XYZ,
     "geometry_msgs/Point": _XYZ,
@@ -75,6 +80,18 @@ def default(kind: str) -> Any:
     if kind in PRIMITIVES:
         return "" if kind == "string" else False if kind == "bool" else 0.0 if kind in FLOATS else 0
     return {name: default(inner) for name, inner in DEFINITIONS[kind].items()}
+
+
+def from_json(message: Any, kind: str) -> Any:
+    """Return a message of a known type with lists of numbers for sequences of uint8, which JSON has as base64."""
+    if kind == "uint8[]" and isinstance(message, str):
+        try:
+            return list(base64.b64decode(message, validate=True))
+        except ValueError:
+            return message
+    if kind in DEFINITIONS and isinstance(message, dict):
+        return {name: from_json(one, DEFINITIONS[kind].get(name, "")) for name, one in message.items()}
+    return message
 
 
 def conforms(message: Any, kind: str) -> bool:

@@ -15,7 +15,7 @@ from shmio.config import Address
 from shmio.connectors.base import Connector, Lost, WriteLostError
 from shmio.connectors.request_count import CycleRequests
 from shmio.connectors.ros.commands import Publication, Sending, plan, stamped
-from shmio.connectors.ros.messages import finite
+from shmio.connectors.ros.messages import finite, from_json, plain
 from shmio.connectors.ros.options import REGISTER_OPTIONS, TopicOptions
 from shmio.connectors.ros.topics import Topic, Topics
 from shmio.connectors.ros.websocket import Link, decode
@@ -168,7 +168,8 @@ class RosbridgeConnector(Connector):
 
     def _pull(self, link: Link) -> None:
         for name, received in link.newest().items():
-            self._topics.take(name, decode(received.json), received.monotonic_ns, received.utc_ns)
+            message = from_json(decode(received.json), plain(self._topics.by_name[name].type))
+            self._topics.take(name, message, received.monotonic_ns, received.utc_ns)
 
     def close(self) -> None:
         """Close the connection. It may be called at any time and more than once."""

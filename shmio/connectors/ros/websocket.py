@@ -18,6 +18,7 @@ import msgspec
 
 from shmio.config import Address
 from shmio.connectors import tcp
+from shmio.connectors.ros.messages import from_json
 from shmio.errors import ConnectorError
 from shmio.logs import printable
 
@@ -303,6 +304,7 @@ def _contains(found: Any, expected: Any) -> bool:
             name in found and _contains(found[name], value) for name, value in expected.items()
         )
     if isinstance(expected, list):
+        found = from_json(found, "uint8[]")
         return (
             isinstance(found, list)
             and len(found) == len(expected)

@@ -7,12 +7,13 @@ import json
 import sys
 import threading
 from dataclasses import dataclass
+from types import new_class
 from typing import Any
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsParticipant
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.types import float64, int16, int32, sequence, uint32
+from cyclonedds.idl.types import float32, float64, int8, int16, int32, int64, sequence, uint8, uint16, uint32, uint64
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
@@ -75,6 +76,27 @@ class String_(IdlStruct, typename="std_msgs::msg::dds_::String_"):  # noqa: N801
     data: str
 
 
+def std_type(name: str, data: Any) -> Any:
+    """Return the type ``std_msgs/name``, whose values are in its field ``data``."""
+    layout = {"layout": MultiArrayLayout_} if name.endswith("MultiArray") else {}
+    body = {"__annotations__": {**layout, "data": data}, "__module__": __name__}
+    return dataclass(
+        new_class(
+            f"{name}_", (IdlStruct,), {"typename": f"std_msgs::msg::dds_::{name}_"}, lambda made: made.update(body)
+        )
+    )
+
+
+NUMBERS = {
+    "Float32": float32, "Float64": float64, "Int8": int8, "Int16": int16, "Int32": int32, "Int64": int64,
+    "UInt8": uint8, "UInt16": uint16, "UInt32": uint32, "UInt64": uint64,
+}  # fmt: skip
+STD_TYPES = {
+    "Bool": std_type("Bool", bool),
+    "String": String_,
+    **{name: std_type(name, number) for name, number in NUMBERS.items()},
+    **{f"{name}MultiArray": std_type(f"{name}MultiArray", sequence[number]) for name, number in NUMBERS.items()},
+}
 RELIABLE = Policy.Reliability.Reliable(10**9)
 
 
@@ -87,6 +109,7 @@ class Node:
         self.counting: threading.Thread | None = None
         self.stopped = threading.Event()
         self.entities: list[Any] = []
+        self.opened: dict[str, tuple[Any, Any]] = {}
         self.join()
 
     def topic(self, name: str, kind: Any) -> Any:
@@ -108,6 +131,7 @@ class Node:
             self.stopped.set()
             self.counting.join()
             self.counting = None
+        self.opened.clear()
         del self.states, self.counts, self.spares, self.received, self.modes
         for entity in reversed(self.entities):
             entity.__del__()
@@ -130,6 +154,23 @@ class Node:
     def commanded(self) -> Any:
         found = self.received.take(1)
         return list(found[-1].data) if found else None
+
+    def open(self, kinds: dict[str, str]) -> None:
+        """Subscribe to topics, and publish on them. Their types are those of ``std_msgs``."""
+        for name, kind in kinds.items():
+            topic = self.topic(name, STD_TYPES[kind])
+            qos = Qos(RELIABLE, Policy.History.KeepLast(1), Policy.IgnoreLocal.Participant)
+            self.opened[name] = (DataReader(self.entities[1], topic, qos=qos), DataWriter(self.entities[1], topic, qos))
+
+    def received_data(self, name: str) -> Any:
+        """Return the data of the newest message that has arrived on an opened topic since the last call."""
+        found = self.opened[name][0].take(1)
+        return found[-1].data if found else None
+
+    def send_data(self, name: str, data: Any) -> None:
+        """Publish data on an opened topic."""
+        made = self.opened[name][1].topic.data_type
+        self.opened[name][1].write(made(MultiArrayLayout_([], 0), data) if isinstance(data, list) else made(data))
 
     def restore(self, number: int) -> None:
         self.last = number

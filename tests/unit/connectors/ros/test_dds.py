@@ -6,6 +6,7 @@ import math
 import os
 import random
 import socket
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -17,6 +18,7 @@ from shmio.connectors import registry
 from shmio.connectors.ros.dds import Ros2Connector, Ros2Options
 from shmio.connectors.ros.messages import DEFINITIONS, default
 from shmio.errors import ConfigError, ConnectorError
+from shmio.layout.values.write import encode
 from shmio.model import statuses
 from tests.unit.connectors.ros.dds_peer import DOMAIN, Peer
 from tests.unit.connectors.source import Source, layout_of
@@ -128,6 +130,20 @@ def test_a_command_reaches_the_node(peer: Peer) -> None:
     }
     with connected(peer, lonely) as source:
         assert "no node subscribes to /nobody" in source.write(nobody=1.0)[0]
+
+
+def test_a_write_waits_for_a_subscriber_that_is_not_discovered_yet(peer: Peer) -> None:
+    tags = {
+        "j1": ("LREAL", peer.address("states", f"{STATE}position[0]")),
+        "late": {"type": "INT", "address": peer.address("late", "std_msgs/Int16 data"), "writable": True},
+    }
+    with connected(peer, tags) as source:
+        source.connector.send(encode(source.layout.registers[source.layout.by_path["late"]], 5, "little"))
+        assert source.connector.confirm(time.monotonic_ns() + 1_000_000) is None
+        peer.ask("open", {"late": "Int16"})
+        while (outcome := source.connector.confirm(time.monotonic_ns() + 1_000_000_000)) is None:
+            pass
+        assert (outcome, peer.ask("received_data", "late")) == ([""], 5)
 
 
 def descriptors() -> set[int]:

@@ -1,7 +1,7 @@
 // A rosbridge v2 server without ROS, written from ROSBRIDGE_PROTOCOL.md with the package ws.
 //
 // Usage: node rosbridge_server.js PORT; it takes commands on standard input, a JSON list a line, and answers each.
-// Every topic is latched: a new subscriber gets the last message.
+// Every topic is latched: a new subscriber gets the last message. As rosbridge does, it sends uint8[] as base64.
 'use strict'
 
 const readline = require('readline')
@@ -10,16 +10,23 @@ const { WebSocketServer } = require('ws')
 const topics = new Map() // name -> {type, last, refused}
 const clients = new Map() // socket -> {subscribed: Set, advertised: Map}
 
+// Whole numbers of 16 and more digits become texts and back, since JavaScript's numbers would round them.
+const parse = text => JSON.parse(text.replace(/(?<=[[:,]\s*)-?\d{16,}(?=\s*[,\]}])/g, '"#$&"'))
+const format = value => JSON.stringify(value).replace(/"#(-?\d+)"/g, '$1')
+
 function topicOf(name) {
   if (!topics.has(name)) topics.set(name, { type: null, last: null, refused: '' })
   return topics.get(name)
 }
 
 function deliver(name, msg) {
+  if (topicOf(name).type === 'std_msgs/UInt8MultiArray' && Array.isArray(msg.data)) {
+    msg = { ...msg, data: Buffer.from(msg.data).toString('base64') }
+  }
   topicOf(name).last = msg
   topicOf(name).history = [...(topicOf(name).history ?? []), msg].slice(-10)
   for (const [socket, client] of clients) {
-    if (client.subscribed.has(name)) socket.send(JSON.stringify({ op: 'publish', topic: name, msg }))
+    if (client.subscribed.has(name)) socket.send(format({ op: 'publish', topic: name, msg }))
   }
 }
 
@@ -36,7 +43,7 @@ function handle(socket, client, { op, id, topic, type, msg }) {
     if (op === 'advertise') client.advertised.add(topic)
     else {
       client.subscribed.add(topic)
-      if (found.last !== null) socket.send(JSON.stringify({ op: 'publish', topic, msg: found.last }))
+      if (found.last !== null) socket.send(format({ op: 'publish', topic, msg: found.last }))
     }
   } else if (op === 'unsubscribe') client.subscribed.delete(topic)
   else if (op === 'unadvertise') client.advertised.delete(topic)
@@ -69,15 +76,15 @@ const server = new WebSocketServer({ host: '127.0.0.1', port: Number(process.arg
 server.on('connection', socket => {
   const client = { subscribed: new Set(), advertised: new Set() }
   clients.set(socket, client)
-  socket.on('message', data => handle(socket, client, JSON.parse(data.toString())))
+  socket.on('message', data => handle(socket, client, parse(data.toString())))
   socket.on('close', () => clients.delete(socket))
   socket.on('error', () => clients.delete(socket))
 })
 server.on('listening', () => {
   process.stdout.write('"ready"\n')
   readline.createInterface({ input: process.stdin }).on('line', line => {
-    const [name, ...given] = JSON.parse(line)
+    const [name, ...given] = parse(line)
     const answer = commands[name](...given)
-    process.stdout.write(JSON.stringify(answer === undefined ? null : answer) + '\n')
+    process.stdout.write(format(answer === undefined ? null : answer) + '\n')
   }).on('close', () => process.exit(0))
 })
