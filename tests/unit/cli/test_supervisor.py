@@ -931,7 +931,7 @@ def test_status_has_the_documented_keys_in_order(instance: str, capsys: pytest.C
         assert main(["status", "--json", "--instance", instance]) == 0
         segment.unlink()
     told = json.loads(capsys.readouterr().out)
-    assert list(told) == documented(page, "One object, with all of these keys, in this order:")
+    assert list(told) == documented(page, "`status --json` prints one object, with all of these keys, in this order:")
     of_process, of_source = documented(page, "Each process has these keys:"), documented(page, "A source also has:")
     counters = page.partition("| kind | counters |\n")[2].partition("\n\n")[0].splitlines()[1:]
     for process, row in zip(told["processes"], counters, strict=True):
