@@ -160,7 +160,7 @@ class ShmioServicer(object):
     """Missing associated documentation comment in .proto file."""
 
     def GetLayouts(self, request, context):
-        """Returns the layouts of sources, with which a client can decode raw frames. A large layout comes in several parts.
+        """Returns the layouts of sources. With them, a client can decode raw frames. A large layout comes in several parts.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -181,21 +181,22 @@ class ShmioServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def Subscribe(self, request, context):
-        """Sends the present values of registers, then changes, or every frame.
+        """Sends the current values of registers, then their changes, or every frame.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Events(self, request, context):
-        """Sends events of sources from now on: commands and their outcomes, injections, quality, starts and stops, notes.
+        """Sends the events of sources as they happen: commands and their outcomes, injections, quality, starts and stops,
+        notes.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Write(self, request, context):
-        """Writes registers of one source, all or none, and returns the outcome of each.
+        """Writes registers of one source, and returns the outcome of each. The source accepts all of them or none.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -217,14 +218,14 @@ class ShmioServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def Declare(self, request, context):
-        """Creates declared injections, which their sources run, all or none; then sends their events.
+        """Creates declared injections, all or none, and sends their events. The sources run these injections.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def ListInjections(self, request, context):
-        """Returns the present injections of all clients.
+        """Returns the current injections of all programs.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -238,15 +239,15 @@ class ShmioServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def LiftAll(self, request, context):
-        """Lifts all injections, whichever program created them, for an emergency.
+        """Lifts all injections of some or all sources, whichever program created them. Use it in an emergency.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Step(self, request, context):
-        """Takes control of time, and moves it by one step. Returns when every stream has the step's changes, except streams
-        of Events, for which no step waits.
+        """Takes control of time, and moves it by one step. Returns when every stream has the step's changes. It does not
+        wait for streams of Events.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -260,35 +261,35 @@ class ShmioServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def SetStepSize(self, request, context):
-        """Takes control of time, and sets the step size: the length of steps that are requested without one.
+        """Takes control of time, and sets the step size: the length of a step if its request gives none.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Play(self, request, context):
-        """Takes control of time, and steps it continuously: in real time, faster or slower.
+        """Takes control of time, and plays it: the endpoint steps it continuously, in real time, faster or slower.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Pause(self, request, context):
-        """Takes control of time, and stops it.
+        """Takes control of time, and pauses it.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Release(self, request, context):
-        """Returns to real time, which continues from the present virtual time. Does nothing if time is real.
+        """Returns to real time, which continues from the current virtual time. Does nothing if time is already real.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def WatchClock(self, request, context):
-        """Sends the state of the clock now, and after each step and each change.
+        """Sends the current state of the clock, then its state after each step and each change.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -302,7 +303,7 @@ class ShmioServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def SaveSnapshot(self, request, context):
-        """Saves the state of the instance, whose time must be virtual, to a file in the instance's folder.
+        """Saves the state of the instance to a file in the instance's folder. Time must be virtual.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

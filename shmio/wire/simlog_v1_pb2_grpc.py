@@ -71,14 +71,14 @@ class SimlogAPIServicer(object):
     """Missing associated documentation comment in .proto file."""
 
     def setStepSize(self, request, context):
-        """Sets the step size of the simulation.
+        """Takes control of time, and sets the step size.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def step(self, request, context):
-        """Steps the simulation.
+        """Takes control of time, and moves it by one step.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -92,21 +92,21 @@ class SimlogAPIServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def Subscribe(self, request, context):
-        """Streams the values of a topic.
+        """Streams the values of a topic: the current value, then every change.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Inject(self, request, context):
-        """Creates a shadow topic over another topic, and streams the values of the other.
+        """Replaces the values of a topic by those of a shadow topic, and streams the original values.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Publish(self, request_iterator, context):
-        """Writes to topics.
+        """Writes a stream of values to topics. Returns when each value has an outcome.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -81,7 +81,7 @@ class SimlogAPIServicer(object):
     """Missing associated documentation comment in .proto file."""
 
     def GetTopicInfo(self, request, context):
-        """Describes a topic, which need not exist.
+        """Describes a topic, or says that it does not exist.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -102,21 +102,21 @@ class SimlogAPIServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def Inject(self, request, context):
-        """Creates a shadow over a topic.
+        """Replaces the values of a topic. Returns two topics: one for the originals, one for the new values.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Publish(self, request_iterator, context):
-        """Writes to topics.
+        """Writes a stream of values to topics. Returns when each value has an outcome.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Write(self, request, context):
-        """Writes to one topic. The status says whether the write was accepted.
+        """Writes to one topic. The status says whether the source accepted the write.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -130,7 +130,7 @@ class SimlogAPIServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def Read(self, request, context):
-        """Reads the present values of topics.
+        """Reads the current values of topics.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

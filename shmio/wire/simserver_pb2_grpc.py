@@ -66,35 +66,35 @@ class SimServerAPIServicer(object):
     """Missing associated documentation comment in .proto file."""
 
     def step(self, request, context):
-        """Steps the simulation once.
+        """Takes control of time, and moves it by one step.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def start(self, request, context):
-        """Steps the simulation continuously, in real time.
+        """Takes control of time, and plays it: the endpoint steps it continuously, in real time.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def stop(self, request, context):
-        """Pauses, and reports `alive` as false until the next step.
+        """Pauses time. `alive` is then false until a client steps or plays time.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def pause(self, request, context):
-        """Takes control of time, and stops it.
+        """Takes control of time, and pauses it.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def subscribe(self, request, context):
-        """Streams the status: one message for each change and each step.
+        """Streams the status: one message for each step, and for each change of time by any program.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
