@@ -13,6 +13,7 @@ from tomllib import TOMLDecodeError
 from typing import Any, Final, get_args
 
 from msgspec import ValidationError
+from msgspec.inspect import DictType, ListType, LiteralType, Metadata, StructType, UnionType, type_info
 
 from shmio.config.masking import mask_line
 from shmio.config.model import (
@@ -196,8 +197,15 @@ def _bare(token: str) -> str:
     return token
 
 
-def explain(error: ValidationError, key: str = "") -> str:
-    """Return msgspec's error as ``key: what is wrong``; ``key`` is the key of the converted value."""
+def explain(error: ValidationError, key: str = "", kind: Any = None) -> str:
+    """Return msgspec's error as ``key: what is wrong``.
+
+    Args:
+        error: The error.
+        key: The key of the converted value.
+        kind: The type to which it was converted, if it is not one of shmio's configuration.
+
+    """
     text, _, at = str(error).partition(" - at `$")
     path = f"{key}{at.rstrip('`')}".lstrip(".")
     missing = re.search(r"missing required field `([^`]*)`", text)
@@ -206,8 +214,9 @@ def explain(error: ValidationError, key: str = "") -> str:
     if repr(NAME_PATTERN) in text:
         text = f"expected a name: {NAME_RULE}"
     elif word := re.fullmatch(r"Invalid enum value '(.*)'", text):
-        words = get_args(_WORDS[path.rpartition(".")[2].partition("[")[0]])
-        text = unknown(path.rpartition(".")[2].partition("[")[0], word[1], words)
+        name = path.rpartition(".")[2].partition("[")[0]
+        words = get_args(_WORDS[name]) if kind is None else tuple(_words(type_info(kind), at.rstrip("`")))
+        text = unknown(name, word[1], words)
     elif field := re.search(r"unknown field `([^`]*)`", text):
         text = f"unknown key {field[1]!r}"
     elif text.endswith("of length >= 1"):
@@ -215,6 +224,25 @@ def explain(error: ValidationError, key: str = "") -> str:
     text = re.sub(r"`([a-z]+(?: \| [a-z]+)*)`", _types, text)
     text = text[:1].lower() + text[1:]
     return f"{path}: {text}" if path else text
+
+
+def _words(kind: Any, at: str) -> Iterator[str]:
+    """Yield the words that a type allows at a place in its values, such as ``.name[...]``."""
+    match kind:
+        case LiteralType(values=values):
+            yield from map(str, values)
+        case UnionType(types=kinds):
+            for one in kinds:
+                yield from _words(one, at)
+        case Metadata(type=inner):
+            yield from _words(inner, at)
+        case DictType(value_type=inner) | ListType(item_type=inner) if at.startswith("["):
+            yield from _words(inner, at.partition("]")[2])
+        case StructType(fields=fields) if at.startswith("."):
+            name = re.split(r"[.[]", at[1:])[0]
+            for field in fields:
+                if field.encode_name == name:
+                    yield from _words(field.type, at[1 + len(name) :])
 
 
 def _types(match: re.Match[str]) -> str:

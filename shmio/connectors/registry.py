@@ -122,7 +122,7 @@ def convert_options(name: str, options: dict[str, Any], texts: Mapping[str, str]
     try:
         return msgspec.convert(_read(kind, texts or {}) | options, kind)
     except msgspec.ValidationError as error:
-        raise ConfigError(explain(error)) from None
+        raise ConfigError(explain(error, "", kind)) from None
 
 
 def option_faults(name: str, options: Mapping[str, Any], texts: Mapping[str, str]) -> Iterator[str]:
@@ -139,7 +139,7 @@ def option_faults(name: str, options: Mapping[str, Any], texts: Mapping[str, str
             elif field.required:
                 yield f"{key}: this key is needed"
         except msgspec.ValidationError as error:
-            yield explain(error, key)
+            yield explain(error, key, field.type)
         except ConfigError as error:
             yield str(error)
 
@@ -153,4 +153,4 @@ def _convert_text(key: str, text: str, kind: Any) -> Any:
     try:
         return msgspec.convert(text, kind, strict=False)
     except msgspec.ValidationError as error:
-        raise ConfigError(explain(error, key)) from None
+        raise ConfigError(explain(error, key, kind)) from None

@@ -6,7 +6,7 @@ import importlib.util
 import logging
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import msgspec
 
@@ -14,12 +14,13 @@ from shmio.connectors.base import Connector, Lost, UnconfirmedError, WriteLostEr
 from shmio.connectors.request_count import CycleRequests
 from shmio.connectors.ros.commands import Publication, Sending, plan, stamped
 from shmio.connectors.ros.options import REGISTER_OPTIONS, TopicOptions
-from shmio.connectors.ros.topics import Topics
+from shmio.connectors.ros.qos import QosKeys, qos_of
+from shmio.connectors.ros.topics import Topic, Topics
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.model import Layout
 from shmio.layout.values.write import Write
-from shmio.model.statuses import BAD_NO_COMMUNICATION, GOOD
-from shmio.wording import counted
+from shmio.model.statuses import BAD_CONFIGURATION_ERROR, BAD_NO_COMMUNICATION, GOOD
+from shmio.wording import counted, unknown
 
 if TYPE_CHECKING:
     from shmio.connectors.ros.participant import Participant
@@ -27,6 +28,10 @@ if TYPE_CHECKING:
 POLL_S: Final = 0.005
 """Period in s at which the connector looks for a first publisher while it connects."""
 
+DISCOVERIES: Final = 4
+"""Largest number of discovered publishers and subscribers to examine in a cycle; each takes about 0.5 ms."""
+DISCOVERIES_AT_END: Final = 1000
+MAX_REASONS: Final = 3
 DISCOVERY_S: Final = 1.0
 """Time in s, from the creation of readers and writers, for which a write waits until a subscriber is discovered."""
 
@@ -34,7 +39,7 @@ log = logging.getLogger("shmio.source")
 
 
 class Ros2Options(TopicOptions, frozen=True, kw_only=True):
-    """Domain and network interface, and how topics are read.
+    """Domain and network interface, how topics are read, and their QoS.
 
     Raises:
         ValueError: Some keys contradict each other.
@@ -49,8 +54,10 @@ class Ros2Options(TopicOptions, frozen=True, kw_only=True):
         list[Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_.:-]{1,253}$")]], msgspec.Meta(max_length=100)
     ] = msgspec.field(default_factory=list)
     """Hosts to contact directly, without multicast."""
-    reliability: Literal["best_effort", "reliable"] = "best_effort"
-    """The reliability that readers request from publishers."""
+    qos: QosKeys = QosKeys()
+    """The QoS of all topics."""
+    topic_qos: Annotated[dict[str, QosKeys], msgspec.Meta(max_length=10_000)] = msgspec.field(default_factory=dict)
+    """The QoS of single topics, which precedes ``qos``."""
     max_message_bytes: Annotated[int, msgspec.Meta(ge=1000, le=1 << 26)] = 1 << 20
     """The largest message that is received, in bytes; larger ones are dropped."""
 
@@ -67,18 +74,34 @@ class Ros2Connector(Connector):
     Options = Ros2Options
     can_write = True
     register_quality = True
-    register_options = REGISTER_OPTIONS | {"reliability"}
+    register_options = REGISTER_OPTIONS | {"qos", "topic_qos"}
 
     def __init__(self, options: Ros2Options, layout: Layout) -> None:
         if importlib.util.find_spec("cyclonedds") is None:
             raise ConfigError("connector: ros2 needs another library; run pip install 'shmio[ros2]'")
         self._options = options
         self._topics = Topics(layout, options, known_types=True)
+        self._set_qos(options)
         self._participant: Participant | None = None
         self._sending = Sending([], [], 0.0)
-        self._incompatible: set[str] = set()
+        self._obstructed: set[str] = set()
+        """The topics that have a publisher or subscriber that does not fit this source."""
         self._discovered_s = 0.0
         """When all present subscribers should have been discovered, s of CLOCK_MONOTONIC."""
+
+    def _set_qos(self, options: Ros2Options) -> None:
+        names = self._topics.by_name
+        for name in options.topic_qos:
+            if name not in names:
+                raise ConfigError(f"topic_qos: {unknown('topic', name, sorted(names))}")
+        if options.qos.lifespan_ms and not any(topic.writable for topic in names.values()):
+            raise ConfigError("qos: lifespan_ms: this source writes no topic; to limit the age of values, use max_age")
+        for topic in names.values():
+            own = options.topic_qos.get(topic.name)
+            try:
+                topic.qos = qos_of(options.qos, own, latched=topic.latched, writable=topic.writable)
+            except ValueError as error:
+                raise ConfigError(f"{'qos' if own is None else 'topic_qos'}: {topic.name}: {error}") from None
 
     @property
     def timeout_s(self) -> float:
@@ -108,7 +131,7 @@ class Ros2Connector(Connector):
 
         self.close()
         self._topics.reset()
-        self._incompatible.clear()
+        self._obstructed.clear()
         options = self._options
         timeout_s = options.timeout / 1000
         end_s = time.monotonic() + timeout_s
@@ -117,7 +140,7 @@ class Ros2Connector(Connector):
         )
         joined = self._participant = participant.Participant(
             options.domain, configured, self._topics.by_name.values(), timeout_s,
-            reliable=options.reliability == "reliable", loopback=options.interface == "lo",
+            loopback=options.interface == "lo",
         )  # fmt: skip
         self._meet(joined, end_s)
 
@@ -130,8 +153,7 @@ class Ros2Connector(Connector):
         end_s = time.monotonic() + self._options.timeout / 1000
         other._pull(joined)
         self._topics.inherit(other._topics)
-        self._incompatible = other._incompatible & self._topics.by_name.keys()
-        joined.change(self._topics.by_name.values(), reliable=self._options.reliability == "reliable")
+        joined.change(self._topics.by_name.values())
         self._meet(joined, end_s)
         return True
 
@@ -146,11 +168,18 @@ class Ros2Connector(Connector):
         self._discovered_s = time.monotonic() + DISCOVERY_S
         while not self._met(joined):
             if time.monotonic() > end_s:
+                joined.discover(DISCOVERIES_AT_END)
+                reasons = [f"{name}: {one}" for name in self._topics.by_name for one in joined.obstacles(name)]
                 self.close()
-                raise ConnectorError(
-                    f"found no publisher or subscriber of any topic in DDS {self._where} within {options.timeout} ms; "
+                fit = "that fits" if reasons else "of"
+                why = ". ".join(reasons[:MAX_REASONS]) or (
                     "check that ROS_DOMAIN_ID, topic names and types are those of the robot"
                 )
+                raise ConnectorError(
+                    f"found no publisher or subscriber {fit} any topic in DDS {self._where} within {options.timeout} "
+                    f"ms; {why}"
+                )
+            joined.discover(DISCOVERIES)
             time.sleep(POLL_S)
 
     def _met(self, joined: Participant) -> bool:
@@ -172,16 +201,23 @@ class Ros2Connector(Connector):
         self._pull(joined)
         if not self._met(joined):
             raise ConnectorError(f"all publishers and subscribers of this source's topics have left DDS {self._where}")
+        for name in joined.discover(DISCOVERIES):
+            self._report(joined, self._topics.by_name[name])
         for topic in self._topics.by_name.values():
-            gone = not topic.writable and topic.received_ns and not joined.publishers(topic.name)
-            topic.fault = BAD_NO_COMMUNICATION if gone else GOOD
-            if not topic.received_ns and topic.name not in self._incompatible and joined.incompatible(topic.name):
-                self._incompatible.add(topic.name)
-                log.warning(
-                    "%s: the topic's publisher offers less than this source requests; remove the topic from latched, "
-                    "or set reliability to best_effort", topic.name,
-                )  # fmt: skip
+            topic.fault = GOOD
+            if topic.received_ns:
+                if not topic.writable and not joined.alive(topic.name):
+                    topic.fault = BAD_NO_COMMUNICATION
+            elif topic.name in self._obstructed and not joined.publishers(topic.name):
+                topic.fault = BAD_CONFIGURATION_ERROR
         return self._topics.image(time.monotonic_ns())
+
+    def _report(self, joined: Participant, topic: Topic) -> None:
+        """Log why other participants' publishers and subscribers of a topic do not fit."""
+        obstacles = joined.obstacles(topic.name)
+        for one in obstacles:
+            self._topics.report(topic.registers[0], f"{topic.name}: {one}")
+        (self._obstructed.add if obstacles else self._obstructed.discard)(topic.name)
 
     def _pull(self, joined: Participant) -> None:
         for name, message in joined.take():
@@ -248,7 +284,12 @@ class Ros2Connector(Connector):
             if not joined.subscribers(name):
                 if until_s < min(self._discovered_s, self._sending.until_s):
                     return None
-                return f"no node subscribes to {name}: nobody would receive the message"
+                reasons = joined.obstacles(name)
+                return (
+                    f"no node that fits subscribes to {name}: {'. '.join(reasons[:MAX_REASONS])}"
+                    if reasons
+                    else (f"no node subscribes to {name}: nobody would receive the message")
+                )
             if "header" in message and not stamped(self._topics, publication.topic):
                 message["header"]["stamp"] = _time(time.time_ns())
             publication.begun = True

@@ -29,6 +29,12 @@ def dds_type(kind: str) -> str:
     return f"{package}::msg::dds_::{name}_"
 
 
+def ros_type(name: str) -> str:
+    """Return a type of DDS as ``package/Name`` if ROS has given it its name, else as it is."""
+    package, middle, last = name.partition("::msg::dds_::")
+    return f"{package}/{last.removesuffix('_')}" if middle else name
+
+
 @lru_cache(maxsize=256)
 def sample_type(kind: str) -> Any:
     """Return the class whose instances are samples of a type."""

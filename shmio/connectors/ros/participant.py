@@ -17,18 +17,23 @@ from cyclonedds.core import DDSException
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.internal import InvalidSample
 from cyclonedds.pub import DataWriter
-from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic as DdsTopic
 
-from shmio.connectors.ros.dds_types import dds_topic, sample_type, to_message, to_sample
+from shmio.connectors.ros.dds_types import dds_topic, dds_type, ros_type, sample_type, to_message, to_sample
+from shmio.connectors.ros.discovery import POLICIES, Discovery, reader_qos, unmet, writer_qos
 from shmio.connectors.ros.messages import plain
 from shmio.connectors.ros.topics import Topic
 from shmio.errors import ConnectorError
 
 MAX_PARTICIPANTS: Final = 60
 """Largest number of participants on a host that are found without multicast."""
-WRITER_DEPTH: Final = 10
+MAX_ENDPOINTS: Final = 10_000
+"""Largest number of publishers, and of subscribers, of the topics that are remembered for messages to the user."""
+_KEYS: Final = {"deadline": "deadline_ms", "lease": "lease_ms"}
+"""The keys of policies, if they have other names."""
+_COMPARED: Final = frozenset({2, 4, 8, 11})
+"""The numbers of the policies that ``unmet`` compares."""
 _HEARTBEAT: Final = '<HeartbeatInterval min="2 ms" minsched="2 ms" max="1 s">5 ms</HeartbeatInterval>'
 """Makes writers ask for acknowledgements at short intervals, because the poll loop waits for them."""
 
@@ -82,17 +87,12 @@ def _keep_to_loopback(before: set[int]) -> None:
 class _Endpoint:
     """The reader of a topic, and the writer of a command topic."""
 
-    def __init__(self, participant: Any, topic: Topic, *, reliable: bool, blocking_ns: int) -> None:
-        self.kind = plain(topic.type)
-        self.qos = _qos_of(topic, reliable)
-        self._participant, self._blocking_ns = participant, blocking_ns
+    def __init__(self, participant: Any, topic: Topic, blocking_ns: int) -> None:
+        self.kind, self.qos = plain(topic.type), topic.qos
+        self._participant = participant
         self._dds = DdsTopic(participant, dds_topic(topic.name), sample_type(self.kind))
-        self._durable = Policy.Durability.TransientLocal if topic.latched else Policy.Durability.Volatile
-        self._sure = Policy.Reliability.Reliable(blocking_ns)
-        self.reader = DataReader(participant, self._dds, qos=Qos(
-            self._sure if reliable or topic.latched else Policy.Reliability.BestEffort, self._durable,
-            Policy.History.KeepLast(1), Policy.IgnoreLocal.Participant,
-        ))  # fmt: skip
+        self.requested, self.offered = reader_qos(topic.qos), writer_qos(topic.qos, blocking_ns)
+        self.reader = DataReader(participant, self._dds, qos=self.requested)
         self.writer: Any = None
         self.set_writable(topic.writable)
 
@@ -102,9 +102,7 @@ class _Endpoint:
             _delete(self.writer)
             self.writer = None
         elif self.writer is None:
-            self.writer = DataWriter(self._participant, self._dds, qos=Qos(
-                self._sure, self._durable, Policy.History.KeepLast(WRITER_DEPTH), Policy.IgnoreLocal.Participant,
-            ))  # fmt: skip
+            self.writer = DataWriter(self._participant, self._dds, qos=self.offered)
 
     def close(self) -> None:
         """Delete the reader, the writer and the topic at once."""
@@ -112,9 +110,16 @@ class _Endpoint:
             _delete(entity)
 
 
-def _qos_of(topic: Topic, reliable: bool) -> tuple[str, bool, bool]:
-    """Return what a reader of a topic requests: the type of messages, whether stored ones, and whether reliably."""
-    return plain(topic.type), topic.latched, reliable
+def _other_policies(endpoint: _Endpoint) -> list[str]:
+    """Return the policies that the library finds incompatible, for those that ``obstacles`` does not compare."""
+    statuses = [endpoint.reader.get_requested_incompatible_qos_status()]
+    if endpoint.writer is not None:
+        statuses.append(endpoint.writer.get_offered_incompatible_qos_status())
+    return [
+        f"another node's QoS is incompatible: {POLICIES.get(one.last_policy_id, f'policy {one.last_policy_id}')}"
+        for one in statuses
+        if one.total_count and one.last_policy_id not in _COMPARED
+    ]
 
 
 def _delete(entity: Any) -> None:
@@ -127,7 +132,7 @@ class Participant:
     """A participant in a DDS domain; it leaves the domain when it is closed."""
 
     def __init__(
-        self, domain: int, configured: str, topics: Iterable[Topic], timeout_s: float, *, reliable: bool, loopback: bool
+        self, domain: int, configured: str, topics: Collection[Topic], timeout_s: float, *, loopback: bool
     ) -> None:
         """Join the domain.
 
@@ -136,7 +141,6 @@ class Participant:
             configured: The configuration of Cyclone DDS, from :func:`configuration`.
             topics: The topics to read. Those that are writable are also written.
             timeout_s: How long a write may wait for room in the queue.
-            reliable: Whether readers require reliable publishers.
             loopback: Whether to receive from this host only.
 
         Raises:
@@ -146,13 +150,15 @@ class Participant:
         self._endpoints: dict[str, _Endpoint] = {}
         self._blocking_ns = round(timeout_s * 1e9)
         self._domain = self._participant = None
+        self.discovery = Discovery()
         try:
             before = set(_sockets())
             self._domain = Domain(domain, configured)
             if loopback:
                 _keep_to_loopback(before)
             self._participant = DomainParticipant(domain)
-            self._add(topics, reliable=reliable)
+            self._add(topics)
+            self._watch()
         except ConnectorError:
             self.close()
             raise
@@ -162,14 +168,15 @@ class Participant:
                 f"cannot join DDS domain {domain}: {error.msg or error}; check that the interface exists and is up"
             ) from None
 
-    def _add(self, topics: Iterable[Topic], *, reliable: bool) -> None:
+    def _add(self, topics: Iterable[Topic]) -> None:
         for topic in topics:
             if topic.name not in self._endpoints:
-                self._endpoints[topic.name] = _Endpoint(
-                    self._participant, topic, reliable=reliable, blocking_ns=self._blocking_ns
-                )
+                self._endpoints[topic.name] = _Endpoint(self._participant, topic, self._blocking_ns)
 
-    def change(self, topics: Collection[Topic], *, reliable: bool) -> None:
+    def _watch(self) -> None:
+        self.discovery.begin(self._participant, {dds_topic(name) for name in self._endpoints}, MAX_ENDPOINTS)
+
+    def change(self, topics: Collection[Topic]) -> None:
         """Read and write these topics, and no others. Topics that stay the same keep their readers and writers.
 
         Raises:
@@ -180,18 +187,20 @@ class Participant:
         try:
             for name, endpoint in list(self._endpoints.items()):
                 topic = wanted.get(name)
-                if topic is not None and endpoint.qos == _qos_of(topic, reliable):
+                if topic is not None and (endpoint.kind, endpoint.qos) == (plain(topic.type), topic.qos):
                     endpoint.set_writable(topic.writable)
                 else:
                     endpoint.close()
                     del self._endpoints[name]
-            self._add(topics, reliable=reliable)
+            self._add(topics)
+            self._watch()
         except DDSException as error:
             raise ConnectorError(f"cannot change the topics that are read: {error.msg or error}") from None
 
     def close(self) -> None:
         """Leave the domain."""
         self._endpoints.clear()
+        self.discovery.close()
         for entity in (self._participant, self._domain):
             _delete(entity)
         self._participant = self._domain = None
@@ -205,9 +214,37 @@ class Participant:
         writer = self._endpoints[topic].writer
         return 0 if writer is None else len(writer.get_matched_subscriptions())
 
-    def incompatible(self, topic: str) -> bool:
-        """Return whether any publisher of the topic so far has offered a QoS that does not satisfy the reader's."""
-        return bool(self._endpoints[topic].reader.get_requested_incompatible_qos_status().total_count)
+    def alive(self, topic: str) -> bool:
+        """Return whether a topic has a publisher that has shown within its lease that it lives."""
+        endpoint = self._endpoints[topic]
+        if not endpoint.qos.lease_ms:
+            return bool(self.publishers(topic))
+        return bool(endpoint.reader.get_liveliness_changed_status().alive_count)
+
+    def discover(self, most: int) -> set[str]:
+        """Take note of what DDS has discovered, at most ``most`` changes; return the topics that have changed."""
+        return {name.removeprefix(dds_topic("")) for name in self.discovery.update(most)} & self._endpoints.keys()
+
+    def obstacles(self, topic: str) -> list[str]:
+        """Return why publishers and subscribers of a topic do not fit this participant's reader and writer."""
+        endpoint, name = self._endpoints[topic], dds_topic(topic)
+        found: dict[str, None] = {}
+        for one in self.discovery.publishers(name):
+            if one.type != dds_type(endpoint.kind):
+                found[f"a publisher sends {ros_type(one.type)}, not {endpoint.kind}"] = None
+            for policy, offered, requested in unmet(one.qos, endpoint.requested):
+                remedy = f"set {_KEYS.get(policy, policy)} in topic_qos.{topic!r}"
+                found[f"a publisher offers {policy} {offered}, but this source requests {requested}; {remedy}"] = None
+        for one in self.discovery.subscribers(name) if endpoint.writer is not None else ():
+            if one.type != dds_type(endpoint.kind):
+                found[f"a subscriber expects {ros_type(one.type)}, not {endpoint.kind}"] = None
+            for policy, offered, requested in unmet(endpoint.offered, one.qos):
+                own = policy in ("durability", "lease")
+                remedy = (
+                    f"set {_KEYS.get(policy, policy)} in topic_qos.{topic!r}" if own else "change the subscriber's QoS"
+                )
+                found[f"a subscriber requests {policy} {requested}, but this source offers {offered}; {remedy}"] = None
+        return list(found) or _other_policies(endpoint)
 
     def take(self) -> Iterator[tuple[str, Any]]:
         """Yield the topics with new messages, each with its newest message, or None if that is malformed.

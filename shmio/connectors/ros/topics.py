@@ -10,6 +10,7 @@ from shmio.connectors.register_image import RegisterImage, no_status_area
 from shmio.connectors.ros.addresses import Address, FieldError, extract, leaf_type, parse
 from shmio.connectors.ros.messages import plain
 from shmio.connectors.ros.options import TopicOptions
+from shmio.connectors.ros.qos import TopicQos
 from shmio.connectors.ros.values import ValueConverter
 from shmio.errors import ConfigError, ValueRangeError
 from shmio.layout.model import Layout
@@ -36,6 +37,8 @@ class Topic:
         self.registers: list[int] = []
         self.writable = False
         self.latched = False
+        self.qos = TopicQos()
+        """The QoS of the topic; only ``ros2`` has any other than this."""
         self.message: Any = None
         """The last message; None before the first one, and if the last one cannot be read."""
         self.received_ns = 0
@@ -159,8 +162,12 @@ class Topics:
             return BAD_WAITING_FOR_INITIAL_DATA
         if topic.message is None:
             return BAD_DECODING_ERROR
+        age_ns = now_ns - topic.received_ns
+        if (deadline_ms := topic.qos.deadline_ms) and age_ns > deadline_ms * 1_000_000:
+            self.report(topic.registers[0], f"{topic.name} has missed its deadline of {deadline_ms} ms")
+            return BAD_TIMEOUT
         if self._max_age_ns and not topic.latched and not topic.writable:
-            return BAD_TIMEOUT if now_ns - topic.received_ns > self._max_age_ns else GOOD
+            return BAD_TIMEOUT if age_ns > self._max_age_ns else GOOD
         return GOOD
 
     def _fail(self, topic: Topic, code: int) -> None:

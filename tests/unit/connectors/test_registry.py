@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -90,3 +91,16 @@ def test_each_connector_to_a_device_keeps_its_connection_in_a_reload(name: str) 
     assert found.register_options is not None
     assert found.register_options <= set(found.Options.__struct_fields__)
     assert found.take_over is not Connector.take_over
+
+
+@pytest.mark.parametrize(
+    ("name", "keys", "words"),
+    [
+        ("opcua", {"url": "opc.tcp://plc", "mode": "pol"}, "mode: unknown mode 'pol'; did you mean 'poll'"),
+        ("mqtt", {"url": "mqtt://broker", "version": "7"}, "version: unknown version '7'; valid: 3.1.1"),
+        ("ros2", {"qos": {"reliability": "firm"}}, "qos.reliability: .*best_effort"),
+    ],
+)
+def test_a_wrong_word_is_reported_with_the_valid_ones(name: str, keys: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        registry.convert_options(name, keys)

@@ -100,6 +100,17 @@ STD_TYPES = {
 RELIABLE = Policy.Reliability.Reliable(10**9)
 
 
+def qos_of(policies: dict[str, Any]) -> Qos:
+    ms = 1_000_000
+    return Qos(
+        RELIABLE if policies.get("reliability", "reliable") == "reliable" else Policy.Reliability.BestEffort,
+        Policy.Durability.TransientLocal if policies.get("stored") else Policy.Durability.Volatile,
+        Policy.History.KeepLast(policies.get("depth", 1)),
+        *([Policy.Deadline(policies["deadline"] * ms)] if "deadline" in policies else []),
+        *([Policy.Liveliness.ManualByTopic(policies["lease"] * ms)] if "lease" in policies else []),
+    )
+
+
 class Node:
     """A node: the topics that it publishes, and the messages that it has received."""
 
@@ -109,7 +120,7 @@ class Node:
         self.counting: threading.Thread | None = None
         self.stopped = threading.Event()
         self.entities: list[Any] = []
-        self.opened: dict[str, tuple[Any, Any]] = {}
+        self.opened: dict[str, tuple[Any, Any]] = {}  # reader and writer, by topic
         self.join()
 
     def topic(self, name: str, kind: Any) -> Any:
@@ -161,6 +172,29 @@ class Node:
             topic = self.topic(name, STD_TYPES[kind])
             qos = Qos(RELIABLE, Policy.History.KeepLast(1), Policy.IgnoreLocal.Participant)
             self.opened[name] = (DataReader(self.entities[1], topic, qos=qos), DataWriter(self.entities[1], topic, qos))
+
+    def offer(self, name: str, kind: str, policies: dict[str, Any]) -> None:
+        """Publish on a topic with this QoS."""
+        self.opened[name] = (None, DataWriter(self.entities[1], self.topic(name, STD_TYPES[kind]), qos_of(policies)))
+
+    def request(self, name: str, kind: str, policies: dict[str, Any], prefix: str = "") -> None:
+        """Subscribe to a topic of this node, or of the one with another prefix, with this QoS."""
+        topic = Topic(self.entities[1], f"rt/{prefix or self.prefix}/{name}", STD_TYPES[kind])
+        reader = DataReader(self.entities[1], topic, qos=qos_of(policies))
+        self.opened[name] = (reader, None)
+
+    def opened_names(self) -> list[str]:
+        return list(self.opened)
+
+    def withdraw(self, name: str) -> None:
+        """Delete what was opened on a topic."""
+        for one in self.opened.pop(name):
+            if one is not None:
+                one.__del__()
+
+    def received_all(self, name: str) -> Any:
+        """Return the data of the messages that have arrived on an opened topic since the last call."""
+        return [one.data for one in self.opened[name][0].take(100)]
 
     def received_data(self, name: str) -> Any:
         """Return the data of the newest message that has arrived on an opened topic since the last call."""

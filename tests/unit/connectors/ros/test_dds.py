@@ -229,8 +229,8 @@ def test_a_reload_changes_readers_and_writers(peer: Peer) -> None:
         source.until(lambda: source.code("mode") == 0)  # it was stored by its publisher
         assert source.value("mode") == "auto"
         spare = ("ARRAY[0..1] OF INT", peer.address("spare", "std_msgs/Int16MultiArray data"))
-        source.reload({"mode": tags["mode"], "spare": spare}, latched=latched, reliability="reliable")
-        source.reload({"mode": tags["mode"], "spare": tags["spare"]}, latched=latched, reliability="reliable")
+        source.reload({"mode": tags["mode"], "spare": spare}, latched=latched, qos={"reliability": "reliable"})
+        source.reload({"mode": tags["mode"], "spare": tags["spare"]}, latched=latched, qos={"reliability": "reliable"})
         source.until(lambda: source.write(spare=[3, 4]) == [""])
         assert (source.value("mode"), peer.ask("commanded")) == ("auto", [3, 4])
         assert peer.ask("participants") == present
