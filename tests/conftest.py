@@ -48,6 +48,8 @@ ONE_AFTER_THE_OTHER = (
         "tests/unit/cli/test_supervisor_cell.py::test_configuration_from_init_runs",
     ),
     # all tests of such a module use one instance, browser or server, which takes seconds to start
+    ("tests/compatibility/test_client.py",),
+    ("tests/compatibility/test_segment.py",),
     ("tests/conformance/test_opcua.py",),
     ("tests/native/test_reader.py",),
     ("tests/system/test_bits.py",),
@@ -70,6 +72,8 @@ ONE_AFTER_THE_OTHER = (
 
 
 START_PROCESSES = (
+    "tests/compatibility/test_client.py",
+    "tests/compatibility/test_segment.py",
     "tests/native/",
     "tests/system/",
     "tests/unit/cli/test_completion.py",
