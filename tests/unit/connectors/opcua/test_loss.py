@@ -127,11 +127,11 @@ def test_a_link_that_has_just_ended_is_closed_and_lost(device: Device, monkeypat
 
 
 def test_threads_end(device: Device) -> None:
-    before = threading.active_count()
+    before = set(threading.enumerate())
     for _ in range(5):
         with connected(device.url, TAGS) as source:
             source.connector.read()
-    until(lambda: threading.active_count() <= before, "the end of the threads")
+    until(lambda: set(threading.enumerate()) <= before, "the end of the threads")
 
 
 # -- hostile peers -----------------------------------------------------------------------------------------------------
