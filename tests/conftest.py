@@ -12,11 +12,12 @@ import secrets
 import signal
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import CodeType, FunctionType, MethodType
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 from hypothesis import settings
@@ -304,25 +305,39 @@ def handlers() -> dict[signal.Signals, Any]:
     return {sign: signal.getsignal(sign) for sign in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
 
 
-def left_over(before: tuple[set[str], set[int], set[str]]) -> tuple[set[str], set[int], set[str]]:
-    return segments() - before[0], children() - before[1], sockets() - before[2]
+class Resources(NamedTuple):
+    """What this process has. The names are compared, not counted: what an earlier test left may end meanwhile."""
+
+    segments: set[str]
+    processes: set[int]
+    sockets: set[str]
+    threads: set[threading.Thread]
+
+    @classmethod
+    def now(cls) -> Resources:
+        return cls(segments(), children(), sockets(), set(threading.enumerate()))
+
+    def added(self) -> dict[str, set[Any]]:
+        """Return what this process has now, and did not have before."""
+        pairs = zip(self._asdict().items(), self.now(), strict=True)
+        return {kind: left for (kind, before), now in pairs if (left := now - before)}
 
 
 @pytest.fixture(autouse=True)
 def nothing_left_behind() -> Iterator[None]:
-    """Fail a test that leaves a segment, a process, a socket or a changed signal handler behind."""
-    before = segments(), children(), sockets()
+    """Fail a test that leaves a segment, a process, a socket, a thread or a changed signal handler behind."""
+    before = Resources.now()
     heeded = handlers()
     yield
-    deadline = time.monotonic() + 2.0
-    while any(left := left_over(before)) and time.monotonic() < deadline:  # processes and sockets may just be closing
+    deadline = time.monotonic() + 20.0
+    while (left := before.added()) and time.monotonic() < deadline:  # they may just be ending
         if not gc.collect():
             time.sleep(0.005)
     now = handlers()
     for sign, handler in heeded.items():
         signal.signal(sign, handler)  # protects the next test
     assert now == heeded, f"signal handlers left behind: {now}"
-    assert not any(left), f"left behind: segments {left[0]}, processes {left[1]}, sockets {left[2]}"
+    assert not left, f"left behind: {left}"
 
 
 def _named() -> Iterator[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import threading
 import time
 import tracemalloc
 from contextlib import ExitStack, suppress
@@ -124,14 +123,6 @@ def test_a_link_that_has_just_ended_is_closed_and_lost(device: Device, monkeypat
         with pytest.raises(ConnectorError, match="was closed"):
             source.connector.read()
         source.connector.close()
-
-
-def test_threads_end(device: Device) -> None:
-    before = set(threading.enumerate())
-    for _ in range(5):
-        with connected(device.url, TAGS) as source:
-            source.connector.read()
-    until(lambda: set(threading.enumerate()) <= before, "the end of the threads")
 
 
 # -- hostile peers -----------------------------------------------------------------------------------------------------
