@@ -17,7 +17,7 @@ from shmio.connectors.base import Connector, Lost, WriteLostError
 from shmio.errors import ConnectorError
 from shmio.local.writer import CommandSender
 from shmio.segment import Event, EventKind, Frame, Quality, Write
-from shmio.testing.conformance import PATIENCE_S, ConnectorConformance, Rig, Run
+from shmio.testing.conformance import PATIENCE_S, ConnectorConformance, Rig, Run, connect
 
 ENDS = {EventKind.WRITTEN, EventKind.REFUSED, EventKind.EXPIRED, EventKind.UNKNOWN}
 FAR_S = 60.0
@@ -153,7 +153,7 @@ class WriteConformance(ConnectorConformance):
         """
         connector = rig.connector()
         try:
-            connector.connect()
+            connect(connector)
             writes = [Write(rig.spare, 0, b"one"), rig.refused, Write(rig.spare + 4, 0, b"two")]
             outcomes = write(connector, writes)
             assert [bool(outcome) for outcome in outcomes] == [False, True, False]
@@ -165,14 +165,14 @@ class WriteConformance(ConnectorConformance):
         """A late confirmation on the next connection never confirms a write that is refused there."""
         connector = rig.connector()
         try:
-            connector.connect()
+            connect(connector)
             rig.proxy.hold()
             with pytest.raises(ConnectorError):
                 write(connector, [Write(rig.spare, 0, b"late")])
             assert rig.proxy.wait_held()
             connector.close()
             rig.proxy.edit(lambda frame: frame)  # frames on hold stay on hold
-            connector.connect()
+            connect(connector)
             rig.proxy.release()
             with contextlib.suppress(ConnectorError):
                 assert write(connector, [rig.refused])[0]
@@ -204,7 +204,7 @@ class WriteConformance(ConnectorConformance):
         writes = [Write(rig.spare + place, 0, bytes([place + 1])) for place in range(SPARE)]
         connector = rig.connector()
         try:
-            connector.connect()
+            connect(connector)
             if fault == "cut before":
                 rig.proxy.cut()
             elif fault == "cut in the answer":
@@ -215,7 +215,7 @@ class WriteConformance(ConnectorConformance):
                 write(connector, writes)
             connector.close()
             rig.proxy.pass_all()
-            connector.connect()
+            connect(connector)
             found = connector.read()
         finally:
             connector.close()
@@ -246,7 +246,7 @@ class WriteConformance(ConnectorConformance):
                     write(connector, [Write(rig.spare, 0, b"lost")])
                 if isinstance(raised.value, WriteLostError):
                     assert raised.value.outcomes == (Lost.UNSENT,)
-                connector.connect()
+                connect(connector)
                 assert connector.read()[rig.spare : rig.spare + 4] == bytes(4)
                 connector.close()
         finally:

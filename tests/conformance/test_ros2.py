@@ -21,7 +21,7 @@ from shmio.layout.tags import place_tags
 from shmio.layout.values.codec import codec
 from shmio.model.statuses import BAD_TIMEOUT, GOOD, StatusArea
 from shmio.segment import Frame, Write
-from shmio.testing.conformance import Rig, Run
+from shmio.testing.conformance import Rig, Run, connect
 from shmio.testing.table_conformance import TableConformance, Tags, connected, value_of
 from shmio.testing.write_conformance import SPARE, WriteConformance, Writer, WriteRig, write
 from tests.unit.connectors.ros.dds_peer import Peer
@@ -295,7 +295,7 @@ class TestRos2(TableConformance, WriteConformance):
         """A topic without a subscriber is refused; the others are published."""
         connector = rig.connector()
         try:
-            connector.connect()
+            connect(connector)
             for _ in range(1000):
                 rig.peer.ask("spare", [0] * SPARE)
                 connector.read()
@@ -334,7 +334,7 @@ class TestRos2(TableConformance, WriteConformance):
         """The node is frozen during several writes, which are one message."""
         connector = rig.connector()
         try:
-            connector.connect()
+            connect(connector)
             for _ in range(1000):
                 rig.peer.ask("spare", [0] * SPARE)
                 connector.read()
