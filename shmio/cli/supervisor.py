@@ -140,6 +140,8 @@ def _add_browse(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("paths", metavar="PATTERN", nargs="*", help="list only these paths; * and ** are wildcards")
     parser.add_argument("-o", dest="output", type=Path, metavar="FILE.toml", help="write a tag table, a new file")
     parser.add_argument("--writable", action="store_true", help="with -o: commands may write what the device permits")
+    text = "the connector that reads the device (default: the one for this kind of URL)"
+    parser.add_argument("--connector", metavar="NAME", help=text)
     text = "a key of the source, such as security=SignAndEncrypt or username=operator; repeatable"
     parser.add_argument("--set", dest="keys", action="append", default=[], metavar="KEY=VALUE", help=text)
     parser.add_argument(

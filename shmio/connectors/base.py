@@ -98,6 +98,9 @@ class Connector(ABC):
     process.
     """
 
+    cannot_browse: ClassVar[str] = "this connector cannot list what a device offers"
+    """Why :meth:`browse` is not possible, and what the user can do instead."""
+
     @classmethod
     def for_layout(cls, layout: Layout) -> type[Connector]:  # noqa: ARG003  most read all layouts
         """Return the connector class for a layout; it has the same ``Options``.
@@ -106,6 +109,18 @@ class Connector(ABC):
         for those.
         """
         return cls
+
+    @classmethod
+    def browse_options(cls, url: str) -> dict[str, Any]:
+        """Return the keys of ``Options`` that the URL of ``shmio-supervisor browse`` stands for.
+
+        Raises:
+            ConfigError: The URL is not one of this connector, or the connector cannot browse.
+
+        """
+        if "url" not in cls.Options.__struct_fields__:
+            raise ConfigError(cls.cannot_browse)
+        return {"url": url}
 
     @classmethod
     def browse(cls, options: Any, wanted: Wanted) -> Browsed:  # noqa: ARG003
@@ -120,7 +135,7 @@ class Connector(ABC):
             ConnectorError: The device cannot be reached, or it refuses to be browsed.
 
         """
-        raise ConfigError("this connector cannot list what a device offers")
+        raise ConfigError(cls.cannot_browse)
 
     @abstractmethod
     def __init__(self, options: Any, layout: Layout) -> None:

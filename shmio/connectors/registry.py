@@ -35,8 +35,14 @@ BUILT_IN = {
     "s7": "shmio.connectors.s7.connector:S7Connector",
 }
 
-BROWSED = {"opc.tcp": "opcua", "mqtt": "mqtt", "mqtts": "mqtt"}
-"""The connector that can browse a device, by the scheme of the device's URL."""
+BROWSED = {
+    "opc.tcp://HOST:PORT": "opcua",
+    "mqtt://HOST:PORT": "mqtt",
+    "mqtts://HOST:PORT": "mqtt",
+    "ws://HOST:PORT": "rosbridge",
+    "ros2://DOMAIN": "ros2",
+}
+"""The connectors that can browse a device, by the form of the device's URL."""
 
 
 def names() -> list[str]:

@@ -27,7 +27,7 @@ def browse(arguments: argparse.Namespace) -> int:
     if output is not None and output.exists():
         raise ConfigError(f"{output}: {EXISTS}")
     wanted = Wanted(arguments.paths, depth=arguments.depth, nodes=arguments.limit)
-    connector, options = _connector(arguments.url, arguments.keys)
+    connector, options = _connector(arguments.url, arguments.connector, arguments.keys)
     found = connector.browse(options, wanted)
     if output is not None:
         _write(arguments, found)
@@ -43,25 +43,37 @@ def browse(arguments: argparse.Namespace) -> int:
     return 1 if found.incomplete else 0
 
 
-def _connector(url: str, keys: list[str]) -> tuple[type[Connector], Any]:
+def _connector(url: str, name: str | None, keys: list[str]) -> tuple[type[Connector], Any]:
     """Return the connector for a URL, and its options."""
-    scheme = urlsplit(url).scheme
-    if scheme not in registry.BROWSED:
-        valid = ", ".join(f"{one}://HOST:PORT" for one in registry.BROWSED)
-        raise ConfigError(f"{url}: shmio cannot browse a device with this kind of URL; valid: {valid}")
-    name = registry.BROWSED[scheme]
+    name = name or _name(url)
     connector = registry.load(name)
-    assert issubclass(connector, Connector)  # noqa: S101 - for the type checker
+    if not issubclass(connector, Connector):
+        raise ConfigError(f"connector {name} reads no device, so there is nothing to browse")
+    given = connector.browse_options(url)
     texts: dict[str, str] = {}
     for pair in keys:
         key, equals, value = pair.partition("=")
         if not equals:
             raise ConfigError(f"--set {pair}: expected KEY=VALUE")
         texts[key] = value
-    known = {field.encode_name for field in msgspec.structs.fields(connector.Options)} - {"url"}
+    known = {field.encode_name for field in msgspec.structs.fields(connector.Options)} - given.keys()
     if others := texts.keys() - known:
         raise ConfigError(f"--set: {unknown('key', min(others), sorted(known), f'connector {name}')}")
-    return connector, registry.convert_options(name, {"url": url}, texts)
+    return connector, registry.convert_options(name, given, texts)
+
+
+def _name(url: str) -> str:
+    """Return the name of the connector that can browse a URL, or that at least says why it cannot."""
+    scheme = urlsplit(url).scheme
+    by_scheme = {form.partition(":")[0]: name for form, name in registry.BROWSED.items()}
+    if scheme in by_scheme:
+        return by_scheme[scheme]
+    if scheme in registry.names():
+        return scheme
+    raise ConfigError(
+        f"{url}: shmio cannot browse a device with this kind of URL; valid: {', '.join(registry.BROWSED)}; "
+        "for a connector of another package, add --connector NAME"
+    )
 
 
 def _write(arguments: argparse.Namespace, found: Browsed) -> None:

@@ -147,6 +147,10 @@ class ModbusConnector(Connector):
     Options = ModbusOptions
     can_write = True
     register_quality = True
+    cannot_browse = (
+        "a Modbus device has neither names nor types to list; write a tag table from the device's manual, or convert "
+        "its tag list with shmio-layout import"
+    )
     register_options = frozenset({"unit", "word_order", "byte_order", "max_registers", "max_bits", "max_gap"})
 
     def __init__(self, options: ModbusOptions, layout: Layout) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+import re
 import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -11,10 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import msgspec
 
 from shmio.connectors.base import Connector, Lost, UnconfirmedError, WriteLostError
+from shmio.connectors.browsing import Browsed, Wanted
 from shmio.connectors.request_count import CycleRequests
+from shmio.connectors.ros.browse import Seen, browsed, levels
 from shmio.connectors.ros.commands import Publication, Sending, plan, stamped
 from shmio.connectors.ros.options import REGISTER_OPTIONS, TopicOptions
-from shmio.connectors.ros.qos import QosKeys, qos_of
+from shmio.connectors.ros.qos import QosKeys, TopicQos, qos_of
 from shmio.connectors.ros.topics import Topic, Topics
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.model import Layout
@@ -77,8 +80,7 @@ class Ros2Connector(Connector):
     register_options = REGISTER_OPTIONS | {"qos", "topic_qos"}
 
     def __init__(self, options: Ros2Options, layout: Layout) -> None:
-        if importlib.util.find_spec("cyclonedds") is None:
-            raise ConfigError("connector: ros2 needs another library; run pip install 'shmio[ros2]'")
+        _check_library()
         self._options = options
         self._topics = Topics(layout, options, known_types=True)
         self._set_qos(options)
@@ -88,6 +90,39 @@ class Ros2Connector(Connector):
         """The topics that have a publisher or subscriber that does not fit this source."""
         self._discovered_s = 0.0
         """When all present subscribers should have been discovered, s of CLOCK_MONOTONIC."""
+
+    @classmethod
+    def browse_options(cls, url: str) -> dict[str, Any]:
+        """Return the domain of a URL such as ``ros2://0``."""
+        domain = url.removeprefix("ros2://").rstrip("/")
+        if not re.fullmatch(r"[0-9]{1,3}", domain):
+            raise ConfigError(f"{url}: expected ros2://DOMAIN with the robot's ROS_DOMAIN_ID, such as ros2://0")
+        return {"domain": int(domain)}
+
+    @classmethod
+    def browse(cls, options: Ros2Options, wanted: Wanted) -> Browsed:
+        """List the topics that DDS discovers within the time-out, and the fields of their messages."""
+        _check_library()
+        from shmio.connectors.ros import participant  # noqa: PLC0415  its library is optional
+
+        configured = participant.configuration(
+            options.domain, options.interface, options.peers, options.max_message_bytes
+        )
+        timeout_s = options.timeout / 1000
+        joined = participant.Participant(
+            options.domain, configured, [], timeout_s, loopback=options.interface == "lo"
+        )  # fmt: skip
+        try:
+            seen = _survey(joined, wanted, time.monotonic() + timeout_s)
+            full = joined.discovery.full
+        finally:
+            joined.close()
+        if not seen and wanted.everything:
+            raise ConnectorError(
+                f"no topic of ROS was discovered in DDS domain {options.domain} on {options.interface} within "
+                f"{options.timeout} ms; check ROS_DOMAIN_ID, and that --set interface=… is the robot's network"
+            )
+        return browsed(seen, wanted, "there are more publishers and subscribers; raise --limit" if full else "")
 
     def _set_qos(self, options: Ros2Options) -> None:
         names = self._topics.by_name
@@ -299,6 +334,44 @@ class Ros2Connector(Connector):
         self._pull(joined)  # what others published before the confirmation is older
         self._topics.take(name, message, time.monotonic_ns(), time.time_ns())
         return ""
+
+
+def _check_library() -> None:
+    if importlib.util.find_spec("cyclonedds") is None:
+        raise ConfigError("connector: ros2 needs another library; run pip install 'shmio[ros2]'")
+
+
+def _survey(joined: Participant, wanted: Wanted, end_s: float) -> dict[str, Seen]:
+    """Return the topics that are discovered by ``end_s``, a time of CLOCK_MONOTONIC, with their newest messages."""
+    from shmio.connectors.ros.dds_types import ros_topic, ros_type  # noqa: PLC0415  its library is optional
+    from shmio.connectors.ros.discovery import stores  # noqa: PLC0415
+
+    seen: dict[str, Seen] = {}
+    read: set[str] = set()
+    joined.watch_all(wanted.nodes)
+    while time.monotonic() < end_s:
+        if joined.discovery.update(DISCOVERIES_AT_END):
+            for published, endpoints in (
+                (True, joined.discovery.publishers()), (False, joined.discovery.subscribers())
+            ):  # fmt: skip
+                for one in endpoints:
+                    name = ros_topic(one.topic)
+                    if name and wanted.enters(levels(name)):
+                        topic = seen.setdefault(name, Seen(ros_type(one.type)))
+                        topic.published |= published
+                        topic.subscribed |= not published
+                        topic.stored |= published and stores(one.qos)
+        for name, found in seen.items():
+            if name not in read and found.published and found.known and not found.sized:
+                read.add(name)
+                topic_read = Topic(name, found.type)
+                if found.stored:
+                    topic_read.qos = TopicQos("reliable", "transient_local")
+                joined.add([topic_read])
+        for name, message in joined.take():
+            seen[name].message = message
+        time.sleep(POLL_S)
+    return seen
 
 
 def _time(utc_ns: int) -> dict[str, Any]:

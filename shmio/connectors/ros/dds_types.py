@@ -23,6 +23,11 @@ def dds_topic(topic: str) -> str:
     return f"rt{topic}"
 
 
+def ros_topic(name: str) -> str:
+    """Return the ROS topic that has a name in DDS; "" if it is none, but a service or a topic of other programs."""
+    return name.removeprefix("rt") if name.startswith("rt/") else ""
+
+
 def dds_type(kind: str) -> str:
     """Return the name that a type ``package/Name`` has in DDS."""
     package, _, name = kind.partition("/")

@@ -137,6 +137,13 @@ def _ns(ms: int) -> int:
     return ms * 1_000_000 if ms else INFINITE_NS
 
 
+def stores(qos: Qos) -> bool:
+    """Return whether a publisher with a QoS stores its messages for late subscribers, and sends them reliably."""
+    return _DURABILITIES.index(_name(qos[Policy.Durability])) > 0 and isinstance(
+        qos[Policy.Reliability], Policy.Reliability.Reliable
+    )
+
+
 def unmet(offered: Qos, requested: Qos) -> Iterator[tuple[str, str, str]]:
     """Yield each policy that a publisher offers and that does not satisfy a subscriber.
 

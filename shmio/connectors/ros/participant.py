@@ -157,7 +157,7 @@ class Participant:
             if loopback:
                 _keep_to_loopback(before)
             self._participant = DomainParticipant(domain)
-            self._add(topics)
+            self.add(topics)
             self._watch()
         except ConnectorError:
             self.close()
@@ -168,13 +168,18 @@ class Participant:
                 f"cannot join DDS domain {domain}: {error.msg or error}; check that the interface exists and is up"
             ) from None
 
-    def _add(self, topics: Iterable[Topic]) -> None:
+    def add(self, topics: Iterable[Topic]) -> None:
+        """Read more topics, and write those of them that are writable."""
         for topic in topics:
             if topic.name not in self._endpoints:
                 self._endpoints[topic.name] = _Endpoint(self._participant, topic, self._blocking_ns)
 
     def _watch(self) -> None:
         self.discovery.begin(self._participant, {dds_topic(name) for name in self._endpoints}, MAX_ENDPOINTS)
+
+    def watch_all(self, limit: int) -> None:
+        """Discover the publishers and subscribers of all topics, at most ``limit`` of each."""
+        self.discovery.begin(self._participant, None, limit)
 
     def change(self, topics: Collection[Topic]) -> None:
         """Read and write these topics, and no others. Topics that stay the same keep their readers and writers.
@@ -192,7 +197,7 @@ class Participant:
                 else:
                     endpoint.close()
                     del self._endpoints[name]
-            self._add(topics)
+            self.add(topics)
             self._watch()
         except DDSException as error:
             raise ConnectorError(f"cannot change the topics that are read: {error.msg or error}") from None

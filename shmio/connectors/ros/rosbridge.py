@@ -13,7 +13,9 @@ import msgspec
 
 from shmio.config import Address
 from shmio.connectors.base import Connector, Lost, WriteLostError
+from shmio.connectors.browsing import Browsed, Wanted
 from shmio.connectors.request_count import CycleRequests
+from shmio.connectors.ros.browse import Seen, browsed, levels
 from shmio.connectors.ros.commands import Publication, Sending, plan, stamped
 from shmio.connectors.ros.messages import finite, from_json, plain
 from shmio.connectors.ros.options import REGISTER_OPTIONS, TopicOptions
@@ -74,13 +76,40 @@ class RosbridgeConnector(Connector):
     register_options = REGISTER_OPTIONS | {"throttle_ms"}
 
     def __init__(self, options: RosbridgeOptions, layout: Layout) -> None:
-        if importlib.util.find_spec("websockets") is None:
-            raise ConfigError("connector: rosbridge needs another library; run pip install 'shmio[rosbridge]'")
+        _check_library()
         self._options = options
         self._topics = Topics(layout, options, known_types=False)
         self._numbers = itertools.count(1)
         self._link: Link | None = None
         self._sending = Sending([], [], 0.0)
+
+    @classmethod
+    def browse(cls, options: RosbridgeOptions, wanted: Wanted) -> Browsed:
+        """List the topics that the server's node rosapi knows, and the fields of their messages.
+
+        Raises:
+            ConnectorError: The server cannot be reached, or has no rosapi.
+
+        """
+        _check_library()
+        timeout_s = options.timeout / 1000
+        link = Link(options.full_url, options.address, timeout_s, options.max_message_bytes, ())
+        try:
+            seen, incomplete = _survey(link, wanted)
+            waiting = {name for name, one in seen.items() if one.known and one.published and not one.sized}
+            link.keep(set(waiting))
+            for name in waiting:
+                link.send(op="subscribe", id=f"subscribe:{name}", topic=name, type=seen[name].type, queue_length=1)
+            end_s = time.monotonic() + timeout_s
+            while waiting and time.monotonic() < end_s:
+                link.check()
+                for name, received in link.newest().items():
+                    seen[name].message = from_json(decode(received.json), plain(seen[name].type))
+                    waiting.discard(name)
+                link.wait_any(min(end_s, time.monotonic() + timeout_s / 4))
+        finally:
+            link.close()
+        return browsed(seen, wanted, incomplete)
 
     @property
     def timeout_s(self) -> float:
@@ -231,6 +260,50 @@ class RosbridgeConnector(Connector):
         if "header" not in message or stamped(self._topics, publication.topic):
             return message
         return message | {"header": {name: one for name, one in message["header"].items() if name != "stamp"}}
+
+
+def _check_library() -> None:
+    if importlib.util.find_spec("websockets") is None:
+        raise ConfigError("connector: rosbridge needs another library; run pip install 'shmio[rosbridge]'")
+
+
+def _survey(link: Link, wanted: Wanted) -> tuple[dict[str, Seen], str]:
+    """Return the topics that rosapi knows, and why they may not be all.
+
+    Raises:
+        ConnectorError: The server does not answer, or has no rosapi.
+
+    """
+    try:
+        answer = link.call("/rosapi/topics", {})
+    except ConnectorError as error:
+        raise ConnectorError(
+            f"{error}; browse needs the node rosapi beside the server, which rosbridge_websocket_launch.xml starts"
+        ) from None
+    found = _texts(answer, "topics")
+    types = _texts(answer, "types")
+    seen: dict[str, Seen] = {}
+    for at, name in enumerate(found):
+        if not wanted.enters(levels(name)):
+            continue
+        if len(seen) == wanted.nodes:
+            return seen, "there are more topics; select some of them by a PATTERN, or raise --limit"
+        kind = types[at] if at < len(types) else _text(link.call("/rosapi/topic_type", {"topic": name}), "type")
+        published, subscribed = (
+            bool(_texts(link.call(f"/rosapi/{role}", {"topic": name}), role)) for role in ("publishers", "subscribers")
+        )
+        seen[name] = Seen(kind, published=published, subscribed=subscribed)
+    return seen, ""
+
+
+def _texts(answer: Any, name: str) -> list[str]:
+    found = answer.get(name) if isinstance(answer, dict) else None
+    return [one for one in found if isinstance(one, str)] if isinstance(found, list) else []
+
+
+def _text(answer: Any, name: str) -> str:
+    found = answer.get(name) if isinstance(answer, dict) else None
+    return found if isinstance(found, str) else ""
 
 
 def _advertise(link: Link, topic: Topic) -> None:

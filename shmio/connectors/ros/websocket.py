@@ -6,6 +6,7 @@ The protocol is rosbridge v2: ROSBRIDGE_PROTOCOL.md of rosbridge_suite.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import socket
 import struct
@@ -45,7 +46,8 @@ class Received(NamedTuple):
 class _Envelope(msgspec.Struct):
     """The fields of the operations that the server sends.
 
-    ``msg`` is the message of a topic, or the text of a status.
+    ``msg`` is the message of a topic, or the text of a status; ``values`` is the answer of a service, or why there
+    is none, and ``result`` whether there is one.
     """
 
     op: str
@@ -53,6 +55,8 @@ class _Envelope(msgspec.Struct):
     id: str | int | None = None
     level: str = ""
     msg: msgspec.Raw = msgspec.Raw(b"null")
+    values: msgspec.Raw = msgspec.Raw(b"null")
+    result: bool = True
 
 
 _envelope = msgspec.json.Decoder(_Envelope)
@@ -85,8 +89,10 @@ class Link:
         self._newest: dict[str, Received] = {}
         self._expected: tuple[str, str, Any] | None = None  # (topic, id, message)
         self._outcome: str | None = None
+        self._answers: dict[str, _Envelope | None] = {}  # by the id of the call whose answer is awaited
         self._failure = ""
         self._reported = 0
+        self._calls = itertools.count(1)
         self._pong: threading.Event | None = None
         self._pinged_ns = self.heard_ns = time.monotonic_ns()
         try:
@@ -150,6 +156,11 @@ class Link:
                 lambda: self._failure or len(self._newest) == len(self._topics), max(0.0, until_s - time.monotonic())
             )
 
+    def wait_any(self, until_s: float) -> None:
+        """Wait until any topic has a message, at most until ``until_s`` (CLOCK_MONOTONIC, in s)."""
+        with self._condition:
+            self._condition.wait_for(lambda: self._failure or self._newest, max(0.0, until_s - time.monotonic()))
+
     def check(self) -> None:
         """Check the connection, and send a ping if the server has been silent.
 
@@ -208,6 +219,30 @@ class Link:
                 raise ConnectorError(self._failure)
             return self._outcome
 
+    # -- services ------------------------------------------------------------------------------------------------------
+
+    def call(self, service: str, arguments: Mapping[str, object]) -> Any:
+        """Call a service; return its answer.
+
+        Raises:
+            ConnectorError: The server does not answer in time, or says that it cannot.
+
+        """
+        number = f"call:{service}:{next(self._calls)}"
+        with self._condition:
+            self._answers[number] = None
+        self.send(op="call_service", id=number, service=service, args=arguments)
+        with self._condition:
+            self._condition.wait_for(lambda: self._answers[number] is not None or self._failure, self._timeout_s)
+            answer = self._answers.pop(number)
+        if answer is None:
+            reason = self._failure or f"no answer within {self._timeout_s * 1000:.0f} ms from {self._peer} to {service}"
+            raise ConnectorError(reason)
+        values = decode(answer.values)
+        if not answer.result:
+            raise ConnectorError(f"{self._peer} does not answer {service}: {printable(str(values))[:200]}")
+        return values
+
     def _receive(self) -> None:
         """Receive messages until the connection ends. This runs in the connection's own thread."""
         failure = f"{self._peer} closed the connection"
@@ -260,6 +295,11 @@ class Link:
             self._take_message(envelope)
         elif envelope.op == "status":
             self._take_status(envelope)
+        elif envelope.op == "service_response":
+            with self._condition:
+                if isinstance(envelope.id, str) and envelope.id in self._answers:
+                    self._answers[envelope.id] = envelope
+                    self._condition.notify_all()
 
     def _take_message(self, envelope: _Envelope) -> None:
         json = envelope.msg.copy()

@@ -76,6 +76,10 @@ class S7Connector(S7Client, Connector):
 
     Options = S7Options
     can_write = True
+    cannot_browse = (
+        "an S7 controller does not tell the names in its blocks; export the data block as .db, or the PLC tags for "
+        "shmio-layout import, from TIA Portal. If the CPU has an OPC UA server, browse opc.tcp://HOST:4840"
+    )
     register_options = REGISTER_OPTIONS
 
     @classmethod

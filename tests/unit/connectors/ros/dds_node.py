@@ -206,6 +206,18 @@ class Node:
         made = self.opened[name][1].topic.data_type
         self.opened[name][1].write(made(MultiArrayLayout_([], 0), data) if isinstance(data, list) else made(data))
 
+    def repeat(self, commands: list[list[Any]]) -> None:
+        """Carry out commands again and again, each 20 ms."""
+
+        def run() -> None:
+            while not self.stopped.wait(0.02):
+                for name, *given in commands:
+                    getattr(self, name)(*given)
+
+        self.stopped.clear()
+        self.counting = threading.Thread(target=run)
+        self.counting.start()
+
     def restore(self, number: int) -> None:
         self.last = number
 

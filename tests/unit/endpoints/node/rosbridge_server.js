@@ -34,7 +34,24 @@ function status(socket, id, text) {
   socket.send(JSON.stringify({ op: 'status', id, level: 'error', msg: text }))
 }
 
-function handle(socket, client, { op, id, topic, type, msg }) {
+// The services of rosapi, from the definitions of rosapi_msgs.
+const rosapi = {
+  '/rosapi/topics': () => {
+    const names = [...topics.keys()].filter(name => topics.get(name).type !== null)
+    return { topics: names, types: names.map(name => topics.get(name).type.replace('/', '/msg/')) }
+  },
+  '/rosapi/topic_type': ({ topic }) => ({ type: topics.get(topic)?.type ?? '' }),
+  '/rosapi/publishers': ({ topic }) => ({ publishers: topics.get(topic)?.last ? ['/robot'] : [] }),
+  '/rosapi/subscribers': ({ topic }) => ({ subscribers: topics.get(topic)?.listens ? ['/robot'] : [] }),
+}
+let services = true
+
+function handle(socket, client, { op, id, topic, type, msg, service, args }) {
+  if (op === 'call_service') {
+    const known = services && service in rosapi
+    const values = known ? rosapi[service](args) : `Service ${service} does not exist`
+    return socket.send(JSON.stringify({ op: 'service_response', id, service, values, result: known }))
+  }
   const found = topicOf(topic)
   if (op === 'subscribe' || op === 'advertise') {
     const plain = type.replace('/msg/', '/')
@@ -56,6 +73,8 @@ function handle(socket, client, { op, id, topic, type, msg }) {
 }
 
 const commands = {
+  declare: (topic, type, listens) => { Object.assign(topicOf(topic), { type, listens }) },
+  services: on => { services = on },
   publish: (topic, msg) => deliver(topic, msg),
   raw: text => { for (const socket of clients.keys()) socket.send(text) },
   binary: hex => { for (const socket of clients.keys()) socket.send(Buffer.from(hex, 'hex')) },
