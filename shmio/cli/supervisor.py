@@ -104,8 +104,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     init.epilog = (
         "A device without source files of data blocks has a tag table, which a [[source]] names as its layout: "
-        "shmio-layout import converts the tag list of another tool, shmio-supervisor browse asks an OPC UA server or "
-        "an MQTT broker, and docs/how-to/use-a-tag-list.md says how to write one."
+        "shmio-layout import converts the tag list of another tool, shmio-supervisor browse asks a device that can "
+        "list its values, and docs/how-to/use-a-tag-list.md says how to write one."
     )
     init.add_argument(
         "--demo", action="store_true", help="the A50 example with its emulated PLC; the same as without files"
@@ -136,7 +136,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_browse(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("url", metavar="URL", help="the device, such as opc.tcp://10.76.0.30:4840")
+    parser.add_argument("url", metavar="URL", help="the device, such as opc.tcp://10.76.0.30:4840 or ros2://0")
     parser.add_argument("paths", metavar="PATTERN", nargs="*", help="list only these paths; * and ** are wildcards")
     parser.add_argument("-o", dest="output", type=Path, metavar="FILE.toml", help="write a tag table, a new file")
     parser.add_argument("--writable", action="store_true", help="with -o: commands may write what the device permits")

@@ -12,12 +12,14 @@ from urllib.parse import urlsplit
 import msgspec
 
 from shmio.connectors.base import Connector
+from shmio.connectors.browsing import Browsed, Wanted
 from shmio.connectors.register_image import RegisterImage, no_status_area
 from shmio.connectors.request_count import CycleRequests
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout
 from shmio.model.statuses import BAD_WAITING_FOR_INITIAL_DATA
 from shmio.wording import counted
+from shmio_mtconnect.browse import offers
 from shmio_mtconnect.documents import DataItem, DevicesDocument, Streams, StreamsDocument
 from shmio_mtconnect.http import Exchange
 from shmio_mtconnect.values import Target, find, parse
@@ -65,6 +67,16 @@ class MTConnectConnector(Connector):
 
     Options = MTConnectOptions
     register_quality = True
+
+    @classmethod
+    def browse(cls, options: MTConnectOptions, wanted: Wanted) -> Browsed:
+        """List the data items of the agent's devices.
+
+        Raises:
+            ConnectorError: The agent cannot be reached, or the peer is not an agent.
+
+        """
+        return offers(_probe(options), wanted)
 
     def __init__(self, options: MTConnectOptions, layout: Layout) -> None:
         self._options, self._layout = options, layout
@@ -132,15 +144,10 @@ class MTConnectConnector(Connector):
 
     def _targets(self, image: RegisterImage) -> dict[str, list[Target]]:
         """Ask for the device model. Return the registers of each data item."""
-        devices = DevicesDocument()
-        exchange = Exchange(self._options.url, self._options.timeout)
-        try:
-            exchange.document("probe", devices)
-        finally:
-            exchange.close()
+        items = _probe(self._options)
         deadline = time.monotonic() + self._options.timeout / 1000
         by_name: dict[str, list[DataItem]] = defaultdict(list)
-        for one in devices.items:
+        for one in items:
             for name in one.names[-1]:
                 by_name[name].append(one)
         found: dict[str, list[Target]] = defaultdict(list)
@@ -162,6 +169,17 @@ class MTConnectConnector(Connector):
         if missing > MAX_REPORTED:
             log.warning("%d more registers have no data item: shmio get shows all", missing - MAX_REPORTED)
         return dict(found)
+
+
+def _probe(options: MTConnectOptions) -> list[DataItem]:
+    """Ask the agent for its device model; return its data items."""
+    devices = DevicesDocument()
+    exchange = Exchange(options.url, options.timeout)
+    try:
+        exchange.document("probe", devices)
+    finally:
+        exchange.close()
+    return devices.items
 
 
 class _Follower:

@@ -35,9 +35,17 @@ class DataItem(NamedTuple):
     category: str
     names: tuple[frozenset[str], ...]
     """For each part of the item's path, the names that an address may use: the device, its components, the item."""
-    path: str
-    """The item's path, as messages show it."""
+    labels: tuple[str, ...]
+    """The item's path, with one name for each part."""
     representation: str
+    kind: str
+    """The type, such as POSITION."""
+    units: str
+
+    @property
+    def path(self) -> str:
+        """The item's path, as messages show it."""
+        return "/".join(self.labels)
 
 
 class Observation(NamedTuple):
@@ -178,8 +186,10 @@ class DevicesDocument:
                 item,
                 attributes.get("category", ""),
                 (*(part for _, part, _ in self._parts), names | {f"{kind}.{sub}" if sub else kind}),
-                "/".join((*(label for _, _, label in self._parts), attributes.get("name") or item)),
+                (*(label for _, _, label in self._parts), attributes.get("name") or item),
                 attributes.get("representation", "VALUE"),
+                kind,
+                attributes.get("units", ""),
             )
         )
 
