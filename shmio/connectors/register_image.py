@@ -82,7 +82,10 @@ class RegisterImage:
             self._codecs[index].encode_into(value, self._image)
         except ValueRangeError as error:
             code, fault = BAD_OUT_OF_RANGE, str(error)
-        self._set_status(index, code, source_ns)
+        if code == GOOD and index not in self._not_good:  # the usual case
+            self._area.write_time(self._image, index, source_ns)
+        else:
+            self._set_status(index, code, source_ns)
         return fault
 
     def put_bytes(self, index: int, data: bytes, source_ns: int = 0, code: int = GOOD) -> None:

@@ -288,6 +288,10 @@ class StatusArea:
         self._code.pack_into(image, self.codes_offset + _CODE_BYTES * index, code)
         self._time.pack_into(image, self.times_offset + _TIME_BYTES * index, source_ns)
 
+    def write_time(self, image: bytearray, index: int, source_ns: int) -> None:
+        """Write the time of a status whose code stays the same."""
+        self._time.pack_into(image, self.times_offset + _TIME_BYTES * index, source_ns)
+
 
 def status_registers(layout: Layout, registers: Iterable[Register], *, times: bool = True) -> list[Register]:
     """Return registers whose values are the statuses of other registers, for tables and comparisons.

@@ -87,7 +87,9 @@ def codec(register: Register, byte_order: ByteOrder = "big") -> RegisterCodec:
     """Return the codec of a register. Results are cached."""
     if register.type == "BOOL":
         return _BoolArray(register) if register.dims else _Bool(register)
-    return _Array(register, byte_order) if register.dims else _Single(register, byte_order)
+    if register.dims:
+        return _Array(register, byte_order)
+    return (_SingleNumber if register.type in _CODES else _Single)(register, byte_order)
 
 
 class _Bool:
@@ -118,6 +120,25 @@ class _Single:
 
     def encode_into(self, value: object, frame: bytearray | memoryview) -> None:
         frame[self._offset : self._stop] = self._scalar.encode(value)
+
+
+class _SingleNumber(_Single):
+    """Codec of a scalar number, which most registers are: it encodes most values without calling another codec."""
+
+    def __init__(self, register: Register, byte_order: ByteOrder) -> None:
+        super().__init__(register, byte_order)
+        code = _CODES[register.type]
+        self._pack = struct.Struct((">" if byte_order == "big" else "<") + code).pack
+        self._native = float if code in "fd" else int
+
+    def encode_into(self, value: object, frame: bytearray | memoryview) -> None:
+        if type(value) is self._native:
+            try:
+                frame[self._offset : self._stop] = self._pack(value)
+                return
+            except (struct.error, OverflowError):  # the other codec raises its error
+                pass
+        super().encode_into(value, frame)
 
 
 class _Array:

@@ -237,7 +237,8 @@ class _Follower:
             for part in self._stream.parts():
                 document = StreamsDocument(self.targets)
                 document.feed(part)
-                self._take(document.finish())
+                document.finish()
+                self._take(document.streams)
         except ConnectorError as error:
             self._error = str(error)
         except Exception as error:

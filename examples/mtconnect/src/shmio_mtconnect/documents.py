@@ -7,12 +7,15 @@ items are limited. Namespaces are not compared, because each version has its own
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Container
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import lru_cache
-from typing import Final, NamedTuple
+from operator import attrgetter
+from typing import ClassVar, Final, NamedTuple
 from xml.parsers import expat
+
+import msgspec
 
 from shmio.errors import ConnectorError
 
@@ -48,7 +51,7 @@ class DataItem(NamedTuple):
         return "/".join(self.labels)
 
 
-class Observation(NamedTuple):
+class Observation(msgspec.Struct, frozen=True, gc=False):
     """One value of a data item."""
 
     item: str
@@ -69,24 +72,24 @@ class Streams:
     observations: list[Observation] = field(default_factory=list)
 
 
-class _Parser:
-    """Feeds expat with limited input, and passes on elements by their local names."""
+class _Document:
+    """Parses one document: feeds expat with limited input, and checks the root, or takes the errors of the agent.
 
-    def __init__(
-        self, root: str, begin: Callable[[str, dict[str, str]], None], end: Callable[[str, str], None]
-    ) -> None:
-        self._root, self._begin, self._end = root, begin, end
-        self._open: list[str] = []
-        self._text: list[str] = []
-        self._length = self._size = 0
-        self._seen = False
+    A derived class handles the elements in :meth:`_begin` and :meth:`_end`, which call :meth:`_enter` and
+    :meth:`_leave`.
+    """
+
+    ROOT: ClassVar[str]
+
+    def __init__(self) -> None:
+        self._depth = self._size = 0
+        self._text: list[str] = []  # of the present element, since the last tag
         self._error: list[str] | None = None
         self._expat = expat.ParserCreate(namespace_separator=" ")
         self._expat.buffer_text = True
         self._expat.StartDoctypeDeclHandler = self._refuse
-        self._expat.StartElementHandler = self._start
-        self._expat.EndElementHandler = self._stop
-        self._expat.CharacterDataHandler = self._add
+        self._expat.StartElementHandler = self._begin_root
+        self._expat.CharacterDataHandler = self._text.append
 
     def feed(self, data: bytes) -> None:
         """Parse more of the document. Raise ConnectorError if it is invalid or too large."""
@@ -94,22 +97,13 @@ class _Parser:
         if self._size > MAX_DOCUMENT_BYTES:
             raise ConnectorError(f"the agent's document has more than {MAX_DOCUMENT_BYTES >> 20} MiB")
         self._parse(data, last=False)
+        self._whole_text()
 
     def finish(self) -> None:
         """Parse the end. Raise ConnectorError if the document is incomplete, or reports an error of the agent."""
         self._parse(b"", last=True)
         if self._error is not None:
             raise ConnectorError(f"the agent reports: {' '.join(self._error)[:MAX_ERROR] or 'an error'}")
-
-    @property
-    def parent(self) -> str:
-        """Local name of the element that contains the present one."""
-        return self._open[-2] if len(self._open) > 1 else ""
-
-    @property
-    def depth(self) -> int:
-        """Number of open elements."""
-        return len(self._open)
 
     def _parse(self, data: bytes, *, last: bool) -> None:
         try:
@@ -122,58 +116,82 @@ class _Parser:
     def _refuse(self, *_: object) -> None:
         raise ConnectorError("the agent's document has a document type declaration, which is not allowed")
 
-    def _start(self, name: str, attributes: dict[str, str]) -> None:
-        local = name.rpartition(" ")[2]
-        if not self._seen:
-            self._seen = True
-            if local == "MTConnectError":
-                self._error = []
-            elif local != self._root:
-                raise ConnectorError(f"the agent answers with {local[:40]} where {self._root} is expected")
-        if len(self._open) >= MAX_DEPTH:
-            raise ConnectorError(f"the agent's document is nested more than {MAX_DEPTH} deep")
-        self._open.append(local)
-        self._clear()
-        if self._error is None:
-            self._begin(local, {key.rpartition(" ")[2]: value for key, value in attributes.items()})
-        elif "errorCode" in attributes and len(self._error) < 5:
-            self._error.append(attributes["errorCode"][:MAX_ERROR])
-
-    def _add(self, text: str) -> None:
-        self._length += len(text)
-        if self._length > MAX_TEXT:
-            raise ConnectorError(f"a text in the agent's document has more than {MAX_TEXT} characters")
-        self._text.append(text)
-
-    def _stop(self, name: str) -> None:
-        local, text = name.rpartition(" ")[2], "".join(self._text).strip()
-        if self._error is None:
-            self._end(local, text)
-        elif text and len(self._error) < 10:
-            self._error.append(text[:MAX_ERROR])
-        self._open.pop()
-        self._clear()
-
-    def _clear(self) -> None:
-        self._text.clear()
-        self._length = 0
-
-
-class DevicesDocument:
-    """Parses the answer to a probe: the data items of all devices."""
-
-    def __init__(self) -> None:
-        self.items: list[DataItem] = []
-        self._parts: list[tuple[int, frozenset[str], str]] = []  # open components: depth, names, label
-        self._parser = _Parser("MTConnectDevices", self._begin, self._end)
-        self.feed, self.finish = self._parser.feed, self._parser.finish
+    def _begin_root(self, name: str, attributes: dict[str, str]) -> None:
+        begin, end = self._begin, self._end
+        if (local := _local(name)) == "MTConnectError":
+            self._error = []
+            begin, end = self._begin_error, self._end_error
+        elif local != self.ROOT:
+            raise ConnectorError(f"the agent answers with {local[:40]} where {self.ROOT} is expected")
+        self._expat.StartElementHandler, self._expat.EndElementHandler = begin, end
+        begin(name, attributes)
 
     def _begin(self, name: str, attributes: dict[str, str]) -> None:
+        raise NotImplementedError
+
+    def _end(self, name: str) -> None:
+        raise NotImplementedError
+
+    def _enter(self) -> int:
+        """Begin an element. Return its depth; the root has 1."""
+        self._text.clear()
+        self._depth += 1
+        if self._depth > MAX_DEPTH:
+            raise _too_deep()
+        return self._depth
+
+    def _leave(self) -> None:
+        """End an element."""
+        self._text.clear()
+        self._depth -= 1
+
+    def _whole_text(self) -> str:
+        """Return the text since the last tag."""
+        text = "".join(self._text)
+        if len(text) > MAX_TEXT:
+            raise ConnectorError(f"a text in the agent's document has more than {MAX_TEXT} characters")
+        return text.strip()
+
+    def _begin_error(self, _name: str, attributes: dict[str, str]) -> None:
+        self._enter()
+        if self._error is not None and "errorCode" in attributes and len(self._error) < 5:
+            self._error.append(attributes["errorCode"][:MAX_ERROR])
+
+    def _end_error(self, _name: str) -> None:
+        text = self._whole_text()
+        if self._error is not None and text and len(self._error) < 10:
+            self._error.append(text[:MAX_ERROR])
+        self._leave()
+
+
+def _too_deep() -> ConnectorError:
+    return ConnectorError(f"the agent's document is nested more than {MAX_DEPTH} deep")
+
+
+def _local(name: str) -> str:
+    """Return a name without its namespace."""
+    return name.rpartition(" ")[2]
+
+
+class DevicesDocument(_Document):
+    """Parses the answer to a probe: the data items of all devices."""
+
+    ROOT = "MTConnectDevices"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.items: list[DataItem] = []
+        self._open: list[str] = [""]  # names of the open elements
+        self._parts: list[tuple[int, frozenset[str], str]] = []  # open components: depth, names, label
+
+    def _begin(self, name: str, attributes: dict[str, str]) -> None:
+        depth, local, parent = self._enter(), _local(name), self._open[-1]
+        self._open.append(local)
         names = frozenset(attributes[key] for key in ("name", "id", "uuid") if attributes.get(key))
-        if self._parser.parent in ("Devices", "Components"):
-            label = attributes.get("name") or attributes.get("id") or name
-            self._parts.append((self._parser.depth, names | {name}, label))
-        elif name == "DataItem":
+        if parent in ("Devices", "Components"):
+            label = attributes.get("name") or attributes.get("id") or local
+            self._parts.append((depth, names | {local}, label))
+        elif local == "DataItem":
             self._add(names, attributes)
 
     def _add(self, names: frozenset[str], attributes: dict[str, str]) -> None:
@@ -193,56 +211,79 @@ class DevicesDocument:
             )
         )
 
-    def _end(self, _name: str, _text: str) -> None:
-        if self._parts and self._parts[-1][0] == self._parser.depth:
+    def _end(self, _name: str) -> None:
+        if self._parts and self._parts[-1][0] == self._depth:
             self._parts.pop()
+        self._open.pop()
+        self._leave()
 
 
-class StreamsDocument:
+class StreamsDocument(_Document):
     """Parses values: the answer to ``current`` or ``sample``. It keeps only the wanted data items."""
 
-    def __init__(self, wanted: Collection[str]) -> None:
+    ROOT = "MTConnectStreams"
+
+    def __init__(self, wanted: Container[str]) -> None:
+        super().__init__()
         self.streams = Streams()
         self._wanted = wanted
-        self._open: dict[str, str] | None = None
-        self._parser = _Parser("MTConnectStreams", self._begin, self._end)
-        self.feed = self._parser.feed
+        self._values_depth = 0
+        """Depth of the values in the present Samples, Events or Condition; 0 outside of them."""
+        self._observations = self.streams.observations
+        self._value: dict[str, str] | None = None
+        """Attributes of the present value, if it is wanted."""
 
-    def finish(self) -> Streams:
-        """Return the content. Raise ConnectorError if the document is incomplete, or reports an error."""
-        self._parser.finish()
+    def finish(self) -> None:
+        """Parse the end. Raise ConnectorError if the document is incomplete, or reports an error of the agent."""
+        super().finish()
         if not self.streams.instance_id:
             raise ConnectorError("the agent's document has no Header with an instanceId")
-        self.streams.observations.sort(key=lambda one: one.sequence)
-        return self.streams
+        self.streams.observations.sort(key=attrgetter("sequence"))
+
+    # Both methods run for each value of the stream, so they do the work of _enter and _leave themselves.
 
     def _begin(self, name: str, attributes: dict[str, str]) -> None:
-        if name == "Header":
+        self._text.clear()
+        depth = self._depth = self._depth + 1
+        if depth == self._values_depth:
+            if attributes.get("dataItemId") in self._wanted:
+                self._value = attributes
+            return
+        if depth > MAX_DEPTH:
+            raise _too_deep()
+        if self._values_depth:  # within a value
+            return
+        local = _local(name)
+        if local in _KINDS:
+            self._values_depth = depth + 1
+        elif local == "Header":
             self.streams.instance_id = attributes.get("instanceId", "")[:64]
             self.streams.next_sequence = _whole(attributes.get("nextSequence", ""), "nextSequence")
             self.streams.last_sequence = _whole(attributes.get("lastSequence", "0"), "lastSequence")
-        elif self._parser.parent in _KINDS and attributes.get("dataItemId") in self._wanted:
-            self._open = attributes
 
-    def _end(self, name: str, text: str) -> None:
-        found = self._open
-        if found is None or self._parser.parent not in _KINDS:
-            return
-        self._open = None
-        if len(self.streams.observations) >= MAX_OBSERVATIONS:
-            raise ConnectorError(f"the agent's document has more than {MAX_OBSERVATIONS} observations")
-        self.streams.observations.append(
-            Observation(
-                found["dataItemId"],
-                _whole(found.get("sequence", ""), "sequence"),
-                to_ns(found.get("timestamp", "")),
-                name,
-                text,
-                found.get("nativeCode", ""),
+    def _end(self, name: str) -> None:
+        if self._value is not None and self._depth == self._values_depth:
+            get = self._value.get
+            self._value = None
+            if len(self._observations) >= MAX_OBSERVATIONS:
+                raise ConnectorError(f"the agent's document has more than {MAX_OBSERVATIONS} observations")
+            self._observations.append(
+                Observation(
+                    get("dataItemId", ""),
+                    _whole(get("sequence", ""), "sequence"),
+                    to_ns(get("timestamp", "")),
+                    _local(name),
+                    self._whole_text(),
+                    get("nativeCode", ""),
+                )
             )
-        )
+        elif self._depth < self._values_depth:
+            self._values_depth = 0
+        self._text.clear()
+        self._depth -= 1
 
 
+@lru_cache(maxsize=1000)  # values that changed together have the same timestamp
 def to_ns(text: str) -> int:
     """Return a timestamp as ns since 1970 UTC, or 0 if the text is not a timestamp."""
     match = _TIME.fullmatch(text)

@@ -24,6 +24,8 @@ from shmio_mtconnect.documents import DataItem, Observation
 LEVELS: Final = {"Normal": 0, "Warning": 1, "Fault": 2}
 MAX_ACTIVE: Final = 1000
 """Most conditions of one data item that are kept as active at once."""
+MAX_NUMBER: Final = 80
+"""Longest text, in characters, that is a number at a glance."""
 _NUMBER = re.compile(r"[+-]?([0-9]{1,40}\.?[0-9]{0,40}|\.[0-9]{1,40})([eE][+-]?[0-9]{1,3})?", re.ASCII)
 _BOOLS: Final = {
     "TRUE": True,
@@ -117,6 +119,9 @@ class Target:
     def __init__(self, index: int, register: Register, address: Address, item: DataItem) -> None:
         self._index, self._register, self._address = index, register, address
         self.item = item
+        self._is_condition = item.category == "CONDITION"
+        self._is_plain = register.type in ("REAL", "LREAL") and not register.dims and register.scale is None
+        """True if a finite number is the register's value as it is."""
         self._conditions = Conditions()
         self._last = -1
 
@@ -130,7 +135,7 @@ class Target:
             return
         self._last = observation.sequence
         text: str = observation.text
-        if self.item.category == "CONDITION":
+        if self._is_condition:
             worst = self._conditions.add(observation)
             if worst is None:
                 image.fail(self._index, BAD_NO_DATA, observation.source_ns)
@@ -157,6 +162,8 @@ class Target:
 
         Raise ValueError if the text is not a value, OverflowError if it has too few elements.
         """
+        if self._is_plain and (number := _finite(text)) is not None:
+            return number
         register = self._register
         if self._address.text is not None:
             return text == self._address.text
@@ -189,3 +196,14 @@ class Target:
         if register.scale is None and not value.is_integer():
             raise ValueError
         return round(value)
+
+
+def _finite(text: str) -> float | None:
+    """Return the number in a text; None if it may be something else."""
+    if len(text) > MAX_NUMBER or not text.isascii() or "_" in text:  # Python's own digits and separators
+        return None
+    try:
+        number = float(text)
+    except ValueError:
+        return None
+    return number if math.isfinite(number) else None
