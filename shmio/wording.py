@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Sequence
 from typing import Final
 
@@ -20,6 +19,8 @@ def counted(count: int, noun: str) -> str:
 
 def near(word: str, names: Iterable[str]) -> list[str]:
     """Return a list with only the name most similar to ``word``, ignoring case; empty if none is similar."""
+    import difflib  # noqa: PLC0415  takes 1 ms, and most processes report no such fault
+
     folded = {name.lower(): name for name in names}
     found = difflib.get_close_matches(word.lower(), folded, 1) if len(word) <= MAX_HINTED else []
     return [folded[found[0]]] if found else []

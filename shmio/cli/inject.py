@@ -18,7 +18,6 @@ import msgspec
 from shmio.cli.common import dumps, seconds, seed_number, stop_on_signals
 from shmio.cli.set import Pairs
 from shmio.config import Declaration
-from shmio.config.campaign import read_campaign
 from shmio.config.declaration import shifted, with_seed
 from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
 from shmio.layout.model import Layout
@@ -210,6 +209,8 @@ def run_campaign(cell: Cell, options: argparse.Namespace) -> int:
             was started.
 
     """
+    from shmio.config.campaign import read_campaign  # noqa: PLC0415  only for a file
+
     seed = secrets.randbits(SEED_BITS) if options.seed is None else options.seed
     read = read_campaign(options.file)
     declarations = [with_seed(declaration, seed) for declaration in read]

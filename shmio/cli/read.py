@@ -41,9 +41,10 @@ def list_registers(cell: Cell, options: argparse.Namespace) -> int:
         return 0
     width = max((len(path) for path, _ in found), default=0)
     lines = [
-        printable(f"{path:<{width}}  {_type(one)}{f'  {one.comment}' if one.comment else ''}".rstrip())
-        for path, one in found
+        f"{path:<{width}}  {_type(one)}{f'  {one.comment}' if one.comment else ''}".rstrip() for path, one in found
     ]
+    if not "".join(lines).isprintable():
+        lines = [printable(line) for line in lines]
     if lines:
         print("\n".join(lines))  # printing each line takes longer than making it
     return 0

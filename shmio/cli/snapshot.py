@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 from collections.abc import Iterable, Iterator
 from datetime import datetime
 from typing import Any, Final
+
+import msgspec
 
 from shmio.cli.common import dumps
 from shmio.logs import printable
@@ -65,7 +66,7 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
 
 
 def _plain(one: SnapshotInfo) -> dict[str, Any]:
-    return dataclasses.asdict(one)
+    return msgspec.structs.asdict(one)
 
 
 def _lines(found: Iterable[SnapshotInfo]) -> Iterator[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import os
 from typing import Final
 
@@ -49,6 +48,8 @@ class Address(msgspec.Struct, frozen=True):
         """
         if self.host == "localhost":
             return True
+        import ipaddress  # noqa: PLC0415  takes 1 ms, and most processes check no address
+
         try:
             return ipaddress.ip_address(self.host).is_loopback
         except ValueError:

@@ -159,7 +159,9 @@ def choose(patterns: Iterable[str], layouts: Mapping[str, Layout]) -> list[tuple
         PathError: A pattern names nothing, or ends in ``/in``.
 
     """
-    chosen: dict[tuple[str, str], Register] = {}  # by path, because hashing a path is faster than hashing a register
+    chosen: list[tuple[str, Register]] = []
+    sources: set[str] = set()
+    repeated = False
     default = next(iter(layouts)) if len(layouts) == 1 else None
     for pattern in patterns:
         topic = parse_topic(pattern, layouts, default)
@@ -170,6 +172,10 @@ def choose(patterns: Iterable[str], layouts: Mapping[str, Layout]) -> list[tuple
         registers = named(layouts[topic.source], topic)
         if not registers:
             raise PathError(f"{pattern}: source {topic.source!r} has no such register")
-        for register in registers:
-            chosen.setdefault((topic.source, register.path), register)
-    return [(source, register) for (source, _), register in chosen.items()]
+        chosen += [(topic.source, register) for register in registers]
+        repeated = repeated or topic.source in sources
+        sources.add(topic.source)
+    if not repeated:
+        return chosen
+    # By path, because hashing a path is faster than hashing a register.
+    return list({(source, register.path): (source, register) for source, register in chosen}.values())

@@ -12,7 +12,7 @@ import hashlib
 import math
 import re
 from bisect import bisect_left
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Annotated, Final, Literal
@@ -254,11 +254,11 @@ class Layout:
     # than the layout.
     @cached_property
     def _sorted(self) -> _Sorted:
-        return _Sorted(register.path for register in self.registers)
+        return _Sorted([register.path for register in self.registers])
 
     @cached_property
     def _sorted_in_lower_case(self) -> _Sorted:
-        return _Sorted(register.path.lower() for register in self.registers)
+        return _Sorted([register.path.lower() for register in self.registers])
 
     def members(self, prefix: str) -> tuple[int, ...]:
         """Return the indices of the registers below a structure or an array of structures."""
@@ -362,10 +362,9 @@ def _describe(register: Register) -> Mapping[str, object]:
 class _Sorted:
     """The paths of a layout in sorted order, with their indices; paths below a structure are adjacent."""
 
-    def __init__(self, paths: Iterable[str]) -> None:
-        ordered = sorted((path, index) for index, path in enumerate(paths))
-        self._paths = [path for path, _ in ordered]
-        self._indices = [index for _, index in ordered]
+    def __init__(self, paths: Sequence[str]) -> None:
+        self._indices = sorted(range(len(paths)), key=paths.__getitem__)
+        self._paths = [paths[index] for index in self._indices]
 
     def below(self, prefix: str) -> tuple[int, ...]:
         """Return the ascending indices of the paths below the prefix."""

@@ -22,7 +22,7 @@ import weakref
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
@@ -37,13 +37,10 @@ from shmio.local.events import Events
 from shmio.local.injection import Campaign, ObservedWrite, Shadow, as_given, by_path, lift_all, written
 from shmio.local.reading import View, reading
 from shmio.local.replays import Replays
-from shmio.local.snapshots import Snapshots, States
 from shmio.local.subscription import Following, Subscription
-from shmio.local.time_control import Coordinator, Timekeeper
 from shmio.local.writer import SourceWriter
 from shmio.model.clock import Clock, check_step
 from shmio.model.injection import Injection, Lifted, Running
-from shmio.model.snapshot import SnapshotInfo
 from shmio.model.values import Outcome, Quality, Reading
 from shmio.segment.block import Block, Cursor, Entry, Frame, Layouts
 from shmio.segment.commands import Direction
@@ -51,6 +48,11 @@ from shmio.segment.injection_list import InjectionEntry
 from shmio.segment.processes import Activity, Report
 from shmio.segment.segment import Segment, running_instances
 from shmio.wording import name_one, unknown
+
+if TYPE_CHECKING:
+    from shmio.local.snapshots import Snapshots, States
+    from shmio.local.time_control import Coordinator, Timekeeper
+    from shmio.model.snapshot import SnapshotInfo
 
 _TURN_S: Final = 1.0
 """Interval in s at which a waiting reader checks whether the instance still runs."""
@@ -70,8 +72,8 @@ class Attachment:
         snapshot_folder: Callable[[], Path] | None = None,
     ) -> None:
         self._segment = segment
-        self._time = Timekeeper(segment, coordinator)
-        self._snapshots = Snapshots(segment, self._time, states, snapshot_folder)
+        self._coordinator, self._states, self._snapshot_folder = coordinator, states, snapshot_folder
+        self._timekeeper: Timekeeper | None = None
         self.replay = Replays(segment)
         """The instance's replays. Call it as ``replay`` of :class:`shmio.Cell`, or use its methods.
 
@@ -82,6 +84,25 @@ class Attachment:
         self._source_writers: dict[str, SourceWriter] = {}
         self._open: weakref.WeakSet[Following[Any]] = weakref.WeakSet()
         self._detached = False
+
+    # Most programs neither move time nor use snapshots, and the modules for both take long to import.
+
+    @property
+    def _time(self) -> Timekeeper:
+        """Moves the instance's time."""
+        from shmio.local.time_control import Timekeeper  # noqa: PLC0415
+
+        with self._lock:
+            if self._timekeeper is None:
+                self._timekeeper = Timekeeper(self._segment, self._coordinator)
+            return self._timekeeper
+
+    @property
+    def _snapshots(self) -> Snapshots:
+        """Saves and restores snapshots."""
+        from shmio.local.snapshots import Snapshots  # noqa: PLC0415
+
+        return Snapshots(self._segment, self._time, self._states, self._snapshot_folder)
 
     def _blocks(self) -> dict[str, Block]:
         if self._segment.closed:
@@ -643,7 +664,8 @@ class Attachment:
         for one in following:
             one.end()
         try:
-            self._time.close()
+            if self._timekeeper is not None:
+                self._timekeeper.close()
         finally:
             self._segment.close()
 

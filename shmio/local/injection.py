@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import secrets
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -459,7 +458,7 @@ def by_path(topics: Iterable[Topic], values: Mapping[str, object]) -> dict[str, 
 
 def as_given(paths: Iterable[str], outcomes: Iterable[Outcome]) -> list[Outcome]:
     """Return outcomes with the paths that the caller gave."""
-    return [dataclasses.replace(outcome, path=path) for path, outcome in zip(paths, outcomes, strict=True)]
+    return [msgspec.structs.replace(outcome, path=path) for path, outcome in zip(paths, outcomes, strict=True)]
 
 
 def _deadline(timeout_s: float | None) -> float | None:

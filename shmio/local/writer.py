@@ -6,7 +6,6 @@ import os
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
 from typing import TYPE_CHECKING, Final, Unpack
@@ -104,8 +103,7 @@ class CommandSender:
             return number
 
 
-@dataclass(slots=True)
-class PendingCommand:
+class PendingCommand(msgspec.Struct):
     """A command whose outcome is not known yet.
 
     ``events`` is the cursor that will read the outcome.

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
+
+import msgspec
 
 from shmio.model.values import Quality
 
@@ -57,8 +58,7 @@ class EventKind(StrEnum):
     """A kind that only a later version of shmio knows."""
 
 
-@dataclass(frozen=True, slots=True)
-class Event:
+class Event(msgspec.Struct, frozen=True):
     """An event of a source.
 
     A write of more than 256 bytes has several events, one for each part.
@@ -105,5 +105,5 @@ class Event:
     by: str = ""
     direction: str = ""
     paths: tuple[str, ...] = ()
-    values: Mapping[str, Any] = field(default_factory=dict)
+    values: Mapping[str, Any] = msgspec.field(default_factory=dict)
     missed: int = 0

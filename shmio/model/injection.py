@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import msgspec
@@ -61,8 +60,7 @@ class Injection(msgspec.Struct, Generic[DeclarationT], frozen=True, omit_default
     source: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Declared:
+class Declared(msgspec.Struct, frozen=True):
     """A declared injection of a campaign. ``seed`` is random if the declaration has no seed."""
 
     source: str
@@ -71,8 +69,7 @@ class Declared:
     seed: int
 
 
-@dataclass(frozen=True, slots=True)
-class InjectionEvent:
+class InjectionEvent(msgspec.Struct, frozen=True):
     """An event of a declared injection.
 
     Attributes:
@@ -99,8 +96,7 @@ class InjectionEvent:
     text: str
 
 
-@dataclass(frozen=True, slots=True)
-class Lifted:
+class Lifted(msgspec.Struct, frozen=True):
     """Result of lifting an injection.
 
     ``failure`` is the reason why the injection was not lifted; empty if it was lifted.

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import TypedDict
 
+import msgspec
 
-@dataclass(frozen=True, slots=True)
-class ReplayStatus:
+
+class ReplayStatus(msgspec.Struct, frozen=True):
     """Status of one source that replays a recording.
 
     Unless the replay is paused, its position moves ``speed`` times as fast as the instance's clock.

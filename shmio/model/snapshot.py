@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import TypeVar
 
 import msgspec
@@ -13,8 +12,7 @@ from shmio.errors import SnapshotError
 Part = TypeVar("Part")
 
 
-@dataclass(frozen=True, slots=True)
-class SnapshotInfo:
+class SnapshotInfo(msgspec.Struct, frozen=True):
     """A saved state of an instance.
 
     Attributes:
@@ -34,7 +32,7 @@ class SnapshotInfo:
     time_ns: int = 0
     step: int = 0
     size_bytes: int = 0
-    left_out: Mapping[str, str] = field(default_factory=dict)
+    left_out: Mapping[str, str] = msgspec.field(default_factory=dict)
     problem: str = ""
 
 

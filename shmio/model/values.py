@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from typing import TYPE_CHECKING, Final
+
+import msgspec
 
 if TYPE_CHECKING:
     from shmio.layout.model import Register
@@ -49,8 +50,7 @@ class Column(IntEnum):
     TEXT = 7
 
 
-@dataclass(frozen=True, slots=True)
-class Reading:
+class Reading(msgspec.Struct, frozen=True):
     """State of one register when it was read.
 
     Attributes:
@@ -111,8 +111,7 @@ class OutcomeKind(StrEnum):
 _DONE = frozenset({OutcomeKind.WRITTEN, OutcomeKind.TAKEN, OutcomeKind.SHADOWED, OutcomeKind.ACCEPTED})
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
+class Outcome(msgspec.Struct, frozen=True):
     """The outcome of one written value.
 
     Attributes:

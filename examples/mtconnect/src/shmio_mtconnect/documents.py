@@ -117,14 +117,15 @@ class _Document:
         raise ConnectorError("the agent's document has a document type declaration, which is not allowed")
 
     def _begin_root(self, name: str, attributes: dict[str, str]) -> None:
-        begin, end = self._begin, self._end
         if (local := _local(name)) == "MTConnectError":
             self._error = []
-            begin, end = self._begin_error, self._end_error
-        elif local != self.ROOT:
+            self._expat.StartElementHandler, self._expat.EndElementHandler = self._begin_error, self._end_error
+            self._begin_error(name, attributes)
+            return
+        if local != self.ROOT:
             raise ConnectorError(f"the agent answers with {local[:40]} where {self.ROOT} is expected")
-        self._expat.StartElementHandler, self._expat.EndElementHandler = begin, end
-        begin(name, attributes)
+        self._expat.StartElementHandler, self._expat.EndElementHandler = self._begin, self._end
+        self._begin(name, attributes)
 
     def _begin(self, name: str, attributes: dict[str, str]) -> None:
         raise NotImplementedError

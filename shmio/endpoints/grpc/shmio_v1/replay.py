@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import threading
 from functools import partial
 from typing import Any, Final
@@ -91,4 +90,4 @@ def _wanted(request: wire.ReplayRequest) -> ReplayRequest:
 
 
 def _to_wire(play: ReplayStatus) -> wire.Playing:
-    return wire.Playing(**dataclasses.asdict(play))
+    return wire.Playing(**msgspec.structs.asdict(play))

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import grpc
+import msgspec
 
 from shmio.audit.trail import Attempt
 from shmio.endpoints.grpc.server.error_status import Context, refuse
@@ -118,4 +118,4 @@ class _Still:
 
 
 def _to_wire(snapshot: SnapshotInfo) -> wire.Snapshot:
-    return wire.Snapshot(**dataclasses.asdict(snapshot))
+    return wire.Snapshot(**msgspec.structs.asdict(snapshot))

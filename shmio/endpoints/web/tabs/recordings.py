@@ -6,7 +6,6 @@ import asyncio
 import shlex
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
 from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final
@@ -215,7 +214,7 @@ class RecordingsTab(Tab):
             found = await run_in_threadpool(self.page.served.cell.replay.status)
         except CommandError:  # the instance plays no recording
             found = []
-        return {"replays": [asdict(one) for one in found], "kinds": ["any", *map(str, _KINDS)]}
+        return {"replays": [msgspec.structs.asdict(one) for one in found], "kinds": ["any", *map(str, _KINDS)]}
 
     @call("control", Request)
     async def replay(self, given: Request) -> list[dict[str, Any]]:
@@ -224,7 +223,7 @@ class RecordingsTab(Tab):
         async with self._moving:
             replay = self.page.served.cell.replay
             found = await run_in_threadpool(replay.change, wanted, self._closed.is_set)
-        return [asdict(one) for one in found]
+        return [msgspec.structs.asdict(one) for one in found]
 
     def _commands(self, path: Path) -> dict[str, str]:
         """Return the commands that replay a file beside this instance, and in place of this instance.

@@ -414,7 +414,9 @@ EVENT = Event(
 @pytest.mark.parametrize("kind", EventKind)
 @pytest.mark.parametrize("direction", ["", "in", "out"])
 def test_an_event_is_the_same_behind_the_wire(kind: EventKind, direction: str) -> None:
-    event = Event(**{name: getattr(EVENT, name) for name in EVENT.__slots__} | {"kind": kind, "direction": direction})
+    event = Event(
+        **{name: getattr(EVENT, name) for name in EVENT.__struct_fields__} | {"kind": kind, "direction": direction}
+    )
     data = event_to_wire(event).SerializeToString()
     assert event_from_wire(wire.Event.FromString(data)) == event
 
