@@ -85,7 +85,7 @@ class Worker:
     def running(self) -> None:
         """Report that start-up is over."""
         self.report(activity=Activity.RUNNING)
-        self.log.info("running")
+        self.log.info("the process is running")
 
     def report(
         self,
@@ -191,12 +191,12 @@ def main(run: Callable[[Worker], None]) -> int:
             realtime.prioritise(priority)
         run(worker)
         worker.report(activity=Activity.STOPPING)
-        worker.log.info("stopped")
+        worker.log.info("the process has stopped")
     except ShmioError as error:
         _report_failure(worker, str(error))
         return 2 if isinstance(error, (ConfigError, LayoutError)) else 1
     except Exception:
-        logging.getLogger("shmio").exception("failed")
+        logging.getLogger("shmio").exception("the process failed")
         raise
     finally:
         trail.close_trail()

@@ -330,7 +330,11 @@ class Trail:
         while not self._closing.is_set() or self._waiting.qsize():
             batch = [*self._merge(self._batch(self._due_s()))]
             if batch and not self._keep_writing(b"".join(map(self._line, batch))):
-                log.error("%s; %d entries are lost", self.problem, len(batch) + self._waiting.qsize())
+                log.error(
+                    "%s; this process ends, and %d entries of the audit log are lost",
+                    self.problem,
+                    len(batch) + self._waiting.qsize(),
+                )
                 return
         for one in self._repeated.values():
             if one.last is not None:
@@ -392,7 +396,7 @@ class Trail:
                 before, self.problem = self.problem, f"audit: {self._path} cannot be written: {error.strerror}"
                 if self.problem != before:
                     log.error(
-                        "%s; up to %d entries wait for the disk, and commands are still carried out",
+                        "%s; up to %d entries wait for the disk, and shmio still carries out commands",
                         self.problem,
                         MAX_WAITING,
                     )

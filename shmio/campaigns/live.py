@@ -32,7 +32,7 @@ from shmio.segment.block import Layouts
 MAX_STEPS: Final = 256
 """Maximum number of steps of virtual time between two turns of the judge."""
 STOP_STEPS: Final = 64
-"""The same, if the run stops at the first failure: at most so many steps may follow the failure."""
+"""Maximum number of steps between two turns, and so after the failure, if the run stops at the first failure."""
 GOOD_S: Final = 10.0
 """Maximum time in s to wait at the start until the sources that the expectations read are good."""
 LOOK_S: Final = 0.02
@@ -43,7 +43,7 @@ BY: Final = "shmio-campaign"
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run does.
+    """What one run of a campaign does.
 
     Attributes:
         injections: The declared injections, with their seeds; their times count from the run's start.
@@ -70,7 +70,7 @@ class Plan:
 
 
 class LiveRun:
-    """One run of a campaign. The judge and the recording get the same frames."""
+    """Runs a campaign once, judges it and records it. The judge and the recording get the same frames."""
 
     def __init__(
         self,

@@ -38,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     around = arguments.verb == "record" and (arguments.before_s, arguments.after_s) != (None, None)
     if around and arguments.when is None:
-        parser.error("--before and --after need --when: without a condition, everything is recorded from now on")
+        parser.error("--before and --after need --when: without a condition, record stores everything from now on")
 
     module = MODULES.get(arguments.verb, arguments.verb)
     execute = load(f"shmio.cli.recordings.{module}:{arguments.verb}")

@@ -236,7 +236,7 @@ def _guarded(run: Callable[[], None]) -> None:
     try:
         run()
     except Exception:
-        logging.getLogger("shmio").exception("failed")
+        logging.getLogger("shmio").exception("the source's thread failed")
 
 
 def _busy_s(since_ns: int) -> float:

@@ -148,9 +148,9 @@ class QualityLog:
         self._state = state
         self._writer.event(Record(EventKind.QUALITY, reason), quality=quality)
         if quality is Quality.GOOD:
-            log.info("quality good%s", well, extra=fields(cycle=cycle))
+            log.info("the quality is good%s", well, extra=fields(cycle=cycle))
         else:
-            log.warning("quality %s: %s", quality, reason, extra=fields(cycle=cycle))
+            log.warning("the quality is %s: %s", quality, reason, extra=fields(cycle=cycle))
         return True
 
 

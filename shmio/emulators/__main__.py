@@ -53,7 +53,7 @@ def run(worker: Worker) -> None:
             device = _started(worker, listen, cleanup)
         if config["clock"] == "instance":
             _follow_clock(worker, device, selector, cleanup, faults)
-        worker.log.info("playing %s", program, extra=fields(address=listen))
+        worker.log.info("the emulator runs the program %s", program, extra=fields(address=listen))
         worker.running()
         worker.on_stop(lambda: os.eventfd_write(stop, 1))
         while not worker.stopping.is_set():

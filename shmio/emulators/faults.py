@@ -82,7 +82,7 @@ class FaultControl:
         self._disturb(request)
         note = "" if request.answers == "ok" else f"disturbed on command: {request.answers}"
         self._worker.report(note=f"{note} {request.delay_ms:g} ms" if request.answers == "delay" else note)
-        self._worker.log.info("answers: %s", request.answers, extra=fields(**what))
+        self._worker.log.info("a client changed how the emulator answers: %s", request.answers, extra=fields(**what))
         answer.ok()
 
     def _disturb(self, request: Disturb) -> None:

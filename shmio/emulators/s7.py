@@ -499,13 +499,13 @@ class S7Server(Server):
                 client, _ = listener.accept()
             except OSError as error:
                 if not self._stopping.is_set():  # the client has left, or no descriptor is free
-                    logger.warning("accept failed: %s", error)
+                    logger.warning("the emulator cannot accept a connection: %s", error)
                     self._stopping.wait(0.1)
                 continue
             try:
                 self._admit(client)
             except (OSError, RuntimeError) as error:  # the client has gone, or no thread can start
-                logger.warning("client refused: %s", error)
+                logger.warning("the emulator refused a client: %s", error)
                 client.close()
 
     def _admit(self, client: socket.socket) -> None:

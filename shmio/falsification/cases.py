@@ -38,7 +38,7 @@ class Stored(NamedTuple):
 
 
 def tables_for(tables: dict[str, Any], campaign: Path, config: Path, folder: Path) -> dict[str, Any]:
-    """Return tables for a campaign file in ``folder``: paths are relative to it.
+    """Return a campaign's tables for a new file in ``folder``, with all paths relative to this folder.
 
     Args:
         tables: The tables of a campaign.
@@ -60,7 +60,7 @@ def tables_for(tables: dict[str, Any], campaign: Path, config: Path, folder: Pat
 def store(
     folder: Path, name: str, tables: dict[str, Any], result: Result, comment: Sequence[str], limit_s: float
 ) -> Stored:
-    """Store a case, and run it twice from its file, each time in a new process.
+    """Store a failing case, and run it twice from its file, each time in a new process.
 
     Args:
         folder: Folder of the search.

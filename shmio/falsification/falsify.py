@@ -1,8 +1,8 @@
 """Searches a campaign's space for points at which an expectation fails.
 
-Results are learned in the order of the trials' numbers, and a point is chosen when all trials but
-the last ``jobs - 1`` before it have been learned. So the trials depend on the seed and on ``jobs``,
-but never on how long they take.
+The search learns results in the order of the trials' numbers. It chooses the next point when it has
+learned all trials before it, except the last ``jobs - 1``. So the trials depend on the seed and on
+``jobs``, but never on how long they take.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from shmio.falsification.shrink import Case, Shrinker
 from shmio.falsification.trial import Result, Status, Task
 
 LOOK_S: Final = 0.25
-"""Maximum time in s between two looks at whether to stop."""
+"""Maximum time in s between two checks whether the search must stop."""
 FIRST_TRIALS: Final = 10
-"""If none of so many trials at the beginning can run, the search ends."""
+"""Number of trials at the beginning of a search. If none of them can run, the search ends."""
 
 
 @dataclass

@@ -1,7 +1,7 @@
-"""The file of a search: its beginning, and the result of each trial, one JSON object a line.
+"""The file of a search: its beginning, and the result of each trial, as one JSON object on each line.
 
-A search that was interrupted at any moment goes on from it. A line that was not written to its end
-is dropped.
+A search that was interrupted at any moment continues from this file. The last line is dropped if it
+was not written to its end.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ MAX_LINE_BYTES: Final = 1 << 24
 
 
 class Beginning(msgspec.Struct):
-    """All that determines the trials of a search, besides the number of them.
+    """Everything that determines the trials of a search, except their number.
 
     Attributes:
         shmio: The version.
@@ -137,7 +137,7 @@ class Journal:
         os.ftruncate(self._fd, end)
 
     def lines(self) -> Iterator[Line]:
-        """Yield what has been written after the beginning.
+        """Yield the lines after the first: results and cases.
 
         Raises:
             ConfigError: A line is damaged.

@@ -28,7 +28,7 @@ END_S: Final = 5.0
 
 @dataclass
 class _Process:
-    """A process, and the trial that it runs. It is ready when it has said so, with an empty line."""
+    """A process, and the trial that it runs. It is ready when it has sent an empty line."""
 
     popen: subprocess.Popen[bytes]
     stdin: IO[bytes]
@@ -59,7 +59,7 @@ class Pool:
 
     @property
     def idle(self) -> int:
-        """How many more trials can be submitted."""
+        """Number of trials that can be submitted now."""
         return self.jobs - sum(one.task is not None for one in self._processes)
 
     def submit(self, task: Task) -> None:
@@ -72,7 +72,7 @@ class Pool:
             one.stdin.flush()
 
     def wait(self, timeout_s: float) -> list[Result]:
-        """Wait for results, at most for a time in s. Return those that there are."""
+        """Wait for results, for at most ``timeout_s`` seconds. Return the results that have arrived."""
         left_s = [self._left_s(one) for one in self._processes if one.task is not None]
         ready = self._selector.select(max(0.0, min([timeout_s, *left_s])))
         found = [result for key, _ in ready if (result := self._read(key.data)) is not None]

@@ -13,7 +13,7 @@ from shmio.errors import ConfigError
 from shmio.falsification.trial import Result
 
 HALVINGS: Final = 4
-"""How often the way from a value to a simpler one is halved."""
+"""How often the shrinker halves the distance between a value and a simpler one."""
 DIGITS: Final = (1, 2, 3, 4)
 """Numbers of digits to which a number may be rounded."""
 ROUNDS: Final = 2
@@ -21,7 +21,7 @@ ROUNDS: Final = 2
 
 @dataclass(frozen=True)
 class Case:
-    """A campaign at a point, with fewer injections and a shorter time.
+    """A campaign with one value for each range, with fewer injections and a shorter duration.
 
     Attributes:
         point: The value of each dimension.
@@ -95,7 +95,7 @@ class Shrinker:
         return self._case, self._result
 
     def _try(self, case: Case) -> bool:
-        """Take a case over if it fails, too. Return whether it does."""
+        """Run a case, and keep it if it fails, too. Return whether it fails."""
         if self._left <= 0 or self.stopped or case == self._case:
             return False
         tables = case.tables(self._space)

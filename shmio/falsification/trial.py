@@ -1,4 +1,4 @@
-"""One trial: a campaign without ranges, run in a laboratory, and what came out."""
+"""Runs one trial, a campaign without ranges, in a laboratory, and returns its result."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from shmio.plan.processes import Plan as InstancePlan
 from shmio.simulation.model import explain
 
 LIMIT: Final = 1e300
-"""Robustness beyond this counts as this much, because an optimiser takes no infinity."""
+"""Limit of the robustness. A greater one counts as this, because an optimiser takes no infinity."""
 
 Status = Literal["passed", "failed", "inconclusive", "error", "invalid"]
 
@@ -57,7 +57,7 @@ class Found(msgspec.Struct):
 
 
 class Result(msgspec.Struct):
-    """What came out of a trial.
+    """The result of a trial.
 
     Attributes:
         number: Number of the trial.
@@ -82,7 +82,7 @@ class Result(msgspec.Struct):
 
     @property
     def robustness(self) -> float | None:
-        """What the search minimises: the least robustness of all expectations. Below 0: one failed.
+        """The number that the search minimises: the least robustness of all expectations. Below 0: one failed.
 
         The robustness of an expectation is the greatest that is possible, whatever unknown values
         were: an inconclusive one is never below 0. None if there is nothing to minimise.

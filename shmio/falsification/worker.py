@@ -1,7 +1,7 @@
-"""A process that runs trials, one after another: one line of JSON in and one out for each.
+"""A process that runs trials, one after another: it reads a trial as a line of JSON, and writes its result.
 
-It begins with an empty line, which says that it is ready. A model that crashes or hangs takes only
-this process with it.
+It first writes an empty line, which says that it is ready. A model that crashes or hangs affects only
+this process.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ _UNKNOWN: Final = (
 )
 
 Refusals = dict[str, str]
-"""Why processes have refused, by name."""
+"""The reasons of the processes that have refused a request, by name of the process."""
 
 
 class States(Protocol):
@@ -65,7 +65,7 @@ class States(Protocol):
 
 
 class StillTime(Protocol):
-    """What moves time, and can keep it still."""
+    """An object that moves time, and can keep it still."""
 
     def still(self) -> AbstractContextManager[Coordinator]:
         """Own time while the ``with`` block runs. Raise TimeError if that is not possible."""
@@ -123,8 +123,8 @@ class Snapshots:
         """Restore a snapshot, of this instance or of another one with the same configuration.
 
         Raises:
-            SnapshotError: There is no such snapshot, it is damaged, or it does not fit; nothing has
-                been changed. Or a process could not restore its state; then it still has the old one, or bad data.
+            SnapshotError: There is no such snapshot, it is damaged, or it does not fit: nothing was
+                changed. Or a process could not restore its state: it has its old state, or bad data.
             TimeError: Time is real, or another program owns it.
         """
         folder = self._folder()

@@ -23,7 +23,7 @@ log = logging.getLogger("shmio.snapshot")
 
 
 class StateKeeper(Protocol):
-    """What has the state of a process. The methods raise ShmioError."""
+    """An object that has the state of a process. Its methods raise ShmioError."""
 
     def save(self, name: str) -> bytes:
         """Return the state, for the snapshot ``name``."""

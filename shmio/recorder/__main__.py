@@ -44,7 +44,7 @@ def run(worker: Worker) -> None:
     else:
         series = RotatingRecorder(tap, settings, SUPERVISED, attachments)
     goes_on = ", continuing where the previous recorder ended" if known else ""
-    worker.log.info("recording %s%s%s", _note(series), goes_on, elsewhere)
+    worker.log.info("the recorder is recording %s%s%s", _note(series), goes_on, elsewhere)
     keeper = Housekeeper(segment.instance, settings, SUPERVISED, series.present)
     keeper.start()
     _record(worker, series)
@@ -53,7 +53,9 @@ def run(worker: Worker) -> None:
         worker.log.error("%s", unclosed)
     _report(worker, series, "")
     counters = series.counters
-    worker.log.info("recorded %d frames and %d events; missed %d", counters.frames, counters.events, counters.missed)
+    worker.log.info(
+        "the recorder recorded %d frames and %d events; it missed %d", counters.frames, counters.events, counters.missed
+    )
 
 
 def _elsewhere(before: Report, directory: Path) -> str:
@@ -90,7 +92,7 @@ def _record(worker: Worker, series: RotatingRecorder | TriggeredRecorder) -> Non
         if problem and not before:
             worker.log.error("%s", problem)
         elif before and not problem:
-            worker.log.info("%s is being written again", series.file)
+            worker.log.info("the recorder writes %s again", series.file)
         _report(worker, series, problem)
 
 

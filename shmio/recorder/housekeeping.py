@@ -99,12 +99,14 @@ class Housekeeper:
             with Reader(file.path, own=True) as reader:
                 closed = reader.records.footer() is not None
             if not closed and finalise(file.path):
-                log.info("closed %s, because its recorder died before it could close the file", file.path)
+                log.info(
+                    "the recorder closed %s, because an earlier recorder died before it could close the file", file.path
+                )
                 file, closed = _file(file.path) or file, True
             self._own[file] = closed
         except (OSError, RecordingError) as error:
             self._strange.add(file)
-            log.warning("%s is left unchanged: %s", file.path, error)
+            log.warning("the recorder leaves %s unchanged: %s", file.path, error)
 
     def _delete(self, present: list[_File]) -> None:
         """Delete closed files that are too old.
@@ -133,10 +135,12 @@ class Housekeeper:
         except OSError as error:
             if file not in self._undeletable:
                 self._undeletable.add(file)
-                log.warning("%s cannot be deleted: %s; %s", file.path, error.strerror, why)
+                log.warning(
+                    "the recorder cannot delete %s: %s; it should be deleted because %s", file.path, error.strerror, why
+                )
             return False
         del self._own[file]
-        log.info("deleted %s: %s", file.path, why)
+        log.info("the recorder deleted %s: %s", file.path, why)
         return True
 
 

@@ -42,7 +42,7 @@ def own_files(directory: Path, instance: str) -> list[Path]:
                 (found if is_own(file.lstat()) else strange).append(file)
     if strange:
         more = f" and {len(strange) - 1} more" if len(strange) > 1 else ""
-        log.warning("ignoring %s%s: not a regular file of this user", strange[0], more)
+        log.warning("the recorder ignores %s%s: this is not a regular file of this user", strange[0], more)
     return found
 
 

@@ -606,12 +606,12 @@ class RotatingRecorder:
         try:
             self.recorder = self._begin(self.tap, old.places, {}, after=old.output)
         except RecordingError as error:
-            log.error("%s; continuing in %s", error, old.output.path)
+            log.error("%s; the recorder continues in %s", error, old.output.path)
             self._again_s = time.monotonic() + RENEWAL.most_s
             return
         old.end()
         self._ending.append(old)
-        log.info("recording to %s, continuing where %s ends", self.recorder.output.path, old.output.path.name)
+        log.info("the recorder continues in %s, where %s ends", self.recorder.output.path, old.output.path.name)
 
     def _renew(self, doubtful: Recorder) -> bool:
         if time.monotonic() < self._again_s:
@@ -631,7 +631,7 @@ class RotatingRecorder:
         except RecordingError as error:
             log.error("%s; %s", output.problem, error)
             return False
-        log.error("%s; continuing in %s", output.problem, recorder.output.path)
+        log.error("%s; the recorder continues in %s", output.problem, recorder.output.path)
         if self.recorder is not doubtful:
             self._ending.remove(doubtful)
             output.close(0)

@@ -224,8 +224,8 @@ class TriggeredRecorder:
         if sum(series.waiting for series in self._ending) > self._settings.buffer_bytes:
             if not self._held:
                 log.error(
-                    "the trigger %s has fired, but no new file is started, because earlier files still wait for "
-                    "the disk",
+                    "the trigger %s has fired, but the recorder starts no new file, because earlier files still "
+                    "wait for the disk",
                     self._trigger.when,
                 )
             self._held = True
@@ -240,13 +240,15 @@ class TriggeredRecorder:
             )  # fmt: skip
         except RecordingError as error:  # the next frame that fires the trigger retries
             if not self._problem:
-                log.error("%s: %s", self._trigger.when, error)
+                log.error(
+                    "the trigger %s has fired, but the recorder cannot start a file: %s", self._trigger.when, error
+                )
             self._problem = str(error)
             return
         self._problem = ""
         self._series = series
         series.put(before)
-        log.info("the trigger %s has fired: recording to %s", self._trigger.when, series.file)
+        log.info("the trigger %s has fired; the recorder is recording to %s", self._trigger.when, series.file)
 
     def _end(self, last: Sequence[BlockEntry | InstanceEntry]) -> None:
         if series := self._series:

@@ -191,19 +191,19 @@ def _log_step(managed: ManagedProcess, before: Life, action: Action | None, limi
         if not before.stuck:
             log.error("%s: %s", name, life.note)
     elif life.state is State.RUNNING:
-        log.info("%s running", name, extra=fields(pid=managed.child.pid) if managed.child else None)
+        log.info("%s is running", name, extra=fields(pid=managed.child.pid) if managed.child else None)
     elif life.state is State.HUNG:
-        log.warning("%s hangs (%s); killing it", name, life.note)
+        log.warning("%s hangs (%s); the supervisor is killing it", name, life.note)
     elif life.state is State.FATAL:
         log.error("%s cannot work as configured: %s", name, life.note)
     elif life.state is State.BACKOFF:
         wait_s = policy.backoff_s(life.crashes, limits)
         when = f"in {wait_s:g} s" if wait_s else "at once"
-        log.warning("%s crashed: %s; starting it again %s", name, life.note, when)
+        log.warning("%s crashed: %s; the supervisor is starting it again %s", name, life.note, when)
     elif life.state is State.STOPPED:
-        log.info("%s stopped", name)
+        log.info("%s has stopped", name)
     elif action is Action.KILL and before.state is life.state:
-        log.warning("%s does not stop; killing it", name)
+        log.warning("%s does not stop; the supervisor is killing it", name)
 
 
 def brief(error: Exception) -> str:

@@ -160,7 +160,7 @@ class Health:
             self._state = state
             reasons = ", ".join([*self._weak(), *filter(None, [note])]) if state is InstanceState.DEGRADED else ""
             text = f"{state}: {reasons}" if reasons else str(state)
-            log.info("instance %s", text)
+            log.info("the instance is %s", text)
             self._notifier.status(text)
             self._on_state(state)
 

@@ -126,7 +126,10 @@ class Supervisor:
                     self._fleet.assign(job)
             how = {"mode": self._plan.mode, "config": str(self._plan.config_file)}
             trail.record("up", how, "took over" if found else "done", "; ".join(self.history), who=_own_actor())
-            log.info("supervising", extra=fields(instance=self._plan.instance, segment=self._segment.shared.name))
+            log.info(
+                "the supervisor is running",
+                extra=fields(instance=self._plan.instance, segment=self._segment.shared.name),
+            )
             fresh.pop_all()
             if self._plan.audit is not None:
                 began = stamp(self._segment.header.started_utc_ns / 1e9)
@@ -139,7 +142,7 @@ class Supervisor:
             for answer in self._stop_answers:
                 answer.ok()
             trail.record("stopped", {}, "failed" if self._failure else "done", self._failure or "")
-            log.info("stopped")
+            log.info("the instance is stopped, and the supervisor ends")
         if self._failure is not None:
             raise ShmioError(self._failure)
 
@@ -169,7 +172,7 @@ class Supervisor:
 
     def _on_signal(self, number: int) -> None:
         name = signal.Signals(number).name
-        log.info("received %s", name)
+        log.info("the supervisor received the signal %s", name)
         trail.record("down", {}, "accepted", who=Acting(Actor("signal", name), SUPERVISOR))
         if self._stopping and number != signal.SIGHUP:  # shell and kernel may each send a SIGHUP
             self._hasten()
@@ -183,7 +186,7 @@ class Supervisor:
 
     def _hasten(self) -> None:
         """Kill the processes that have not stopped yet, after a second request to stop."""
-        log.warning("killing the processes that have not stopped yet")
+        log.warning("the supervisor is killing the processes that have not stopped yet")
         for managed in self._fleet:
             self._fleet.apply(managed, Event.HASTEN)
 
@@ -191,7 +194,7 @@ class Supervisor:
         if not (isinstance(request, Where) or (isinstance(request, Reload) and request.dry_run)):
             answer.ended = self._audit(request, answer.peer)
         if isinstance(request, Stop):
-            log.info("asked to stop")
+            log.info("a client asked to stop the instance")
             self._stop_answers.append(answer)
             self._stop()
         elif isinstance(request, Restart):
@@ -304,7 +307,9 @@ class Supervisor:
         """Stop if the segment no longer has its name: nobody could find or stop the instance."""
         if not self._segment.shared.current():
             name = self._segment.shared.name
-            self._failure = f"the shared memory {name} was removed while the instance ran: stopping all processes"
+            self._failure = (
+                f"the shared memory {name} was removed while the instance ran; the supervisor is stopping all processes"
+            )
             log.error("%s", self._failure)
             self._stop()
 

@@ -408,7 +408,7 @@ class Reloader:
         except Exception as error:  # noqa: BLE001 - a connector's own check may raise anything; the instance goes on
             expected = isinstance(error, ShmioError)
             reason = str(error) if expected else f"the reload failed: {brief(error)}"
-            log.error("nothing was changed: %s", reason, exc_info=None if expected else error)
+            log.error("the reload changed nothing: %s", reason, exc_info=None if expected else error)
             self._answer_client(lambda answer: answer.error(reason))
             return
         self.plan, self.read_ns = plan, planning.read_ns
@@ -426,7 +426,7 @@ class Reloader:
         for line in problems:
             log.error("%s", line)
         kept = list(change.changes.kept)
-        log.info("the change is done", extra=fields(kept=len(kept)))
+        log.info("the reload is done", extra=fields(kept=len(kept)))
         self._change = None
         result = {"warnings": list(change.plan.warnings), "done": done, "problems": problems, "kept": kept}
         self._answer_client(lambda answer: answer.ok(**result))

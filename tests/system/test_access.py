@@ -87,7 +87,7 @@ def test_a_reload_adds_and_removes_tokens(guarded: Cell) -> None:
         assert caught.value.code() is grpc.StatusCode.UNAUTHENTICATED
     assert guarded.processes()["grpc"]["pid"] == pid
     told = guarded.logs() + guarded.supervisor("status", "--json").stdout
-    assert "reloaded tokens and roles" in told
+    assert "the endpoint has reloaded tokens and roles" in told
     assert DASH not in told
     assert OTHER not in told
 

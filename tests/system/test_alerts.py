@@ -119,7 +119,7 @@ def test_a_failing_action_is_visible_and_harms_no_other(make_cell: Callable[...,
         for text in (
             "hangs: command",
             "took longer than 0.2 s",
-            "command says: no printer",
+            "its command printed: no printer",
             "answers 500",
             "trying again",
         ):

@@ -34,7 +34,7 @@ def test_the_readme_runs_as_shown() -> None:
             lines = []
             for line in cell.stdout:
                 lines.append(line)
-                if "instance running" in line:
+                if "the instance is running" in line:
                     break
             assert any("127.0.0.1:8089" in line for line in lines), "".join(lines)
             for background, commands in found:

@@ -70,11 +70,11 @@ def test_user_filters_the_log(cell: Cell, page: Any) -> None:
     expect(page.get_by_role("tab", name="3D")).to_be_hidden()  # this cell has no scene
     open_tab(page, "Log")
     log = page.get_by_label("Log", exact=True).last
-    expect(log).to_contain_text("supervisor: supervising")
+    expect(log).to_contain_text("supervisor: the supervisor is running")
     expect(log).to_contain_text(HOSTILE)
     keep(page, "log")
     page.get_by_label("Filter").fill("connected")
-    expect(log).not_to_contain_text("supervising")
+    expect(log).not_to_contain_text("the supervisor is running")
     expect(log).to_contain_text("connected")
 
 

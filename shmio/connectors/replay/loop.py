@@ -238,7 +238,7 @@ class Player:
 
     def _change_quality(self, quality: Quality, reason: str, at: Stamp) -> None:
         self._writer.event(Record(EventKind.QUALITY, reason), quality=quality, at=at)
-        log.info("quality %s: %s", quality, reason)
+        log.info("the quality is %s: %s", quality, reason)
 
 
 # -- requests ----------------------------------------------------------------------------------------------------------

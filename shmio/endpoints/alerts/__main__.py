@@ -133,7 +133,7 @@ def run(worker: Worker) -> None:
     try:
         alerts = Alerts(worker, msgspec.convert(worker.config, Settings))
         worker.on_stop(alerts.wake)
-        log.info("watching %d alerts", len(worker.config["alert"]))
+        log.info("this process watches %d alerts", len(worker.config["alert"]))
         worker.running()
         while not worker.stopping.is_set():
             alerts.run_once()

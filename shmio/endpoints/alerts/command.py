@@ -138,6 +138,10 @@ class _Output:
         self._pipe.close()
         for line in self._kept.decode(errors="replace").splitlines():
             if line.strip():
-                log.info("alert %s: command says: %s", self._alert, printable(line))
+                log.info("alert %s: its command printed: %s", self._alert, printable(line))
         if self._size > len(self._kept):
-            log.info("alert %s: the command's other %d bytes are left out", self._alert, self._size - len(self._kept))
+            log.info(
+                "alert %s: its command printed %d more bytes, which the log leaves out",
+                self._alert,
+                self._size - len(self._kept),
+            )

@@ -178,7 +178,7 @@ class Sender:
             if self.problem:
                 log.info("alert %s: %s works again", self._alert, self._action.text)
             self.problem = ""
-        log.info("alert %s: %s, reported by %s", self._alert, notice.state, self._action.text)
+        log.info("alert %s: its notice (%s) was delivered by %s", self._alert, notice.state, self._action.text)
         self._on_change()
 
     def _fail(self, notice: Notice, problem: str, *, again: bool) -> None:
@@ -189,7 +189,7 @@ class Sender:
                 self.failed += 1
                 log.error("%s; this notice (%s) is lost", text, notice.state)
             elif text != self.problem:
-                log.warning("%s; trying again", text)
+                log.warning("%s; shmio tries again", text)
             self.problem = text
         self._on_change()
 

@@ -57,7 +57,7 @@ async def _serve(worker: Worker) -> None:
 
     def on_quality(source: str, good: bool) -> None:
         if good != (source in good_ones):
-            worker.log.info("source %s", "good" if good else "bad", extra=fields(source=source))
+            worker.log.info("the source %s is %s", source, "good" if good else "bad", extra=fields(source=source))
             good_ones.symmetric_difference_update({source})
         task = loop.create_task(server.set_source(source, good))
         tasks.add(task)
@@ -82,7 +82,7 @@ async def _serve(worker: Worker) -> None:
         str(Address(address.host, port) if isinstance(address, Address) else address)
         for address, port in zip(addresses, ports, strict=True)
     ]
-    worker.log.info("serving %s", ", ".join(served))
+    worker.log.info("the endpoint serves %s", ", ".join(served))
     if server.shortage:
         worker.report(note=server.shortage)
     if (file := place.config_file) is not None:
@@ -169,12 +169,14 @@ async def _take_anew(worker: Worker, file: Path, listeners: Listeners, server: S
                 return  # the supervisor is about to stop this process
             listeners.take(config.grpc)
         except ShmioError as error:
-            worker.log.error("tokens and roles stay as they were: %s", error)
+            worker.log.error("the endpoint keeps its tokens and roles as they were: %s", error)
             return
         ended = server.calls.review()
     if not (ended or config.grpc.guarded):
         return  # no tokens are in use, so there is nothing to report
-    worker.log.info("reloaded tokens and roles", extra=fields(tokens=len(config.grpc.token), calls_ended=ended))
+    worker.log.info(
+        "the endpoint has reloaded tokens and roles", extra=fields(tokens=len(config.grpc.token), calls_ended=ended)
+    )
 
 
 if __name__ == "__main__":

@@ -53,7 +53,7 @@ def _run_bridge(worker: Worker) -> None:
             worker.report_readers(bridge.readers)
     bridge.close()
     worker.report(bridge.counters, note="")
-    log.info("stopped; %d messages were sent to the broker", bridge.outbox.sent)
+    log.info("the bridge has stopped; it sent %d messages to the broker", bridge.outbox.sent)
 
 
 def run_broker(worker: Worker) -> None:
@@ -86,7 +86,7 @@ def run_broker(worker: Worker) -> None:
 def _run_mosquitto(worker: Worker, broker: Mosquitto, settings: Mqtt) -> None:
     try:
         broker.await_start(worker.report)
-        log.info("mosquitto on %s", settings.listen)
+        log.info("mosquitto serves MQTT on %s", settings.listen)
         worker.running()
         while not worker.stopping.wait(BEAT_S):
             broker.check()

@@ -231,7 +231,9 @@ class _Reply:
 
     def __call__(self, kind: EventKind, reason: str) -> None:
         if kind not in DONE:
-            log.warning("command on %s%s: %s: %s", shorten(self._command, 400), self.asked, kind, reason)
+            log.warning(
+                "the command on %s%s was not carried out: %s: %s", shorten(self._command, 400), self.asked, kind, reason
+            )
         payload = msgspec.json.encode({"outcome": str(kind), "done": kind in DONE, "reason": reason})
         properties = None
         if self._correlation is not None and len(self._correlation) <= MAX_CORRELATION_BYTES:

@@ -47,7 +47,7 @@ async def _serve(worker: Worker) -> None:
         await asyncio.wait((starting,), timeout=BEAT_S)
         worker.report()
     starting.result()
-    worker.log.info("serving opc.tcp://%s", endpoint.server.address)
+    worker.log.info("the server serves opc.tcp://%s", endpoint.server.address)
     worker.running()
     while not stopping.is_set():
         endpoint.follow_reloads()

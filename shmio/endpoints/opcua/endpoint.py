@@ -89,7 +89,7 @@ class Endpoint:
             if source.feed.follower.ended:  # all its frames were read
                 self._stop(source)
                 self.server.iserver.space.remove(source.name)
-                log.info("source %s was removed", source.name)
+                log.info("a reload removed the source %s", source.name)
 
     def _read(self, known: Container[int]) -> list[SourceNode]:
         self._generation = self._segment.generation  # first, so that the next check notices a change meanwhile

@@ -267,7 +267,7 @@ class Session(InternalSession):
         if kind in DONE:
             return Fault.Good
         path = f"{node.feed.block.source}/{node.register.path}"
-        log.warning("write to %s: %s: %s", shorten(path, 400), kind, reason)
+        log.warning("the write to %s was not carried out: %s: %s", shorten(path, 400), kind, reason)
         return _OUTCOMES.get(kind, Fault.BadUnexpectedError)
 
     async def call(self, params: list[ua.CallMethodRequest]) -> list[ua.CallMethodResult]:

@@ -75,7 +75,7 @@ async def _serve(worker: Worker) -> None:
     await server.start()
     measurements.start()
     scheme = "https" if config.certificate else "http"
-    worker.log.info("serving %s://%s/%s", scheme, server.address, "" if page else "metrics")
+    worker.log.info("the server serves %s://%s/%s", scheme, server.address, "" if page else "metrics")
     worker.running()
     while not stopping.is_set():
         counters = server.counters

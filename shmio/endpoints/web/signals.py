@@ -272,7 +272,7 @@ def _sent(feed: Feed) -> bool:
         retired = feed.block.retired  # before the frames are read: nothing is published after the end
         feed.send()
     except Exception:  # noqa: BLE001  the feeds of other sources continue
-        _log.exception("a plot of %s ends", feed.block.source)
+        _log.exception("a plot of %s failed and ends", feed.block.source)
         return False
     return not retired
 

@@ -28,9 +28,9 @@ from shmio.version import __version__
 IDENTIFIER: Final = "shmio_cell"
 MAX_BYTES: Final = 64 << 20
 COMPILE_S: Final = 120
-"""Maximum time in s of the C compiler."""
+"""Time limit in s for the C compiler."""
 SUFFIXES: Final = frozenset({".toml", ".db", ".udt", ".scl", ".csv", ".xlsx", ".ini", ".py", ".fmu", ".npy", ".json"})
-"""Files of the configuration's folder that the FMU contains."""
+"""Endings of the files that the FMU takes from the configuration's folder."""
 _SKIPPED: Final = frozenset({"__pycache__", "node_modules", "logs", "dumps", "snapshots", "build", "dist"})
 _NOT_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 _PLATFORMS: Final = {"x86_64": "linux64"}
@@ -42,7 +42,7 @@ def quoteattr(text: str) -> str:
 
 
 class Exported(NamedTuple):
-    """What was exported: number of inputs and outputs, and the registers that were left out."""
+    """The result of an export: number of inputs and outputs, and the registers that were left out."""
 
     inputs: int
     outputs: int
@@ -97,7 +97,7 @@ def _copy(source: Path, target: Path) -> None:
     """Copy the files that an instance may need.
 
     Raises:
-        ConfigError: They are too large, or cannot be read.
+        ConfigError: The files are too large, or cannot be read.
 
     """
     size = 0
@@ -124,7 +124,7 @@ def _compile(work: Path, guid: str) -> Path:
     """Compile the library.
 
     Raises:
-        ConfigError: There is no C compiler, or it fails.
+        ConfigError: There is no C compiler, or the compiler fails.
 
     """
     source, library = work / "library.c", work / f"{IDENTIFIER}.so"

@@ -46,7 +46,7 @@ class Session:
         """Find the variables.
 
         Raises:
-            ValueRangeError: They are not those of the FMU's description.
+            ValueRangeError: The variables are not those of the FMU's description.
 
         """
         self._cell = cell

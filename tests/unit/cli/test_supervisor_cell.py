@@ -313,7 +313,7 @@ def test_signal_stops_a_foreground_instance_cleanly(cell: Cell, sign: signal.Sig
         assert up.stderr is not None
         assert up.stdout is not None
         said = b""
-        while b"instance running" not in said:
+        while b"the instance is running" not in said:
             assert select.select([up.stderr], [], [], DEADLINE_S)[0], said
             line = up.stderr.readline()
             assert line, said

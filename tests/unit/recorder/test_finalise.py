@@ -194,7 +194,7 @@ def test_the_successor_closes_the_file_of_a_killed_recorder(segment: Segment, tm
         until(lambda: second.counts("frames") == 5, "its own file")
         assert second.stop() == 0
     assert [topic for topic, _, _ in messages(old)].count("cell/frames") == 20
-    assert f"closed {old}, because its recorder died" in second.log.read_text()
+    assert f"the recorder closed {old}, because an earlier recorder died" in second.log.read_text()
     assert numbers(old) + numbers(second.file) == list(range(1, 26))
     assert gaps(second.file) == []
 
@@ -211,9 +211,14 @@ def test_a_full_disk_leaves_the_file_unchanged_with_a_log_line(segment: Segment,
     before = old.read_bytes()
     limit = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({len(before)}, resource.RLIM_INFINITY))"
     with Process(segment, tmp_path, before=limit) as second:
-        until(lambda: "is left unchanged: " in second.log.read_text() if second.log.exists() else False, "the log line")
+        until(
+            lambda: (
+                f"the recorder leaves {old} unchanged: " in second.log.read_text() if second.log.exists() else False
+            ),
+            "the log line",
+        )
         second.popen.kill()
-    assert f"{old} is left unchanged: [Errno {errno.EFBIG}]" in second.log.read_text()
+    assert f"the recorder leaves {old} unchanged: [Errno {errno.EFBIG}]" in second.log.read_text()
     assert before.startswith(old.read_bytes())
     assert numbers(old) == list(range(1, 21))
 

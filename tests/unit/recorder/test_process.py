@@ -54,7 +54,7 @@ def test_it_records_reports_counters_and_closes_its_file(
         assert reader.about["recorder"] == "supervised"
     assert main(["info", str(file)]) == 0
     assert "; recorded by the instance's own recorder, shmio " in capsys.readouterr().out
-    assert "recorded 5 frames and 1 events; missed 0" in process.log.read_text()
+    assert "the recorder recorded 5 frames and 1 events; it missed 0" in process.log.read_text()
 
 
 def test_a_killed_recorders_file_is_readable_and_its_successor_continues(segment: Segment, tmp_path: Path) -> None:
@@ -249,7 +249,7 @@ def test_files_of_other_users_are_ignored(segment: Segment, tmp_path: Path) -> N
         until(lambda: process.counts("frames") == 10, "the frames from the first on")
         process.stop()
         own = process.file
-        assert ": not a regular file of this user" in process.log.read_text()
+        assert ": this is not a regular file of this user" in process.log.read_text()
     after = strange.stat()
     assert (strange.read_bytes(), after.st_mtime_ns, after.st_ino) == (content, before.st_mtime_ns, before.st_ino)
     with Process(segment, tmp_path) as process:
@@ -298,7 +298,7 @@ def test_without_room_it_reports_that_and_continues_once_there_is_room(segment: 
         publish(writer, 1, first=writer.block.ring.head())
         until(lambda: file.stat().st_size > size, "more bytes in the file")
         process.stop()
-    assert "is being written again" in process.log.read_text()
+    assert f"the recorder writes {file} again" in process.log.read_text()
     found, missed = numbers(file), gaps(file)
     assert {gap.reason for gap in missed} == {Reason.NO_ROOM}
     lost = [number for gap in missed for number in range(gap.first, gap.last + 1)]
@@ -340,7 +340,7 @@ def test_after_a_failed_fsync_it_continues_in_a_new_file(
     first, second = numbers(old), numbers(new)
     assert (first[0], second[-1]) == (1, 21 + more)
     assert "fsync failed (Input/output error): the data after byte" in process.log.read_text()
-    assert f"may be lost; continuing in {new}" in process.log.read_text()
+    assert f"may be lost; the recorder continues in {new}" in process.log.read_text()
     with Reader(new) as reader:
         assert check(reader).whole
         assert reader.about["doubtful"] == old.name

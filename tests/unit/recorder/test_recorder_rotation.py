@@ -336,7 +336,12 @@ def test_a_file_that_cannot_be_deleted_is_reported_once(
         readonly.setattr(Path, "unlink", refuse)
         keeper.check_folder()
         keeper.check_folder()
-    assert caplog.text.count(f"{old} cannot be deleted: Permission denied; it is 9.0 days old") == 1
+    assert (
+        caplog.text.count(
+            f"the recorder cannot delete {old}: Permission denied; it should be deleted because it is 9.0 days old"
+        )
+        == 1
+    )
     keeper.check_folder()
     assert not old.exists()
 

@@ -229,7 +229,7 @@ def test_the_waiting_data_are_bounded_while_the_disk_fails(
         bench.publish(10)
     assert 1 < len(list(tmp_path.iterdir())) < 10
     assert "No space left on device" in bench.work.problem
-    assert caplog.text.count("but no new file is started") == 1
+    assert caplog.text.count("but the recorder starts no new file") == 1
     full = False
     until(lambda: all(series.ended for series in bench.work._ending), "the waiting data written")
     bench.publish(10)

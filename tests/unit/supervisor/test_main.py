@@ -25,7 +25,7 @@ from tests.unit.supervisor.harness import CELL, DEADLINE_S, HERE, ROOT, Launch, 
 def test_processes_start_in_order_and_stop_in_reverse(launch: Launch, tmp_path: Path, runtime: Path) -> None:
     cell = launch([("grpc", "grpc", ["good"]), ("cell", "source", ["good"]), ("plc", "emulator", ["good"])])
     cell.wait_state("running")
-    assert re.findall(r"(\w+) running pid=", cell.log()) == ["plc", "cell", "grpc"]
+    assert re.findall(r"(\w+) is running pid=", cell.log()) == ["plc", "cell", "grpc"]
     assert list(cell.pids()) == ["grpc", "cell", "plc"]
     assert cell.stop() == 0
     assert (tmp_path / "ends").read_text().split() == ["grpc", "cell", "plc"]
@@ -48,14 +48,14 @@ def test_a_killed_process_is_restarted_and_no_other(launch: Launch, name: str) -
     assert [process.restarts for process in cell.status().processes] == [
         int(n == name) for n in ("plc", "cell", "grpc")
     ]
-    assert f"{name} crashed: killed by SIGKILL; starting it again at once" in cell.log()
+    assert f"{name} crashed: killed by SIGKILL; the supervisor is starting it again at once" in cell.log()
 
 
 def test_a_process_that_crashes_at_its_start_is_retried(launch: Launch) -> None:
     cell = launch([("plc", "emulator", ["crash", "crash", "good"])], backoff_first_s=0.05)
     cell.wait_state("running")
     assert cell.of("plc").restarts == 2
-    assert "plc crashed: exit status 3; starting it again in 0.05 s" in cell.log()
+    assert "plc crashed: exit status 3; the supervisor is starting it again in 0.05 s" in cell.log()
 
 
 @pytest.mark.parametrize("behaviour", ["silent", "stopped"])
@@ -65,14 +65,14 @@ def test_a_process_that_hangs_is_replaced(launch: Launch, behaviour: str) -> Non
     if behaviour == "stopped":
         os.kill(cell.pid("cell"), signal.SIGSTOP)
     until(lambda: cell.of("cell").restarts == 1 and cell.of("cell").state == "running")
-    assert "cell hangs (no heartbeat for 0.5 s); killing it" in cell.log()
+    assert "cell hangs (no heartbeat for 0.5 s); the supervisor is killing it" in cell.log()
     assert "cell crashed: no heartbeat for 0.5 s, killed by SIGKILL" in cell.log()
 
 
 def test_a_process_that_never_becomes_ready_is_replaced(launch: Launch) -> None:
     cell = launch([("cell", "source", ["never", "good"])], start_s=1.5)
     cell.wait_state("running")
-    assert "cell hangs (not ready 1.5 s after its start); killing it" in cell.log()
+    assert "cell hangs (not ready 1.5 s after its start); the supervisor is killing it" in cell.log()
     assert cell.of("cell").restarts >= 1, "on a busy host the next process may be late, too"
 
 
@@ -80,7 +80,7 @@ def test_a_process_that_ignores_sigterm_is_killed(launch: Launch) -> None:
     cell = launch([("plc", "emulator", ["stubborn"])], grace_s=0.2)
     cell.wait_state("running")
     assert cell.stop() == 0
-    assert "plc does not stop; killing it" in cell.log()
+    assert "plc does not stop; the supervisor is killing it" in cell.log()
 
 
 def test_a_second_stop_signal_skips_the_grace_time(launch: Launch) -> None:
@@ -280,7 +280,7 @@ def test_a_closed_terminal_stops_the_instance_cleanly(launch: Launch, tmp_path: 
     cell.wait_state("stopping")
     cell.process.send_signal(signal.SIGHUP)  # the shell sends SIGHUP, too
     assert cell.wait_end() == 0
-    assert "killing the processes that have not stopped yet" not in cell.log()
+    assert "the supervisor is killing the processes that have not stopped yet" not in cell.log()
     assert cell.instance not in instances()
 
 
@@ -301,7 +301,8 @@ def test_a_removed_segment_stops_the_instance(launch: Launch, tmp_path: Path) ->
     cell.wait_state("running")
     Path(f"/dev/shm/shmio-{cell.instance}").unlink()
     assert cell.wait_end() == 1
-    error = f"the shared memory shmio-{cell.instance} was removed while the instance ran: stopping all processes\n"
+    what = f"the shared memory shmio-{cell.instance} was removed while the instance ran"
+    error = f"{what}; the supervisor is stopping all processes\n"
     assert cell.errors() == error
     assert error in cell.log()
     assert (tmp_path / "ends").read_text().split() == ["grpc", "cell", "plc"]

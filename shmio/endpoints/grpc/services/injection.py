@@ -434,7 +434,7 @@ class Shadows:
         return found
 
     def _forget(self, injection: Injection) -> None:
-        log.info("injection over %s: %s", injection.target, injection.over)
+        log.info("the injection over %s has ended: %s", injection.target, injection.over)
         del self._users[injection]
         self._named = {name: shadow for name, shadow in self._named.items() if shadow.injection is not injection}
 

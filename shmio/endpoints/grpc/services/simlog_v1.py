@@ -368,7 +368,7 @@ class SimlogV1:
         try:
             await self._stepper.step(peer=context.peer())
         except ShmioError as error:
-            log.warning("step failed: %s", str(error), extra=fields(peer=context.peer()))
+            log.warning("a step failed: %s", str(error), extra=fields(peer=context.peer()))
             return wire.StepResponse(code=-1)
         return wire.StepResponse(code=0)
 

@@ -306,7 +306,9 @@ class BrokerConnection:
         self._limits = Limits.from_connack(properties, self._most)
         self._deadline_s, self._misc_s = None, time.monotonic() + 1.0
         version = "5" if self._protocol == MQTTv5 else "3.1.1"
-        log.info("connected to broker %s as %s, MQTT %s", self._target, self._policy.client_id, version)
+        log.info(
+            "the bridge is connected to broker %s as %s, by MQTT %s", self._target, self._policy.client_id, version
+        )
 
     def _disconnected(
         self, client: Client, _data: Any, flags: DisconnectFlags, code: ReasonCode, _properties: Properties | None

@@ -376,7 +376,7 @@ class Session:
 
     def _refuse(self, why: str) -> None:
         self._refused += 1
-        log.warning("Sparkplug command: %s", shorten(why, 500))  # the topic may be long
+        log.warning("the node refused a Sparkplug command: %s", shorten(why, 500))  # the topic may be long
 
 
 class _Outcome:
@@ -387,7 +387,7 @@ class _Outcome:
 
     def __call__(self, kind: EventKind, reason: str) -> None:
         if kind not in DONE:
-            log.warning("Sparkplug command: %s: %s: %s", self._path, kind, reason)
+            log.warning("the Sparkplug command for %s was not carried out: %s: %s", self._path, kind, reason)
 
 
 def _size(sample: Sample) -> int:

@@ -47,7 +47,10 @@ class Configuration(FollowedTab):
         """Apply the changes of the file, if it is still the version that the user has seen."""
         if version(self.page.served.config_file) != given.version:
             raise CommandError("the file has changed since you saw what a reload would do; look at it again")
-        _log.info("%s asks to reload", f"user {self.page.user.name!r}" if self.page.user.name else "a page")
+        _log.info(
+            "%s asks the supervisor to reload the configuration",
+            f"user {self.page.user.name!r}" if self.page.user.name else "a page",
+        )
         try:
             answer = await self.page.served.supervisor.ask(Reload(), RELOAD_S)
         finally:

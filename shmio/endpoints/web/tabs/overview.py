@@ -47,7 +47,9 @@ class Overview(Tab):
     async def restart(self, given: Named) -> None:
         """Stop and start a process; return when it runs again."""
         _log.info(
-            "%s asks to restart %s", f"user {self.page.user.name!r}" if self.page.user.name else "a page", given.name
+            "%s asks the supervisor to restart %s",
+            f"user {self.page.user.name!r}" if self.page.user.name else "a page",
+            given.name,
         )
         await self.page.served.supervisor.ask(Restart(given.name), RESTART_S)
 

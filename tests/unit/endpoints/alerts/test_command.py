@@ -41,8 +41,8 @@ def test_the_log_has_the_beginning_of_the_output(caplog: pytest.LogCaptureFixtur
     caplog.set_level(logging.INFO, "shmio.alerts")
     python("import sys; print('said'); sys.stderr.write('x' * 1_000_000)").deliver(notice())
     text = caplog.text
-    assert "command says: said" in text
-    assert f"{1_000_005 - MAX_OUTPUT_BYTES} bytes are left out" in text
+    assert "its command printed: said" in text
+    assert f"its command printed {1_000_005 - MAX_OUTPUT_BYTES} more bytes, which the log leaves out" in text
     assert len(text) < 3 * MAX_OUTPUT_BYTES
 
 

@@ -238,7 +238,7 @@ def test_a_failed_step_gives_a_negative_code_or_a_status_and_the_next_works(
         assert await step(served) == -1
         status, text = await refusal(served.time.step(sim.StepRequest(), timeout=TIMEOUT_S))
         assert (status, text) == (Status.FAILED_PRECONDITION, "step 2: sim: out of memory")
-        assert "step failed: step 1: sim: out of memory" in caplog.text
+        assert "a step failed: step 1: sim: out of memory" in caplog.text
         models["sim"].failure = ""
         assert await step(served) == 0
         assert await messages(stream, 3) == [("sim/count", 0.0), ("sim/count", 3.0), ("SIMLOG://step", 3.0)]

@@ -100,7 +100,7 @@ def test_failed_commands_have_a_result_and_the_bridge_continues(
         told = listener.json(f"{topic}/result")
         assert (told["outcome"], told["done"]) == ("rejected", False)
         assert reason in told["reason"]
-        assert f"command on {PREFIX}/{topic}: rejected: {told['reason']}" in caplog.messages
+        assert f"the command on {PREFIX}/{topic} was not carried out: rejected: {told['reason']}" in caplog.messages
         assert not plant.written
         listener.publish("cell/step/in", "5")
         assert listener.json("cell/step/in/result")["done"]

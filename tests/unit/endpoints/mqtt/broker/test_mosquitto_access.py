@@ -163,7 +163,7 @@ def test_no_other_client_can_connect_as_the_bridge(
         secret = (place / SECRET).read_text()
         with Raw(cell.address, "me", account=("bridge", secret)) as client:
             assert client.code == 5, "the bridge's account works only on its own socket"
-        assert f"connected to broker of this instance as {name}," in caplog.text
+        assert f"the bridge is connected to broker of this instance as {name}," in caplog.text
         assert secret_id(name, secret) not in caplog.text
         for file in place.iterdir():
             mode = file.stat().st_mode
