@@ -121,7 +121,7 @@ def test_a_failing_action_is_visible_and_harms_no_other(make_cell: Callable[...,
             "took longer than 0.2 s",
             "its command printed: no printer",
             "answers 500",
-            "trying again",
+            "shmio tries again",
         ):
             assert text in log
         assert cell.processes()["cell"]["quality"] == "good"
