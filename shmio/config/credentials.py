@@ -76,7 +76,7 @@ def digest(token: bytes) -> bytes:
 
 def _read_token(key: str, name: str) -> bytes:
     key = f"{key}.token_file: {name}"
-    text = _read_secret(key, name, MAX_TOKEN_BYTES + 3, instead="a new token").rstrip(b"\r\n")
+    text = read_secret(key, name, MAX_TOKEN_BYTES + 3, instead="a new token").rstrip(b"\r\n")
     if not MIN_TOKEN_BYTES <= len(text) <= MAX_TOKEN_BYTES or not all(0x21 <= byte <= 0x7E for byte in text):
         raise ConfigError(
             f"{key}: the file must contain one token of {MIN_TOKEN_BYTES} to {MAX_TOKEN_BYTES} letters, digits and "
@@ -197,7 +197,7 @@ def _is_hash(secret: str) -> bool:
 
 def _read_passwords(name: str, key: str = _KEY) -> str:
     key = f"{key}: {name}"
-    data = _read_secret(key, name, MAX_PASSWORDS_BYTES + 1, instead="new passwords")
+    data = read_secret(key, name, MAX_PASSWORDS_BYTES + 1, instead="new passwords")
     if len(data) > MAX_PASSWORDS_BYTES:
         raise ConfigError(f"{key}: {larger_than(MAX_PASSWORDS_BYTES)}")
     try:
@@ -206,7 +206,7 @@ def _read_passwords(name: str, key: str = _KEY) -> str:
         raise ConfigError(f"{key}: the file is not UTF-8; save it as UTF-8") from None
 
 
-def _read_secret(key: str, name: str, most_bytes: int, *, instead: str) -> bytes:
+def read_secret(key: str, name: str, most_bytes: int, *, instead: str) -> bytes:
     """Return the beginning of a file that contains a secret, at most ``most_bytes`` bytes.
 
     Args:

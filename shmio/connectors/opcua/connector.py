@@ -160,7 +160,9 @@ class OpcUaConnector(Connector):
     register_quality = True
     reads_optimized = True
     register_options = frozenset({"nodes"})
-    path_options: ClassVar[tuple[str, ...]] = ("certificate", "key", "trusted", "password_file")
+    path_options: ClassVar[tuple[str, ...]] = (
+        "certificate", "key", "trusted", "password_file", "user_certificate", "user_key",
+    )  # fmt: skip
 
     def __init__(self, options: OpcUaOptions, layout: Layout) -> None:
         _need_library()
@@ -574,7 +576,7 @@ def _address(options: OpcUaOptions, layout: Layout, register: Register) -> tuple
 
 
 def _credentials(options: OpcUaOptions) -> Credentials:
-    """Read the password and the certificate from their files. Raise ConfigError if a file cannot be used."""
+    """Read the password and the certificates from their files. Raise ConfigError if a file cannot be used."""
     password = read_password(options.password_file, "password_file") if options.password_file else ""
     if options.certificate is None or options.key is None:
         return Credentials(password=password)
@@ -587,7 +589,10 @@ def _credentials(options: OpcUaOptions) -> Credentials:
             f"certificate: {options.certificate}: this certificate has no application URI; OPC UA needs one as an "
             "alternative name, such as URI:urn:cell:shmio"
         )
-    return Credentials(uri, (certificate, key), password)
+    user = None
+    if options.user_certificate is not None and options.user_key is not None:
+        user = trust.read_user(Path(options.user_certificate), Path(options.user_key))
+    return Credentials(uri, (certificate, key), password, user)
 
 
 def _overlapping(layout: Layout, write: Write) -> range:

@@ -44,6 +44,9 @@ class OpcUaOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_o
     """Folder of trusted certificates."""
     username: Annotated[str, msgspec.Meta(min_length=1, max_length=256)] | None = None
     password_file: str | None = None
+    user_certificate: str | None = None
+    """File of the certificate by which the server knows the user."""
+    user_key: str | None = None
     insecure: bool = False
     """True to allow a password over an unencrypted channel to another host."""
 
@@ -61,6 +64,14 @@ class OpcUaOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_o
                 raise ValueError(f"{name}: this key is needed with security = {self.security!r}")
             if not secured and getattr(self, name) is not None:
                 raise ValueError(f'{name}: this key has no effect without security = "SignAndEncrypt" or "Sign"')
+        if (self.user_certificate is None) != (self.user_key is None):
+            raise ValueError("user_certificate: give both user_certificate and user_key, or neither")
+        if self.user_certificate is not None and self.username is not None:
+            raise ValueError("user_certificate: the user has either a certificate or a password; remove one of them")
+        if self.user_certificate is not None and not secured:
+            raise ValueError(
+                "user_certificate: the server can check it only with security = 'SignAndEncrypt' or 'Sign'"
+            )
         if (self.username is None) != (self.password_file is None):
             raise ValueError("username: give both username and password_file, or neither")
         if self.username and self.security != "SignAndEncrypt" and not self.address.loopback and not self.insecure:
@@ -89,16 +100,18 @@ class OpcUaOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_o
 
 @dataclass(frozen=True)
 class Credentials:
-    """Certificate and password of a client.
+    """Certificates and password of a client.
 
     Attributes:
         application_uri: The client's URI, which is also in its certificate.
         identity: The client's certificate and its private key, as objects of the library
             cryptography; None without security.
-        password: The user's password; empty without a user.
+        password: The user's password; empty without one.
+        user: The user's certificate and its private key; None without one.
 
     """
 
     application_uri: str = "urn:shmio:client"
     identity: tuple[Any, Any] | None = None
     password: str = ""
+    user: tuple[Any, Any] | None = None

@@ -194,13 +194,18 @@ class Session:
         if options.username is not None:
             client.set_user(options.username)
             client.set_password(self._credentials.password)
+        if self._credentials.user is not None:
+            from shmio.connectors.opcua.trust import check_dates  # noqa: PLC0415  not needed without security
+
+            client.user_certificate, client.user_private_key = self._credentials.user
+            check_dates(client.user_certificate, f"the user's certificate {options.user_certificate}")
         await client.connect_socket()
         self._protocol = client.uaclient.protocol
         await client.send_hello()
         await client.open_secure_channel()
         await client.create_session()
         try:
-            await client.activate_session(username=client._username, password=client._password)
+            await client.activate_session(client._username, client._password, client.user_certificate)
         except ua.UaStatusCodeError as error:
             raise ConnectorError(_refused_user(error.code, options)) from None
         self._stage = ""
@@ -1025,8 +1030,16 @@ def _flat(values: list[Any]) -> list[Any]:
 
 
 def _refused_user(code: int, options: OpcUaOptions) -> str:
+    if options.user_certificate is not None:
+        return (
+            f"the server refuses the user's certificate ({describe(code)}); let the server trust "
+            f"{options.user_certificate}, and admit users with certificates"
+        )
     if options.username is None:
-        return f"the server does not admit clients without a user ({describe(code)}); set username and password_file"
+        return (
+            f"the server does not admit clients without a user ({describe(code)}); set username and password_file, or "
+            "user_certificate and user_key"
+        )
     return f"the server refuses the user {options.username!r} ({describe(code)}); check username and password_file"
 
 

@@ -22,6 +22,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import rsa
 from cryptography.x509.oid import NameOID
 
+from shmio.config.credentials import read_secret
 from shmio.errors import ConfigError, ConnectorError
 from shmio.wording import larger_than
 
@@ -41,19 +42,49 @@ def read_identity(certificate: Path, key: Path) -> tuple[x509.Certificate, rsa.R
         ConfigError: A file cannot be used, or the key does not belong to the certificate.
 
     """
-    found = _certificates(_read("certificate", certificate))
+    return _identity("", certificate, key, _read("key", key))
+
+
+def read_user(certificate: Path, key: Path) -> tuple[x509.Certificate, rsa.RSAPrivateKey]:
+    """Return the certificate and key of the user. Only its owner may have access to the file of the key.
+
+    Raises:
+        ConfigError: A file cannot be used, or the key does not belong to the certificate.
+
+    """
+    data = read_secret(f"user_key: {key}", str(key), MAX_FILE_BYTES + 1, instead="a new key and certificate")
+    if len(data) > MAX_FILE_BYTES:
+        raise ConfigError(f"user_key: {key}: {larger_than(MAX_FILE_BYTES)}")
+    return _identity("user_", certificate, key, data)
+
+
+def _identity(prefix: str, certificate: Path, key: Path, data: bytes) -> tuple[x509.Certificate, rsa.RSAPrivateKey]:
+    """Return a certificate and its key.
+
+    Args:
+        prefix: The beginning of the names of both keys in the configuration.
+        certificate: The file of the certificate.
+        key: The file of the key.
+        data: The contents of the latter.
+
+    Raises:
+        ConfigError: A file cannot be used, or the key does not belong to the certificate.
+
+    """
+    found = _certificates(_read(f"{prefix}certificate", certificate))
     if not found:
-        raise ConfigError(f"certificate: {certificate}: the file has no usable certificate in PEM or DER")
-    data = _read("key", key)
+        raise ConfigError(f"{prefix}certificate: {certificate}: the file has no usable certificate in PEM or DER")
     load = serialization.load_pem_private_key if b"-----BEGIN" in data else serialization.load_der_private_key
     try:
         private = load(data, password=None)
     except (ValueError, TypeError):
-        raise ConfigError(f"key: {key}: the file has no usable private key in PEM or DER, without a password") from None
+        raise ConfigError(
+            f"{prefix}key: {key}: the file has no usable private key in PEM or DER, without a password"
+        ) from None
     if not isinstance(private, rsa.RSAPrivateKey) or private.key_size < _MIN_KEY_BITS:
-        raise ConfigError(f"key: {key}: the policies of OPC UA need an RSA key of {_MIN_KEY_BITS} bits or more")
+        raise ConfigError(f"{prefix}key: {key}: the policies of OPC UA need an RSA key of {_MIN_KEY_BITS} bits or more")
     if private.public_key() != found[0].public_key():
-        raise ConfigError(f"key: {key}: this key does not belong to the certificate {certificate}")
+        raise ConfigError(f"{prefix}key: {key}: this key does not belong to the certificate {certificate}")
     return found[0], private
 
 
@@ -86,13 +117,13 @@ def check_server(data: bytes, trusted: Path, host: str) -> x509.Certificate:
         issuer = next((one for one in known if _has_signed(one, certificate)), None)
         if issuer is None:
             raise ConnectorError(_reject(certificate, data[:size], trusted))
-        _check_dates(issuer, "the authority of the server's certificate")
+        check_dates(issuer, "the authority of the server's certificate")
         if not _is_for(certificate, host):
             raise ConnectorError(
                 f"the server's certificate is signed by a trusted authority, but is not for {host}; use the name in "
                 "it in url, or trust the certificate itself"
             )
-    _check_dates(certificate, "the server's certificate")
+    check_dates(certificate, "the server's certificate")
     return certificate
 
 
@@ -117,7 +148,8 @@ def _reject(certificate: x509.Certificate, data: bytes, trusted: Path) -> str:
     return f"{text}; to trust it, run mv '{file}' '{trusted}/'"
 
 
-def _check_dates(certificate: x509.Certificate, what: str) -> None:
+def check_dates(certificate: x509.Certificate, what: str) -> None:
+    """Raise ConnectorError if a certificate has expired or is not valid yet."""
     now = datetime.now(UTC)
     if now < certificate.not_valid_before_utc:
         raise ConnectorError(f"{what} is valid only from {certificate.not_valid_before_utc:%Y-%m-%d %H:%M} UTC on")

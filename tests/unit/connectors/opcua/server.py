@@ -28,9 +28,13 @@ WRITE = InternalSession.write
 
 
 class Accounts:
-    """One account."""
+    """One account with a password, and those whose certificates are trusted."""
+
+    trusted: set[bytes] = set()  # noqa: RUF012
 
     def get_user(self, _server: Any, username: str = "", password: str = "", certificate: Any = None) -> User | None:
+        if not username:
+            return User(UserRole.User, name="by certificate") if certificate in self.trusted else None
         return User(UserRole.User, name=username) if (username, password) == ("operator", PASSWORD) else None
 
 
@@ -246,6 +250,10 @@ class Device:
         """Return how many made up references were sent, and how many continuation points are open."""
         return [self.sent, len(self.points)]
 
+    async def trust(self, certificate: str) -> None:
+        """Admit the user with this certificate, in hex."""
+        Accounts.trusted.add(bytes.fromhex(certificate))
+
     async def expire(self) -> None:
         """End all sessions of clients, but not their connections, as if they had timed out."""
         for session in list(self.server.iserver._external_sessions.values()):
@@ -301,7 +309,7 @@ async def main(port: str, certificate: str = "", key: str = "") -> None:
         ])  # fmt: skip
         await server.load_certificate(Path(certificate))
         await server.load_private_key(Path(key))
-        server.set_identity_tokens([ua.UserNameIdentityToken])
+        server.set_identity_tokens([ua.UserNameIdentityToken, ua.X509IdentityToken])
     else:
         server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
     await server.register_namespace("http://test/device")

@@ -194,6 +194,71 @@ def test_users(secured: tuple[Device, Path], keys: dict[str, Any], tmp_path: Pat
         pass
 
 
+@pytest.fixture
+def user(keys: dict[str, Any], authority: Authority) -> dict[str, Any]:
+    """Keys of a user with a certificate."""
+    certificate, key = authority.issue("user", uri="")
+    key.chmod(0o600)
+    others = {name: value for name, value in keys.items() if name not in ("username", "password_file")}
+    return others | {"user_certificate": str(certificate), "user_key": str(key)}
+
+
+@pytest.mark.parametrize("channel", [{}, {"security": "Sign", "policy": "Aes256Sha256RsaPss"}])
+def test_a_user_with_a_certificate(
+    secured: tuple[Device, Path], user: dict[str, Any], tmp_path: Path, channel: dict[str, str]
+) -> None:
+    device, certificate = secured
+    (tmp_path / "trusted/server.der").write_bytes(certificate.read_bytes())
+    with (
+        pytest.raises(ConnectorError, match=r"refuses the user's certificate .*user\.der"),
+        connected(device.url, TAGS, **user | channel),
+    ):
+        pass
+    device.ask("trust", Path(user["user_certificate"]).read_bytes().hex())
+    with connected(device.url, TAGS, **user | channel) as source:
+        assert (source.value("level"), source.write("level", 3.5), source.write("level", 2.5)) == (2.5, "", "")
+
+
+def test_a_user_whose_certificate_has_expired(
+    secured: tuple[Device, Path], user: dict[str, Any], tmp_path: Path, authority: Authority
+) -> None:
+    device, certificate = secured
+    (tmp_path / "trusted/server.der").write_bytes(certificate.read_bytes())
+    expired, key = authority.issue("past", uri="", days=(-5, -1))
+    key.chmod(0o600)
+    given = user | {"user_certificate": str(expired), "user_key": str(key)}
+    with pytest.raises(ConnectorError, match=r"past\.der has expired"), connected(device.url, TAGS, **given):
+        pass
+
+
+def test_a_user_with_a_certificate_at_node_opcua(user: dict[str, Any], tmp_path: Path) -> None:
+    """The server admits a user whose certificate it trusts, and refuses another one."""
+    folder = tmp_path / "node"
+    client, person, other = (self_signed(tmp_path, f"urn:test:{name}", name) for name in ("client", "person", "other"))
+    for shown, place in ((client, folder / "pki"), (person, folder / "users")):
+        (place / "trusted/certs").mkdir(parents=True)
+        (place / "trusted/certs/known.pem").write_bytes(shown[0].read_bytes())
+    level = {"id": "level", "type": "Float", "value": 2.5, "writable": False}
+    tags = {"level": {"type": "REAL", "address": f"nsu={NAMESPACE};s=level"}}
+
+    def source(files: tuple[Path, Path]) -> Source:
+        files[1].chmod(0o600)
+        given = user | {"certificate": str(client[0]), "key": str(client[1]), "timeout": 5000}
+        return Source(server.url, tags, **given | {"user_certificate": str(files[0]), "user_key": str(files[1])})
+
+    with NodeServer(folder, [level], secured=True) as server:
+        with pytest.raises(ConnectorError, match="not trusted"):
+            source(other).connector.connect()
+        (stored,) = (tmp_path / "rejected").iterdir()
+        stored.rename(tmp_path / "trusted" / stored.name)
+        with pytest.raises(ConnectorError, match=r"refuses the user's certificate .*other\.pem"):
+            source(other).connector.connect()
+        admitted = source(person)
+        admitted.connector.connect()
+        assert admitted.value("level") == 2.5
+        admitted.connector.close()
+
+
 def test_certificates_of_others_do_not_count(authority: Authority, tmp_path: Path) -> None:
     trusted = tmp_path / "trusted"
     trusted.mkdir()
@@ -236,10 +301,17 @@ def test_the_folder_of_rejected_certificates_is_bounded(
         ({"certificate": "key"}, "certificate: .*no usable certificate"),
         ({"certificate": "trusted"}, "certificate: .*directory"),
         ({"password_file": "certificate"}, "password_file: "),
+        ({"user_certificate": "key", "user_key": "user_key"}, "user_certificate: .*no usable certificate"),
+        ({"user_certificate": "certificate", "user_key": "user_key"}, "user_key: .*does not belong to"),
+        ({"user_certificate": "certificate", "user_key": "key"}, "user_key: .*mode is 0644; run chmod 600"),
+        ({"user_certificate": "certificate", "user_key": "password_file"}, "user_key: .*no usable private key"),
+        ({"user_certificate": "certificate", "user_key": "trusted"}, "user_key: .*not a regular file"),
     ],
 )
-def test_wrong_files_are_named(keys: dict[str, Any], change: dict[str, str], words: str) -> None:
-    changed = keys | {key: keys[other] for key, other in change.items()}
+def test_wrong_files_are_named(keys: dict[str, Any], user: dict[str, Any], change: dict[str, str], words: str) -> None:
+    changed = keys | {key: (keys | user)[other] for key, other in change.items()}
+    if "user_key" in change:
+        del changed["username"], changed["password_file"]
     with pytest.raises(ConfigError, match=words):
         Source("opc.tcp://127.0.0.1:4840", TAGS, **changed)
 
@@ -263,6 +335,9 @@ def test_the_certificate_has_an_application_uri_and_fits_the_key(keys: dict[str,
         ({"trusted": "x"}, "trusted: this key has no effect"),
         ({"username": "x"}, "both username and password_file"),
         ({"username": "x", "password_file": "y"}, "without encryption"),
+        ({"user_key": "x"}, "both user_certificate and user_key"),
+        ({"user_key": "x", "user_certificate": "y"}, "only with security"),
+        ({"user_key": "x", "user_certificate": "y", "username": "z", "password_file": "w"}, "either a certificate or"),
     ],
 )
 def test_keys_that_contradict(given: dict[str, Any], words: str) -> None:

@@ -2,6 +2,7 @@
 // Usage: node opcua_server.js PORT FOLDER NODES.json [secured]; a node is {"id", "type", "value", "writable"}.
 // With {"id", "structure", "value"}, a node is a structure of opcua_structures.xml, or an array of them.
 // A secured server also has an encrypted endpoint, and rejects there clients whose certificates are not in its folder.
+// It admits users whose certificates are in the folder "users" beside that.
 'use strict';
 
 const fs = require('fs');
@@ -19,12 +20,15 @@ const structures = nodes.some((one) => one.structure) ? [path.join(__dirname, 'o
 async function main() {
   const certificates = new OPCUACertificateManager({ rootFolder: folder, automaticallyAcceptUnknownCertificate: !secured });
   await certificates.initialize();
+  const users = new OPCUACertificateManager({ rootFolder: `${path.dirname(folder)}/users` });
+  await users.initialize();
   const server = new opcua.OPCUAServer({
     port: Number(port),
     hostname: '127.0.0.1',
     securityModes: [MessageSecurityMode.None, ...(secured ? [MessageSecurityMode.SignAndEncrypt] : [])],
     securityPolicies: [SecurityPolicy.None, ...(secured ? [SecurityPolicy.Basic256Sha256] : [])],
     serverCertificateManager: certificates,
+    userCertificateManager: users,
     disableDiscovery: true,
     nodeset_filename: [nodesets.standard, ...structures],
   });
