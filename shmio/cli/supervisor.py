@@ -16,6 +16,7 @@ from shmio.version import __version__
 
 PROGRAM = "shmio-supervisor"
 MODES = ("live", "log", "replay")
+SCHEMAS = ("supervisor", "campaign", "scene")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -119,6 +120,11 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         help="source files of data blocks (.db, .udt, .scl), optionally after a plc.ini",
     )
+    text = "print the JSON schema of a file, with which editors complete and check its keys"
+    verb("schema", text).add_argument(
+        "file", metavar="KIND", nargs="?", choices=SCHEMAS, default="supervisor",
+        help="supervisor (default), campaign or scene",
+    )  # fmt: skip
     text = "write the instance as an FMU for co-simulation (FMI 2.0); all its sources must be computed"
     export = verb("export-fmu", text, file, command="export_fmu:export_fmu")
     export.add_argument("-o", dest="output", type=Path, required=True, metavar="FILE.fmu", help="the FMU to write")

@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 import msgspec
 
@@ -95,7 +95,8 @@ _SEVERAL = {
     "opcua.client",
 }
 _SLIPPED = re.compile(r"[A-Za-z]:[\x00-\x1f\\]")  # a Windows path in double quotes, \t being a tab
-_DERIVED = ("folder", "options", "texts")  # fields that are not keys of the file
+DERIVED: Final[Mapping[type[Section], tuple[str, ...]]] = {Config: ("folder",), Source: ("options", "texts")}
+"""Fields that are not keys of the file."""
 _Table = TypeVar("_Table", bound=Section)
 
 
@@ -292,7 +293,7 @@ def _files(names: str | list[str] | None) -> list[str]:
 @cache
 def _fields(kind: type[Section]) -> tuple[msgspec.structs.FieldInfo, ...]:
     """Return the keys of a section."""
-    return tuple(field for field in msgspec.structs.fields(kind) if field.name not in _DERIVED)
+    return tuple(field for field in msgspec.structs.fields(kind) if field.name not in DERIVED.get(kind, ()))
 
 
 class Structure:
@@ -426,7 +427,7 @@ class _ConfigStructure(Structure):
         if name != "source" or not isinstance(value, dict):
             return super()._one(value, name, index)
         key = f"{name}[{index}]"
-        common = {*Source.__struct_fields__} - {*_DERIVED}
+        common = {*_known(Source)}
         connector, misspelled = _connector_of(value, common)
         options = {name: item for name, item in value.items() if name not in common and name != misspelled}
         before = self._faults.count
@@ -482,7 +483,7 @@ def convert(tables: dict[str, Any], kind: type[_Table]) -> _Table:
 
 def _known(kind: type[Section]) -> list[str]:
     """Return the names of the keys of a table."""
-    return [name for name in kind.__struct_fields__ if name not in _DERIVED]
+    return [name for name in kind.__struct_fields__ if name not in DERIVED.get(kind, ())]
 
 
 def _unknown(key: str, known: Sequence[str]) -> str:
