@@ -72,10 +72,19 @@ for module in (shmio_v1_pb2, simlog_v1_pb2, simlog_v2_pb2, simserver_pb2, sparkp
     module.DESCRIPTOR.CopyToProto(found.file.add())
 sys.stdout.buffer.write(found.SerializeToString(deterministic=True))
 """
+KEYS = """
+import json, sys
+import msgspec
+from shmio.config.model import Config
+from shmio.connectors.registry import BUILT_IN, options_type
+kinds = {name: options_type(name) for name in sorted(BUILT_IN)}
+found = {"supervisor.toml": Config, **kinds}
+json.dump({name: msgspec.json.schema(kind) for name, kind in found.items()}, sys.stdout)
+"""
 
 
 def store(version: str, tree: Path, python: Path) -> None:
-    """Write ``baselines/VERSION``: its wire, recordings, what it reads in them, and its reader of segments.
+    """Write ``baselines/VERSION``: wire, keys, recordings and what it reads in them, reader of segments.
 
     Args:
         version: The name of the folder.
@@ -89,6 +98,8 @@ def store(version: str, tree: Path, python: Path) -> None:
     with tempfile.TemporaryDirectory() as elsewhere:  # where the tree's sources are not on the path
         work = Path(elsewhere)
         (folder / "wire.binpb").write_bytes(_output(work, python, "-c", WIRE))
+        keys = json.loads(_output(work, python, "-c", KEYS))
+        (folder / "keys.json").write_text(json.dumps(keys, indent=1) + "\n")
         shutil.copy(tree / "db201.db", work)
         (work / "notes.db").write_text(LAYOUT)
         _record(work, python.parent, folder)
@@ -97,6 +108,9 @@ def store(version: str, tree: Path, python: Path) -> None:
     (folder / "reading.json").write_text(json.dumps(read, indent=1) + "\n")
     for name in ("reader.c", "clock.h"):
         shutil.copy(tree / "examples" / name, folder)
+    for file in (tree / "supervisor.toml", *sorted((tree / "examples").rglob("supervisor.toml"))):
+        name = "-".join(file.relative_to(tree).parent.parts) or "demo"
+        shutil.copy(file, folder / f"{name}.toml")
 
 
 def _record(work: Path, commands: Path, folder: Path) -> None:

@@ -66,6 +66,7 @@ def test_all_sections_are_read(folder: Path) -> None:
     assert config.path("db201.db") == folder / "db201.db"
     assert config.emulator[0].program == "a50"
     assert load(written(folder, WHOLE.replace('program = "a50"\n', ""))).emulator[0].program == "idle"
+    assert load(written(folder, WHOLE.replace('program = "a50"\n', 'folder = "x"\n'))).emulator[0].folder == "x"
     assert config.grpc is not None
     assert config.grpc.listen == ["127.0.0.1:8089", "[::1]:8090"]
 
