@@ -28,7 +28,5 @@ class Robot(Model):
         now = list(self.axes.values())
         way = max(abs(end - begin) for begin, end in zip(now, target, strict=True))
         share = min(1.0, self.speed * dt_s / way) if way else 1.0
-        self.axes = {
-            axis: begin + share * (end - begin) for axis, begin, end in zip(AXES, now, target, strict=True)
-        }
+        self.axes = {axis: begin + share * (end - begin) for axis, begin, end in zip(AXES, now, target, strict=True)}
         self.at = self.to if share == 1.0 else 0
