@@ -22,8 +22,11 @@ def carry(cell: shmio.Cell) -> None:
     """Write to the PLC what differs there, whenever a signal changes or the PLC comes back."""
     with cell.subscribe(*INPUTS, *INPUTS.values()) as updates:
         for _ in updates:
-            readings = cell.get(*INPUTS, *INPUTS.values())
-            now = {reading.path: reading.value for reading in readings if reading.quality is Quality.GOOD}
+            now = {
+                reading.path: reading.value
+                for reading in cell.get(*INPUTS, *INPUTS.values())
+                if reading.quality is Quality.GOOD and isinstance(reading.value, int | float)
+            }
             pairs = [(signal, place) for signal, place in INPUTS.items() if signal in now and place in now]
             changed = {place: now[signal] for signal, place in pairs if abs(now[signal] - now[place]) >= RESOLUTION}
             try:

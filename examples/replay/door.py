@@ -27,6 +27,7 @@ class Door(Program):
         position_mm = 256 * self.position_high + self.position_low
         there = self.at_station and (position_mm > 2900 or not self.checked)
         self.close = self.arrived(there)
-        way = dt_s / TRAVEL_S
-        self.closed = min(self.closed + way, 1.0) if self.close else max(self.closed - way, 0.0)
-        self.clearance = float(position_mm - PASSED_MM) if self.closed > 0 else float(PASSED_MM)
+        way = dt_s / TRAVEL_S if self.close else -dt_s / TRAVEL_S
+        closed = min(max(self.closed + way, 0.0), 1.0)
+        self.closed = closed
+        self.clearance = float(position_mm - PASSED_MM if closed > 0 else PASSED_MM)

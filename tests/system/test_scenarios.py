@@ -39,8 +39,8 @@ class Example:
         self.name, self.instance = name, instance
         self.folder = folder / "examples" / name
         shutil.copytree(ROOT / "examples" / name, self.folder, ignore=shutil.ignore_patterns(*MADE))
-        for file in ("db201.db", "scene.toml", "examples/remote.py"):
-            (folder / file).symlink_to(ROOT / file)
+        for beside in ("db201.db", "scene.toml", "examples/remote.py"):
+            (folder / beside).symlink_to(ROOT / beside)
         (folder / ".venv").symlink_to(sys.prefix)
         (folder / "scripts").mkdir()
         (folder / "scripts/install-missing").symlink_to(ROOT / "scripts/install-missing")
@@ -104,6 +104,9 @@ def blocks(page: str) -> list[tuple[str, str]]:
     found = BLOCK.findall((ROOT / "docs/how-to" / page).read_text())
     assert found
     return found
+
+
+pytestmark = pytest.mark.timeout(300)  # on a busy host
 
 
 @pytest.fixture
