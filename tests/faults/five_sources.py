@@ -36,6 +36,7 @@ from shmio.local.attach import Attachment
 from shmio.model.values import Quality
 from shmio.testing.cell import Cell, kill, until
 from shmio.testing.ports import reserved_port
+from tests.faults.pulse import waited_ns
 
 EXAMPLE: Final = Path(__file__).parents[2] / "examples/five-sources"
 PORTS: Final = {"10102": "press", "14840": "furnace", "10502": "conveyor", "11883": "broker", "5555": "grpc"}
@@ -44,7 +45,7 @@ DOMAIN: Final = 42
 FAULTS: Final = ("kill", "freeze")
 COLUMNS: Final = (
     "peer", "fault", "times", "bad after, ms: median", "max", "allowed", "good again, ms: median", "max",
-    "others: frames", "bad", "skipped cycles", "longest gap, ms",
+    "others: frames", "bad", "bad without a processor", "skipped cycles", "longest gap, ms",
 )  # fmt: skip
 PATIENCE_S: Final = 30.0
 CALM_S: Final = 0.5
@@ -118,6 +119,8 @@ class Result:
     """Times from the end of the fault (a kill: from the kill) until all registers were good."""
     others_bad: int = 0
     """Bad frames of other sources during the faults."""
+    others_starved: int = 0
+    """Further such frames, of sources whose processes could not run in time, because the host was busy."""
     others_skipped: int = 0
     """Cycles that other sources skipped during the faults."""
     others_frames: int = 0
@@ -187,6 +190,11 @@ class Example:
         children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()  # mosquitto, of the broker
         return int(children[0]) if children else pid
 
+    def _waited_ns(self, source: str) -> int:
+        """Return how long the processes of a source and of its peers have waited for a processor, in ns."""
+        pids = [self.cell.processes()[source]["pid"], *(self._pid(one) for one in self.peers if one.source == source)]
+        return sum(map(waited_ns, pids))
+
     def calm(self) -> None:
         """Wait until all sources have been good for a while."""
 
@@ -208,6 +216,8 @@ class Example:
         """Inflict one fault, end it, and wait until the source has recovered."""
         self.calm()
         own, pid = self.watchers[peer.source], self._pid(peer)
+        others = [name for name in self.watchers if name != peer.source]
+        waited = {name: self._waited_ns(name) for name in others}
         begin_ns = time.monotonic_ns()
         kill(pid, signal.SIGKILL if fault == "kill" else signal.SIGSTOP)
         until(
@@ -230,14 +240,19 @@ class Example:
         assert good_ns is not None
         result.bad_ms.append((bad_ns - begin_ns) / 1e6)
         result.good_ms.append((good_ns - ended_ns) / 1e6)
-        for name, watcher in self.watchers.items():
-            if name != peer.source:
-                _add(result, watcher.between(begin_ns, good_ns))
+        for name in others:
+            limit_ms = min(one.limit_ms for one in self.peers if one.source == name)
+            starved = (self._waited_ns(name) - waited[name]) / 1e6 > limit_ms / 2
+            _add(result, self.watchers[name].between(begin_ns, good_ns), starved=starved)
 
 
-def _add(result: Result, samples: Sequence[Sample]) -> None:
+def _add(result: Result, samples: Sequence[Sample], *, starved: bool) -> None:
     result.others_frames += len(samples)
-    result.others_bad += sum(not one.good for one in samples)
+    bad = sum(not one.good for one in samples)
+    if starved:
+        result.others_starved += bad
+    else:
+        result.others_bad += bad
     for before, after in pairwise(samples):
         result.others_skipped += max(0, after.cycle - before.cycle - 1)
         result.others_late_ms = max(result.others_late_ms, (after.publish_ns - before.publish_ns) / 1e6)
@@ -276,8 +291,8 @@ def report(results: Sequence[Result]) -> str:
     lines += [
         f"| {one.peer.name} | {one.fault} | {len(one.bad_ms)} | {statistics.median(one.bad_ms):.0f} "
         f"| {max(one.bad_ms):.0f} | {one.limit_ms:.0f} | {statistics.median(one.good_ms):.0f} "
-        f"| {max(one.good_ms):.0f} | {one.others_frames:,} | {one.others_bad} | {one.others_skipped} "
-        f"| {one.others_late_ms:.1f} |"
+        f"| {max(one.good_ms):.0f} | {one.others_frames:,} | {one.others_bad} | {one.others_starved} "
+        f"| {one.others_skipped} | {one.others_late_ms:.1f} |"
         for one in results
     ]
     return "\n".join(lines)

@@ -46,12 +46,17 @@ class Pulse:
         return 1.0 + (waited_ns - wait_ns) / (ran_ns - run_ns)
 
 
-def _worked() -> tuple[int, int]:
-    """Return how many ns this process's threads have run, and have waited for a processor."""
+def waited_ns(pid: int) -> int:
+    """Return how many ns the threads of a process have waited for a processor; those that have ended do not count."""
+    return _worked(str(pid))[1]
+
+
+def _worked(pid: str = "self") -> tuple[int, int]:
+    """Return how many ns a process's threads have run, and have waited for a processor."""
     run_ns = wait_ns = 0
-    for task in Path("/proc/self/task").iterdir():
+    for figures in Path("/proc").glob(f"{pid}/task/*/schedstat"):
         try:
-            run, wait, _ = (task / "schedstat").read_text().split()
+            run, wait, _ = figures.read_text().split()
         except (OSError, ValueError):
             continue  # the thread has just ended, or the kernel has no figures
         run_ns += int(run)

@@ -18,6 +18,7 @@ pytest.importorskip("pymodbus")
 COMMANDS = {"press/Lamp": True, "furnace/Setpoint": 900.0, "conveyor/Start": True, "sensors/Lamp": True}
 
 
+@pytest.mark.timeout(600)  # twelve faults, each with a wait of at least half a second, on a host that may be busy
 @pytest.mark.skipif(bool(missing()), reason=missing())
 def test_a_fault_of_a_peer_reaches_its_own_source_only(tmp_path: Path, instance: str) -> None:
     with started(tmp_path, instance) as example:
