@@ -31,6 +31,7 @@ SEEN_S: Final = 90.0
 MOST_CHANGES: Final = 30
 """Number of blocks changed by reloads after which the instance is restarted. Its memory has room for 40."""
 HISTORY: Final = 20
+"""Number of faults, and of the supervisor's warnings, that a violation lists."""
 MOST_VIOLATIONS: Final = 10
 """Maximum number of violations that are kept; further ones are only counted."""
 END_S: Final = 5.0
@@ -83,10 +84,21 @@ class Run:
             if len(self.record.violations) < MOST_VIOLATIONS:
                 now = f"{time.monotonic_ns()} ({time.strftime('%H:%M:%S', time.gmtime())} UTC)"
                 past = "".join(f"\n    {line}" for line in self._history)
-                evidence = f"{problem}\n  seed {self.record.seed}, now {now}; the last faults, oldest first:{past}"
+                warned = "".join(f"\n    {line}" for line in self._warnings())
+                evidence = (
+                    f"{problem}\n  seed {self.record.seed}, now {now}; the last faults, oldest first:{past}"
+                    f"\n  the supervisor's last warnings:{warned}"
+                )
                 self.record.violations.append(evidence)
                 self._say(f"VIOLATION: {evidence}")
         self._stopping.set()
+
+    def _warnings(self) -> list[str]:
+        """Return the last warnings in the supervisor's log, which say why it started processes again."""
+        with suppress(FileNotFoundError):
+            lines = (self._folder / "logs/supervisor.log").read_text().splitlines()
+            return [line for line in lines if " WARNING " in line or " ERROR " in line][-HISTORY:]
+        return []
 
     def stop(self) -> None:
         """End the run after the present round."""

@@ -98,4 +98,5 @@ def test_a_piece_of_a_schedule_and_then_a_broken_promise(
     assert "grpc was not hit, but went from" in record.violations[0]
     assert f"seed {SEED}" in record.violations[0]
     assert "kill grpc" in record.violations[0]
+    assert "grpc crashed: killed by SIGKILL" in record.violations[0]
     assert record.rounds == len(piece) + 1, "it went on"
