@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -32,6 +33,9 @@ MAX_HELD: Final = 256
 """The largest number of writes that one injection may delay at once; further writes are rejected."""
 
 Bits = np.ndarray[Any, np.dtype[np.uint8]]
+
+_OUT: Final = Direction.OUT  # each image needs these, and looking up a member of an enum is slow
+_ACTIVE: Final = State.ACTIVE
 
 
 @dataclass(frozen=True)
@@ -139,8 +143,14 @@ class LayerStack:
 
     def effective(self, raw: bytes) -> bytes | None:
         """Return the image that readers see instead of ``raw``; None if no active layer covers ``/out``."""
-        layers = [layer for layer in self.layers if layer.direction is Direction.OUT and layer.active]
-        return self.seen(raw, layers).tobytes() if layers else None
+        layers = [layer for layer in self.layers if layer.direction is _OUT and layer.active]
+        if not layers:
+            return None
+        buffer = bytearray(raw)
+        image = np.frombuffer(buffer, np.uint8)
+        for layer in layers:
+            layer.show(image, self.now)
+        return bytes(buffer)
 
     def seen(self, raw: bytes, inner: Iterable[Layer]) -> Bits:
         """Return a copy of the image ``raw`` with the given layers over ``/out`` applied."""
@@ -304,7 +314,7 @@ class DeclaredLayer(Layer):
     @property
     def active(self) -> bool:
         """True if the injection is active at present."""
-        return self.activation.state is State.ACTIVE
+        return self.activation.state is _ACTIVE
 
     @property
     def configured(self) -> bool:
@@ -402,8 +412,11 @@ class DeclaredLayer(Layer):
         return OperationContext(self.activation.runs, place, now.cycle, now.time_ns)
 
     def _happens(self, at: OperationContext) -> bool:
-        probability = self.program.declaration.probability
-        return probability is None or self.draw.happens(probability, at.run, at.place)
+        return self._probability is None or self.draw.happens(self._probability, at.run, at.place)
+
+    @cached_property
+    def _probability(self) -> float | None:
+        return self.program.declaration.probability
 
 
 def declared(number: int, program: Program, owner: Owner, seed: int, *, keep: bool) -> DeclaredLayer:

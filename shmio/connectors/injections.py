@@ -37,7 +37,7 @@ from shmio.errors import ConfigError, SegmentError, SnapshotError
 from shmio.injection import Program, compile_program
 from shmio.injection.activation import State
 from shmio.injection.language import Number
-from shmio.injection.program import NEVER, compile_condition
+from shmio.injection.program import NEVER, Condition, compile_condition
 from shmio.layout.values.write import Write, apply
 from shmio.model.clock import Clock
 from shmio.model.injection import Running
@@ -59,6 +59,7 @@ OwnerOf = Callable[[int], Owner | None]
 """Returns the process that uses the command queue of a writer; None if no live process does."""
 
 _DECODER: Final = msgspec.json.Decoder(Declaration)
+_OVER: Final = State.OVER  # each cycle needs it, and looking up a member of an enum is slow
 
 log = logging.getLogger("shmio.source")
 
@@ -105,12 +106,10 @@ class ConditionValues:
         known = image.quality is not Quality.BAD and image.source_ns != 0
         self._images: dict[str, bytes | None] = {own: image.raw if known else None}
 
-    def of(self, program: Program) -> Sequence[Number | None]:
-        """Return the values that the program's condition reads; each unknown value is None."""
-        if program.condition is None:
-            return ()
+    def of(self, condition: Condition) -> Sequence[Number | None]:
+        """Return the values that a condition reads; each unknown value is None."""
         values: list[Number | None] = []
-        for source, codec in program.condition.reads:
+        for source, codec in condition.reads:
             image = self._image(source)
             value = None if image is None else codec.decode(image)
             values.append(value if isinstance(value, bool | int | float) else None)
@@ -327,38 +326,50 @@ class DeclaredInjections:
         a cycle, because the number of further images depends on timing, which must not influence
         the result.
         """
-        looked = self._publisher.injections.now.cycle
+        stack, cycle = self._publisher.injections, image.cycle
+        looked = stack.now.cycle
         state = self._own.clock.last_written()
-        time_ns = image.at.clock_ns if image.at else self._time_of(image.cycle, state)
-        now = self._publisher.injections.now = CycleImage(image.cycle, time_ns, image.raw)
-        if image.cycle == looked:
+        time_ns = image.at.clock_ns if image.at else self._time_of(cycle, state)
+        now = stack.now = CycleImage(cycle, time_ns, image.raw)
+        if cycle == looked:
             return []
-        step = state.step if self._own.attributes.stepped and state.virtual else None
-        readings = ConditionValues(self._own.source, image, self._blocks, step)
-        changed = []
+        readings: ConditionValues | None = None
+        changed = False
         turned = []
         for layer in self._layers:
             before = layer.active
-            if layer.advance(now, readings.of(layer.program)):
-                changed.append(layer)
+            values: Sequence[Number | None] = ()
+            if layer.program.condition is not None:
+                if readings is None:
+                    step = state.step if self._own.attributes.stepped and state.virtual else None
+                    readings = ConditionValues(self._own.source, image, self._blocks, step)
+                values = readings.of(layer.program.condition)
+            if layer.advance(now, values):
+                changed = True
                 if layer.active is not before:
                     turned.append(_activation_event(layer))
         if changed:
             self._publisher.publish()
-        return [*self._publisher.computed(image.base), *turned, *self._lift_finished()]
+        events = turned
+        if len(stack.layers) > len(self._layers):  # clients' layers get values from declared ones
+            events = [*self._publisher.computed(image.base), *turned]
+        return events + self._lift_finished()
 
     def _lift_finished(self) -> list[Record]:
         """Lift the injections that are over, and return the events about them."""
-        if not any(map(_finished, self._layers)):
+        over = {layer.id for layer in self._layers if layer.activation.state is _OVER and _finished(layer)}
+        if not over:
             return []
-        over = {layer.id for layer in self._layers if _finished(layer)}
         records = self._publisher.removed(lambda layer: layer.id in over, "over")
         self._settle()
         return records
 
     def release(self, cycle: int) -> list[tuple[DeclaredLayer, Write]]:
         """Return the delayed writes that are due in ``cycle``, each with its layer."""
-        if not any(layer.held for layer in self._layers):
+        for layer in self._layers:
+            if layer.held:
+                break
+        else:
             return []
         now = CycleImage(cycle, self._time_ns(cycle), b"")
         with self._output.lock:
@@ -395,7 +406,7 @@ def _finished(layer: DeclaredLayer) -> bool:
 
     Injections of the configuration stay in the list when they are over.
     """
-    return layer.activation.state is State.OVER and not layer.configured and not layer.held
+    return layer.activation.state is _OVER and not layer.configured and not layer.held
 
 
 def _activation_event(layer: DeclaredLayer) -> Record:

@@ -173,7 +173,7 @@ class Output:
     def _publish(self, at: Stamp | None = None) -> None:
         if self._last is not None:
             raw, cycle, source_ns, quality, provenance, reason, asked_ns, shown, _ = self._last
-            effective = self.injections.effective(self._last.base)
+            effective = self.injections.effective(raw if shown is None else shown)
             self.writer.publish(
                 raw,
                 cycle=cycle,

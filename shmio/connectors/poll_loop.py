@@ -122,6 +122,7 @@ class QualityLog:
 
     def __init__(self, writer: BlockWriter) -> None:
         self._writer = writer
+        self._last: tuple[Quality, str] | None = None
         self._state: tuple[Quality, str] | None = None  # the reason without its numbers
         self.note = ""
         """Why quality is not good, for the process table; empty if quality is good."""
@@ -141,7 +142,9 @@ class QualityLog:
             Whether there was a change.
 
         """
-        self.note = reason
+        if (quality, reason) == self._last:
+            return False
+        self.note, self._last = reason, (quality, reason)
         state = quality, _MEASURES.sub("#", reason)
         if state == self._state:
             return False

@@ -23,6 +23,9 @@ class State(StrEnum):
     """A client has lifted the injection, which is still in the configuration."""
 
 
+_WAITING, _ACTIVE, _OVER, _LIFTED = State  # each cycle needs these, and looking up a member of an enum is slow
+
+
 @dataclass(frozen=True, slots=True)
 class Window:
     """Limits on when, how long and how often an injection is active.
@@ -62,20 +65,20 @@ class Activation:
             holds: True if the condition is true, or there is no condition.
 
         """
-        if self.state in (State.OVER, State.LIFTED):
-            return False
         before, window = self.state, self.window
+        if before is _OVER or before is _LIFTED:
+            return False
         ended = window.end_ns is not None and time_ns >= window.end_ns
         met = holds and time_ns >= window.start_ns and not ended
-        if self.state is State.ACTIVE and self._stops(time_ns, met=met, ended=ended):
-            self.state = State.WAITING
-        elif self.state is State.WAITING and met and self._begins():
-            self.state, self.runs = State.ACTIVE, self.runs + 1
+        if before is _ACTIVE and self._stops(time_ns, met=met, ended=ended):
+            self.state = _WAITING
+        elif before is _WAITING and met and self._begins():
+            self.state, self.runs = _ACTIVE, self.runs + 1
             self.cycle, self.time_ns = cycle, time_ns
         self.met = met
         used_up = window.times is not None and self.runs >= window.times
-        if self.state is State.WAITING and (ended or used_up):
-            self.state = State.OVER
+        if self.state is _WAITING and (ended or used_up):
+            self.state = _OVER
         return self.state is not before
 
     def _begins(self) -> bool:

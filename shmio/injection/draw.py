@@ -47,6 +47,7 @@ class SeededRandom:
     def __init__(self, seed: int, name: str) -> None:
         """Create the generator. For the same seed, different names give different numbers."""
         self._key = int.from_bytes(hashlib.sha256(f"{seed}/{name}".encode()).digest()[:8], "little")
+        self._of_run = -1, 0  # the number of a run, and the mixed word that depends on it alone
 
     def words(self, run: int, place: int, purpose: Purpose, count: int) -> Words:
         """Return ``count`` random 64-bit integers: an array of shape (count,) and type uint64."""
@@ -87,7 +88,11 @@ class SeededRandom:
         return math.sqrt(-2 * math.log(radius)) * math.cos(math.tau * self.one_uniform(run, place, Purpose.ANGLE))
 
     def _base(self, run: int, place: int, purpose: Purpose) -> int:
-        return _mix(_mix(_mix(self._key + run & _MASK) + place & _MASK) + purpose & _MASK)
+        known, word = self._of_run
+        if known != run:
+            word = _mix(self._key + run & _MASK)
+            self._of_run = run, word
+        return _mix(_mix(word + place & _MASK) + purpose & _MASK)
 
     def _few(self, run: int, place: int, purpose: Purpose, count: int) -> list[int]:
         base = self._base(run, place, purpose)

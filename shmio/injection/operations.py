@@ -111,15 +111,19 @@ class ValueGroup:
 
     def change_single(self, packing: struct.Struct, image: Bytes, change: Callable[[float], float]) -> None:
         """Change the only value: the same as :meth:`numbers` and :meth:`put_numbers`, but faster."""
-        at = self._at
-        value = change(float(packing.unpack_from(image.data, at)[0]))
+        at, data = self._at, image.data
+        value = change(float(packing.unpack_from(data, at)[0]))
         least, most = self._range
-        if self.dtype.kind != "f":
-            packing.pack_into(image.data, at, round(min(max(value, least), most)))
-        elif value == value:  # noqa: PLR0124  NaN stays NaN
-            packing.pack_into(image.data, at, min(max(value, least), most))
+        if self._whole:
+            packing.pack_into(data, at, round(min(max(value, least), most)))
+        elif least <= value <= most or value != value:  # noqa: PLR0124  NaN stays NaN
+            packing.pack_into(data, at, value)
         else:
-            packing.pack_into(image.data, at, value)
+            packing.pack_into(data, at, min(max(value, least), most))
+
+    @cached_property
+    def _whole(self) -> bool:
+        return self.dtype.kind != "f"
 
     @cached_property
     def _at(self) -> int:
@@ -298,12 +302,13 @@ class Noise(Operation):
 
     def __init__(self, places: Sequence[ValueGroup], draw: SeededRandom, amplitude: float, *, gaussian: bool) -> None:
         self._places = places
+        self._count = places[-1].first + len(places[-1])
         self._draw = draw
         self._amplitude = amplitude
         self._gaussian = gaussian
 
     def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: D102
-        count = self._places[-1].first + len(self._places[-1])
+        count = self._count
         only = self._places[0]
         if count == 1 and only.single is not None:
             draw = self._draw.one_gaussian if self._gaussian else self._draw.one_uniform

@@ -400,7 +400,8 @@ class Recorder:
             return
         log_ns, follower, item = entry
         followed = self._known(follower)
-        self._tell_lost(followed, log_ns)
+        if followed.lost:
+            self._tell_lost(followed, log_ns)
         if isinstance(item, Gap):
             self.counters.missed += item.count
             self._writer.gap(item, log_ns)

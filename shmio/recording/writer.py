@@ -31,9 +31,8 @@ from shmio.recording.format.encoding import (
     Gap,
     ProcessChange,
     StepMark,
-    differ,
     encode_event,
-    encode_frame,
+    encode_frame_v2,
     encode_json,
     encode_position,
 )
@@ -158,7 +157,7 @@ class Writer:
         """Add a frame."""
         told_ns = frame.source_ns if frame.source_ns > 0 else log_ns
         sequence = frame.number & 0xFFFFFFFF
-        data = differ(encode_frame(frame), sequence, log_ns, told_ns)
+        data = encode_frame_v2(frame, sequence, log_ns, told_ns)
         self._mcap.add_message(channels.frames, log_ns, data, told_ns, sequence)
 
     def event(self, channels: Channels, event: Event, log_ns: int) -> None:

@@ -508,7 +508,11 @@ class BlockWriter:
             The frame's number.
         """
         with self._lock:
-            now_ns, clock_ns, _ = at or self._present()
+            if at is None:
+                now_ns = self.now_ns()
+                clock_ns = self._clock_ns(now_ns)
+            else:
+                now_ns, clock_ns, _ = at
             self._quality = quality
             return self.block.ring.publish(
                 raw,

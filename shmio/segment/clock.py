@@ -145,6 +145,7 @@ class ClockPage:
         self._answers_at += 2 * _REQUEST_COPY
         self._owned = owned
         self._last = b"", Clock()  # the last state read
+        self._stepped = bool(_word(memory, offset + _STEPPED_AT))
         self._started_ns, self._started_utc_ns = head.started_ns, head.started_utc_ns
         self.bell = Doorbell(memory, offset + _BELL_AT)
         """Doorbell that the owner of time rings after a change of the page."""
@@ -164,7 +165,7 @@ class ClockPage:
     @property
     def stepped(self) -> bool:
         """True if time is virtual from the instance's start, as the configuration demands."""
-        return bool(_word(self._memory, self._offset + _STEPPED_AT))
+        return self._stepped
 
     def read(self) -> Clock:
         """Return the present state. If the owner of time has died, ``playing`` is False.
@@ -230,7 +231,7 @@ class ClockPage:
         If time is virtual from the start, UTC begins at ``SIMULATED_UTC_NS`` in each run.
         """
         since_ns = monotonic_ns - self._started_ns
-        return (SIMULATED_UTC_NS if self.stepped else self._started_utc_ns) + since_ns
+        return (SIMULATED_UTC_NS if self._stepped else self._started_utc_ns) + since_ns
 
     def slot_bell(self, index: int) -> Doorbell:
         """Return the doorbell that wakes the process in a slot when it must act on a change."""
@@ -316,14 +317,14 @@ def _cell(memory: memoryview, offset: int) -> DoubleBuffer:
 
 
 def _pack(state: Clock) -> bytes:
-    flags = (_PLAYING if state.playing else 0) | (_STEPPING if state.stepping else 0)
-    time_ns, dt_ns = state.time_ns, state.dt_ns
-    if not state.virtual:
-        time_ns, dt_ns = state.resumed_ns, state.resumed_ns - state.offset_ns
+    (mode, step, time_ns, dt_ns, done, step_size_ns, playing, rate, stepping, owner, note, resumed_ns,
+     offset_ns) = state  # fmt: skip
+    flags = (_PLAYING if playing else 0) | (_STEPPING if stepping else 0)
+    if not mode:
+        time_ns, dt_ns = resumed_ns, resumed_ns - offset_ns
     return _STATE.pack(
-        state.mode, flags, state.step, time_ns, dt_ns, state.done, state.step_size_ns, state.rate, state.owner,
-        cut(state.note, _NOTE_SIZE),
-    )  # fmt: skip
+        mode, flags, step, time_ns, dt_ns, done, step_size_ns, rate, owner, cut(note, _NOTE_SIZE) if note else b""
+    )
 
 
 def _unpack(data: bytes) -> Clock:

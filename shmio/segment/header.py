@@ -280,7 +280,8 @@ def text(field: bytes) -> str:
 
 def cut(message: str, size: int) -> bytes:
     """Encode a text in at most ``size`` bytes of UTF-8, cut at a whole character."""
-    return message.encode()[:size].decode("utf-8", "ignore").encode()
+    data = message.encode()
+    return data if len(data) <= size else data[:size].decode("utf-8", "ignore").encode()
 
 
 def _set_table_state(memory: memoryview, generation: int, count: int) -> None:

@@ -411,23 +411,22 @@ class SteppedLoop:
         self._carry_out()
         if self._published:
             return ""  # a prompt source published the frame when it was written
-        begun_ns, asked_ns = self._clock.now_ns(), self._writer.now_ns()
+        asked_ns, counters, doubt = self._writer.now_ns(), self.counters, ""
+        counters.busy_since_ns = begun_ns = self._clock.now_ns()
         try:
-            raw, doubt = self.counters.watch(self._clock.now_ns, lambda: self._step(time_ns, dt_ns))
+            if self._inputs is not None:
+                values, doubt = self._inputs.read(self._handled if self._in_virtual_time else None)
+                self._source.connect(values, doubt)
+            raw = self._source.step(time_ns, dt_ns)
         except ShmioError as error:
-            self.counters.failures += 1
+            counters.failures += 1
             self._fail(cycle, str(error))
             return str(error) or "it gave no reason"
-        self.counters.round_trip_us = (self._clock.now_ns() - begun_ns) // 1000
+        finally:
+            counters.busy_since_ns = 0
+        counters.round_trip_us = (self._clock.now_ns() - begun_ns) // 1000
         self._publish(raw, asked_ns, doubt)
         return ""
-
-    def _step(self, time_ns: int, dt_ns: int) -> tuple[bytes, str]:
-        doubt = ""
-        if self._inputs is not None:
-            values, doubt = self._inputs.read(self._handled if self._in_virtual_time else None)
-            self._source.connect(values, doubt)
-        return self._source.step(time_ns, dt_ns), doubt
 
     @property
     def _in_virtual_time(self) -> bool:

@@ -48,6 +48,7 @@ In the file, all three have the encoding PLAIN; only their topics differ.
 """
 
 _FRAME: Final = struct.Struct("<QQqqqQIBBHHHII")
+_FRAME_V2: Final = struct.Struct("<QQQQQQIBBHHHII")  # the first five are differences
 _COUNTED: Final = struct.Struct("<QQQQQ")  # the first fields of a frame: number, cycle, publish, clock, source
 _EVENT: Final = struct.Struct("<QQQqqqQQIIIIIIHBBHH")
 _QUALITIES: Final = (*Quality, Quality.BAD)  # an unknown quality counts as bad
@@ -204,23 +205,26 @@ def decode_frame(data: bytes) -> Frame:
     )  # fmt: skip
 
 
-def differ(data: bytes, sequence: int, log_ns: int, publish_ns: int) -> bytes:
-    """Convert a frame from FRAME to FRAME_V2.
+def encode_frame_v2(frame: Frame, sequence: int, log_ns: int, publish_ns: int) -> bytes:
+    """Encode a frame as FRAME_V2.
 
     This replaces the numbers and times of the frame by their differences, modulo 2^64, from those
     in the message's header. The differences hardly change from frame to frame, so they compress
     well.
     """
-    number, cycle, publish, clock, source = _COUNTED.unpack_from(data)
-    head = _COUNTED.pack(
-        number - sequence & _MAX_U64, cycle - number & _MAX_U64, publish - clock & _MAX_U64, clock - log_ns & _MAX_U64,
-        source - publish_ns & _MAX_U64,
+    (number, cycle, published_ns, clock_ns, source_ns, incarnation, quality, provenance, event, delay_us, text, raw,
+     effective) = frame  # fmt: skip
+    reason = text.encode()
+    head = _FRAME_V2.pack(
+        number - sequence & _MAX_U64, cycle - number & _MAX_U64, published_ns - clock_ns & _MAX_U64,
+        clock_ns - log_ns & _MAX_U64, source_ns - publish_ns & _MAX_U64, event, incarnation, quality, provenance,
+        0 if effective is None else _EFFECTIVE, len(reason), 0, len(raw), delay_us,
     )  # fmt: skip
-    return head + data[_COUNTED.size :]
+    return b"".join((head, reason, raw, effective or b""))
 
 
 def restore(data: bytes, sequence: int, log_ns: int, publish_ns: int) -> bytes:
-    """Convert a frame from FRAME_V2 to FRAME.
+    """Convert a frame from FRAME_V2 to FRAME; the opposite of :func:`encode_frame_v2`.
 
     Return bytes that are too short for a frame unchanged.
     """
