@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Final, Self, cast
@@ -33,6 +32,8 @@ class _Process:
     popen: subprocess.Popen[bytes]
     stdin: IO[bytes]
     stdout: IO[bytes]
+    unsent: memoryview = memoryview(b"")
+    """The part of the present task that its pipe has no room for yet."""
     task: Task | None = None
     since_s: float = 0.0
     ready: bool = False
@@ -67,15 +68,32 @@ class Pool:
         one = next((one for one in self._processes if one.task is None), None) or self._start()
         one.task, one.since_s = task, time.monotonic()
         one.answer.clear()
-        with suppress(BrokenPipeError):  # wait() finds that it has ended
-            one.stdin.write(msgspec.json.encode(task) + b"\n")
-            one.stdin.flush()
+        one.unsent = memoryview(msgspec.json.encode(task) + b"\n")
+        self._send(one)
+
+    def _send(self, one: _Process) -> None:
+        """Send as much of a task as the pipe takes. A process that hangs delays nobody."""
+        try:
+            one.unsent = one.unsent[os.write(one.stdin.fileno(), one.unsent) :]
+        except BlockingIOError:
+            pass
+        except BrokenPipeError:  # wait() finds that it has ended
+            one.unsent = memoryview(b"")
+        waits = one.stdin in self._selector.get_map()
+        if one.unsent and not waits:
+            self._selector.register(one.stdin, selectors.EVENT_WRITE, one)
+        elif waits and not one.unsent:
+            self._selector.unregister(one.stdin)
 
     def wait(self, timeout_s: float) -> list[Result]:
         """Wait for results, for at most ``timeout_s`` seconds. Return the results that have arrived."""
         left_s = [self._left_s(one) for one in self._processes if one.task is not None]
         ready = self._selector.select(max(0.0, min([timeout_s, *left_s])))
-        found = [result for key, _ in ready if (result := self._read(key.data)) is not None]
+        for key, events in ready:
+            if events & selectors.EVENT_WRITE:
+                self._send(key.data)
+        reads = [key.data for key, events in ready if events & selectors.EVENT_READ]
+        found = [result for one in reads if (result := self._read(one)) is not None]
         for one in list(self._processes):
             if one.task is not None and self._left_s(one) <= 0:
                 number = one.task.number
@@ -108,8 +126,10 @@ class Pool:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
+            bufsize=0,
         )
         one = _Process(popen, cast("IO[bytes]", popen.stdin), cast("IO[bytes]", popen.stdout))
+        os.set_blocking(one.stdin.fileno(), False)
         self._selector.register(one.stdout, selectors.EVENT_READ, one)
         self._processes.append(one)
         return one
@@ -137,8 +157,9 @@ class Pool:
         """End a process at once, and return how it ended."""
         self._processes.remove(one)
         self._selector.unregister(one.stdout)
-        with suppress(BrokenPipeError):
-            one.stdin.close()
+        if one.unsent:
+            self._selector.unregister(one.stdin)
+        one.stdin.close()
         one.stdout.close()
         try:
             status = one.popen.wait(0 if one.task is not None else END_S)

@@ -9,6 +9,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -73,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
     with stop_on_signals() as over:
         try:
             execute = _in_laboratory if arguments.lab else _on_instance
-            name, work = execute(arguments, campaign, plan, reports, facts, over)
+            name, work = execute(_Run(arguments, campaign, plan, reports, facts, over))
         except (ConfigError, DeclarationError) as error:
             raise ConfigError(f"{arguments.campaign}: {error}") from None
     how = f"virtual, steps of {work.step_s * 1000:g} ms" if work.virtual else "real"
@@ -117,52 +118,53 @@ def duration_of(arguments: argparse.Namespace, campaign: Campaign) -> float:
     return duration_s
 
 
-def _in_laboratory(
-    arguments: argparse.Namespace,
-    campaign: Campaign,
-    plan: Plan,
-    reports: Reports,
-    facts: list[tuple[str, str]],
-    over: threading.Event,
-) -> tuple[str, LiveRun]:
+@dataclass(frozen=True)
+class _Run:
+    """A run of a campaign: what the user asked for, and where the results go.
+
+    ``facts`` are the names and values for the report, and ``over`` ends the run when it is set.
+    """
+
+    arguments: argparse.Namespace
+    campaign: Campaign
+    plan: Plan
+    reports: Reports
+    facts: list[tuple[str, str]]
+    over: threading.Event
+
+
+def _in_laboratory(run: _Run) -> tuple[str, LiveRun]:
     """Run the campaign in this process, without an instance. Return the instance's name and the run."""
-    file: Path | None = arguments.config
+    file: Path | None = run.arguments.config
     if file is None:
         raise ConfigError("--lab: name the configuration with -c FILE, or with the key config of the campaign")
-    if arguments.real_time:
+    if run.arguments.real_time:
         raise ConfigError("--real-time: the time of a laboratory is always virtual")
     prepared = prepare_laboratory(file)
-    with Laboratory(prepared, campaign.parameters) as lab:
-        work = lab.prepare(plan, reports.collector(lambda: work.judge))
-        facts += of_configuration(file)
-        facts += of_layouts({block.source: block.layout for block in prepared.blocks})
-        work.run(over, lambda: _told(arguments, campaign, plan, "laboratory", work))
+    with Laboratory(prepared, run.campaign.parameters) as lab:
+        work = lab.prepare(run.plan, run.reports.collector(lambda: work.judge))
+        run.facts += of_configuration(file)
+        run.facts += of_layouts({block.source: block.layout for block in prepared.blocks})
+        work.run(run.over, lambda: _told(run, "laboratory", work))
     return prepared.instance, work
 
 
-def _on_instance(
-    arguments: argparse.Namespace,
-    campaign: Campaign,
-    plan: Plan,
-    reports: Reports,
-    facts: list[tuple[str, str]],
-    over: threading.Event,
-) -> tuple[str, LiveRun]:
+def _on_instance(run: _Run) -> tuple[str, LiveRun]:
     """Run the campaign on an instance. Return the instance's name and the run."""
-    if campaign.parameters:
+    if run.campaign.parameters:
         raise ConfigError(
             "parameters: an instance cannot change the parameters of its models; use --lab, "
             "or set them in supervisor.toml"
         )
-    with _instance(arguments) as wanted:
+    with _instance(run.arguments) as wanted:
         segment = wanted.open(writable=True)
         with segment:
             file = _configuration(segment)
             attachments: AttachedFiles = no_attachments if file is None else ConfigFiles(file)
-            facts += [] if file is None else of_configuration(file)
-            facts += of_layouts({source: block.layout for source, block in segment.blocks.items()})
-            work = LiveRun(segment, plan, attachments, reports.collector(lambda: work.judge))
-            work.run(over, lambda: _told(arguments, campaign, plan, wanted.name, work))
+            run.facts += [] if file is None else of_configuration(file)
+            run.facts += of_layouts({source: block.layout for source, block in segment.blocks.items()})
+            work = LiveRun(segment, run.plan, attachments, run.reports.collector(lambda: work.judge))
+            work.run(run.over, lambda: _told(run, wanted.name, work))
     return wanted.name, work
 
 
@@ -194,8 +196,9 @@ def _configuration(segment: Segment) -> Path | None:
         return None
 
 
-def _told(arguments: argparse.Namespace, campaign: Campaign, plan: Plan, instance: str, work: LiveRun) -> None:
-    if arguments.json:
+def _told(run: _Run, instance: str, work: LiveRun) -> None:
+    campaign, plan = run.campaign, run.plan
+    if run.arguments.json:
         return
     how = f"virtual time, steps of {work.step_s * 1000:g} ms" if work.virtual else "real time"
     if work.start is not None:

@@ -389,15 +389,18 @@ class SteppedLoop:
             ShmioError: The source's own code failed.
 
         """
-        prepared = PreparedSource(self._source, self._output, self.commands, data)
-        saved = prepared.saved
-        self._handled = self._writer.cycle = saved.step
-        self._writer.at_ns = self._page.monotonic_ns(saved.time_ns)
-        self._time_ns = saved.computed_ns
+        state = self._page.read()
+        self._handled = self._writer.cycle = state.step
+        self._writer.at_ns = self._page.monotonic_ns(state.time_ns)
         try:
+            prepared = PreparedSource(self._source, self._output, self.commands, data)
+            saved = prepared.saved
+            self._handled = self._writer.cycle = saved.step
+            self._writer.at_ns = self._page.monotonic_ns(saved.time_ns)
+            self._time_ns = saved.computed_ns
             prepared.restore(self._writer, name)
         except ShmioError as error:
-            self._fail(saved.step, f"the snapshot {name} was not restored: {error}")
+            self._fail(self._writer.cycle, f"the snapshot {name} was not restored: {error}")
             raise
         self._quality_log.update(saved.quality, saved.reason, saved.step)
 

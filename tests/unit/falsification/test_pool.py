@@ -132,3 +132,15 @@ def test_a_process_ends_with_its_parent(folder: Path) -> None:
     command = [sys.executable, "-m", "shmio.falsification.worker", "1", str(folder / "supervisor.toml"), str(folder)]
     done = subprocess.run(command, stdin=subprocess.PIPE, capture_output=True, timeout=60, check=False)
     assert done.returncode == 0, "its parent is not process 1, so it ended at once"
+
+
+def test_a_process_that_hangs_at_its_start_delays_nobody(folder: Path, task: Callable[..., Task]) -> None:
+    """Its pipe has room for 64 KiB only."""
+    long = " or ".join(["lift/height > 1000"] * 6000)
+    with Pool(folder / "supervisor.toml", folder, 1, 60) as pool:
+        (folder / "falsify_lift.py").write_text("import time\ntime.sleep(1000)")
+        pool.submit(task(1, when=long))
+        assert pool.wait(0.05) == []
+        pool.cancel()
+        (folder / "falsify_lift.py").write_text(MODEL)
+        assert pool.run(task(2, when=long)).status == "invalid", "it came whole: conditions are shorter than this"

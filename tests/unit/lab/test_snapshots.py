@@ -18,7 +18,7 @@ from shmio.lab import Laboratory, prepare_laboratory
 from shmio.local.attach import Attachment
 from shmio.plan.processes import Plan
 from shmio.recording.dump import open_dump
-from shmio.segment import EventKind
+from shmio.segment import EventKind, Quality
 
 SECTIONS = """
 [instance]
@@ -304,3 +304,13 @@ def test_edges_across_a_snapshot_are_noticed(plan: Callable[..., Plan]) -> None:
         cell.write({"panel/N": 1, "panel/Go": True})
         cell.step(0.02, 2)
         assert runs(cell) == {"edge": 1, "again": 2}
+
+
+def test_a_state_that_cannot_be_restored_makes_the_source_bad(plan: Callable[..., Plan]) -> None:
+    with Laboratory(plan()) as lab, lab.attach() as cell:
+        cell.step(0.02, 3)
+        with pytest.raises(SnapshotError):
+            lab.loops["walk"].restore(b"damaged", "old")
+        frame = cell.frame("walk")
+        assert (frame.quality, frame.cycle) == (Quality.BAD, 3)
+        assert "the snapshot old was not restored" in frame.reason
