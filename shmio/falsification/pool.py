@@ -32,7 +32,7 @@ class _Process:
     popen: subprocess.Popen[bytes]
     stdin: IO[bytes]
     stdout: IO[bytes]
-    unsent: memoryview = memoryview(b"")
+    unsent: bytes = b""
     """The part of the present task that its pipe has no room for yet."""
     task: Task | None = None
     since_s: float = 0.0
@@ -68,7 +68,7 @@ class Pool:
         one = next((one for one in self._processes if one.task is None), None) or self._start()
         one.task, one.since_s = task, time.monotonic()
         one.answer.clear()
-        one.unsent = memoryview(msgspec.json.encode(task) + b"\n")
+        one.unsent = msgspec.json.encode(task) + b"\n"
         self._send(one)
 
     def _send(self, one: _Process) -> None:
@@ -78,7 +78,7 @@ class Pool:
         except BlockingIOError:
             pass
         except BrokenPipeError:  # wait() finds that it has ended
-            one.unsent = memoryview(b"")
+            one.unsent = b""
         waits = one.stdin in self._selector.get_map()
         if one.unsent and not waits:
             self._selector.register(one.stdin, selectors.EVENT_WRITE, one)
