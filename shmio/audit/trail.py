@@ -309,11 +309,19 @@ class Trail:
         self._counting = threading.Lock()
         self._closing = threading.Event()
         self._repeated: dict[object, _Repeated] = {}
+        self._merging = threading.Lock()  # only the thread adds and removes repetitions
         self._thread = threading.Thread(target=self._run, name="audit", daemon=True)
         self._thread.start()
 
     def add(self, entry: _Waiting) -> None:
-        """Add an entry. Any thread may call this."""
+        """Add an entry. Any thread may call this. A repetition does not wake the thread that writes."""
+        kind = entry.kind
+        if kind is not None and kind in self._repeated:
+            with self._merging:
+                if (known := self._repeated.get(kind)) is not None:
+                    known.times += entry.times
+                    known.last = entry
+                    return
         if self._waiting.qsize() < MAX_WAITING:
             self._waiting.put(entry)
         else:
@@ -328,7 +336,9 @@ class Trail:
 
     def _run(self) -> None:
         while not self._closing.is_set() or self._waiting.qsize():
-            batch = [*self._merge(self._batch(self._due_s()))]
+            found = self._batch(self._due_s())
+            with self._merging:
+                batch = [*self._merge(found)]
             if batch and not self._keep_writing(b"".join(map(self._line, batch))):
                 log.error(
                     "%s; this process ends, and %d entries of the audit log are lost",

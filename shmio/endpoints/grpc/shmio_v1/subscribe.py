@@ -511,10 +511,14 @@ class SubscribeCalls:
     async def deliver(self, step: Step) -> None:
         """Send the changes and the marker of a step on all streams, and wait until they are sent."""
         marks = {subscription.mark(step): subscription for subscription in self._open}
-        if marks:
-            _, late = await asyncio.wait(marks, timeout=PATIENCE_S)
-            for mark in late:
-                marks[mark].give_up()
+        try:
+            async with asyncio.timeout(PATIENCE_S):
+                for mark in marks:
+                    await mark
+        except TimeoutError:
+            for mark, subscription in marks.items():
+                if mark.cancelled() or not mark.done():  # the time-out cancels the one that it has waited for
+                    subscription.give_up()
 
     def release(self) -> None:
         """Wake all streams. Time is real again, so values need no longer wait for steps."""
