@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping, Sequence
 from contextlib import aclosing
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from typing import Any, Final
 from weakref import WeakKeyDictionary
@@ -405,7 +406,17 @@ class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]
         came, self._came = self._came, set()
         return came, set()
 
-    def _call_came(self, request: asyncio.Future[Any]) -> None:
+    def _call_came(self, request: asyncio.Future[Any], done: asyncio.Task[Any]) -> None:
+        """End a request, and wake the serving task in the same turn of the loop."""
+        failure = None if done.cancelled() else done.exception()
+        if done.cancelled():
+            request.cancel()
+        elif request.done():  # cancelled
+            return
+        elif failure is not None:
+            request.set_exception(failure)
+        else:
+            request.set_result(done.result())
         self._came.add(request)
         if self._waiter is not None and not self._waiter.done():
             self._waiter.set_result(None)
@@ -425,12 +436,11 @@ class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]
         return bool(self.is_running()) and not any(worker.done() for worker in self._workers)
 
     def _make_request_call_future(self, method: bytes | None) -> asyncio.Future[Any]:
-        if method is None:
-            request: asyncio.Future[Any] = asyncio.get_running_loop().create_future()  # the workers take these
-        else:
-            request = _kept(super()._make_request_call_future(method))
-        request.add_done_callback(self._call_came)
+        """Return a future for the next call; if it is cancelled, the core may still write to the request's memory."""
+        request: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
         _requests[request] = self
+        if method is not None:  # the workers take calls of other methods
+            super()._make_request_call_future(method).add_done_callback(partial(self._call_came, request))
         return request
 
     async def _refuse(self) -> None:
