@@ -30,7 +30,7 @@ from shmio.emulators.programs import A50
 from shmio.layout.model import Layout
 from shmio.recorder.file_output import Output, create
 from shmio.recorder.recorder import CHUNK_S
-from shmio.recording.format.encoding import FRAME, differ, encode_frame
+from shmio.recording.format.encoding import FRAME, encode_frame, encode_frame_v2
 from shmio.recording.writer import Writer
 from shmio.segment import Block, BlockSpec, BlockWriter, Frame, ProcessSpec, Provenance, Quality, Segment
 from shmio.segment.processes import Activity
@@ -170,8 +170,9 @@ def layouts() -> None:
         all REALs come first, the least significant bytes before the others.
         """
         header = frame.number & 0xFFFFFFFF, START_NS + frame.clock_ns, frame.source_ns
-        data = encode_frame(frame._replace(raw=bytes(map(frame.raw.__getitem__, order))) if sort else frame)
-        return struct.pack("<BQHIQQ", 5, 22 + len(data), 1, *header) + (differ(data, *header) if once else data)
+        frame = frame._replace(raw=bytes(map(frame.raw.__getitem__, order))) if sort else frame
+        data = encode_frame_v2(frame, *header) if once else encode_frame(frame)
+        return struct.pack("<BQHIQQ", 5, 22 + len(data), 1, *header) + data
 
     plain = [message(frame) for frame in some]
     default = zstandard.ZstdCompressor().compress

@@ -143,8 +143,8 @@ def _in_laboratory(run: _Run) -> tuple[str, LiveRun]:
     prepared = prepare_laboratory(file)
     with Laboratory(prepared, run.campaign.parameters) as lab:
         work = lab.prepare(run.plan, run.reports.collector(lambda: work.judge))
-        run.facts += of_configuration(file)
-        run.facts += of_layouts({block.source: block.layout for block in prepared.blocks})
+        run.facts.extend(of_configuration(file))
+        run.facts.extend(of_layouts({block.source: block.layout for block in prepared.blocks}))
         work.run(run.over, lambda: _told(run, "laboratory", work))
     return prepared.instance, work
 
@@ -161,8 +161,8 @@ def _on_instance(run: _Run) -> tuple[str, LiveRun]:
         with segment:
             file = _configuration(segment)
             attachments: AttachedFiles = no_attachments if file is None else ConfigFiles(file)
-            run.facts += [] if file is None else of_configuration(file)
-            run.facts += of_layouts({source: block.layout for source, block in segment.blocks.items()})
+            run.facts.extend([] if file is None else of_configuration(file))
+            run.facts.extend(of_layouts({source: block.layout for source, block in segment.blocks.items()}))
             work = LiveRun(segment, run.plan, attachments, run.reports.collector(lambda: work.judge))
             work.run(run.over, lambda: _told(run, wanted.name, work))
     return wanted.name, work
