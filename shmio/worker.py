@@ -23,7 +23,7 @@ from typing import Any
 
 import msgspec
 
-from shmio import logs, realtime
+from shmio import garbage, logs, realtime
 from shmio.audit import trail
 from shmio.audit.file import AuditSettings
 from shmio.errors import ConfigError, LayoutError, SegmentError, ShmioError
@@ -84,6 +84,7 @@ class Worker:
 
     def running(self) -> None:
         """Report that start-up is over."""
+        garbage.resume()
         self.report(activity=Activity.RUNNING)
         self.log.info("the process is running")
 
@@ -185,6 +186,7 @@ class Worker:
 def main(run: Callable[[Worker], None]) -> int:
     """Run a worker until it ends, and return the exit status of the process."""
     worker = None
+    garbage.pause()  # until Worker.running()
     try:
         worker = Worker(_read_spec())
         if priority := worker.config.get("realtime_priority"):

@@ -69,6 +69,16 @@ class _Expansion:
             if key not in self._listed:
                 self._listed[key] = _element_values(text, array.dims)
             texts.append(self._listed[key])
+        if not texts:  # all elements are alike
+            first = list(self.registers(array.group, "", 0, ()))
+            for flat, index in enumerate(_indices(array.dims)):
+                prefix, start = f"{path}/{index}/", offset + flat * array.group.size
+                for one in first:
+                    yield Register(
+                        prefix + one.path, one.type, one.dims, start + one.offset, one.bit, one.size, one.count,
+                        one.comment, one.initial,
+                    )  # fmt: skip
+            return
         for flat, index in enumerate(_indices(array.dims)):
             own = [values[flat] for values in texts]
             layers = tuple(self._members(text, array.group, field) for text in own if text is not None)

@@ -24,8 +24,10 @@ def initial_frame(layout: Layout) -> tuple[bytearray, tuple[str, ...]]:
     """
     frame = bytearray(layout.size)
     unread: list[str] = []
+    types = {register.type: register for register in layout.own}
+    zero = {name for name, register in types.items() if _default_is_zeros(register.element)}
     for register in layout.own:
-        if register.initial is None and _default_is_zeros(register.element):
+        if register.initial is None and register.type in zero:
             continue
         value = _default(register) if register.initial is None else _given(register)
         if value is None:

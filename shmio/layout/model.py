@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import operator
 import re
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
@@ -340,23 +341,29 @@ class Layout:
         return msgspec.json.encode(self.describe() | {"byte_order": self.byte_order})
 
 
-_OF_TAGS: Final = ("unit", "address", "scale", "deadband", "writable", "over")
-_DEFAULTS: Final = {"unit": "", "address": "", "scale": None, "deadband": 0.0, "writable": False, "over": ""}
+_OF_TAGS: Final = {"unit": "", "address": "", "scale": None, "deadband": 0.0, "writable": False, "over": ""}
+"""The keys that only registers of tag tables have, and their default values."""
+_tags_of: Final = operator.attrgetter(*_OF_TAGS)
+_NO_TAGS: Final = tuple(_OF_TAGS.values())
 
 
 def _describe(register: Register) -> Mapping[str, object]:
-    return {
+    described = {
         "path": register.path,
         "type": register.type,
-        "dims": [list(bounds) for bounds in register.dims] or None,
+        "dims": [list(bounds) for bounds in register.dims] if register.dims else None,
         "offset": register.offset,
         "bit": register.bit,
         "size": register.size,
         "count": register.count,
         "comment": register.comment,
         "initial": register.initial,
-        **{name: given for name in _OF_TAGS if (given := getattr(register, name)) != _DEFAULTS[name]},
     }
+    if (tags := _tags_of(register)) != _NO_TAGS:
+        for (name, default), given in zip(_OF_TAGS.items(), tags, strict=True):
+            if given != default:
+                described[name] = given
+    return described
 
 
 class _Sorted:

@@ -15,7 +15,7 @@ from typing import Any
 
 import msgspec
 
-from shmio import logs
+from shmio import garbage, logs
 from shmio.cli.common import say
 from shmio.cli.instance.detach import Configured, Failed, Started, StartMessage, headline, replay_keys
 from shmio.cli.target import config_file
@@ -36,6 +36,7 @@ def up(arguments: argparse.Namespace) -> int:
     With ``--report``, act as the child process of ``up --detach``.
     """
     file, mode, keys = config_file(arguments), arguments.mode, replay_keys(arguments)
+    garbage.pause()  # until the instance runs
     if arguments.report is not None:
         return _detached(file, mode, keys, arguments.report)
     return _foreground(file, mode, keys)
@@ -58,6 +59,7 @@ def _foreground(file: Path, mode: str, keys: Mapping[str, Any]) -> int:
     hints = list(_hints(prepared))
 
     def on_state(state: State) -> None:
+        garbage.resume()
         if state in (State.RUNNING, State.DEGRADED):  # not before: nobody would answer
             while hints:
                 say(hints.pop(0))
@@ -94,6 +96,7 @@ def _detached(file: Path, mode: str, keys: Mapping[str, Any], report: int) -> in
         check_startable(plan)
 
         def on_state(state: State) -> None:
+            garbage.resume()
             if state is not State.STOPPING:
                 history, processes = (
                     [*map(printable, lines)]

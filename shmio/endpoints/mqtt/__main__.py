@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import logging
 import time
 
@@ -38,10 +37,7 @@ def run(worker: Worker) -> None:
 def _run_bridge(worker: Worker) -> None:
     from shmio.endpoints.mqtt.bridge import Bridge  # noqa: PLC0415  the broker's process does not need it
 
-    gc.disable()  # the channels of all registers are made now, and stay: there is nothing to collect
     bridge = Bridge(worker.segment, worker.slot, msgspec.convert(worker.config, Mqtt))
-    gc.freeze()
-    gc.enable()
     worker.on_stop(bridge.wake)
     worker.running()
     reported_s = 0.0

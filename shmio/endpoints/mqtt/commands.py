@@ -115,11 +115,8 @@ def _report(done: Done, ends: Sequence[End]) -> None:
 
 
 def _depths(layout: Layout) -> Sequence[int]:
-    depths = set()
-    for register in layout.registers:
-        depth = register.path.count("/") + 1
-        depths |= {depth, depth + len(register.dims)}
-    return sorted(depths)
+    kinds = {(register.path.count("/") + 1, len(register.dims)) for register in layout.registers}
+    return sorted({depth for names, indices in kinds for depth in (names, names + indices)})
 
 
 def command_filters(prefix: str, clients: Iterable[CommandClient]) -> list[str]:

@@ -54,6 +54,8 @@ class TopicRules:
 
     def of(self, source: str, path: str) -> MqttTopic:
         """Return the rule that applies to a register, bit or slice."""
+        if not self._rules and not self._parts:
+            return DEFAULT
         full = f"{source}/{path}"
         return self._parts.get(full) or self._first(full)[1]
 
