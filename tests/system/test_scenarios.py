@@ -77,7 +77,7 @@ class Example:
                     printed += line
                     if "in a browser" in line:
                         break
-                assert "instance running" in printed, printed
+                assert "the instance is running" in printed, printed
                 yield printed
             finally:
                 os.killpg(script.pid, signal.SIGINT)
