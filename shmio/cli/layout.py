@@ -26,6 +26,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
     if given[:1] == ["import"]:
         return layout_import.main(given[1:])
+    parser = _parser()
+    complete(parser)
+    options = parser.parse_intermixed_args(arguments)
+    names, sizes = [options.file, *options.types], dict(options.type_bytes)
+    return run(parser.prog, lambda: _compile(names, options.block, sizes, as_json=options.json), options)
+
+
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="shmio-layout",
         description="Compile the data blocks of a source exported by TIA Portal or STEP 7 and print each register: "
@@ -50,10 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     add_json(parser, "print JSON: one object, or a list for several blocks")
     parser.add_argument("--version", action="version", version=f"shmio {__version__}")
-    complete(parser)
-    options = parser.parse_intermixed_args(arguments)
-    names, sizes = [options.file, *options.types], dict(options.type_bytes)
-    return run(parser.prog, lambda: _compile(names, options.block, sizes, as_json=options.json), options)
+    return parser
 
 
 def _size(text: str) -> tuple[str, int]:

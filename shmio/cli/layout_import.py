@@ -16,6 +16,13 @@ from shmio.wording import EXISTS, NOT_TOML
 
 def main(arguments: Sequence[str]) -> int:
     """Run the command. Return its exit status: 0 success, 1 failure, 2 wrong usage."""
+    parser = parser_of_import()
+    options = parser.parse_args(arguments)
+    return run(parser.prog, lambda: _import(options.file, options.output, writable=options.writable), options)
+
+
+def parser_of_import() -> argparse.ArgumentParser:
+    """Return the parser of ``shmio-layout import``."""
     parser = argparse.ArgumentParser(
         prog="shmio-layout import",
         description=f"Convert a tag list into a tag table, and report what was left out. Imports {FORMATS}.",
@@ -29,8 +36,7 @@ def main(arguments: Sequence[str]) -> int:
         action="store_true",
         help="allow commands to write what the vendor's tool lets other programs write",
     )
-    options = parser.parse_args(arguments)
-    return run(parser.prog, lambda: _import(options.file, options.output, writable=options.writable), options)
+    return parser
 
 
 def _import(file: Path, output: Path | None, *, writable: bool) -> int:
