@@ -161,5 +161,5 @@ def test_an_injection_on_in_intercepts_one_bit(cell: Cell, local: Attachment) ->
 def test_hundreds_of_bits_in_one_command(cell: Cell, local: Attachment) -> None:
     values = {f"cell/Outputs/{byte}.%X{bit}": bool((byte ^ bit) & 1) for byte in range(200, 280) for bit in range(8)}
     with connect(str(cell.grpc)) as remote:
-        assert {str(outcome.kind) for outcome in remote.write(values)} == {"written"}
+        assert {str(outcome.kind) for outcome in remote.write(values, timeout_s=PATIENCE_S)} == {"written"}
     assert local["cell/Outputs/199..202"] == [0, 0b10101010, 0b01010101, 0b10101010]

@@ -51,7 +51,7 @@ def test_a_frozen_server_is_noticed_and_found_again(device: Device, mode: str) -
         try:
             begun = time.monotonic()
             assert "no answer within" in lost(source)
-            assert time.monotonic() - begun < 10 * TIMEOUT_MS / 1000
+            assert time.monotonic() - begun < TIMEOUT_MS / 1000 + 5
             with pytest.raises(ConnectorError, match="no answer within"):
                 source.connector.connect()
         finally:
