@@ -139,13 +139,13 @@ class Run:
 
 
 def connect(connector: Connector) -> None:
-    """Connect. Try again if the host is so busy that this takes longer than the rig's short time-out."""
+    """Connect. Try again if the host is so busy that this takes longer than the connector's time-out."""
     deadline = time.monotonic() + PATIENCE_S
     while True:
         try:
             return connector.connect()
-        except ConnectorError:
-            if time.monotonic() > deadline:
+        except ConnectorError as error:
+            if "no answer" not in str(error) or time.monotonic() > deadline:
                 raise
             connector.close()
 

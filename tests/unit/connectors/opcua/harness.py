@@ -14,6 +14,7 @@ from shmio.layout.tags import place_tags
 from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.write import encode
 from shmio.model.statuses import RegisterStatus, StatusArea
+from shmio.testing.conformance import connect
 from shmio.testing.write_conformance import write
 
 PATIENCE_S = 20.0
@@ -79,7 +80,7 @@ class Source:
 def connected(url: str, tags: Mapping[str, Any], **options: Any) -> Iterator[Source]:
     source = Source(url, tags, **options)
     try:
-        source.connector.connect()
+        connect(source.connector)
         yield source
     finally:
         source.connector.close()

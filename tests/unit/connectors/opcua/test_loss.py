@@ -12,6 +12,7 @@ import pytest
 from shmio.connectors.base import Lost, WriteLostError
 from shmio.errors import ConnectorError
 from shmio.layout.values.write import Write
+from shmio.testing.conformance import connect
 from shmio.testing.proxy import FaultProxy
 from shmio.testing.write_conformance import write
 from tests.unit.connectors import hostile
@@ -57,7 +58,7 @@ def test_a_frozen_server_is_noticed_and_found_again(device: Device, mode: str) -
         finally:
             device.thaw()
         source.connector.close()
-        source.connector.connect()
+        connect(source.connector)
         assert source.value("count") == 7
 
 
@@ -77,7 +78,7 @@ def test_a_killed_server_is_noticed_and_found_again() -> None:
         device.restart()
         device.ask("add", "count", "UInt32", 8)
         for source in sources:
-            source.connector.connect()
+            connect(source.connector)
             assert source.value("count") == 8
 
 
@@ -87,7 +88,7 @@ def test_an_expired_session_is_lost_and_another_one_begins(device: Device, mode:
         device.ask("expire")
         assert "BadSession" in lost(source)
         source.connector.close()
-        source.connector.connect()
+        connect(source.connector)
         device.ask("set", "count", "UInt32", 8)
         until(lambda: source.value("count") == 8, "a change in the new session")
         device.ask("set", "count", "UInt32", 7)
@@ -184,6 +185,6 @@ def test_damaged_answers_never_become_values(device: Device, seed: int) -> None:
                 source.connector.read()
         source.connector.close()
         proxy.pass_all()
-        source.connector.connect()
+        connect(source.connector)
         assert source.value("count") == 7
         source.connector.close()
