@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
+import msgspec
 from google.protobuf.message import DecodeError
 
 from shmio.backoff import Backoff
@@ -409,7 +410,7 @@ class Host:
         if node is None or (len(levels) == 5) != levels[2].startswith("D"):
             return
         if len(message.payload) > self._max_bytes:
-            message = message._replace(payload=b"\xff")
+            message = msgspec.structs.replace(message, payload=b"\xff")
         node.take(levels[2], levels[4] if len(levels) == 5 else "", message)
 
     def requests(self, now_ns: int) -> Iterator[tuple[str, bytes]]:

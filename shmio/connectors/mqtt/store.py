@@ -91,6 +91,8 @@ class Store:
         log.filters[:] = [LogRateLimit()]  # a process has one source
         self._changed = threading.Condition()
         """Guards all attributes below; waiting threads are notified at each message."""
+        self._waiting = 0
+        """Number of threads that wait. A needless notification would cost a tenth of storing a message."""
         self.addresses: list[Address] = []
         self.converters: list[ValueConverter] = []
         self.host = Host(max_bytes=options.max_payload_bytes)
@@ -189,7 +191,8 @@ class Store:
                 self._all_changed = True  # a node's message may concern all of its devices
             if self._expected and self._expected.get(topic) == payload:
                 del self._expected[topic]
-            self._changed.notify_all()
+            if self._waiting:
+                self._changed.notify_all()
 
     # -- the poll thread -----------------------------------------------------------------------------------------------
 
@@ -253,7 +256,7 @@ class Store:
 
     def _show(self, image: RegisterImage, group: Group, state: int) -> None:
         origin = group.origin
-        if quality_of(state) is Quality.BAD:
+        if state != GOOD and quality_of(state) is Quality.BAD:
             source_ns = origin.message.utc_ns if origin.message is not None else 0
             for index in group.registers:
                 image.fail(index, state, source_ns)
@@ -270,7 +273,8 @@ class Store:
                 self._note(index, error.code, str(error))
             else:
                 fault = image.put(index, value, source_ns, code or state)
-                self._note(index, BAD_OUT_OF_RANGE if fault else GOOD, fault)
+                if fault or self._codes[index] != GOOD:
+                    self._note(index, BAD_OUT_OF_RANGE if fault else GOOD, fault)
 
     def _find(self, index: int, origin: Origin) -> tuple[Value, int, int]:
         """Return the value of a register, its source time in ns and its status.
@@ -375,7 +379,11 @@ class Store:
         ``until_s`` is a time of CLOCK_MONOTONIC. The condition is checked after each message.
         """
         with self._changed:
-            return self._changed.wait_for(condition, max(0.0, until_s - time.monotonic()))
+            self._waiting += 1
+            try:
+                return self._changed.wait_for(condition, max(0.0, until_s - time.monotonic()))
+            finally:
+                self._waiting -= 1
 
     def wake(self) -> None:
         """Wake a thread in :meth:`wait`, so that it checks its condition again."""

@@ -5,7 +5,9 @@ from __future__ import annotations
 import datetime
 from abc import ABC, abstractmethod
 from contextlib import suppress
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
+
+import msgspec
 
 from shmio.connectors.mqtt import json_path
 from shmio.connectors.mqtt.faults import ValueFaultError
@@ -18,7 +20,7 @@ _UNITS: Final = ((1e11, 10**9), (1e14, 10**6), (1e17, 10**3))
 """Pairs (limit, unit in ns): a time below the limit is in this unit (s, ms or µs). A larger time is in ns."""
 
 
-class Message(NamedTuple):
+class Message(msgspec.Struct, frozen=True, gc=False):
     """A received message; ``order`` is its number since the source started."""
 
     payload: bytes
@@ -29,7 +31,7 @@ class Message(NamedTuple):
     utc_ns: int
 
 
-class Found(NamedTuple):
+class Found(msgspec.Struct, frozen=True):
     """What a message contains for a register: text as bytes, or a JSON value."""
 
     value: Any

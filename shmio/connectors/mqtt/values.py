@@ -30,6 +30,8 @@ _NO_NUMBER: Final = {"nan": math.nan, "inf": math.inf, "infinity": math.inf, "-i
 _BOOLS: Final = {"true": True, "false": False, "1": True, "0": False, "on": True, "off": False}
 _EXACT: Final = 1 << 53
 """Every whole number up to this one has an exact float."""
+MAX_PLAIN: Final = 40
+"""Longest payload, in bytes, that is read as a number at a glance."""
 SHOWN: Final = 40
 """Largest number of characters that a message shows of a wrong value."""
 
@@ -52,6 +54,8 @@ class ValueConverter:
         if base not in (*_REALS, *_TEXTS, *model.INTEGERS, "BOOL"):
             raise ValueError(f"a {base} cannot be read from MQTT; use BOOL, whole numbers, REAL, LREAL or STRING[n]")
         self._register, self._base, self._scale, self._texts = register, base, register.scale, texts
+        self._is_plain = base in _REALS and self._scale is None and not register.dims
+        """True if a finite number is the register's value as it is."""
         self._bools = _BOOLS | {texts[0].casefold(): False, texts[1].casefold(): True}
 
     # -- reading -------------------------------------------------------------------------------------------------------
@@ -64,6 +68,12 @@ class ValueConverter:
             ValueRangeError: The register cannot hold the value.
 
         """
+        if self._is_plain and len(payload) <= MAX_PLAIN and b"_" not in payload:  # Python's own separator
+            try:
+                if math.isfinite(number := float(payload)):
+                    return number
+            except ValueError:  # the code below says why, or knows the text
+                pass
         if not payload:
             raise ValueFaultError(BAD_NO_DATA, "the payload is empty")
         try:

@@ -10,7 +10,7 @@ without brackets at the end of FIELD is a whole array.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple
 
 from shmio.connectors.ros.messages import DEFINITIONS, PRIMITIVES, TYPE, plain
@@ -169,6 +169,33 @@ def extract(message: Any, address: Address) -> Any:
             )
         found = found[index]
     return found
+
+
+def getter(address: Address) -> Callable[[Any], Any]:
+    """Return a function that does the same as :func:`extract` with one address, in less time for most messages."""
+    *outer, last = address.steps
+    name, place, key = last
+    if any(not step.whole for step in outer):
+        return lambda message: extract(message, address)
+    names = tuple(step.name for step in outer)
+
+    def get(message: Any) -> Any:
+        scope = message
+        try:
+            for one in names:
+                scope = scope[one]
+            found = scope[name]
+            if place is None and key is None:
+                return found
+            if type(found) is list and place is not None:
+                return found[place]
+            if type(found) is list and key is not None and type(scope[key[0]]) is list:
+                return found[scope[key[0]].index(key[1])]
+        except (TypeError, LookupError, ValueError):  # the message lacks something, or the names are further out
+            pass
+        return extract(message, address)
+
+    return get
 
 
 def place_of(scopes: Sequence[Any], step: Step, address: Address) -> int:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, Final
 
 from shmio.connectors.register_image import RegisterImage, no_status_area
-from shmio.connectors.ros.addresses import Address, FieldError, extract, leaf_type, parse
+from shmio.connectors.ros.addresses import Address, FieldError, getter, leaf_type, parse
 from shmio.connectors.ros.messages import plain
 from shmio.connectors.ros.options import TopicOptions
 from shmio.connectors.ros.qos import TopicQos
@@ -80,6 +80,8 @@ class Topics:
         self.by_name: dict[str, Topic] = {}
         self.addresses: list[Address] = []
         self.converters: list[ValueConverter] = []
+        self._getters: list[Callable[[Any], Any]] = []
+        """For each register, the function that finds its value in a message."""
         self._max_age_ns = options.max_age * 1_000_000
         self._stamps = options.time == "stamp"
         self._image = RegisterImage(layout) if layout.status_offset is not None else None
@@ -113,6 +115,7 @@ class Topics:
         except ValueError as error:
             raise ConfigError(f"layout: {register.path}: {error}") from None
         self.addresses.append(address)
+        self._getters.append(getter(address))
         topic.registers.append(index)
         topic.writable = topic.writable or register.writable
 
@@ -179,9 +182,10 @@ class Topics:
     def _put(self, image: RegisterImage, topic: Topic) -> None:
         topic.shown = GOOD
         source_ns = self._source_ns(topic)
+        message = topic.message
         for index in topic.registers:
             try:
-                image.put(index, self.converters[index].value(extract(topic.message, self.addresses[index])), source_ns)
+                image.put(index, self.converters[index].value(self._getters[index](message)), source_ns)
             except FieldError as error:
                 image.fail(index, error.code, source_ns)
                 self.report(index, str(error))

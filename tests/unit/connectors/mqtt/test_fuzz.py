@@ -23,6 +23,7 @@ from shmio.connectors.mqtt.store import Store
 from shmio.connectors.mqtt.topic import time_ns
 from shmio.layout.values.codec import codec
 from shmio.model.statuses import (
+    BAD_DECODING_ERROR,
     BAD_OUT_OF_RANGE,
     BAD_TIMEOUT,
     BAD_WAITING_FOR_INITIAL_DATA,
@@ -132,7 +133,7 @@ def test_each_topic_has_an_age_of_its_own(monkeypatch: pytest.MonkeyPatch) -> No
 def test_a_number_beyond_all_registers_is_bad() -> None:
     store = store_of({"number": ("LREAL", "t")})
     area = StatusArea(store.layout)
-    for text, code in ((b"1e308", GOOD), (b"-1e309", BAD_OUT_OF_RANGE), (b"inf", GOOD)):
+    for text, code in ((b"1e308", GOOD), (b"-1e309", BAD_OUT_OF_RANGE), (b"inf", GOOD), (b"1_0", BAD_DECODING_ERROR)):
         store.take("t", text, retained=False)
         assert area.get(store.image(0), 0).code == code
 

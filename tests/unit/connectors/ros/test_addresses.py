@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmio.connectors.ros.addresses import Address, FieldError, Step, extract, leaf_type, parse
+from shmio.connectors.ros.addresses import Address, FieldError, Step, extract, getter, leaf_type, parse
 from shmio.connectors.ros.messages import DEFINITIONS, PRIMITIVES, conforms, default
 
 _NAMES = st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,8}", fullmatch=True)
@@ -52,8 +52,33 @@ def test_no_message_breaks_the_extraction(message: Any, field: str) -> None:
         address = parse(f"/t std_msgs/M {field}")
     except ValueError:
         return
-    with suppress(FieldError):
-        extract(message, address)
+    found, other = _outcome(lambda: extract(message, address)), _outcome(lambda: getter(address)(message))
+    assert found is other or found == other
+
+
+def _outcome(call: Callable[[], object]) -> object:
+    """Return the value that a call returns, or the text and the code of its error."""
+    try:
+        return call()
+    except FieldError as error:
+        return str(error), error.code
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("position[1]", 2.0),
+        ("position[name=b]", 2.0),
+        ("position", [1.0, 2.0]),
+        ("inner.data", 3),
+        ("inner.list[0]", "x"),
+        ("inner.list[name=a]", "x"),
+    ],
+)
+def test_a_getter_finds_what_the_extraction_finds(field: str, value: object) -> None:
+    message = {"name": ["a", "b"], "position": [1.0, 2.0], "inner": {"data": 3, "list": ["x"]}}
+    address = parse(f"/t std_msgs/M {field}")
+    assert (getter(address)(message), extract(message, address)) == (value, value)
 
 
 @pytest.mark.parametrize("kind", DEFINITIONS)
