@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import gc
+import itertools
 import json
 import os
 import platform
@@ -13,6 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -26,6 +28,8 @@ DB201 = ROOT / "shmio/cli/a50/db201.db"
 """The reference load: a block of 2,180 bytes with 20 REALs that change."""
 
 Samples = Mapping[str, Sequence[float]]
+PATIENCE_S = 20.0
+"""How long a client may wait for a value."""
 
 
 # -- the run -----------------------------------------------------------------------------------------------------------
@@ -106,6 +110,87 @@ def quantiles(values: Sequence[float]) -> tuple[float, float, float]:
     """Return median, 90th and 99th percentile."""
     cuts = statistics.quantiles(values, n=100, method="inclusive")
     return cuts[49], cuts[89], cuts[98]
+
+
+# -- clients of a device -----------------------------------------------------------------------------------------------
+
+Connect = Callable[[ExitStack], Callable[[], object]]
+"""Connects a client, and returns a function that gets all of the device's values once. The stack disconnects it."""
+
+
+def compare_clients(title: str, clients: Mapping[str, Connect], count: int, rounds: int, round_s: float) -> None:
+    """Print the values a second and the CPU time a value of clients in this process, which take turns.
+
+    Args:
+        title: The title of the table.
+        clients: The clients by name. The first one is shmio's.
+        count: Number of the device's values.
+        rounds: Number of turns of each client, which connects for each of them.
+        round_s: Length of a turn in s.
+
+    """
+    used: dict[str, list[float]] = {name: [] for name in clients}
+    samplers = {name: _turn(connect, count, round_s, used[name]) for name, connect in clients.items()}
+    rates = {name: statistics.median(found) for name, found in interleave(samplers, rounds).items()}
+    costs = {name: statistics.median(found) for name, found in used.items()}
+    ours = next(iter(clients))
+    rows = [
+        [name, f"{rates[name]:.0f}", f"{costs[name]:.2f}"]
+        + (["", ""] if name == ours else [f"{rates[ours] / rates[name]:.2f}", f"{costs[ours] / costs[name]:.2f}"])
+        for name in clients
+    ]
+    table([title, "values/s", "µs of CPU a value", "shmio's rate to it", "shmio's CPU to it"], rows)
+
+
+def _turn(connect: Connect, count: int, duration_s: float, costs: list[float]) -> Callable[[], float]:
+    """Make a sampler of a client's values a second, which adds its CPU time a value, in us, to a list."""
+
+    def sample() -> float:
+        with ExitStack() as stack:
+            get_all = connect(stack)
+            cycles, used_s, begun_s = 0, time.process_time(), time.perf_counter()
+            while (taken_s := time.perf_counter() - begun_s) < duration_s:
+                get_all()
+                cycles += 1
+            costs.append(1e6 * (time.process_time() - used_s) / (cycles * count))
+        return cycles * count / taken_s
+
+    return sample
+
+
+def follow(device: Child, newest: Callable[[], object], period_s: float) -> Callable[[], object]:
+    """Return a function that lets a device change all its values at once, and waits until a client has the last one.
+
+    Args:
+        device: A program that gives all values the number that it reads.
+        newest: Returns the client's newest number from the last value.
+        period_s: Time between two calls of ``newest``.
+
+    """
+
+    def wait(number: int, patience_s: float) -> bool:
+        end_s = time.monotonic() + patience_s
+        while newest() != number:
+            if time.monotonic() > end_s:
+                return False
+            time.sleep(period_s)
+        return True
+
+    numbers = itertools.count()
+    end_s = time.monotonic() + PATIENCE_S
+    device.ask(-1)
+    while not wait(-1, 0.5):  # until the device has found the client
+        if time.monotonic() > end_s:
+            raise SystemExit("the client does not get the device's values")
+        device.ask(-1)
+
+    def change() -> None:
+        number = next(numbers)
+        device.ask(number)
+        if not wait(number, PATIENCE_S):
+            raise SystemExit("a value of the device is lost")
+
+    return change
 
 
 # -- printing ----------------------------------------------------------------------------------------------------------

@@ -8,14 +8,16 @@ outputs). In the last table, two tanks fill each other, and the A50 cell is comp
 
 from __future__ import annotations
 
+import itertools
 import sys
 import tempfile
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
-from common import ROOT, begin, interleave, report
+from common import ROOT, begin, interleave, per_second, report
 from instance import started
 from step import local
 
@@ -39,12 +41,19 @@ folder = "{file.parent}"
 """
 
 
+def extracted(file: Path) -> tuple[str, Any]:
+    """Extract an FMU. Return the folder, and FMPy's model description."""
+    import fmpy  # noqa: PLC0415
+
+    folder = fmpy.extract(str(file), str(file.with_suffix("")))
+    return folder, fmpy.read_model_description(folder)
+
+
 def alone(file: Path, outputs: list[str], count: int) -> Callable[[], float]:
     """Make a sampler of the steps a second of FMPy, without the extraction."""
     import fmpy  # noqa: PLC0415
 
-    folder = fmpy.extract(str(file), str(file.with_suffix("")))
-    description = fmpy.read_model_description(folder)
+    folder, description = extracted(file)
 
     def sample() -> float:
         fmu = fmpy.instantiate_fmu(folder, description, "CoSimulation")
@@ -105,8 +114,7 @@ def coupled_alone(file: Path, duration_s: float) -> Callable[[], float]:
     """Make a sampler of the steps a second of two FMUs that a loop over FMPy couples, without the A50 cell."""
     import fmpy  # noqa: PLC0415
 
-    folder = fmpy.extract(str(file), str(file.with_suffix("")))
-    description = fmpy.read_model_description(folder)
+    folder, description = extracted(file)
     references = {variable.name: variable.valueReference for variable in description.modelVariables}
     inflow, shown = [references["pump.inflow"]], [references["phase"], references["level"]]
 
@@ -116,17 +124,20 @@ def coupled_alone(file: Path, duration_s: float) -> Callable[[], float]:
             fmu.setupExperiment(startTime=0.0)
             fmu.enterInitializationMode()
             fmu.exitInitializationMode()
-        steps, begun_s = 0, time.perf_counter()
-        while (taken_s := time.perf_counter() - begun_s) < duration_s:
+        numbers = itertools.count()
+
+        def step() -> None:
+            begin_s = next(numbers) * DT_NS / 1e9
             phases = [fmu.getReal(shown)[0] for fmu in pair]
             for fmu, phase in zip(pair, reversed(phases), strict=True):
                 fmu.setReal(inflow, [phase])
-                fmu.doStep(steps * DT_NS / 1e9, DT_NS / 1e9)
-            steps += 1
+                fmu.doStep(begin_s, DT_NS / 1e9)
+
+        rate = per_second(step, duration_s)()
         for fmu in pair:
             fmu.terminate()
             fmu.freeInstance()
-        return steps / taken_s
+        return rate
 
     return sample
 

@@ -7,20 +7,17 @@ returns words; in its second row it also makes REALs of them.
 
 from __future__ import annotations
 
-import statistics
-import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 
-from common import Child, begin, interleave, table
+from common import Child, Connect, begin, compare_clients
 from pymodbus.client import ModbusTcpClient
 
 from shmio.connectors.modbus.connector import ModbusConnector, ModbusOptions
 from shmio.layout.tags import place_tags
 from shmio.layout.values.codec import codec
 
-OURS, WORDS, REALS = "shmio", "pymodbus, words", "pymodbus, REALs"
 MOST_WORDS = 125
 
 
@@ -65,38 +62,15 @@ def values(count: int) -> list[float]:
     return [n / 2 for n in range(count)]
 
 
-def sampler(read: Callable[[], object], count: int, duration_s: float, costs: list[float]) -> Callable[[], float]:
-    """Make a function that returns a client's values a second, and adds its CPU time for each, in us, to a list."""
-
-    def sample() -> float:
-        cycles, used_s, begun_s = 0, time.process_time(), time.perf_counter()
-        while (taken_s := time.perf_counter() - begun_s) < duration_s:
-            read()
-            cycles += 1
-        costs.append(1e6 * (time.process_time() - used_s) / (cycles * count))
-        return cycles * count / taken_s
-
-    return sample
-
-
 def compare(count: int, rounds: int, round_s: float) -> None:
     """Print the table for so many registers."""
-    with Child("modbus_peer.py", count) as device, ExitStack() as stack:
-        reads = {
-            OURS: connector(stack, device.hello, count),
-            WORDS: library(stack, device.hello, count, reals=False),
-            REALS: library(stack, device.hello, count, reals=True),
+    with Child("modbus_peer.py", count) as device:
+        clients: dict[str, Connect] = {
+            "shmio": lambda stack: connector(stack, device.hello, count),
+            "pymodbus, words": lambda stack: library(stack, device.hello, count, reals=False),
+            "pymodbus, REALs": lambda stack: library(stack, device.hello, count, reals=True),
         }
-        used: dict[str, list[float]] = {name: [] for name in reads}
-        samplers = {name: sampler(read, count, round_s, used[name]) for name, read in reads.items()}
-        rates = {name: statistics.median(found) for name, found in interleave(samplers, rounds).items()}
-    costs = {name: statistics.median(found) for name, found in used.items()}
-    rows = [
-        [name, f"{rates[name]:.0f}", f"{costs[name]:.2f}"]
-        + ([""] * 2 if name == OURS else [f"{rates[OURS] / rates[name]:.2f}", f"{costs[OURS] / costs[name]:.2f}"])
-        for name in reads
-    ]
-    table([f"{count} REALs", "values/s", "µs of CPU a value", "shmio's rate to it", "shmio's CPU to it"], rows)
+        compare_clients(f"{count} REALs", clients, count, rounds, round_s)
 
 
 def main() -> None:

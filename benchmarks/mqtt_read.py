@@ -7,15 +7,13 @@ connector also puts each value with its status and time into an image, which it 
 
 from __future__ import annotations
 
-import statistics
 import tempfile
-import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from common import Child, begin, interleave, table
+from common import Child, Connect, begin, compare_clients, follow
 from paho.mqtt.client import Client, MQTTv5
 from paho.mqtt.enums import CallbackAPIVersion
 
@@ -27,13 +25,12 @@ from shmio.layout.values.codec import codec
 from shmio.testing.mosquitto import Mosquitto, missing
 from shmio.testing.ports import reserved_port
 
-OURS, BARE = "shmio", "paho"
 PERIOD_S = 0.01
-Wait = Callable[[float], None]
-"""Wait until the client has a number from the last topic."""
+Newest = Callable[[], object]
+"""Returns the newest number from the last topic."""
 
 
-def connector(stack: ExitStack, address: Address, topics: int) -> Wait:
+def connector(stack: ExitStack, address: Address, topics: int) -> Newest:
     """Connect the connector."""
     layout = place_tags("bench", {f"v{n}": {"type": "REAL", "address": f"plant/{n}"} for n in range(topics)})
     layout = layout.with_statuses()
@@ -42,14 +39,10 @@ def connector(stack: ExitStack, address: Address, topics: int) -> Wait:
     stack.callback(made.close)
     last = codec(layout.registers[-1], layout.byte_order)
 
-    def wait(number: float) -> None:
-        while last.decode(made.read()) != number:
-            time.sleep(PERIOD_S)
-
-    return wait
+    return lambda: last.decode(made.read())
 
 
-def library(stack: ExitStack, address: Address, topics: int) -> Wait:
+def library(stack: ExitStack, address: Address, topics: int) -> Newest:
     """Connect paho's client."""
     values: dict[str, float] = {}
     last = f"plant/{topics - 1}"
@@ -65,32 +58,7 @@ def library(stack: ExitStack, address: Address, topics: int) -> Wait:
     client.loop_start()
     stack.callback(client.loop_stop)
 
-    def wait(number: float) -> None:
-        while values.get(last) != number:
-            time.sleep(PERIOD_S)
-
-    return wait
-
-
-def sampler(
-    client: str, device: Child, address: Address, topics: int, duration_s: float, costs: list[float]
-) -> Callable[[], float]:
-    """Make a function that returns a client's values a second, and adds its CPU time for each, in us, to a list."""
-
-    def sample() -> float:
-        with ExitStack() as stack:
-            wait = (connector if client == OURS else library)(stack, address, topics)
-            device.ask(0)
-            wait(0)
-            cycles, used_s, begun_s = 0, time.process_time(), time.perf_counter()
-            while (taken_s := time.perf_counter() - begun_s) < duration_s:
-                cycles += 1
-                device.ask(cycles)
-                wait(cycles)
-            costs.append(1e6 * (time.process_time() - used_s) / (cycles * topics))
-        return cycles * topics / taken_s
-
-    return sample
+    return lambda: values.get(last)
 
 
 def compare(topics: int, rounds: int, round_s: float) -> None:
@@ -102,15 +70,11 @@ def compare(topics: int, rounds: int, round_s: float) -> None:
         broker.start()
         stack.callback(broker.stop)
         device = stack.enter_context(Child("mqtt_peer.py", address.port, topics))
-        used: dict[str, list[float]] = {OURS: [], BARE: []}
-        samplers = {name: sampler(name, device, address, topics, round_s, used[name]) for name in used}
-        rates = {name: statistics.median(found) for name, found in interleave(samplers, rounds).items()}
-    costs = {name: statistics.median(found) for name, found in used.items()}
-    ratios = [f"{rates[OURS] / rates[BARE]:.2f}", f"{costs[OURS] / costs[BARE]:.2f}"]
-    rows = [
-        [name, f"{rates[name]:.0f}", f"{costs[name]:.2f}", *(["", ""] if name == OURS else ratios)] for name in rates
-    ]
-    table([f"{topics} topics", "values/s", "µs of CPU a value", "shmio's rate to it", "shmio's CPU to it"], rows)
+        clients: dict[str, Connect] = {
+            "shmio": lambda stack: follow(device, connector(stack, address, topics), PERIOD_S),
+            "paho": lambda stack: follow(device, library(stack, address, topics), PERIOD_S),
+        }
+        compare_clients(f"{topics} topics", clients, topics, rounds, round_s)
 
 
 def main() -> None:

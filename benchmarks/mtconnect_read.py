@@ -8,16 +8,14 @@ accepts, and puts each value with its status and time into an image, which it ma
 
 from __future__ import annotations
 
-import statistics
 import sys
 import threading
-import time
 import urllib.request
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from xml.etree import ElementTree
 
-from common import ROOT, Child, begin, interleave, table
+from common import ROOT, Child, Connect, begin, compare_clients, follow
 
 from shmio.layout.tags import place_tags
 from shmio.layout.values.codec import codec
@@ -25,13 +23,12 @@ from shmio.layout.values.codec import codec
 sys.path.insert(0, str(ROOT / "examples/mtconnect/src"))
 from shmio_mtconnect.connector import MTConnectConnector, MTConnectOptions
 
-OURS, BARE = "shmio", "urllib, ElementTree"
 PERIOD_S = 0.01
-Wait = Callable[[float], None]
-"""Wait until the client has a number from the last data item."""
+Newest = Callable[[], object]
+"""Returns the newest number from the last data item."""
 
 
-def connector(stack: ExitStack, port: int, items: int) -> Wait:
+def connector(stack: ExitStack, port: int, items: int) -> Newest:
     """Connect the connector."""
     layout = place_tags("bench", {f"v{n}": {"type": "REAL", "address": f"v{n}"} for n in range(items)}).with_statuses()
     made = MTConnectConnector(MTConnectOptions(url=f"http://127.0.0.1:{port}", interval=1, count=items), layout)
@@ -39,14 +36,10 @@ def connector(stack: ExitStack, port: int, items: int) -> Wait:
     stack.callback(made.close)
     last = codec(layout.registers[-1], layout.byte_order)
 
-    def wait(number: float) -> None:
-        while last.decode(made.read()) != number:
-            time.sleep(PERIOD_S)
-
-    return wait
+    return lambda: last.decode(made.read())
 
 
-def library(stack: ExitStack, port: int, items: int) -> Wait:
+def library(stack: ExitStack, port: int, items: int) -> Newest:
     """Connect the bare client."""
     values: dict[str, float] = {}
     answer = urllib.request.urlopen(f"http://127.0.0.1:{port}/sample?interval=1&count={items}", timeout=5)
@@ -69,46 +62,22 @@ def library(stack: ExitStack, port: int, items: int) -> Wait:
     stack.callback(answer.close)
     last = f"v{items - 1}"
 
-    def wait(number: float) -> None:
-        while values.get(last) != number:
-            if not thread.is_alive():
-                raise SystemExit("the stream of the bare client has ended")
-            time.sleep(PERIOD_S)
+    def newest() -> float | None:
+        if not thread.is_alive():
+            raise SystemExit("the stream of the bare client has ended")
+        return values.get(last)
 
-    return wait
-
-
-def sampler(client: str, agent: Child, items: int, duration_s: float, costs: list[float]) -> Callable[[], float]:
-    """Make a function that returns a client's values a second, and adds its CPU time for each, in us, to a list."""
-
-    def sample() -> float:
-        with ExitStack() as stack:
-            wait = (connector if client == OURS else library)(stack, agent.hello, items)
-            agent.ask(0)
-            wait(0)
-            cycles, used_s, begun_s = 0, time.process_time(), time.perf_counter()
-            while (taken_s := time.perf_counter() - begun_s) < duration_s:
-                cycles += 1
-                agent.ask(cycles)
-                wait(cycles)
-            costs.append(1e6 * (time.process_time() - used_s) / (cycles * items))
-        return cycles * items / taken_s
-
-    return sample
+    return newest
 
 
 def compare(items: int, rounds: int, round_s: float) -> None:
     """Print the table for so many data items."""
     with Child("mtconnect_peer.py", items) as agent:
-        used: dict[str, list[float]] = {OURS: [], BARE: []}
-        samplers = {name: sampler(name, agent, items, round_s, used[name]) for name in used}
-        rates = {name: statistics.median(found) for name, found in interleave(samplers, rounds).items()}
-    costs = {name: statistics.median(found) for name, found in used.items()}
-    ratios = [f"{rates[OURS] / rates[BARE]:.2f}", f"{costs[OURS] / costs[BARE]:.2f}"]
-    rows = [
-        [name, f"{rates[name]:.0f}", f"{costs[name]:.2f}", *(["", ""] if name == OURS else ratios)] for name in rates
-    ]
-    table([f"{items} data items", "values/s", "µs of CPU a value", "shmio's rate to it", "shmio's CPU to it"], rows)
+        clients: dict[str, Connect] = {
+            "shmio": lambda stack: follow(agent, connector(stack, agent.hello, items), PERIOD_S),
+            "urllib, ElementTree": lambda stack: follow(agent, library(stack, agent.hello, items), PERIOD_S),
+        }
+        compare_clients(f"{items} data items", clients, items, rounds, round_s)
 
 
 def main() -> None:

@@ -11,14 +11,12 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
-import statistics
 import threading
-import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 
-from common import Child, begin, interleave, table
+from common import Child, Connect, begin, compare_clients, follow
 from ros_peer import JOINTS, KIND
 
 from shmio.connectors.base import Connector
@@ -28,7 +26,7 @@ from shmio.layout.model import Layout
 from shmio.layout.tags import place_tags
 from shmio.layout.values.codec import codec
 
-PERIOD_S, PATIENCE_S = 0.001, 20.0
+PERIOD_S = 0.001
 DOMAIN = 100 + os.getpid() % 100
 Newest = Callable[[], object]
 """Returns the newest number from the last arm."""
@@ -116,55 +114,14 @@ def dds_library(stack: ExitStack, _: Any, arms: int) -> Newest:
     return lambda: values.get(f"rt/arm{arms - 1}", {}).get(JOINTS[-1])
 
 
-def reaches(newest: Newest, number: float, patience_s: float) -> bool:
-    """Wait until the client has a number; return False if it does not come."""
-    end_s = time.monotonic() + patience_s
-    while newest() != number:
-        if time.monotonic() > end_s:
-            return False
-        time.sleep(PERIOD_S)
-    return True
-
-
-def sampler(client: Make, robot: Child, arms: int, duration_s: float, costs: list[float]) -> Callable[[], float]:
-    """Make a function that returns a client's values a second, and adds its CPU time for each, in us, to a list."""
-
-    def sample() -> float:
-        with ExitStack() as stack:
-            newest = client(stack, robot.hello, arms)
-            end_s = time.monotonic() + PATIENCE_S
-            robot.ask(-1)
-            while not reaches(newest, -1, 0.5):  # until the robot has found the client
-                if time.monotonic() > end_s:
-                    raise SystemExit("the client does not get the robot's messages")
-                robot.ask(-1)
-            cycles, used_s, begun_s = 0, time.process_time(), time.perf_counter()
-            while (taken_s := time.perf_counter() - begun_s) < duration_s:
-                cycles += 1
-                robot.ask(cycles)
-                if not reaches(newest, cycles, PATIENCE_S):
-                    raise SystemExit("a message of the robot is lost")
-            values = cycles * arms * len(JOINTS)
-            costs.append(1e6 * (time.process_time() - used_s) / values)
-        return values / taken_s
-
-    return sample
-
-
-def compare(title: str, clients: dict[str, Make], robot: Child, arms: int,
-            rounds: int, round_s: float) -> None:  # fmt: skip
+def compare(title: str, makes: dict[str, Make], robot: Child, arms: int, rounds: int, round_s: float) -> None:
     """Print the table of a connector, which is the first client, and the bare library."""
-    used: dict[str, list[float]] = {name: [] for name in clients}
-    samplers = {name: sampler(client, robot, arms, round_s, used[name]) for name, client in clients.items()}
-    rates = {name: statistics.median(found) for name, found in interleave(samplers, rounds).items()}
-    costs = {name: statistics.median(found) for name, found in used.items()}
-    ours = next(iter(clients))
-    rows = [
-        [name, f"{rates[name]:.0f}", f"{costs[name]:.2f}"]
-        + (["", ""] if name == ours else [f"{rates[ours] / rates[name]:.2f}", f"{costs[ours] / costs[name]:.2f}"])
-        for name in clients
-    ]
-    table([title, "values/s", "µs of CPU a value", "shmio's rate to it", "shmio's CPU to it"], rows)
+
+    def client(make: Make) -> Connect:
+        return lambda stack: follow(robot, make(stack, robot.hello, arms), PERIOD_S)
+
+    clients = {name: client(make) for name, make in makes.items()}
+    compare_clients(title, clients, arms * len(JOINTS), rounds, round_s)
 
 
 def main() -> None:

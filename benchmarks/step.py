@@ -9,12 +9,11 @@ the cost of the client itself.
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable
 from contextlib import ExitStack
 
 import ready
-from common import HERE, Child, begin, interleave, report, table
+from common import HERE, Child, begin, interleave, per_second, report, table
 from instance import started
 from stepping import PATHS
 
@@ -47,11 +46,7 @@ def local(instance: str, duration_s: float) -> Callable[[], float]:
     def sample() -> float:
         with attach(instance, writable=True) as program:
             program.step()
-            steps, begun_s = 0, time.perf_counter()
-            while (taken_s := time.perf_counter() - begun_s) < duration_s:
-                program.step()
-                steps += 1
-        return steps / taken_s
+            return per_second(program.step, duration_s)()
 
     return sample
 
