@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import selectors
+import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from pathlib import Path
@@ -21,6 +23,7 @@ from shmio.errors import ShmioError
 from shmio.layout.document import load_layout
 from shmio.local.state_requests import StateRequests
 from shmio.logs import fields
+from shmio.segment import Activity
 from shmio.segment.doorbell import Relay
 from shmio.worker import BEAT_S, Worker
 
@@ -53,18 +56,46 @@ def run(worker: Worker) -> None:
             device = _started(worker, listen, cleanup)
         if config["clock"] == "instance":
             _follow_clock(worker, device, selector, cleanup, faults)
+        woken = threading.Event()
+        worker.on_reread(woken.set)
         worker.log.info("the emulator runs the program %s", program, extra=fields(address=listen))
         worker.running()
         worker.on_stop(lambda: os.eventfd_write(stop, 1))
         while not worker.stopping.is_set():
             for key, _ in selector.select(BEAT_S):
                 key.data()
+            if woken.is_set():
+                woken.clear()
+                if (changed := worker.revised()) is not None:
+                    _change(worker, device, changed, woken)
             if faults is not None:
                 faults.expire()
             cycle = device.cycle
             if cycle.failure is not None:
                 raise ShmioError(f"program {program} failed: {cycle.failure}") from cycle.failure
             worker.report((cycle.cycles, cycle.overruns))
+
+
+def _change(worker: Worker, device: Device, config: dict[str, Any], woken: threading.Event) -> None:
+    """Serve other layouts, once the supervisor says so. Meanwhile, the device continues as before.
+
+    If the supervisor dies before that, nothing changes.
+    """
+    served, digest, supervisor = _served(config), worker.slot.digest, worker.segment.supervisor[0]
+    worker.report(activity=Activity.PAUSED)
+    while worker.slot.digest == digest and not worker.stopping.is_set():
+        if not worker.segment.supervised or worker.segment.supervisor[0] != supervisor:
+            worker.log.warning("the supervisor ended during a reload; the emulator continues as before")
+            break
+        woken.wait(BEAT_S)
+        woken.clear()
+        worker.report()
+    else:
+        if not worker.stopping.is_set():
+            worker.config = config
+            with device.cycle.held():
+                _beating(worker, lambda: device.change(served))
+    worker.running()
 
 
 def _follow_clock(
@@ -94,19 +125,28 @@ def _follow_clock(
     selector.register(relay.descriptor, selectors.EVENT_READ, follow)
 
 
+def _beating(worker: Worker, call: Callable[[], object]) -> None:
+    """Call a function that may take seconds, as with some libraries, while the heartbeat continues."""
+    with ThreadPoolExecutor(1) as pool:
+        calling = pool.submit(call)
+        while not wait((calling,), BEAT_S).done:
+            worker.report()
+    calling.result()
+
+
+def _served(config: dict[str, Any]) -> list[Served]:
+    layouts = [load_layout(layout.encode()) for layout in config["layouts"]]
+    return [Served(layout, options) for layout, options in zip(layouts, config["options"], strict=True)]
+
+
 def _started(worker: Worker, listen: Address, cleanup: ExitStack) -> Device:
     """Create and start the device. ``cleanup`` will stop it."""
     config: dict[str, Any] = worker.config
-    layouts = [load_layout(layout.encode()) for layout in config["layouts"]]
-    served = [Served(layout, options) for layout, options in zip(layouts, config["options"], strict=True)]
+    served = _served(config)
     code = UserCode(config["folder"], config["parameters"])
     device = create(config["kind"], served, config["program"], listen, db_number=config["dbNumber"], code=code)
     cleanup.callback(device.stop)
-    with ThreadPoolExecutor(1) as pool:  # some libraries take seconds, during which the heartbeat continues
-        starting = pool.submit(device.start)
-        while not wait((starting,), BEAT_S).done:
-            worker.report()
-    starting.result()
+    _beating(worker, device.start)
     return device
 
 

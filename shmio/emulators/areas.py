@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
 from typing import Final
 
@@ -59,17 +59,30 @@ class TableMemory:
             sizes[place] = max(sizes.get(place, _LEAST.get(place[0], 0)), one.stop + (one.stop & 1))
         return sizes
 
-    def fill(self, memory: Mapping[Place, bytearray], present: frozenset[Place] = frozenset()) -> None:
+    @property
+    def keys(self) -> frozenset[tuple[object, ...]]:
+        """What makes each register the same one in another table."""
+        return frozenset(map(_key, self._conversions))
+
+    def fill(
+        self,
+        memory: Mapping[Place, bytearray],
+        present: Collection[Place] = (),
+        known: Collection[tuple[object, ...]] = (),
+    ) -> None:
         """Store the initial values. Those of the tag table override the defaults of the types.
 
         Args:
             memory: The areas.
             present: Areas that already have values. Defaults do not overwrite these.
+            known: The ``keys`` of registers that already have values.
 
         """
         frame, _ = initial_frame(self.layout)
         for given in (False, True):
             for one in self._conversions:
+                if _key(one) in known:
+                    continue
                 if given is (one.register.initial is not None) and (given or _place(one) not in present):
                     with suppress(ValueError, ValueRangeError):  # for example, the scale has no raw value for 0
                         _store(one, frame, memory)
@@ -98,6 +111,10 @@ class TableMemory:
 def _place(one: Conversion) -> Place:
     area = one.address.area
     return (Area.INPUT if area is Area.PERIPHERAL else area), one.address.db
+
+
+def _key(one: Conversion) -> tuple[object, ...]:
+    return one.register.path, one.register.type, one.register.dims, one.register.address
 
 
 def _store(one: Conversion, frame: bytearray, memory: Mapping[Place, bytearray]) -> None:

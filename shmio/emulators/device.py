@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
@@ -41,6 +41,16 @@ class Device(Protocol):
 
         Raises:
             SnapshotError: The state is damaged, or does not fit the device.
+        """
+
+    def change(self, served: Sequence[Served]) -> None:
+        """Serve other layouts from now on, and keep the connections of clients. Call it between two cycles.
+
+        Memory that both have keeps its values. The program starts again, on the first layout.
+
+        Raises:
+            ConfigError: A layout does not suit the device or its program; nothing was changed.
+
         """
 
     def stop(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from types import TracebackType
 from typing import Final, Self
 
@@ -13,12 +14,14 @@ from snap7.type import SrvArea
 from shmio.config.address import Address
 from shmio.emulators.areas import Place, TableMemory, is_table, place_name
 from shmio.emulators.cycle import Cycle
-from shmio.emulators.programs import BUILT_IN, Idle, UserCode, program
+from shmio.emulators.device import Served
+from shmio.emulators.programs import BUILT_IN, Idle, Program, UserCode, program
 from shmio.emulators.s7 import S7Server, ServerOptions
-from shmio.errors import ConfigError, SnapshotError
+from shmio.errors import ConfigError, SnapshotError, ValueRangeError
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
 from shmio.layout.s7.address import Area
+from shmio.layout.values.codec import codec
 from shmio.model.snapshot import decode_part
 
 AREAS: Final[Mapping[Area, SrvArea]] = {
@@ -69,18 +72,13 @@ class Emulator:
                 or used twice, or a block is too short for a tag table.
 
         """
-        self._program = program(program_name, layout, code)
         self._server = S7Server(listen, max_clients=max_clients, options=options)
-        self._memory: dict[Place, bytearray] = {}
-        self._table = TableMemory(layout) if is_table(layout) else None
-        self._frame = bytearray(layout.size) if self._table else self._serve(layout, db_number)
-        for other in others:
-            if not is_table(other):
-                self._serve(other)
-        tables = [TableMemory(one) for one in others if is_table(one)]
-        self._serve_tables([self._table, *tables] if self._table else tables)
+        self._program_name, self._code, self._db_number = program_name, code, db_number
+        self._contents = self._made([layout, *others])
+        for (area, number), data in self._contents.memory.items():
+            self._serve(area, number, data)
         self.cycle = Cycle(
-            self._program.period_ms / 1000,
+            self._contents.program.period_ms / 1000,
             self._step,
             f"program-{program_name}",
             lambda: bool(self._server.cpu_state == CPUState.RUN),
@@ -107,6 +105,25 @@ class Emulator:
         self._server.stop()
         self.cycle.stop()
 
+    def change(self, served: Sequence[Served]) -> None:
+        """Serve other blocks and tables from now on. Memory that both have keeps its values.
+
+        Raises:
+            ConfigError: As for a new emulator; nothing was changed.
+
+        """
+        contents = self._made([one.layout for one in served])
+        with self._server.lock:
+            contents.adopt(self._contents)
+            for area, number in self._contents.memory.keys() - contents.memory.keys():
+                self._server.remove(AREAS.get(area, SrvArea.DB), number)
+            for (area, number), data in contents.memory.items():
+                if (area, number) in self._contents.memory:
+                    self._server.replace(AREAS.get(area, SrvArea.DB), number, data)
+                else:
+                    self._serve(area, number, data)
+            self._contents = contents
+
     def save(self) -> bytes:
         """Return the state of the memory and the program, for a snapshot.
 
@@ -118,8 +135,9 @@ class Emulator:
         if self._server.cpu_state != CPUState.RUN:
             raise SnapshotError("its CPU is not in RUN; start it first")
         with self._server.lock:
-            memory = [bytes(area) for area in self._memory.values()]
-            return msgspec.msgpack.encode((bytes(self._frame), memory, self._program.save()))
+            contents = self._contents
+            memory = [bytes(area) for area in contents.memory.values()]
+            return msgspec.msgpack.encode((bytes(contents.frame), memory, contents.program.save()))
 
     def prepare_restore(self, data: bytes) -> Callable[[], None]:
         """Check a state, and return the function that restores it.
@@ -131,15 +149,16 @@ class Emulator:
         if self._server.cpu_state != CPUState.RUN:
             raise SnapshotError("its CPU is not in RUN; start it first")
         frame, memory, program_state = decode_part(data, tuple[bytes, list[bytes], bytes])
-        areas = list(self._memory.values())
-        if len(frame) != len(self._frame) or list(map(len, memory)) != list(map(len, areas)):
+        contents = self._contents
+        areas = list(contents.memory.values())
+        if len(frame) != len(contents.frame) or list(map(len, memory)) != list(map(len, areas)):
             raise SnapshotError("its memory has other areas")
-        restore_program = self._program.prepare_restore(program_state)
+        restore_program = contents.program.prepare_restore(program_state)
 
         def restore() -> None:
             with self._server.lock:
                 restore_program()
-                self._frame[:] = frame
+                contents.frame[:] = frame
                 for area, content in zip(areas, memory, strict=True):
                     area[:] = content
 
@@ -154,47 +173,106 @@ class Emulator:
     ) -> None:
         self.stop()
 
-    def _serve(self, layout: Layout, number: int | None = None) -> bytearray:
-        """Serve a block with its initial values, under ``number`` or the block's own number."""
+    def _made(self, layouts: Sequence[Layout]) -> _Contents:
+        return _Contents(layouts, program(self._program_name, layouts[0], self._code), self._db_number)
+
+    def _serve(self, area: Area, number: int, data: bytearray) -> None:
+        if area is Area.BLOCK:
+            self._server.add_block(number, data)
+        else:
+            self._server.add_area(AREAS[area], data)
+
+    def _step(self, time_s: float) -> None:
+        with self._server.lock:
+            self._contents.step(time_s)
+
+
+class _Contents:
+    """The controller's memory, its program, and the registers by which the program sees the memory."""
+
+    def __init__(self, layouts: Sequence[Layout], own: Program, db_number: int | None) -> None:
+        """Create the memory with its initial values.
+
+        Args:
+            layouts: The data blocks and tag tables; the program runs on the first.
+            own: The program.
+            db_number: The number of the program's block; default: the layout's own.
+
+        Raises:
+            ConfigError: A number is missing or used twice, or a block is too short for a tag table.
+
+        """
+        self.program = own
+        self.memory: dict[Place, bytearray] = {}
+        self._blocks: dict[Place, Layout] = {}
+        self._table = TableMemory(layouts[0]) if is_table(layouts[0]) else None
+        self.frame = bytearray(layouts[0].size) if self._table else self._add_block(layouts[0], db_number)
+        for other in layouts[1:]:
+            if not is_table(other):
+                self._add_block(other, None)
+        others = [TableMemory(one) for one in layouts[1:] if is_table(one)]
+        self._tables = [self._table, *others] if self._table else others
+        self._add_tables()
+
+    def step(self, time_s: float) -> None:
+        """Run a cycle of the program."""
+        if self._table is None:
+            self.program.step(time_s, self.frame)
+        elif not isinstance(self.program, Idle):
+            self._table.load(self.frame, self.memory)
+            before = bytes(self.frame)
+            self.program.step(time_s, self.frame)
+            self._table.store(before, self.frame, self.memory)
+
+    def adopt(self, other: _Contents) -> None:
+        """Take the values of other contents, as far as these have them."""
+        for place, area in self.memory.items():
+            before = other.memory.get(place)
+            if before is None:
+                continue
+            block, old = self._blocks.get(place), other._blocks.get(place)
+            if block is None or old is None:
+                size = min(len(area), len(before))
+                area[:size] = before[:size]
+                continue
+            known = {(one.path, one.type, one.dims): one for one in old.registers}
+            for one in block.registers:
+                if (there := known.get((one.path, one.type, one.dims))) is not None:
+                    with suppress(ValueError, ValueRangeError):  # a client may have stored bytes that are no value
+                        value = codec(there, old.byte_order).decode(before)
+                        codec(one, block.byte_order).encode_into(value, area)
+        keys = frozenset(key for table in other._tables for key in table.keys)
+        for table in self._tables:
+            table.fill(self.memory, other.memory, keys)
+
+    def _add_block(self, layout: Layout, number: int | None) -> bytearray:
+        """Add a block with its initial values, under ``number`` or the block's own number."""
         number = layout.number if number is None else number
         if number is None:
             raise ConfigError(
                 f"dbNumber: this key is needed, because the layout {layout.name!r} has no number in its name"
             )
-        frame, _ = initial_frame(layout)
-        self._server.add_block(number, frame)
-        self._memory[Area.BLOCK, number] = frame
-        return frame
+        place = Area.BLOCK, number
+        if place in self.memory:
+            raise ConfigError(f"DB{number} is served already")
+        self._blocks[place] = layout
+        self.memory[place], _ = initial_frame(layout)
+        return self.memory[place]
 
-    def _serve_tables(self, tables: Sequence[TableMemory]) -> None:
-        """Serve the memory areas that tables need and that are not served yet; store the tables' initial values."""
-        present = frozenset(self._memory)
+    def _add_tables(self) -> None:
+        """Add the areas that tables need and that are not there yet; store the tables' initial values."""
+        present = frozenset(self.memory)
         sizes: dict[Place, int] = {}
-        for table in tables:
+        for table in self._tables:
             for place, size in table.needs.items():
                 sizes[place] = max(sizes.get(place, 0), size)
         for place, size in sizes.items():
-            if place in present:
-                if len(self._memory[place]) < size - 1:
-                    raise ConfigError(
-                        f"layout: a tag table needs {size} bytes of {place_name(place)}, whose layout has "
-                        f"{len(self._memory[place])}; correct one of the two"
-                    )
-                continue
-            area = self._memory[place] = bytearray(size)
-            if place[0] is Area.BLOCK:
-                self._server.add_block(place[1], area)
-            else:
-                self._server.add_area(AREAS[place[0]], area)
-        for table in tables:
-            table.fill(self._memory, present)
-
-    def _step(self, time_s: float) -> None:
-        with self._server.lock:
-            if self._table is None:
-                self._program.step(time_s, self._frame)
-            elif not isinstance(self._program, Idle):
-                self._table.load(self._frame, self._memory)
-                before = bytes(self._frame)
-                self._program.step(time_s, self._frame)
-                self._table.store(before, self._frame, self._memory)
+            if place not in present:
+                self.memory[place] = bytearray(size)
+            elif len(self.memory[place]) < size - 1:
+                raise ConfigError(
+                    f"layout: a tag table needs {size} bytes of {place_name(place)}, whose layout has "
+                    f"{len(self.memory[place])}; correct one of the two"
+                )
+        for table in self._tables:
+            table.fill(self.memory, present)

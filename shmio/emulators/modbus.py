@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import struct
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -24,7 +24,7 @@ from shmio.errors import ConfigError, EndpointError, SnapshotError, ValueRangeEr
 from shmio.layout.addresses.modbus import MAX_ADDRESS, Order, Table, WordCodec, parse
 from shmio.layout.addresses.modbus import Address as Place
 from shmio.layout.image import initial_frame
-from shmio.layout.model import Layout, Register
+from shmio.layout.model import Register
 from shmio.layout.values.codec import codec, flatten, nest
 from shmio.model.snapshot import decode_part
 from shmio.wording import IN_USE
@@ -40,7 +40,9 @@ _READS: Final = {1: Table.COIL, 2: Table.DISCRETE, 3: Table.HOLDING, 4: Table.IN
 _TABLES: Final = _READS | {5: Table.COIL, 15: Table.COIL} | dict.fromkeys((6, 16, 22, 23), Table.HOLDING)
 """The table that each function reads or writes."""
 
-Words = dict[tuple[int, Table], list[int]]
+Where = tuple[int, Table]
+Key = tuple[str, str, Any, str, Where]
+Words = dict[Where, list[int]]
 """The entries of each unit's tables: bits as 0 and 1, and words."""
 
 
@@ -64,6 +66,12 @@ class _Place:
             self._words = WordCodec(address, register, *orders)
         self._starts = range(address.number, self.stop, self.width)
         self._packed = struct.Struct(f">{self.width}H")
+
+    @property
+    def key(self) -> Key:
+        """What makes a register the same one in another table."""
+        register = self.register
+        return register.path, register.type, register.dims, register.address, self.where
 
     @property
     def stop(self) -> int:
@@ -114,11 +122,21 @@ class _TableImage:
         self._spans = [(one.offset, one.offset + one.size) for one in layout.registers]
         self._codecs = [codec(register, layout.byte_order) for register in layout.registers]
 
-    def fill(self, words: Words) -> None:
-        """Store the initial values. Those of the tag table override the defaults of the types."""
+    def fill(self, words: Words, known: Collection[Key], sizes: Mapping[Where, int]) -> None:
+        """Store the initial values. Those of the tag table override the defaults of the types.
+
+        Args:
+            words: The tables.
+            known: The registers that have values already.
+            sizes: The sizes of those parts of the tables that have values, which defaults do not override.
+
+        """
         frame, _ = initial_frame(self.layout)
-        for given in (False, True):
-            self._store(words, frame, [place.register.initial is not None for place in self.places], given)
+        unknown = [place.key not in known for place in self.places]
+        given = [place.register.initial is not None for place in self.places]
+        new = [place.stop > sizes.get(place.where, 0) for place in self.places]
+        self._store(words, frame, [a and b and not c for a, b, c in zip(new, unknown, given, strict=True)])
+        self._store(words, frame, [a and b for a, b in zip(unknown, given, strict=True)])
 
     def load(self, frame: bytearray, words: Words) -> None:
         """Copy the values of the device to an image."""
@@ -130,9 +148,9 @@ class _TableImage:
         """Copy the changed values of an image to the device."""
         self._store(words, frame, [before[start:stop] != frame[start:stop] for start, stop in self._spans])
 
-    def _store(self, words: Words, frame: bytearray, chosen: Sequence[bool], wanted: bool = True) -> None:
+    def _store(self, words: Words, frame: bytearray, chosen: Sequence[bool]) -> None:
         for place, own, one in zip(self.places, self._codecs, chosen, strict=True):
-            if one is wanted:
+            if one:
                 with suppress(ValueError, ValueRangeError):  # for example, the scale has no raw value for 0
                     place.write(words[place.where], own.decode(frame))
 
@@ -159,22 +177,38 @@ class ModbusEmulator:
 
         """
         self.address = listen
-        self._images = [_TableImage(one) for one in served]
-        self._layout: Layout = served[0].layout
-        self._program = program(program_name, self._layout, code)
+        self._code, self._program_name = code, program_name
         self._words: Words = {}
-        for image in self._images:
-            for place in image.places:
-                entries = self._words.setdefault(place.where, [0] * LEAST)
-                entries += [0] * (place.stop - len(entries))
-        for image in self._images:
-            image.fill(self._words)
-        self._frame = bytearray(self._layout.size)
         self._lock = threading.Lock()
         self._store = _Store(self._words, self._lock)
+        self._serve_tables(served)
         self._loop = LoopThread("modbus-server")
         self._server: ModbusTcpServer | None = None
         self.cycle = Cycle(self._program.period_ms / 1000, self._step, f"program-{program_name}")
+
+    def _serve_tables(self, served: Sequence[Served], known: Collection[Key] = ()) -> None:
+        """Serve tables, with the initial values of registers that are not ``known``."""
+        images = [_TableImage(one) for one in served]
+        made = program(self._program_name, served[0].layout, self._code)
+        words: Words = {}
+        for image in images:
+            for place in image.places:
+                entries = words.setdefault(place.where, [0] * LEAST)
+                entries += [0] * (place.stop - len(entries))
+        for where, entries in words.items():
+            before = self._words.get(where, [])[: len(entries)]
+            entries[: len(before)] = before
+        sizes = {where: len(entries) for where, entries in self._words.items()}
+        for image in images:
+            image.fill(words, known, sizes)
+        self._images, self._program = images, made
+        self._frame = bytearray(served[0].layout.size)
+        self._store.replace(words)
+
+    def change(self, served: Sequence[Served]) -> None:
+        """Serve other tables from now on. Entries that both have keep their values."""
+        with self._lock:
+            self._serve_tables(served, {place.key for image in self._images for place in image.places})
 
     def start(self) -> None:
         """Run the first cycle, listen, and continue in threads.
@@ -256,11 +290,18 @@ class ModbusEmulator:
 class _Store:
     """The device's tables, with the methods that pymodbus's server calls. The first entry is number 0."""
 
-    def __init__(self, words: Mapping[tuple[int, Table], list[int]], lock: threading.Lock) -> None:
+    def __init__(self, words: Words, lock: threading.Lock) -> None:
         self._words, self._lock = words, lock
         self.written = True
         """True if the tables may differ from the program's image: at first, and after a client has written."""
         self._units = {unit for unit, _ in words}
+
+    def replace(self, words: Words) -> None:
+        """Serve these tables from now on."""
+        self._words.clear()
+        self._words.update(words)
+        self._units = {unit for unit, _ in words}
+        self.written = True
 
     def device_ids(self) -> list[int]:
         """Return the unit ids."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any, Final
@@ -52,6 +52,11 @@ class _Variable:
         self._base = base
         self.codec = codec(register, byte_order)
         self.node: Any = None
+
+    @property
+    def shape(self) -> str:
+        """The type of the node, and its dimensions."""
+        return f"{self.kind} {self.register.dims}"
 
     def there(self, frame: bytearray) -> Any:
         """Return the register's value in an image, converted to the node's type."""
@@ -113,9 +118,11 @@ class OpcUaEmulator:
 
         """
         self.address = listen
+        self._code, self._program_name = code, program_name
         self._program = program(program_name, served[0].layout, code)
         self._tables = [list(_variables(one)) for one in served]
         self._frames = [bytearray(initial_frame(one.layout)[0]) for one in served]
+        self._nodes: _Nodes | None = None
         self._loop = LoopThread("opcua-server")
         self._server: Server | None = None
         self.cycle = Cycle(self._program.period_ms / 1000, self._step, f"program-{program_name}")
@@ -139,6 +146,14 @@ class OpcUaEmulator:
             self._loop.run(self._server.stop)
         self._loop.stop()
 
+    def change(self, served: Sequence[Served]) -> None:
+        """Serve other layouts from now on. Nodes that both have keep their values."""
+        made = program(self._program_name, served[0].layout, self._code)
+        tables = [list(_variables(one)) for one in served]
+        frames = [bytearray(initial_frame(one.layout)[0]) for one in served]
+        self._loop.run(self._replace, tables, frames)
+        self._program, self._tables, self._frames = made, tables, frames
+
     def save(self) -> bytes:
         """Raise SnapshotError, because the server's nodes cannot be saved."""
         raise SnapshotError("the emulator of OPC UA servers does not support snapshots")
@@ -158,17 +173,25 @@ class OpcUaEmulator:
         server.set_server_name("shmio emulator")
         server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
         server.iserver.max_connections = MAX_CLIENTS
-        makers = _Nodes(server)
-        for variables, frame in zip(self._tables, self._frames, strict=True):
-            for variable in variables:
-                value = ua.Variant(variable.there(frame), getattr(ua.VariantType, variable.kind))
-                variable.node = await makers.variable(variable, value)
+        self._nodes = _Nodes(server)
+        await self._replace(self._tables, self._frames)
         try:
             await server.start()
         except OSError as error:
             await server.stop()
             raise EndpointError(f"cannot listen on {self.address}: {error.strerror}") from None
         self._server = server
+
+    async def _replace(self, tables: Sequence[Sequence[_Variable]], frames: Sequence[bytearray]) -> None:
+        """Create the nodes of tables that do not exist yet, and delete the others."""
+        from asyncua import ua  # noqa: PLC0415  it needs the extra
+
+        assert self._nodes is not None  # noqa: S101 - for the type checker
+        await self._nodes.keep(variable for variables in tables for variable in variables)
+        for variables, frame in zip(tables, frames, strict=True):
+            for variable in variables:
+                value = ua.Variant(variable.there(frame), getattr(ua.VariantType, variable.kind))
+                variable.node = await self._nodes.variable(variable, value)
 
     def _step(self, time_s: float) -> None:
         if not isinstance(self._program, Idle):
@@ -198,7 +221,26 @@ class _Nodes:
     def __init__(self, server: Server) -> None:
         self._server = server
         self._objects: dict[tuple[tuple[int, str], ...], Any] = {}
-        self._known: dict[NodeAddress | BrowsePath, Any] = {}
+        self._known: dict[NodeAddress | BrowsePath, tuple[Any, str]] = {}  # node and type
+
+    async def keep(self, variables: Iterable[_Variable]) -> None:
+        """Delete the nodes that registers do not have, or have with another type or length."""
+        wanted = {one.address: one.shape for one in variables}
+        for address, (node, shape) in list(self._known.items()):
+            if wanted.get(address) != shape:
+                del self._known[address]
+                await self._delete(node)
+
+    async def _delete(self, node: Any) -> None:
+        """Delete a node. Clients that monitor it get its status at once, which the library forgets to await."""
+        from asyncua import ua  # noqa: PLC0415  it needs the extra
+
+        gone = ua.DataValue(None, ua.StatusCode(ua.UInt32(ua.StatusCodes.BadNodeIdUnknown)))
+        await self._server.write_attribute_value(node.nodeid, gone)
+        space = self._server.iserver.aspace
+        for handle in list(space[node.nodeid].attributes[ua.AttributeIds.Value].datachange_callbacks):
+            space.delete_datachange_callback(handle)
+        await self._server.delete_nodes([node])
 
     async def variable(self, variable: _Variable, value: ua.Variant) -> Any:
         """Return the node of a register. Registers with the same address share a node."""
@@ -206,7 +248,7 @@ class _Nodes:
 
         address = variable.address
         if address in self._known:
-            return self._known[address]
+            return self._known[address][0]
         if isinstance(address, BrowsePath):
             *steps, (number, name) = address.steps
             await self._namespace(number)
@@ -220,7 +262,7 @@ class _Nodes:
         await node.set_writable()
         now = datetime.now(UTC)
         await node.write_value(ua.DataValue(value, SourceTimestamp=now, ServerTimestamp=now))
-        self._known[address] = node
+        self._known[address] = node, variable.shape
         return node
 
     async def _object(self, steps: tuple[tuple[int, str], ...]) -> Any:

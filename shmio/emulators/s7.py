@@ -405,6 +405,19 @@ class S7Server(Server):
             if number == 0:
                 self.area_locks[(kind, number)] = self.lock  # for python-snap7's own code
 
+    def replace(self, area: SrvArea, number: int, data: bytearray) -> None:
+        """Serve ``data`` in place of what is served there. The caller holds ``lock``.
+
+        Clients see the same block, with the same checksum, although it may be longer or shorter.
+        """
+        self.memory_areas[(S7Area[area.name], number)] = data
+
+    def remove(self, area: SrvArea, number: int) -> None:
+        """No longer serve an area or a block. The caller holds ``lock``."""
+        self.unregister_area(area, number)
+        if area is SrvArea.DB:
+            self._checksums.pop(number, None)
+
     @property
     def address(self) -> Address:
         """Address on which the server listens, with the actual port if port 0 was requested.

@@ -63,6 +63,9 @@ MODULES: Final[Mapping[str, str]] = {
 }
 """The module that each kind of process runs."""
 
+EMULATED: Final = ("layouts", "options")
+"""The keys of an emulator's section that say what it serves, and that it can change while clients are connected."""
+
 RULES: Final[Mapping[str, tuple[str, ...]]] = {"grpc": ("token", "client")}
 """By kind of process, the keys of its section that the process can read again while it runs."""
 
@@ -94,7 +97,7 @@ class Job:
     audit: AuditSettings | None = None
     """The audit log, to which the process writes who did what; None if there is none."""
     connection: dict[str, Any] | None = None
-    """The part of a source's section that says how to connect to its device.
+    """The part of a source's section that says how to connect to its device; of an emulator's, how to listen.
 
     While this part stays the same, the process can follow other changes without a new connection.
     None if the process must be restarted for each change.
@@ -383,4 +386,6 @@ def _job(
         options = {key: value for key, value in section["options"].items() if key not in changeable[1]}
         connection = {"class": changeable[0], "options": options}
         connection |= {key: section[key] for key in ("connector", "realtime_priority")}
+    if kind == "emulator":
+        connection = {key: value for key, value in section.items() if key not in EMULATED}
     return Job(name, kind, log_file, section, rules, log_format, audit, connection)

@@ -19,8 +19,8 @@ from shmio.supervisor.fleet import Fleet, digest
 class Changes:
     """The differences between an instance and a plan, as names.
 
-    The processes in ``replaced`` are restarted. The sources in ``changed`` keep their process and its
-    connection. ``add`` has the blocks to create, and ``retire`` those to remove.
+    The processes in ``replaced`` are restarted. The sources and emulators in ``changed`` keep their
+    process and its connections. ``add`` has the blocks to create, and ``retire`` those to remove.
     """
 
     kept: tuple[str, ...]
@@ -137,7 +137,7 @@ def preview(plan: Plan, running: Plan, epoch: int, fleet: Fleet, segment: Segmen
         "start": list(changes.started),
         "restart": [f"{name}: {'; '.join(_reasons(name, plan, running, fleet))}" for name in changes.replaced],
         "change": [
-            f"{name}: {'; '.join([*_reasons(name, plan, running, fleet), *_unconnected(segment.blocks[name])])}"
+            f"{name}: {'; '.join([*_reasons(name, plan, running, fleet), *_unconnected(segment.blocks.get(name))])}"
             for name in changes.changed
         ],
         "injections": list(_changed_injections(plan, running)),
@@ -146,9 +146,9 @@ def preview(plan: Plan, running: Plan, epoch: int, fleet: Fleet, segment: Segmen
     }
 
 
-def _unconnected(block: Block) -> Iterator[str]:
-    """Yield why a source has no connection that it could keep."""
-    frame = block.latest()
+def _unconnected(block: Block | None) -> Iterator[str]:
+    """Yield why a source has no connection that it could keep; nothing for an emulator, which has no block."""
+    frame = block.latest() if block is not None else None
     if frame is not None and frame.quality is Quality.BAD:
         yield f"but it is not connected now: {frame.reason}"
 

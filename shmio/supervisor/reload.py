@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Final
 
 from shmio.control import Answer
@@ -23,30 +23,33 @@ from shmio.supervisor.health import Notifier
 from shmio.supervisor.policy import Event, Limits, State
 
 PAUSE_S: Final = 6.0
-"""Time in s by which a source whose registers change must wait for its new block; else it is restarted."""
+"""Time in s by which a process whose registers change must wait for the new blocks; else it is restarted."""
 FOLLOW_S: Final = 20.0
-"""Time in s by which such a source must run with its new block; else it is restarted."""
+"""Time in s by which such a process must run with its new registers; else it is restarted."""
 _SETTLED = (State.RUNNING, State.BACKOFF, State.FATAL, State.STOPPED)
 
 
 class _Followers:
-    """The sources that keep their process and its connection, while their registers change.
+    """The sources and emulators that keep their process and its connections, while their registers change.
 
-    Each receives its new description, ends its loop and pauses. When the segment has been changed, it
-    continues with its new block. A process that ends or takes too long is restarted instead, so that
-    nothing waits for it for ever.
+    Each receives its new description and pauses. When the segment has been changed, the emulators
+    change what they serve, and then the sources continue with their new blocks, so that no source
+    asks its emulator for registers that are not there yet. A process that ends or takes too long is
+    restarted instead, so that nothing waits for it for ever.
     """
 
     def __init__(self, fleet: Fleet, jobs: list[Job]) -> None:
         self._fleet = fleet
         self._jobs = {job.name: job for job in jobs}
         self._pids: dict[str, int] = {}
+        self._waiting: list[str] = []
+        """The names of the processes that pause."""
         self._before: dict[str, tuple[str, tuple[int, ...]]] = {}
         """By name, why a source has not kept its connection, and its attempts to connect before the change."""
         self.failed: dict[str, str] = {}
-        """Why the other sources are restarted, by name."""
+        """Why the other processes are restarted, by name."""
         self._deadline_s = time.monotonic() + PAUSE_S
-        for job in jobs:
+        for job in sorted(jobs, key=lambda job: job.rank):
             managed = fleet.named(job.name)
             try:
                 fleet.offer(managed, job)
@@ -57,7 +60,7 @@ class _Followers:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of the sources that are not restarted."""
+        """The names of the processes that are not restarted."""
         return tuple(self._pids)
 
     def _fail(self, name: str, why: str) -> None:
@@ -65,10 +68,12 @@ class _Followers:
         self.failed[name] = why
         log.warning("restarting %s, because it cannot keep its connection: %s", name, why)
 
-    def _all(self, activity: Activity) -> bool:
-        """Return whether all remaining sources have reported an activity; give up those that ended or are late."""
+    def _all(self, activity: Activity, names: Iterable[str]) -> bool:
+        """Return whether processes have reported an activity; give up those that ended or are late."""
         done = True
-        for name, pid in list(self._pids.items()):
+        for name in names:
+            if (pid := self._pids.get(name)) is None:
+                continue
             managed = self._fleet.named(name)
             if managed.life.state is not State.RUNNING or managed.child is None or managed.child.pid != pid:
                 self._fail(name, managed.life.note or "its process has ended")
@@ -80,27 +85,36 @@ class _Followers:
         return done
 
     def paused(self) -> bool:
-        """Return whether all remaining sources wait for their new blocks."""
-        return self._all(Activity.PAUSED)
+        """Return whether all remaining processes wait for the change of the segment."""
+        return self._all(Activity.PAUSED, self.names)
 
     def go_on(self) -> None:
-        """Let the remaining sources continue, after the segment has been changed."""
+        """Let the remaining processes continue, after the segment has been changed: first the emulators."""
+        self._waiting = list(self._pids)
+        emulators = [name for name in self._pids if self._jobs[name].kind == "emulator"]
+        self._continue(emulators or self._waiting)
+
+    def _continue(self, names: Iterable[str]) -> None:
         self._deadline_s = time.monotonic() + FOLLOW_S
-        for name in self._pids:
-            self._before[name] = self._fleet.named(name).slot.report.note, self._attempts(name)
-            self._fleet.follow(self._fleet.named(name), self._jobs[name])
+        for name in tuple(names):
+            self._waiting.remove(name)
+            if name in self._pids:
+                self._before[name] = self._fleet.named(name).slot.report.note, self._attempts(name)
+                self._fleet.follow(self._fleet.named(name), self._jobs[name])
 
     def _attempts(self, name: str) -> tuple[int, ...]:
-        """Return how often a source has connected, and how often it has failed."""
+        """Return how often a source has connected, and how often it has failed; nothing for an emulator."""
         counters = self._fleet.named(name).slot.counters
-        return counters["connects"], counters["failures"]
+        return tuple(counters[key] for key in ("connects", "failures") if key in counters)
 
     def outcome(self) -> Iterator[str]:
-        """Yield a line for each source that was not restarted."""
+        """Yield a line for each process that was not restarted."""
         for name in self._pids:
             why, before = self._before[name]
             after = self._attempts(name)
-            if after == before:
+            if self._jobs[name].kind == "emulator":
+                yield f"{name}: changed, and keeps its clients"
+            elif after == before:
                 yield f"{name}: changed, and keeps its connection"
             elif after[0] > before[0]:
                 yield f"{name}: changed, and connected again: {why or 'its connection was lost during the change'}"
@@ -109,11 +123,14 @@ class _Followers:
                 yield f"{name}: changed, but not connected: {note or why or 'its connection was lost'}"
 
     def running(self) -> bool:
-        """Return whether all remaining sources run again. Restart those that have ended or take too long."""
+        """Return whether all remaining processes run again. Restart those that have ended or take too long."""
         before = self.names
-        done = self._all(Activity.RUNNING)
+        done = self._all(Activity.RUNNING, [name for name in self._pids if name not in self._waiting])
         for name in set(before) - set(self._pids):
             self._fleet.apply(self._fleet.named(name), Event.RESTART)
+        if done and self._waiting:
+            self._continue(self._waiting)
+            return False
         return done
 
 

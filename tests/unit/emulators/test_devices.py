@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -14,6 +14,8 @@ from shmio.connectors.base import Connector
 from shmio.connectors.modbus.connector import ModbusConnector, ModbusOptions
 from shmio.connectors.opcua.connector import OpcUaConnector
 from shmio.connectors.opcua.options import OpcUaOptions
+from shmio.connectors.s7.connector import S7Connector
+from shmio.connectors.s7.session import S7Options
 from shmio.emulators.device import Device, Served
 from shmio.emulators.kinds import KINDS, create
 from shmio.errors import ConfigError, EndpointError
@@ -63,6 +65,9 @@ def table(tags: dict[str, object]) -> Layout:
 
 
 def reader(kind: str, address: Address, layout: Layout, **options: Any) -> Connector:
+    if kind == "s7":
+        made: Any = S7Connector.for_layout(layout)
+        return cast("Connector", made(S7Options(host=address.host, port=address.port, **options), layout))
     if kind == "modbus":
         return ModbusConnector(ModbusOptions(host=address.host, port=address.port, **options), layout)
     return OpcUaConnector(OpcUaOptions(url=f"opc.tcp://{address}", publishing_ms=10, sampling_ms=10, **options), layout)
@@ -238,3 +243,67 @@ def test_too_many_clients_are_refused(kind: str, monkeypatch: pytest.MonkeyPatch
             assert third.recv(10) == b""
         with connected(kind, address, layout) as connector:
             assert values(connector, layout) == {"a": 3}
+
+
+BEFORE: dict[str, dict[str, object]] = {
+    "s7": {"kept": "%MW10", "moved": "DB5.DBW0", "gone": "%MW12"},
+    "modbus": {"kept": "holding 10", "moved": "holding 11", "gone": "unit 7 holding 3"},
+    "opcua": {"kept": "ns=2;s=kept", "moved": "ns=2;s=moved", "gone": "ns=2;s=gone"},
+}
+AFTER: dict[str, dict[str, object]] = {
+    "s7": {"new": "DB9.DBW2", "kept": "%MW10", "more": "DB5.DBW700", "moved": "%MW20"},
+    "modbus": {"new": "unit 9 holding 4", "kept": "holding 10", "more": "holding 700", "moved": "holding 12"},
+    "opcua": {"new": "ns=3;s=new", "kept": "ns=2;s=kept", "more": "/Objects/2:D/2:more", "moved": "ns=2;s=there"},
+}
+
+
+def words(addresses: dict[str, object]) -> Layout:
+    tags = {
+        path: {"type": "INT", "address": address, "initial": 40 + at}
+        for at, (path, address) in enumerate(addresses.items())
+    }
+    return table({path: tag | {"writable": True} for path, tag in tags.items()})
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_layouts_change_while_clients_are_connected(kind: str) -> None:
+    before, after = words(BEFORE[kind]), words(AFTER[kind])
+    with device(kind, [Served(before)]) as (made, address), connected(kind, address, before) as client:
+        until(lambda: values(client, before) == {"kept": 40, "moved": 41, "gone": 42}, "the initial values")
+        assert write(client, before, "kept", 7) == [""]
+        with pytest.raises(ConfigError), made.cycle.held():
+            made.change([Served(table({"wrong": {"type": "INT", "address": "nothing"}}))])
+        with made.cycle.held():
+            made.change([Served(after)])
+        made.cycle.advance(0)
+        area = status_area(before)
+        assert area is not None
+        assert area.get(client.read(), 0).code == GOOD  # over the same connection
+        with connected(kind, address, after) as other:
+            expected = {"new": 40, "kept": 7, "more": 42, "moved": 43}
+            until(lambda: values(other, after) == expected, "the new registers, and the value that was written")
+            assert write(other, after, "more", -5) == [""]
+            until(lambda: values(other, after) == expected | {"more": -5}, "the written value")
+        with made.cycle.held():
+            made.change([Served(before)])
+        with connected(kind, address, before) as other:
+            until(lambda: values(other, before) == {"kept": 7, "moved": 41, "gone": 42}, "the first registers again")
+
+
+def test_a_data_block_changes_by_names() -> None:
+    """A register that gets another place in an S7 data block keeps its value."""
+    source = "DATA_BLOCK DB5\nSTRUCT\n{}END_STRUCT;\nBEGIN\nEND_DATA_BLOCK\n"
+    kept = "flag : Bool; speed : Real := 2.5; name : String[6] := 'abc';\n"
+    before, after = (
+        compiler.compile_sources([compiler.Source("a.db", source.format(text).encode())]).layouts[0]
+        for text in (kept, f"first : Array[0..4] of Int := [5(7)];\n{kept}last : LReal := 1.5;\n")
+    )
+    with device("s7", [Served(before)]) as (made, address), connected("s7", address, before, dbNumber=5) as client:
+        assert write(client, before, "speed", 9.5) == [""]
+        assert write(client, before, "flag", True) == [""]
+        with made.cycle.held():
+            made.change([Served(after)])
+        with connected("s7", address, after, dbNumber=5) as other:
+            assert values(other, after) == {
+                "first": [7] * 5, "flag": True, "speed": 9.5, "name": "abc", "last": 1.5,
+            }  # fmt: skip
