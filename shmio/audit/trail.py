@@ -412,7 +412,7 @@ class Trail:
                     )
             else:
                 if self.problem:
-                    log.warning("audit: %s can be written again", self._path)
+                    log.warning("the audit log %s can be written again", self._path)
                 self.problem = ""
                 return True
             if self._closing.wait(RETRY_S):

@@ -72,7 +72,7 @@ class Housekeeper:
             try:
                 self.check_folder()
             except Exception:  # an error here must not end the recording
-                log.exception("cleaning up earlier recordings failed")
+                log.exception("the recorder cannot clean up earlier recordings; it tries again")
             self._stop.wait(LOOK_S)
 
     def check_folder(self) -> None:

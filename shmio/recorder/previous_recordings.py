@@ -101,7 +101,7 @@ def last_positions(
             with Reader(file, own=True, beat=beat) as reader:
                 found = _positions(reader, blocks) | found
         except (OSError, RecordingError) as error:
-            log.warning("cannot find where the previous recording ended: %s", error)
+            log.warning("the recorder cannot find where its previous recording ended: %s", error)
         if found.keys() >= blocks.keys():
             break
     return found
@@ -130,7 +130,7 @@ def _of_this_run(directory: Path, segment: Segment, by: str, beat: Callable[[], 
             if about.get("epoch") == epoch:
                 found.append((int(about["recording_ns"]), file))
         except (OSError, RecordingError, KeyError, ValueError) as error:
-            log.warning("%s is ignored: %s", file, error)
+            log.warning("the recorder ignores the earlier recording %s: %s", file, error)
     return [file for _, file in sorted(found, reverse=True)]
 
 

@@ -66,7 +66,7 @@ class _Followers:
     def _fail(self, name: str, why: str) -> None:
         self._pids.pop(name, None)
         self.failed[name] = why
-        log.warning("restarting %s, because it cannot keep its connection: %s", name, why)
+        log.warning("the supervisor is restarting %s, because it cannot keep its connection: %s", name, why)
 
     def _all(self, activity: Activity, names: Iterable[str]) -> bool:
         """Return whether processes have reported an activity; give up those that ended or are late."""

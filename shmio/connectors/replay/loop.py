@@ -529,7 +529,7 @@ class ReplayLoop:
         self.counters.overruns += left_out
         if too_late:  # otherwise the speed is too high, and the message would repeat in each round
             skipped = counted(left_out, "frame")
-            log.warning("skipped %s: this process was delayed by %.1f s", skipped, late_ns / 1e9)
+            log.warning("the replay skipped %s, because this process was delayed by %.1f s", skipped, late_ns / 1e9)
         if play.wraps:
             self._keep(play.settled(clock_ns))
         self._player.show(min(self._play.at_ns(clock_ns), play.end_ns - 1), self._stamp)

@@ -80,7 +80,7 @@ class Discovery:
             except DDSException:
                 continue
             except Exception as error:  # noqa: BLE001  decoding of a peer's bytes may fail in any way
-                log.warning("what a node says of its topics cannot be decoded: %s", type(error).__name__)
+                log.warning("shmio cannot decode what a node says about its topics: %s", type(error).__name__)
                 continue
             topics += [name for name in (self._note(one, found) for one in changes) if name]
         return topics

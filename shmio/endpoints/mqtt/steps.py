@@ -87,7 +87,9 @@ class StepDelivery:
         if marker.sent is not None and not self._connection.is_unacknowledged(marker.sent):
             return True  # a broker acknowledges in the order of sending (MQTT 5.0, section 4.6)
         if time.monotonic() >= self._until_s:
-            log.warning("step %d: the broker does not accept it", marker.number)
+            log.warning(
+                "the broker does not accept step %d; the bridge ends the connection and connects again", marker.number
+            )
             self._connection.drop(f"it did not accept step {marker.number} within {PATIENCE_S:g} s")
             return True
         return False

@@ -87,7 +87,10 @@ class TopicGuard:
             break_s = BREAK.wait_s(self._breaks)
             self._breaks += 1
             self._on_break, self._everything, self._until_s = True, True, now_s + break_s
-            log.warning("other clients publish too much on this instance's topics: no corrections for %g s", break_s)
+            log.warning(
+                "other clients publish too much on this instance's topics; the bridge does not correct them for %g s",
+                break_s,
+            )
         elif topic not in self._waiting and len(self._waiting) >= MOST_WAITING:
             self._everything = True
         else:

@@ -178,7 +178,7 @@ class _Delivery:
             try:
                 feed.resume()
             except SegmentError as error:
-                log.warning("on the return to real time, values were not sent: %s", str(error))
+                log.warning("the server did not send some values when the cell returned to real time: %s", str(error))
         for receiver in self.receivers:
             receiver.release()
 

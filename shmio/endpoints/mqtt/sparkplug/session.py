@@ -86,7 +86,8 @@ class PrimaryHost:
             state = msgspec.json.decode(payload, type=_State)
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
             log.warning(
-                '%s: ignored a state message: expected JSON such as {"online": true, "timestamp": 1700000000000}',
+                "the bridge ignored a state message on %s, which is not JSON such as "
+                '{"online": true, "timestamp": 1700000000000}',
                 self.topic,
             )
             return
