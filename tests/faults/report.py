@@ -19,18 +19,23 @@ def write(record: Record) -> str:
     host = f"{platform.system()} {platform.release()} {platform.machine()}, {len(os.sched_getaffinity(0))} cores"
     lines = f"""# Fault suite: report
 
-{result} Seed {record.seed}, begun {record.begun_utc} UTC, {_duration(record.duration_s)}. \
-shmio {__version__}, Python {platform.python_version()}, {host}.
+{result} The run with seed {record.seed} began on {record.begun_utc} UTC, and took {_duration(record.duration_s)}. \
+It tested shmio {__version__} with Python {platform.python_version()} on {host}.
 
-{sum(record.faults.values())} faults in {record.rounds} rounds; {frames:,} frames and {values:,} values were compared \
-with what the PLCs had. After a kill of its supervisor the instance was adopted {record.adopted} times and replaced \
-{record.replaced} times. {record.mid_kills} writers were killed at full speed, {record.mid_torn} of them in the middle \
-of a slot; {record.mid_frames:,} of their frames were read.
+The suite caused {sum(record.faults.values())} faults in {record.rounds} rounds. It compared {frames:,} frames and \
+{values:,} values with what the PLCs had.
+
+The suite also counted what happened after two kinds of kills:
+
+- Supervisors: the next supervisor adopted the instance's processes {record.adopted} times, and replaced them \
+{record.replaced} times.
+- Writers at full speed: {record.mid_kills} were killed, {record.mid_torn} of them in the middle of a slot. Readers \
+had read {record.mid_frames:,} of their frames.
 
 ## Faults
 
-Recovery: from the end of a round until all processes ran and every reader, local and remote, had newer good values;
-counted for the kind that ended last.
+The recovery of a round is the time from its end until all processes ran, and every reader, local and remote, had newer
+good values. The table counts it for the kind of fault that ended last in the round.
 
 | kind | times | recovery, s: median | max |
 |---|---|---|---|""".splitlines()
@@ -45,7 +50,15 @@ counted for the kind that ended last.
     lines += ["", "## Processes", "", "| process | private MB, max | descriptors, max |", "|---|---|---|"]
     lines += [f"| {name} | {peak[0]:.0f} | {peak[1]} |" for name, peak in sorted(record.peaks.items())]
     if record.steps:
-        lines += ["", "## Steps", "", "Of the instance with stepped time.", "", "| | |", "|---|---|"]
+        lines += [
+            "",
+            "## Steps",
+            "",
+            "These steps are those of the instance with stepped time.",
+            "",
+            "| | |",
+            "|---|---|",
+        ]
         lines += [f"| {what} | {count:,} |" for what, count in sorted(record.steps.items())]
     if record.violations:
         lines += ["", "## Violations"]

@@ -337,7 +337,7 @@ def test_the_truth_forgets_in_order(truth: Truth) -> None:
 
 def test_a_violation_is_in_the_report() -> None:
     record = Record(7)
-    assert "**No violation.** Seed 7" in report.write(record)
+    assert "**No violation.** The run with seed 7 began on" in report.write(record)
     record.violated, record.violations = 1, ["cell: frame 3 is torn"]
     text = report.write(record)
     assert "**1 violations**" in text
