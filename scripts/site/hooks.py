@@ -27,7 +27,7 @@ GENERATED: Final = {
     "Messages of gRPC": proto_pages.pages(ROOT / "proto"),
 }
 """The generated pages, by group: title and text of each, by its path."""
-SHOWN: Final = ("examples", "packaging", "proto", "scene.toml")
+SHOWN: Final = ("examples", "packaging", "proto", "scene.toml", "tests")
 """Files and folders outside docs that pages may refer to. The site has copies of the files that they name."""
 LINK: Final = re.compile(r"(?<=\]\()([^)\s#:]+)(#[^)\s]*)?(?=\))")
 ROW: Final = re.compile(r"^\| ([^|]+) \| (.*) \|$", re.MULTILINE)
