@@ -99,7 +99,7 @@ def _make_declared(
 ) -> DeclaredLayer:
     try:
         program = compiled(_DECLARATION.decode(state.declaration))
-    except (msgspec.MsgspecError, ConfigError, RecursionError) as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError, ConfigError, RecursionError) as error:
         raise SnapshotError(f"injection {saved.name}: {error}") from None
     held = [DelayedWrite(Write(offset, mask, data), cycle, at) for offset, mask, data, cycle, at in state.held]
     wrong_write = any(not 0 <= w.offset <= w.offset + len(w.data) <= size for w, _, _ in held)

@@ -196,7 +196,7 @@ class DeclaredInjections:
             for complaint in contradictions(declaration):
                 return complaint
             program = self._program(declaration)
-        except (msgspec.MsgspecError, ConfigError, RecursionError) as error:
+        except (msgspec.MsgspecError, UnicodeDecodeError, ConfigError, RecursionError) as error:
             return str(error)
         layer = declared(command.id, program, owner, _seed(declaration), keep=command.keep)
         return self._add(layer, command)

@@ -145,7 +145,7 @@ def read_snapshot(file: Path) -> tuple[SnapshotInfo, SnapshotHead, dict[str, byt
     head = _head(file, bytes(data[_HEADER.size : _HEADER.size + head_size]))
     try:
         states = _STATES.decode(data[_HEADER.size + head_size :])
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
         raise SnapshotError(f"{file} is invalid: {error}") from None
     return _info(file, head, len(data)), head, states
 
@@ -210,7 +210,7 @@ def _sizes(file: Path, header: bytes) -> tuple[int, int, bytes]:
 def _head(file: Path, data: bytes) -> SnapshotHead:
     try:
         return msgspec.json.decode(data, type=SnapshotHead)
-    except (msgspec.MsgspecError, RecursionError) as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise SnapshotError(f"{file} is invalid: {error}") from None
 
 

@@ -50,5 +50,5 @@ def decode_part(data: bytes, kind: type[Part], what: str = "its state") -> Part:
     """
     try:
         return msgspec.msgpack.decode(data, type=kind)
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
         raise SnapshotError(f"{what} is damaged: {error}") from None

@@ -8,12 +8,14 @@ import socket
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from shmio.backoff import Backoff
 from shmio.config import Recorder as Settings
 from shmio.config import load
+from shmio.config.masking import mask
 from shmio.errors import ConfigError, RecordingError
 from shmio.recorder.file_output import Output, create
 from shmio.recorder.instance_follower import (
@@ -78,10 +80,10 @@ class ConfigFiles:
     def __call__(self, source: str | None, block: int) -> list[AttachedFile]:
         """Return the files of a source's layout.
 
-        If ``source`` is None, return the configuration file.
+        If ``source`` is None, return the configuration file without its secrets: recordings are shown to others.
         """
         if source is None:
-            return self._read("config", [self._file], TOML)
+            return [one._replace(data=_masked(one.data)) for one in self._read("config", [self._file], TOML)]
         try:
             config = load(self._file)
         except ConfigError as error:
@@ -112,6 +114,12 @@ class ConfigFiles:
         if why not in self._logged:
             self._logged.add(why)
             log.warning("%s", why)
+
+
+@lru_cache(1)  # the file is read again and again
+def _masked(data: bytes) -> bytes:
+    """Return the text of a configuration without its secrets."""
+    return mask(data.decode(errors="surrogateescape")).text.encode(errors="surrogateescape")
 
 
 @dataclass(slots=True)

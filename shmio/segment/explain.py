@@ -230,7 +230,7 @@ class Explainer:
         document = (self._documents.pop(event.injection, b"") if event.offset else b"") + event.data
         try:
             definition = msgspec.json.decode(document, type=dict[str, Any])
-        except (msgspec.MsgspecError, RecursionError):
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
             if document and len(document) < MAX_DEFINITION_BYTES and len(self._documents) < MAX_REMEMBERED:
                 self._documents[event.injection] = document
             return None

@@ -207,7 +207,7 @@ class BlockCommands:
             return True
         try:
             msgspec.json.decode(b"".join(event.data for event in events))
-        except msgspec.MsgspecError:
+        except (msgspec.MsgspecError, UnicodeDecodeError):
             return False
         return True
 

@@ -177,7 +177,8 @@ def _metrics(topic: str, payload: bytes | None, all_topics: Mapping[str, object]
         yield Offer(owner, refused="its birth is not a Sparkplug payload, or is too large")
         return
     for one in metrics:
-        if not one.name or one.name == "bdSeq":
+        # Protobuf gives a name that is not UTF-8 as bytes.
+        if not isinstance(one.name, str) or one.name in {"", "bdSeq"}:
             continue
         names = (*owner, *_levels(one.name))
         kind = _KINDS.get(one.datatype, "")

@@ -50,6 +50,21 @@ def test_a_snapshot_is_read_as_it_was_written(tmp_path: Path) -> None:
         read_snapshot(file)
 
 
+def test_a_text_that_is_not_utf_8_makes_it_invalid(tmp_path: Path) -> None:
+    """Its checksum is right, as anybody can compute it."""
+    file = write(tmp_path)
+    good = file.read_bytes()
+    at = good.index(b"{") + 2
+    damaged = good[:at] + b"\xff" + good[at + 1 :]
+    begin = at - 2
+    assert good[begin - 32 : begin] == hashlib.sha256(good[begin:]).digest()
+    file.write_bytes(damaged[: begin - 32] + hashlib.sha256(damaged[begin:]).digest() + damaged[begin:])
+    with pytest.raises(SnapshotError, match="invalid"):
+        read_snapshot(file)
+    (listed,) = list_snapshots(tmp_path)
+    assert "invalid" in listed.problem
+
+
 def test_each_damaged_byte_is_noticed(tmp_path: Path) -> None:
     file = write(tmp_path)
     good = file.read_bytes()

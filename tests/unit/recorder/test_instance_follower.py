@@ -151,6 +151,15 @@ def test_the_largest_file_is_attached_and_a_larger_one_is_not(
     ]
 
 
+def test_a_configuration_is_attached_without_its_secrets(tmp_path: Path) -> None:
+    file = tmp_path / "supervisor.toml"
+    file.write_bytes(b'[[alert]]\nname = "a"\nwebhook = "https://hooks.example/s3cr3t"\n# \xff\n')
+    (attached,) = recorder_module.ConfigFiles(file)(None, 0)
+    assert b"s3cr3t" not in attached.data
+    assert attached.data.startswith(b'[[alert]]\nname = "a"\nwebhook = ')
+    assert attached.data.endswith(b"# \xff\n")
+
+
 def test_a_configuration_that_became_invalid_is_named_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     file = tmp_path / "supervisor.toml"
     file.write_text("[instance\n")

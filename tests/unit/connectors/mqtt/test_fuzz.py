@@ -216,6 +216,11 @@ def _browse(messages: list[tuple[str, bytes]]) -> None:
             parse(str(one.columns["address"]))
 
 
+def test_browsing_leaves_out_metrics_whose_names_are_not_utf_8() -> None:
+    birth = wire.Payload(seq=0, metrics=[_metric("m0", 0, 3, 5, b"", 0, null=False)]).SerializeToString()
+    _browse([("spBv1.0/G/NBIRTH/N", birth.replace(b"m0", b"m\xff"))])
+
+
 PAYLOADS = st.builds(
     lambda seq, metrics: wire.Payload(seq=seq, metrics=metrics, timestamp=seq).SerializeToString(),
     st.integers(0, 3),
