@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import subprocess
+import sys
 import tempfile
 import zipfile
 from pathlib import Path
@@ -20,9 +21,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         library = Path(folder) / "motor.so"
         compiler = shlex.split(os.environ.get("CC", "cc"))
-        subprocess.run(
-            [*compiler, "-shared", "-fPIC", "-O2", f"-I{HEADERS}", "-o", library, HERE / "motor.c"], check=True
-        )
+        command = [*compiler, "-shared", "-fPIC", "-O2", f"-I{HEADERS}", "-o", library, HERE / "motor.c"]
+        try:
+            subprocess.run(command, check=True)
+        except (OSError, subprocess.CalledProcessError) as error:
+            sys.exit(f"motor.fmu: the C compiler failed: {error}; install one (Debian: apt install gcc libc6-dev)")
         with zipfile.ZipFile(HERE.parent / "motor.fmu", "w") as fmu:
             fmu.write(HERE / "modelDescription.xml", "modelDescription.xml")
             fmu.write(library, f"binaries/{fmpy.platform}/motor.so")
