@@ -21,7 +21,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         library = Path(folder) / "motor.so"
         compiler = shlex.split(os.environ.get("CC", "cc"))
-        command = [*compiler, "-shared", "-fPIC", "-O2", f"-I{HEADERS}", "-o", library, HERE / "motor.c"]
+        command = [*compiler, "-shared", "-fPIC", "-O2", f"-I{HEADERS}", "-o", str(library), str(HERE / "motor.c")]
         try:
             subprocess.run(command, check=True)
         except (OSError, subprocess.CalledProcessError) as error:
