@@ -77,7 +77,7 @@ def run(worker: Worker) -> None:
 
 
 def _change(worker: Worker, device: Device, config: dict[str, Any], woken: threading.Event) -> None:
-    """Serve other layouts, once the supervisor says so. Meanwhile, the device continues as before.
+    """Wait until the supervisor permits it, and serve other layouts. Until then the device continues as before.
 
     If the supervisor dies before that, nothing changes.
     """

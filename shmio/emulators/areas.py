@@ -61,7 +61,7 @@ class TableMemory:
 
     @property
     def keys(self) -> frozenset[tuple[object, ...]]:
-        """What makes each register the same one in another table."""
+        """The keys by which registers are recognised in another table."""
         return frozenset(map(_key, self._conversions))
 
     def fill(

@@ -46,7 +46,8 @@ class Device(Protocol):
     def change(self, served: Sequence[Served]) -> None:
         """Serve other layouts from now on, and keep the connections of clients. Call it between two cycles.
 
-        Memory that both have keeps its values. The program starts again, on the first layout.
+        Memory that the old and the new layouts share keeps its values. The program starts again, on
+        the first layout.
 
         Raises:
             ConfigError: A layout does not suit the device or its program; nothing was changed.

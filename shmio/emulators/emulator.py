@@ -106,7 +106,7 @@ class Emulator:
         self.cycle.stop()
 
     def change(self, served: Sequence[Served]) -> None:
-        """Serve other blocks and tables from now on. Memory that both have keeps its values.
+        """Serve other blocks and tables from now on. Memory that old and new ones share keeps its values.
 
         Raises:
             ConfigError: As for a new emulator; nothing was changed.
@@ -225,7 +225,7 @@ class _Contents:
             self._table.store(before, self.frame, self.memory)
 
     def adopt(self, other: _Contents) -> None:
-        """Take the values of other contents, as far as these have them."""
+        """Copy the values that other contents have for the same memory."""
         for place, area in self.memory.items():
             before = other.memory.get(place)
             if before is None:
@@ -260,7 +260,7 @@ class _Contents:
         return self.memory[place]
 
     def _add_tables(self) -> None:
-        """Add the areas that tables need and that are not there yet; store the tables' initial values."""
+        """Add the areas that tables need and that do not exist yet, and store the tables' initial values."""
         present = frozenset(self.memory)
         sizes: dict[Place, int] = {}
         for table in self._tables:

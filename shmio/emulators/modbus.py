@@ -69,7 +69,7 @@ class _Place:
 
     @property
     def key(self) -> Key:
-        """What makes a register the same one in another table."""
+        """The key by which the register is recognised in another table."""
         register = self.register
         return register.path, register.type, register.dims, register.address, self.where
 

@@ -224,7 +224,7 @@ class _Nodes:
         self._known: dict[NodeAddress | BrowsePath, tuple[Any, str]] = {}  # node and type
 
     async def keep(self, variables: Iterable[_Variable]) -> None:
-        """Delete the nodes that registers do not have, or have with another type or length."""
+        """Delete the nodes that no register has, and those whose register has another type or length."""
         wanted = {one.address: one.shape for one in variables}
         for address, (node, shape) in list(self._known.items()):
             if wanted.get(address) != shape:

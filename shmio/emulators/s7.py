@@ -406,14 +406,14 @@ class S7Server(Server):
                 self.area_locks[(kind, number)] = self.lock  # for python-snap7's own code
 
     def replace(self, area: SrvArea, number: int, data: bytearray) -> None:
-        """Serve ``data`` in place of what is served there. The caller holds ``lock``.
+        """Serve ``data`` in place of the present data of an area or block. The caller holds ``lock``.
 
         Clients see the same block, with the same checksum, although it may be longer or shorter.
         """
         self.memory_areas[(S7Area[area.name], number)] = data
 
     def remove(self, area: SrvArea, number: int) -> None:
-        """No longer serve an area or a block. The caller holds ``lock``."""
+        """Stop serving an area or a block. The caller holds ``lock``."""
         self.unregister_area(area, number)
         if area is SrvArea.DB:
             self._checksums.pop(number, None)

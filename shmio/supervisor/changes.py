@@ -147,7 +147,7 @@ def preview(plan: Plan, running: Plan, epoch: int, fleet: Fleet, segment: Segmen
 
 
 def _unconnected(block: Block | None) -> Iterator[str]:
-    """Yield why a source has no connection that it could keep; nothing for an emulator, which has no block."""
+    """Yield why a source has no connection that it could keep. Yield nothing for an emulator: it has no block."""
     frame = block.latest() if block is not None else None
     if frame is not None and frame.quality is Quality.BAD:
         yield f"but it is not connected now: {frame.reason}"

@@ -23,14 +23,14 @@ from shmio.supervisor.health import Notifier
 from shmio.supervisor.policy import Event, Limits, State
 
 PAUSE_S: Final = 6.0
-"""Time in s by which a process whose registers change must wait for the new blocks; else it is restarted."""
+"""Time in s within which a process whose registers change must pause. Otherwise the supervisor restarts it."""
 FOLLOW_S: Final = 20.0
-"""Time in s by which such a process must run with its new registers; else it is restarted."""
+"""Time in s within which such a process must run with its new registers. Otherwise the supervisor restarts it."""
 _SETTLED = (State.RUNNING, State.BACKOFF, State.FATAL, State.STOPPED)
 
 
 class _Followers:
-    """The sources and emulators that keep their process and its connections, while their registers change.
+    """The sources and emulators whose registers change while they keep their process and its connections.
 
     Each receives its new description and pauses. When the segment has been changed, the emulators
     change what they serve, and then the sources continue with their new blocks, so that no source
@@ -69,7 +69,7 @@ class _Followers:
         log.warning("the supervisor is restarting %s, because it cannot keep its connection: %s", name, why)
 
     def _all(self, activity: Activity, names: Iterable[str]) -> bool:
-        """Return whether processes have reported an activity; give up those that ended or are late."""
+        """Return whether processes have reported an activity. Give up those that have ended or are late."""
         done = True
         for name in names:
             if (pid := self._pids.get(name)) is None:
@@ -89,7 +89,7 @@ class _Followers:
         return self._all(Activity.PAUSED, self.names)
 
     def go_on(self) -> None:
-        """Let the remaining processes continue, after the segment has been changed: first the emulators."""
+        """Let the remaining processes continue, the emulators first. Call this when the segment has been changed."""
         self._waiting = list(self._pids)
         emulators = [name for name in self._pids if self._jobs[name].kind == "emulator"]
         self._continue(emulators or self._waiting)
@@ -103,7 +103,7 @@ class _Followers:
                 self._fleet.follow(self._fleet.named(name), self._jobs[name])
 
     def _attempts(self, name: str) -> tuple[int, ...]:
-        """Return how often a source has connected, and how often it has failed; nothing for an emulator."""
+        """Return how often a source has connected, and how often it has failed. For an emulator, return nothing."""
         counters = self._fleet.named(name).slot.counters
         return tuple(counters[key] for key in ("connects", "failures") if key in counters)
 

@@ -92,7 +92,7 @@ class Store:
         self._changed = threading.Condition()
         """Guards all attributes below; waiting threads are notified at each message."""
         self._waiting = 0
-        """Number of threads that wait. A needless notification would cost a tenth of storing a message."""
+        """Number of threads that wait. While it is 0, nobody is notified, which saves a tenth of storing a message."""
         self.addresses: list[Address] = []
         self.converters: list[ValueConverter] = []
         self.host = Host(max_bytes=options.max_payload_bytes)

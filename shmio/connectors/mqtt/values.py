@@ -31,7 +31,7 @@ _BOOLS: Final = {"true": True, "false": False, "1": True, "0": False, "on": True
 _EXACT: Final = 1 << 53
 """Every whole number up to this one has an exact float."""
 MAX_PLAIN: Final = 40
-"""Longest payload, in bytes, that is read as a number at a glance."""
+"""Longest payload, in bytes, that the converter first tries to read as a plain number."""
 SHOWN: Final = 40
 """Largest number of characters that a message shows of a wrong value."""
 
@@ -55,7 +55,7 @@ class ValueConverter:
             raise ValueError(f"a {base} cannot be read from MQTT; use BOOL, whole numbers, REAL, LREAL or STRING[n]")
         self._register, self._base, self._scale, self._texts = register, base, register.scale, texts
         self._is_plain = base in _REALS and self._scale is None and not register.dims
-        """True if a finite number is the register's value as it is."""
+        """Whether a finite number is the register's value without a conversion."""
         self._bools = _BOOLS | {texts[0].casefold(): False, texts[1].casefold(): True}
 
     # -- reading -------------------------------------------------------------------------------------------------------
