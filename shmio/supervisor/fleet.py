@@ -24,6 +24,8 @@ from shmio.supervisor.process import AdoptedProcess, ChildProcess, describe_end
 
 TICK_S: Final = 0.1
 """Interval in s at which heartbeats are checked."""
+LATE_S: Final = 0.4
+"""Time in s after which a heartbeat is late: two of its intervals."""
 _LOST: Final = {"mqtt": ("dropped", "changes"), "alerts": ("failed", "notices")}
 """For each kind of process, the counter of what it loses while it has a problem, and what messages call that."""
 
@@ -46,6 +48,8 @@ class ManagedProcess:
         self._job: Job | None = None
         self._beat_ns = 0
         self._quiet_ns = 0
+        self._waited_ns: int | None = None
+        """How long the process had waited for a processor when its heartbeat was first late; None: it is not late."""
 
     @property
     def name(self) -> str:
@@ -155,7 +159,15 @@ class ManagedProcess:
         fresh = beat_ns != self._beat_ns or self.life.state is not State.RUNNING
         self._beat_ns = beat_ns
         self._quiet_ns = 0 if fresh else self._quiet_ns + elapsed_ns
+        if self._quiet_ns < LATE_S * 1e9:
+            self._waited_ns = None
+        elif self._waited_ns is None and self.child is not None:
+            self._waited_ns = self.child.waited_ns()
         return self._quiet_ns
+
+    def waited_ns(self) -> int:
+        """Return how long the process has waited for a processor, in ns: since its start, or since it is late."""
+        return 0 if self.child is None else self.child.waited_ns() - (self._waited_ns or 0)
 
     def end_note(self, pid: int, code: int | None) -> str:
         """Return why the process ended, with its last message if it left one."""
@@ -307,7 +319,8 @@ class Fleet:
             if managed.life.state is State.STARTING:
                 self._evict(managed)
             late = managed.life.state is State.STARTING and now_ns >= (managed.life.due_ns or now_ns)
-            waited_ns = managed.child.waited_ns() if late and managed.child else 0
+            late = late or quiet_ns >= self._limits.hang_s * 1e9
+            waited_ns = managed.waited_ns() if late else 0
             event = policy.due(
                 managed.life,
                 now_ns,

@@ -140,6 +140,8 @@ class Limits:
     """The same time-out for a process that has waited for a processor at least half of the time."""
     hang_s: float = 5.0
     """Longest time without a heartbeat, while the process runs."""
+    hang_most_s: float = 20.0
+    """The same for a process that has waited for a processor at least half of this time."""
     grace_s: float = 5.0
     """Time from SIGTERM to SIGKILL."""
     kill_s: float = 5.0
@@ -258,7 +260,8 @@ def due(life: Life, now_ns: int, *, ready: bool, quiet_ns: int, limits: Limits, 
         ready: True if the process has reported that it runs.
         quiet_ns: Time since the last heartbeat, in ns.
         limits: The limits that apply.
-        waited_ns: How long the process has waited for a processor since its start, in ns.
+        waited_ns: How long the process has waited for a processor, in ns: since its start or, if it runs,
+            while it gave no heartbeat.
 
     """
     if life.state is State.STARTING:
@@ -268,7 +271,8 @@ def due(life: Life, now_ns: int, *, ready: bool, quiet_ns: int, limits: Limits, 
         if 2 * waited_ns >= since_ns and since_ns < limits.start_most_s * 1e9:  # the host is overloaded
             return None
     if life.state is State.RUNNING and quiet_ns >= limits.hang_s * 1e9:
-        return Event.HANG
+        overloaded = 2 * waited_ns >= quiet_ns and quiet_ns < limits.hang_most_s * 1e9
+        return None if overloaded else Event.HANG
     if life.due_ns is not None and now_ns >= life.due_ns:
         return Event.ELAPSED
     return None

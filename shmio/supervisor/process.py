@@ -96,10 +96,8 @@ class ChildProcess:
         return code
 
     def waited_ns(self) -> int:
-        """Return how long the process's main thread has waited for a processor, in ns; 0 if unknown."""
-        with suppress(OSError, IndexError, ValueError):  # proc(5): a kernel may lack the file
-            return int(Path(f"/proc/{self.pid}/schedstat").read_text().split()[1])
-        return 0
+        """Return how long the process's threads have waited for a processor, in ns; 0 if unknown."""
+        return _waited_ns(self.pid)
 
     def last_words(self) -> str:
         """Return the last line that the process left in its log file; empty if there is none."""
@@ -154,12 +152,20 @@ class AdoptedProcess:
         os.close(self.pidfd)
 
     def waited_ns(self) -> int:
-        """Return 0, because an adopted process has already started."""
-        return 0
+        """Return how long the process's threads have waited for a processor, in ns; 0 if unknown."""
+        return _waited_ns(self.pid)
 
     def last_words(self) -> str:
         """Return "", because nobody knows which lines of the log file are from this process."""
         return ""
+
+
+def _waited_ns(pid: int) -> int:
+    waited_ns = 0
+    for figures in Path("/proc").glob(f"{pid}/task/*/schedstat"):  # proc(5): a kernel may lack the file
+        with suppress(OSError, IndexError, ValueError):
+            waited_ns += int(figures.read_text().split()[1])
+    return waited_ns
 
 
 def _write_description(pid: int, pidfd: int, description: bytes) -> None:

@@ -212,7 +212,7 @@ def test_observations_that_fell_out_of_the_buffer(agent: Agent, reader: Reader) 
 )
 def test_hostile_documents(agent: Agent, answer: tuple[str, str, int], error: str) -> None:
     """The connector refuses each document with a reason, and within its limits."""
-    reader = Reader(agent, timeout=5000)
+    reader = Reader(agent, timeout=60_000)  # a busy host needs seconds for the largest
     agent.tell(raw=answer)
     with pytest.raises(ConnectorError, match=error):
         reader.connector.connect()

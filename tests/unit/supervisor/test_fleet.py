@@ -23,6 +23,33 @@ from shmio.supervisor.policy import Life, Limits, State
 from shmio.supervisor.process import AdoptedProcess
 
 
+@pytest.mark.parametrize(("share", "state"), [(0.6, State.RUNNING), (0.4, State.HUNG)])
+def test_a_quiet_process_is_not_killed_while_it_waits_for_a_processor(
+    instance: str, share: float, state: State, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the process had waited before its last heartbeat does not count."""
+    begun_ns = now_ns = time.monotonic_ns()
+    monkeypatch.setattr(AdoptedProcess, "waited_ns", lambda _: 10**12 + round((now_ns - begun_ns) * share))
+    with (
+        Segment.create(instance, [], [ProcessSpec("plc", "emulator")]) as segment,
+        selectors.DefaultSelector() as selector,
+        subprocess.Popen(["sleep", "60"]) as child,
+    ):
+        try:
+            fleet = Fleet(segment, selector, Limits(), {})
+            managed = fleet.named("plc")
+            managed.child = AdoptedProcess(child.pid, os.pidfd_open(child.pid))
+            managed.life = Life(State.RUNNING)
+            while now_ns < begun_ns + 8 * 10**9 and managed.life.state is State.RUNNING:
+                now_ns += 100_000_000
+                fleet.check(now_ns)
+            assert managed.life.state is state
+            os.close(managed.child.pidfd)
+        finally:
+            child.kill()
+            segment.unlink()
+
+
 @pytest.mark.parametrize("holder_is_child", [True, False])
 def test_only_an_unknown_process_is_evicted_from_a_slot(
     instance: str, monkeypatch: pytest.MonkeyPatch, holder_is_child: bool

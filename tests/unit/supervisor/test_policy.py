@@ -154,6 +154,18 @@ def test_a_missing_heartbeat_while_running_is_a_hang(world: World) -> None:
     assert world.life.note == "no heartbeat for 5 s, killed by SIGKILL"
 
 
+def test_a_process_that_waits_for_a_processor_may_be_quiet_for_longer_up_to_a_limit(world: World) -> None:
+    def quiet(quiet_s: float, waited_s: float) -> Event | None:
+        quiet_ns, waited_ns = round(quiet_s * S), round(waited_s * S)
+        return policy.due(world.life, world.now_ns, ready=True, quiet_ns=quiet_ns, limits=LIMITS, waited_ns=waited_ns)
+
+    started(world)
+    assert quiet(LIMITS.hang_s, 0.5 * LIMITS.hang_s) is None
+    assert quiet(LIMITS.hang_s, 0.4 * LIMITS.hang_s) is Event.HANG, "it did not wait for a processor"
+    assert quiet(LIMITS.hang_most_s - 1, LIMITS.hang_most_s - 2) is None
+    assert quiet(LIMITS.hang_most_s, LIMITS.hang_most_s - 1) is Event.HANG
+
+
 def test_a_missing_heartbeat_while_starting_is_ignored(world: World) -> None:
     world.happens(Event.START)
     assert world.passes(LIMITS.start_s - 1, quiet_s=LIMITS.start_s) is None
