@@ -27,6 +27,7 @@ GENERATED: Final = {
     "Messages of gRPC": proto_pages.pages(ROOT / "proto"),
 }
 """The generated pages, by group: title and text of each, by its path."""
+STYLE: Final = ".md-grid { max-width: 78rem; }  /* tables are wide */\n"
 SHOWN: Final = ("examples", "packaging", "proto", "scene.toml", "tests")
 """Files and folders outside docs that pages may refer to. The site has copies of the files that they name."""
 LINK: Final = re.compile(r"(?<=\]\()([^)\s#:]+)(#[^)\s]*)?(?=\))")
@@ -64,6 +65,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for part in GENERATED.values():
         for path, (_, text) in part.items():
             files.append(File.generated(config, path, content=text))
+    files.append(File.generated(config, "site.css", content=STYLE))
     for name, path in PAGES.items():
         files.append(File.generated(config, path, content=(ROOT / name).read_text()))
     for file in _referred(Path(config.docs_dir)):
