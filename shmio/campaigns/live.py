@@ -135,10 +135,12 @@ class LiveRun:
                 raise ConfigError("--real-time: the time of this instance is virtual already")
             if plan.step_s is not None and not self.virtual:
                 why = "--real-time" if plan.real_time else ", ".join(cell.real_sources())
-                raise ConfigError(f"step_ms, or --step-ms: this run is in real time, because of {why}")
+                raise ConfigError(
+                    f"step_ms and --step-ms need virtual time, but this run is in real time, because of {why}"
+                )
             if plan.start is not None and not self.virtual:
                 why = "--real-time" if plan.real_time else ", ".join(cell.real_sources())
-                raise ConfigError(f"start: snapshots need virtual time, but this run is in real time: {why}")
+                raise ConfigError(f"start: snapshots need virtual time, but this run is in real time, because of {why}")
             self.step_s = plan.step_s or min(block.period_ns for block in self._segment.blocks.values()) / 1e9
             self._await_good(over)
             if self.virtual:

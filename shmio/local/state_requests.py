@@ -76,7 +76,7 @@ class StateRequests:
         except OSError as error:
             _refuse(folder / f"{self._name}{REFUSAL}", f"{part}: {error.strerror}")
         except Exception as error:
-            log.exception("a request about the state failed")
+            log.exception("the process failed to save, check or restore its state")
             _refuse(folder / f"{self._name}{REFUSAL}", f"{type(error).__name__}: {error}")
         else:
             return True
