@@ -44,7 +44,7 @@ def tree(tmp_path: Path) -> Path:
 
 
 def release(tree: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, tree / "scripts" / "release", *arguments]
+    command: list[str | Path] = [sys.executable, tree / "scripts" / "release", *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False, cwd=tree)
 
 
