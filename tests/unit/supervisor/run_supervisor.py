@@ -15,7 +15,8 @@ from shmio.backoff import Backoff
 from shmio.errors import ConfigError, ShmioError
 from shmio.layout.model import Layout, Register
 from shmio.plan.processes import Job, Plan
-from shmio.segment import BlockSpec, State
+from shmio.segment import BlockSpec, State, stale_segment
+from shmio.supervisor import health
 from shmio.supervisor.main import Supervisor
 from shmio.supervisor.policy import Limits
 from shmio.supervisor.process import ChildProcess
@@ -85,6 +86,8 @@ signal.pidfd_send_signal = send  # type: ignore[assignment]
 logs.setup(folder / "supervisor.log", "supervisor")
 if first_s := limits.pop("backoff_first_s", None):
     limits["backoff"] = Backoff(first_s, 10.0)
+health.LOOK_S = limits.pop("look_s", health.LOOK_S)  # type: ignore[misc]
+stale_segment.GRACE_S = limits.get("grace_s", stale_segment.GRACE_S)
 modules = dict.fromkeys(("source", "emulator", "grpc"), "fake_worker")
 
 

@@ -34,7 +34,7 @@ def test_a_disk_that_does_not_answer_blocks_nothing(tmp_path: Path, monkeypatch:
 
 
 def test_status_reports_the_problem_while_it_lasts_and_processes_continue(launch: Launch, tmp_path: Path) -> None:
-    cell = launch()
+    cell = launch(look_s=0.1)
     cell.wait_state("running")
     pids = cell.pids()
     away = tmp_path.with_name("away")

@@ -114,13 +114,13 @@ def test_a_take_over_fails_if_a_hanging_process_cannot_be_ended(launch: Launch) 
     with Segment.open(cell.instance) as segment:
         beat_ns = segment.processes.find("cell").heartbeat_ns
         until(lambda: time.monotonic_ns() - beat_ns > 500_000_000)
-    failing = launch(hang_s=0.5)
+    failing = launch(hang_s=0.5, grace_s=0.5)
     assert failing.wait_end() == 1
     stuck = f"cell: {STUCK.format(pid=pid)}"
     assert failing.errors() == f"instance '{cell.instance}' has processes that do not end: {stuck}; then try again\n"
     assert cell.pids() == before
     (cell.folder / "held").unlink()
-    successor = launch(hang_s=0.5)
+    successor = launch(hang_s=0.5, grace_s=0.5)
     successor.wait_state("running")
     assert {name for name, pid in successor.pids().items() if pid == before[name]} == {"plc", "grpc"}
     assert successor.stop() == 0
