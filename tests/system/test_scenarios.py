@@ -144,7 +144,7 @@ def test_the_program_meets_its_requirements_in_virtual_time(example: Example) ->
     assert example.shown(commands) == output
     program = example.folder / "station.py"
     program.write_text(program.read_text().replace("else 60.0", "else 85.0"))
-    late = example.shown(f"{commands}echo $?\n")
+    late = example.shown(f"{commands.strip()} --for 15; echo $?\n")
     assert re.search(r"^failed +cool", late, re.MULTILINE)
     assert late.endswith("\n1\n")
 
