@@ -15,7 +15,6 @@ import importlib
 import itertools
 import logging
 import math
-import os
 import resource
 import signal
 import sys
@@ -27,7 +26,7 @@ from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 
-from tests.fuzz import layout_checks
+from tests.fuzz import layout_checks, page_calls
 from tests.fuzz.layout_inputs import FRAGMENTS, MAX_INPUT, seeds
 from tests.fuzz.parsers import PARSERS, Parser
 
@@ -171,6 +170,7 @@ def guide(options: argparse.Namespace) -> int:
 
 
 if __name__ == "__main__":
-    status = main()
-    sys.stdout.flush()
-    os._exit(status)  # the thread that plays a Modbus device waits for ever
+    try:
+        sys.exit(main())
+    finally:
+        page_calls.close()

@@ -44,6 +44,7 @@ from shmio.wire import shmio_v1_pb2, sparkplug_b_pb2
 from tests.fuzz.layout_checks import SPLIT
 from tests.fuzz.layout_checks import check as check_layout
 from tests.fuzz.layout_inputs import Mutator
+from tests.fuzz.page_calls import calls, check_call
 from tests.unit.connectors.mqtt import test_fuzz as mqtt
 from tests.unit.connectors.opcua import test_decode as opcua
 from tests.unit.emulators import test_s7_jobs as s7_jobs
@@ -391,4 +392,5 @@ PARSERS: dict[str, Parser] = {
     "snapshot": Parser(damaged(_snapshots), _check_snapshot),
     "import": Parser(damaged(lambda: importers.SAMPLES), _check_import),
     "upload": Parser(damaged(_uploads), _check_upload),
+    "page-call": Parser(damaged(calls), check_call),
 }

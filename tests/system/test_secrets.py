@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import json
 import subprocess
 from collections.abc import Callable, Iterator
@@ -108,15 +109,16 @@ def _processes(cell: Cell) -> list[int]:
 
 def _page(web: str, token: str) -> bytes:
     """Sign in to the page, and return everything that it gets."""
-    body = json.dumps({"token": token})
-    signed_in = subprocess.run(
-        ["curl", "-sS", "-i", "-d", body, f"http://{web}/session"], capture_output=True, check=True, timeout=60
-    ).stdout
-    cookies = [line.split(b": ")[1] for line in signed_in.split(b"\r\n") if line.lower().startswith(b"set-cookie")]
-    if not cookies:
-        return signed_in
-    received = signed_in
-    cookie = cookies[0].split(b";")[0].decode()
+    connection = http.client.HTTPConnection(web, timeout=60)
+    try:
+        connection.request("POST", "/session", json.dumps({"token": token}))
+        answer = connection.getresponse()
+        received = str(answer.headers).encode() + answer.read()
+    finally:
+        connection.close()
+    cookie = answer.headers.get("Set-Cookie", "").partition(";")[0]
+    if not cookie:
+        return received
     with websockets.connect(f"ws://{web}/socket", additional_headers={"Cookie": cookie}) as socket:
         calls = ("configuration.check", "overview.follow", "recordings.files", "registers.rows", "log.lines")
         for number, call in enumerate(calls):
