@@ -15,7 +15,6 @@ from typing import Any, Final, get_args
 from msgspec import ValidationError
 from msgspec.inspect import DictType, ListType, LiteralType, Metadata, StructType, UnionType, type_info
 
-from shmio.config.masking import mask_line
 from shmio.config.model import (
     NAME_PATTERN,
     NAME_RULE,
@@ -275,6 +274,8 @@ def explain_toml(error: Exception, text: str) -> str:
         return str(error)
     lines = text.replace("\r\n", "\n").split("\n")
     line, column = lines[int(place[1]) - 1], int(place[2]) - 1
+    from shmio.config.masking import mask_line  # noqa: PLC0415  compiles many patterns, for this message only
+
     if (masked := mask_line(line)) != line:
         return f"{error}: {masked.strip()[:MAX_LINE]}"
     shown = line.strip()[:MAX_LINE]
