@@ -21,6 +21,7 @@ name = "sim"
 connector = "simulation"
 model = "shmio.simulation.loopback:Loopback"
 period_ms = 20
+stale_ms = 60_000
 writable = ["joints/**", "safetyzones/**"]
 
 [[source]]
@@ -28,6 +29,7 @@ name = "notes"
 connector = "memory"
 layout = "notes.db"
 period_ms = 50
+stale_ms = 60_000
 writable = ["**"]
 
 [[injection]]

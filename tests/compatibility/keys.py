@@ -45,8 +45,9 @@ class _Comparison:
                 yield from self.of(option, is_, key)
             return
         if "anyOf" in is_:
-            tried = [list(self.of(was, option, key)) for option in is_["anyOf"]]
-            yield from min(tried, key=len)
+            options = [_resolved(option, self._new) for option in is_["anyOf"]]
+            alike = [option for option in options if option.get("type") == was.get("type")]
+            yield from min((list(self.of(was, option, key)) for option in alike or options), key=len)
             return
         if "type" in is_ and was.get("type") != is_["type"] and (was.get("type"), is_["type"]) != ("integer", "number"):
             yield f"{key}: expects {is_['type']}, not {was.get('type')}"
