@@ -59,7 +59,8 @@ OwnerOf = Callable[[int], Owner | None]
 """Returns the process that uses the command queue of a writer; None if no live process does."""
 
 _DECODER: Final = msgspec.json.Decoder(Declaration)
-_OVER: Final = State.OVER  # each cycle needs it, and looking up a member of an enum is slow
+_OVER, _BAD = State.OVER, Quality.BAD
+"""Each cycle needs these, and looking up a member of an enum is slow."""
 
 log = logging.getLogger("shmio.source")
 
@@ -103,7 +104,7 @@ class ConditionValues:
         """
         self._blocks = blocks
         self._before = before
-        known = image.quality is not Quality.BAD and image.source_ns != 0
+        known = image.quality is not _BAD and image.source_ns != 0
         self._images: dict[str, bytes | None] = {own: image.raw if known else None}
 
     def of(self, condition: Condition) -> Sequence[Number | None]:

@@ -185,9 +185,11 @@ class Output:
                 asked_ns=asked_ns,
                 at=at,
             )
-        pending, self._pending, self._changed = self._pending, [], False
-        for record in pending:
-            self.writer.event(record)
+        self._changed = False
+        if self._pending:
+            pending, self._pending = self._pending, []
+            for record in pending:
+                self.writer.event(record)
         self._next_ns = self._now_ns() + self._gap_ns
 
 

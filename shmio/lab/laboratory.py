@@ -26,7 +26,7 @@ from shmio.judging.source import Rows
 from shmio.local.attach import Attachment
 from shmio.local.snapshots import Refusals
 from shmio.local.time_control import Coordinator, Step
-from shmio.model.clock import check_step
+from shmio.model.clock import Clock, check_step
 from shmio.plan.prepare import prepare
 from shmio.plan.processes import Job, Plan
 from shmio.recorder.recorder import AttachedFiles, ConfigFiles
@@ -256,12 +256,13 @@ class _LabCoordinator(Coordinator):
         """
         lab, page = self._lab, self._lab.page
         with lab.moving:
-            self.take_over(steps=True)
-            before = page.last_written()
-            dt_ns = before.step_size_ns if dt_ns is None else dt_ns
+            if not self.owns:
+                self.take_over(steps=True)
+            mode, step, time_ns, _, done, size_ns, playing, rate, _, owner, _, *wall = page.last_written()
+            dt_ns = size_ns if dt_ns is None else dt_ns
             check_step(dt_ns)
-            step = Step(before.step + 1, before.time_ns + dt_ns, dt_ns)
-            asked = before._replace(step=step.number, time_ns=step.time_ns, dt_ns=dt_ns, stepping=True, note="")
+            step, time_ns = step + 1, time_ns + dt_ns
+            asked = Clock(mode, step, time_ns, dt_ns, done, size_ns, playing, rate, True, owner, "", *wall)
             problems = ["it was cancelled"]
             lab.stepping = True
             try:
@@ -270,12 +271,15 @@ class _LabCoordinator(Coordinator):
             finally:
                 lab.stepping = False
                 problem = "; ".join(problems)
-                note = f"step {step.number} failed: {problem}" if problem else ""
-                done = before.done if problem else step.number
-                page.write(asked._replace(done=done, stepping=False, note=note), ring=False)
+                note = f"step {step} failed: {problem}" if problem else ""
+                done = done if problem else step
+                page.write(
+                    Clock(mode, step, time_ns, dt_ns, done, size_ns, playing, rate, False, owner, note, *wall),
+                    ring=False,
+                )
             if problem:
-                raise TimeError(f"step {step.number}: {problem}")
-            return step
+                raise TimeError(f"step {step}: {problem}")
+            return Step(step, time_ns, dt_ns)
 
     def announce(self) -> None:
         """Do nothing, because no other process follows time."""

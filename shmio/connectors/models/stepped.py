@@ -28,6 +28,8 @@ from shmio.segment import Block, BlockWriter, EventKind, Frame, Provenance, Qual
 from shmio.segment.clock import ClockPage
 
 NO_DATA: Final = "no data yet"
+_GOOD, _UNCERTAIN, _SIMULATED = Quality.GOOD, Quality.UNCERTAIN, Provenance.SIMULATED
+"""Each step needs these, and looking up a member of an enum is slow."""
 RESTARTED: Final = "the source's process was restarted during this step; it continues with the next step"
 
 
@@ -459,10 +461,10 @@ class SteppedLoop:
         return refusals
 
     def _publish(self, raw: bytes, asked_ns: int, doubt: str = "") -> None:
-        quality = Quality.UNCERTAIN if doubt else Quality.GOOD
+        quality = _UNCERTAIN if doubt else _GOOD
         cycle = self._writer.cycle
         self._quality_log.update(quality, doubt, cycle)
-        image = Image(raw, cycle, self._utc_ns(), quality, Provenance.SIMULATED, doubt, asked_ns)
+        image = Image(raw, cycle, self._utc_ns(), quality, _SIMULATED, doubt, asked_ns)
         self._output.publish(image)
         self._published = True
         self.counters.polls += 1
