@@ -3,12 +3,14 @@
 FMPy simulates with its own loop and records the outputs. The runner makes the same steps, and has the outputs in its
 image. In the instance, a program on the host steps, and each step has a frame in the shared memory. The FMUs of the
 tests are compiled from C: a tank (FMI 2.0, 4 inputs and 5 outputs) and two axes (FMI 3.0, arrays, 6 inputs and 7
-outputs). In the last table, two tanks fill each other, and the A50 cell is computed beside them.
+outputs). In the last tables, two tanks fill each other, and the A50 cell is computed beside them. Each tank's step
+takes some CPU time, as the solver of a real FMU does.
 """
 
 from __future__ import annotations
 
 import itertools
+import os
 import sys
 import tempfile
 import time
@@ -21,7 +23,9 @@ from common import ROOT, begin, interleave, per_second, report
 from instance import started
 from step import local
 
+from shmio.lab import Laboratory, prepare_laboratory
 from shmio.simulation import ModelRunner, load
+from shmio.simulation.a50 import A50Cell
 
 sys.path.insert(0, str(ROOT))
 from tests.fmus import build
@@ -90,6 +94,8 @@ def by_runner(file: Path, count: int) -> Callable[[], float]:
     return sample
 
 
+WORKS_US = (0, 100, 300, 1000)
+HEAD = '[instance]\nname = "coupled"\nclock = "stepped"\n'
 COUPLED = """
 [[source]]
 name = "one"
@@ -110,8 +116,23 @@ model = "shmio.simulation.a50:A50Cell"
 """
 
 
-def coupled_alone(file: Path, duration_s: float) -> Callable[[], float]:
-    """Make a sampler of the steps a second of two FMUs that a loop over FMPy couples, without the A50 cell."""
+def laboratory(config: Path, duration_s: float) -> Callable[[], float]:
+    """Make a sampler of the steps a second of all sources in this process."""
+    plan = prepare_laboratory(config)
+
+    def sample() -> float:
+        with Laboratory(plan) as lab, lab.attach() as cell:
+            cell.step(DT_NS / 1e9)
+            return per_second(lambda: cell.step(DT_NS / 1e9), duration_s)()
+
+    return sample
+
+
+def coupled_alone(file: Path, duration_s: float, *, cell: bool) -> Callable[[], float]:
+    """Make a sampler of the steps a second of two FMUs that a loop over FMPy couples.
+
+    With ``cell``, the loop also lets the bare runner compute the A50 cell.
+    """
     import fmpy  # noqa: PLC0415
 
     folder, description = extracted(file)
@@ -124,10 +145,14 @@ def coupled_alone(file: Path, duration_s: float) -> Callable[[], float]:
             fmu.setupExperiment(startTime=0.0)
             fmu.enterInitializationMode()
             fmu.exitInitializationMode()
+        beside = ModelRunner(A50Cell) if cell else None
         numbers = itertools.count()
 
         def step() -> None:
-            begin_s = next(numbers) * DT_NS / 1e9
+            number = next(numbers)
+            begin_s = number * DT_NS / 1e9
+            if beside is not None:
+                beside.step((number + 1) * DT_NS, DT_NS)
             phases = [fmu.getReal(shown)[0] for fmu in pair]
             for fmu, phase in zip(pair, reversed(phases), strict=True):
                 fmu.setReal(inflow, [phase])
@@ -144,7 +169,7 @@ def coupled_alone(file: Path, duration_s: float) -> Callable[[], float]:
 
 def main() -> None:
     quick = begin("FMUs: steps a second, next to FMPy alone")
-    count, duration_s, rounds = (200, 0.2, 1) if quick else (20_000, 2.0, 7)
+    count, duration_s, rounds = (200, 0.2, 1) if quick else (20_000, 1.0, 7)
     with tempfile.TemporaryDirectory() as folder:
         for name, outputs in OUTPUTS.items():
             file = build(name, Path(folder))
@@ -160,13 +185,22 @@ def main() -> None:
                 )
             report(f"{name}.fmu: steps a second", samples, OURS, "more")
         file = build("tank2", Path(folder))
-        with started([], more=COUPLED.format(file=file), clock="stepped") as running:
-            ours = "shmio, an instance with the A50 cell"
-            samples = interleave(
-                {ours: local(running.segment.instance, duration_s), "FMPy, in a loop": coupled_alone(file, duration_s)},
-                rounds,
-            )
-        report("two coupled tanks: steps a second", samples, ours, "more")
+        config = Path(folder) / "supervisor.toml"
+        config.write_text(HEAD + COUPLED.format(file=file))
+        for work_us in WORKS_US[:1] if quick else WORKS_US:
+            os.environ["TANK_WORK_US"] = str(work_us)
+            with started([], more=COUPLED.format(file=file), clock="stepped") as running:
+                ours = "shmio, an instance: three processes"
+                samples = interleave(
+                    {
+                        ours: local(running.segment.instance, duration_s),
+                        "shmio, a laboratory: one process": laboratory(config, duration_s),
+                        "FMPy in a loop, with the runner of the A50 cell": coupled_alone(file, duration_s, cell=True),
+                        "FMPy in a loop, the FMUs only": coupled_alone(file, duration_s, cell=False),
+                    },
+                    rounds,
+                )
+            report(f"two coupled tanks of {work_us} us and the A50 cell: steps a second", samples, ours, "more")
 
 
 if __name__ == "__main__":

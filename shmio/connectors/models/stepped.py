@@ -243,7 +243,7 @@ class SteppedLoop:
         """
         try:
             self.begin()
-            while not (self._live() if self._page.read().virtual else self._free_run()):
+            while not (self._live(state) if (state := self._page.read()).virtual else self._free_run()):
                 pass
         finally:
             self.commands.stop()
@@ -324,14 +324,11 @@ class SteppedLoop:
 
     # ---- virtual time --------------------------------------------------------------------------------------------
 
-    def _live(self) -> bool:
+    def _live(self, state: Clock) -> bool:
         """Compute the requested step; between steps, carry out commands and publish new results.
 
         Then wait, and return whether the loop must stop.
         """
-        state = self._page.read()
-        if not state.virtual:
-            return False
         if state.stepping and state.step != self._handled:
             self.step(state)
         elif not state.stepping:
