@@ -356,16 +356,16 @@ class DeclaredLayer(Layer):
 
     def show(self, image: Bits, now: CycleImage) -> None:
         """Apply the operation to the covered bits of an image, in place."""
-        at = self._moment(now.cycle - self.activation.cycle, now)
-        if not self._happens(at):
-            self.operation.passed(image, at)
-            return
-        if self.operation.exact:
-            self.operation.apply(image, at)
-            return
-        changed = image.copy()
-        self.operation.apply(changed, at)
-        image ^= (image ^ changed) & self.cover
+        activation, operation = self.activation, self.operation
+        at = OperationContext(activation.runs, now.cycle - activation.cycle, now.cycle, now.time_ns)
+        if self._probability is not None and not self._happens(at):
+            operation.passed(image, at)
+        elif operation.exact:
+            operation.apply(image, at)
+        else:
+            changed = image.copy()
+            operation.apply(changed, at)
+            image ^= (image ^ changed) & self.cover
 
     def transform_write(self, write: Write, bits: Bits, now: CycleImage) -> bytes | None:
         """Apply the operation to the given bits of a write to the device.

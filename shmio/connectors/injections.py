@@ -358,9 +358,12 @@ class DeclaredInjections:
 
     def _lift_finished(self) -> list[Record]:
         """Lift the injections that are over, and return the events about them."""
-        over = {layer.id for layer in self._layers if layer.activation.state is _OVER and _finished(layer)}
-        if not over:
+        for layer in self._layers:
+            if layer.activation.state is _OVER and _finished(layer):
+                break
+        else:
             return []
+        over = {layer.id for layer in self._layers if _finished(layer)}
         records = self._publisher.removed(lambda layer: layer.id in over, "over")
         self._settle()
         return records

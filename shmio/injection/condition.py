@@ -5,7 +5,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, cast
 
 from shmio.injection.language import Constant, Number, Operation, Reference, Tree, nodes, parse_condition
 
@@ -79,10 +79,10 @@ class Expression(NamedTuple):
             memory: The last arguments of the edge functions. They are updated.
 
         """
-        known = [value for value in values if value is not None]
         stack: _Stack = []
         try:
-            if len(known) == len(values):
+            if None not in values:
+                known = cast("Sequence[Number]", values)
                 for step in self.steps:
                     step(stack, known, memory.seen)
                 return bool(stack[-1])

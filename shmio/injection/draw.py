@@ -80,7 +80,16 @@ class SeededRandom:
 
     def one_uniform(self, run: int, place: int, purpose: Purpose = Purpose.VALUE) -> float:
         """Return the number that :meth:`uniform` returns for a count of 1."""
-        return (_mix_word(self._base(run, place, purpose) + _GOLDEN & _MASK) >> 11) * 2.0**-53
+        known, word = self._of_run
+        if known != run:
+            word = _mix(self._key + run & _MASK)
+            self._of_run = run, word
+        for part in (place, purpose, 0):  # _mix, without its calls
+            word = word + part + _GOLDEN & _MASK
+            word = (word ^ word >> 30) * _FIRST & _MASK
+            word = (word ^ word >> 27) * _SECOND & _MASK
+            word ^= word >> 31
+        return (word >> 11) * 2.0**-53
 
     def one_gaussian(self, run: int, place: int) -> float:
         """Return the number that :meth:`gaussian` returns for a count of 1."""
@@ -88,11 +97,7 @@ class SeededRandom:
         return math.sqrt(-2 * math.log(radius)) * math.cos(math.tau * self.one_uniform(run, place, Purpose.ANGLE))
 
     def _base(self, run: int, place: int, purpose: Purpose) -> int:
-        known, word = self._of_run
-        if known != run:
-            word = _mix(self._key + run & _MASK)
-            self._of_run = run, word
-        return _mix(_mix(word + place & _MASK) + purpose & _MASK)
+        return _mix(_mix(_mix(self._key + run & _MASK) + place & _MASK) + purpose & _MASK)
 
     def _few(self, run: int, place: int, purpose: Purpose, count: int) -> list[int]:
         base = self._base(run, place, purpose)
