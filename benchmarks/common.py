@@ -76,6 +76,11 @@ def interleave(contenders: Mapping[str, Callable[[], float]], rounds: int) -> di
     return samples
 
 
+def median_ratio(values: Sequence[float], others: Sequence[float]) -> float:
+    """Return the median of the ratios in each round. The machine's speed changes less within a round."""
+    return statistics.median(value / other for value, other in zip(values, others, strict=True))
+
+
 def per_call_ns(function: Callable[[], object], calls: int) -> Callable[[], float]:
     """Make a sampler of the mean time of one call in ns, over a number of calls, without garbage collection."""
 

@@ -8,12 +8,11 @@ the cost of the client itself.
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Callable
 from contextlib import ExitStack
 
 import ready
-from common import HERE, Child, begin, interleave, per_second, report, table
+from common import HERE, Child, begin, interleave, median_ratio, per_second, report, table
 from instance import started
 from stepping import PATHS
 
@@ -58,7 +57,7 @@ def remote(client: Child, target: str, kind: str, duration_s: float) -> Callable
 
 def main() -> None:
     quick = begin("Steps: a model with 100 changing registers")
-    duration_s, rounds = (0.1, 1) if quick else (3.0, 9)
+    duration_s, rounds = (0.1, 1) if quick else (0.5, 9)
     with ExitStack() as stack:
         running = stack.enter_context(started([], more=MODEL, clock="stepped"))
         client = stack.enter_context(Child("stepping.py"))
@@ -74,9 +73,10 @@ def main() -> None:
         contenders["a program on the host, no subscriber"] = local(running.segment.instance, duration_s)
         samples = interleave(contenders, rounds)
     report("steps a second", samples, OURS, "more")
-    medians = {name: statistics.median(values) for name, values in samples.items()}
     rows = [
-        [name, f"{medians[name] / medians[bare]:.2f}"] for name in CONTENDERS if (bare := BARE.format(name)) in medians
+        [name, f"{median_ratio(samples[name], samples[bare]):.2f}"]
+        for name in CONTENDERS
+        if (bare := BARE.format(name)) in samples
     ]
     table(["beside a bare server with the same client", "of its rate"], rows)
 
