@@ -169,7 +169,7 @@ def coupled_alone(file: Path, duration_s: float, *, cell: bool) -> Callable[[], 
 
 def main() -> None:
     quick = begin("FMUs: steps a second, next to FMPy alone")
-    count, duration_s, rounds = (200, 0.2, 1) if quick else (20_000, 1.0, 7)
+    count, duration_s, rounds = (200, 0.2, 1) if quick else (10_000, 0.5, 5)
     with tempfile.TemporaryDirectory() as folder:
         for name, outputs in OUTPUTS.items():
             file = build(name, Path(folder))

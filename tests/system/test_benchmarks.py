@@ -76,7 +76,16 @@ def printed(benchmark: str) -> str:
                 "a model elsewhere, a client of shmio.v1 steps, and has all values": 1,
             },
         ),
-        ("fmu", ROW, {"shmio, the runner alone": 2, "FMPy alone": 2, "shmio, an instance": 2, "FMPy, in a loop": 1}),
+        (
+            "fmu",
+            ROW,
+            {
+                "shmio, the runner alone": 2,
+                "FMPy alone": 2,
+                "shmio, an instance": 2,
+                "FMPy in a loop, the FMUs only": 1,
+            },
+        ),
         ("command", SPREAD, {"shmio": 2, "python-snap7, without an instance": 2, "accepted to written": 1}),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
