@@ -17,11 +17,12 @@ from shmio.segment import Activity, ProcessSpec, Segment
 from shmio.testing.cell import until
 
 WORK = """
-import os, signal, sys
+import gc, os, signal, sys
 from shmio import worker
 from shmio.errors import ConfigError, ConnectorError
 
 def run(w):
+    started = gc.isenabled()
     w.running()
     what = w.config["do"]
     if what == "refuse":
@@ -36,6 +37,8 @@ def run(w):
         w.stopping.wait(0.2)
     if what.startswith("reread"):
         w.on_reread(lambda: told.append("anew"))
+    if what == "collect":
+        told.append(f"collects: {started}, then {gc.isenabled()}")
     while not w.stopping.wait(0.01):
         w.report((1, 2, 3), note=" ".join(["at work", *told]))
 
@@ -104,6 +107,12 @@ def test_it_takes_its_role_reports_sends_heartbeats_and_stops(segment: Segment, 
         assert worker.end() == (0, "")
     assert (slot.report.activity, slot.alive()) == (Activity.STOPPING, False)
     assert "stopped" in worker.log.read_text().splitlines()[-1]
+
+
+def test_garbage_is_collected_once_the_start_is_over(segment: Segment, tmp_path: Path) -> None:
+    slot = segment.processes.find("cell")
+    with Started(segment, tmp_path, "collect"):
+        until(lambda: slot.report.note == "at work collects: False, then True", "collection after the start")
 
 
 def test_it_reads_its_files_again_at_each_sighup(segment: Segment, tmp_path: Path) -> None:

@@ -1,0 +1,34 @@
+"""Garbage collection while a process starts."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Iterator
+
+import pytest
+
+from shmio import garbage
+
+
+@pytest.fixture(autouse=True)
+def collection() -> Iterator[None]:
+    """Restore the collector's state."""
+    yield
+    gc.enable()
+    gc.unfreeze()
+
+
+def test_nothing_is_collected_during_the_start_and_only_new_objects_after_it() -> None:
+    garbage.pause()
+    assert not gc.isenabled()
+    kept: list[list[int]] = [[]]
+    garbage.resume()
+    assert gc.isenabled()
+    assert all(one is not kept for one in gc.get_objects())
+    assert gc.get_freeze_count() > 0
+
+
+def test_without_a_pause_nothing_is_frozen() -> None:
+    before = gc.get_freeze_count()
+    garbage.resume()
+    assert (gc.isenabled(), gc.get_freeze_count()) == (True, before)
