@@ -110,13 +110,9 @@ class Duplex(Stream):
         self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self.write(*first)
         super().__init__(channel, method, iter(self._requests.get, None))
-
-    def __next__(self) -> Any:
-        try:
-            return super().__next__()
-        except BaseException:
-            self.finish()  # grpcio's thread waits for requests until then
-            raise
+        # grpcio's thread waits for requests until then. The call also ends with its channel.
+        if not self._call.add_callback(self.finish):
+            self.finish()
 
     def write(self, *requests: Any) -> None:
         """Send requests.
@@ -129,11 +125,6 @@ class Duplex(Stream):
     def finish(self) -> None:
         """Tell the endpoint that no more requests follow."""
         self._requests.put(None)
-
-    def close(self) -> None:
-        """End the stream."""
-        self.finish()
-        super().close()
 
 
 class Condition(threading.Condition):
