@@ -78,6 +78,8 @@ START_PROCESSES = (
     "tests/native/",
     "tests/system/",
     "tests/unit/cli/test_completion.py",
+    "tests/unit/cli/test_schema.py::test_both_accept",
+    "tests/unit/cli/test_schema.py::test_both_refuse_an_invalid_configuration",
     "tests/unit/cli/test_supervisor.py::test_up_detach_reports_faults",
     "tests/unit/client/test_generated.py",
     "tests/unit/test_client_distribution.py::test_each_module",
