@@ -32,7 +32,7 @@ POLL_S: Final = 0.005
 """Period in s at which the connector looks for a first publisher while it connects."""
 
 DISCOVERIES: Final = 4
-"""Largest number of discovered publishers and subscribers to examine in a cycle; each takes about 0.5 ms."""
+"""Largest number of discovered publishers and subscribers to examine in a cycle; each takes about 0.2 ms."""
 DISCOVERIES_AT_END: Final = 1000
 MAX_REASONS: Final = 3
 DISCOVERY_S: Final = 1.0
