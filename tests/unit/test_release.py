@@ -92,6 +92,7 @@ def test_only_a_tag_with_its_own_version_is_released(tree: Path) -> None:
     git(tree, "commit", "-qam", "y")
     assert "0 tags" in release(tree).stderr
     git(tree, "tag", "-f", "v0.2.0")
+    assert "store-baseline 0.2.0" in release(tree).stderr
     (tree / "changes" / "late.fixed.md").write_text("- Late.\n")
     git(tree, "add", "-A")
     git(tree, "commit", "-qm", "z")
