@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import msgspec
@@ -22,11 +25,13 @@ from tests.unit.endpoints.web.test_page import Pages, pages
 FAILED: Final = "the server failed to do this"
 """How the answer to a call begins that raised an unexpected exception."""
 _REGISTER: Final = f"cell/{LAYOUT.registers[0].path}"
+RECORDING: Final = Path(__file__).parents[1] / "golden" / "dump" / "closed.mem"
 _NAMED: Final[Mapping[str, object]] = {
     "source": "cell",
     "path": _REGISTER,
     "paths": [_REGISTER, f"cell/{LAYOUT.registers[1].path}"],
     "value": "1",
+    "name": RECORDING.name,
     "when": f"{_REGISTER} > 1 for 2s",
     "text": f'[[injection]]\nname = "n"\ntarget = "{_REGISTER}"\noperation = "set"\nvalue = 1\n',
     "filter": "a",
@@ -49,7 +54,11 @@ class _Browser:
         segment = _open.enter_context(Segment.create(f"fuzz-{os.getpid()}", [spec()], processes()))
         _open.callback(segment.unlink)
         segment.writer("cell").publish(bytes(segment.blocks["cell"].layout.size), cycle=1)
-        self._pages: Pages = _open.enter_context(pages(segment, roles=("read", "write", "inject", "control")))
+        folder = Path(_open.enter_context(TemporaryDirectory(prefix="fuzz-page-")))
+        (folder / "cell.log").write_text("2026-01-01T00:00:00Z INFO cell: a line\n")
+        shutil.copy(RECORDING, folder)
+        roles = ("read", "write", "inject", "control")
+        self._pages: Pages = _open.enter_context(pages(segment, (), roles, {"logs": str(folder)}, folder))
         self._socket: ClientConnection | None = None
 
     def say(self, text: str) -> Mapping[str, Any]:
