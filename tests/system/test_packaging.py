@@ -24,6 +24,16 @@ def test_systemd_verifies_the_unit(tmp_path: Path) -> None:
     assert (verified.returncode, verified.stderr) == (0, "")
 
 
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
+def test_the_unit_is_hardly_exposed(tmp_path: Path) -> None:
+    """docs/how-to/run-as-a-service.md gives the score, in which 10 is the worst; 0.1 more may be another systemd."""
+    shutil.copy(UNIT, tmp_path)
+    unit = str(tmp_path / UNIT.name)
+    command = ["systemd-analyze", "security", "--offline=true", "--no-pager", "--threshold=18", unit]
+    rated = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert rated.returncode == 0, rated.stdout + rated.stderr
+
+
 @pytest.mark.parametrize(
     ("result", "cleared"),
     [("success", True), ("timeout", True), ("signal", False), ("watchdog", False), ("oom-kill", False)],
