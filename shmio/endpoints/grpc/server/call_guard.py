@@ -391,6 +391,7 @@ class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
+        self._asking: set[asyncio.Task[Any]] = set()  # asyncio itself holds tasks only weakly
         self._came: set[asyncio.Future[Any]] = set()
         self._waiter: asyncio.Future[None] | None = None
         cygrpc.asyncio = _CoreAsyncio()
@@ -408,6 +409,7 @@ class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]
 
     def _call_came(self, request: asyncio.Future[Any], done: asyncio.Task[Any]) -> None:
         """End a request, and wake the serving task in the same turn of the loop."""
+        self._asking.discard(done)
         failure = None if done.cancelled() else done.exception()
         if done.cancelled():
             request.cancel()
@@ -440,7 +442,9 @@ class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]
         request: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
         _requests[request] = self
         if method is not None:  # the workers take calls of other methods
-            super()._make_request_call_future(method).add_done_callback(partial(self._call_came, request))
+            asking = super()._make_request_call_future(method)
+            self._asking.add(asking)
+            asking.add_done_callback(partial(self._call_came, request))
         return request
 
     async def _refuse(self) -> None:
