@@ -251,7 +251,7 @@ def steps_requests(count: int, dt_s: float | None) -> list[Any]:
 
 
 def status(found: Any) -> dict[str, Any]:
-    """Convert the answer to GetStatus to what ``shmio-supervisor status --json`` prints."""
+    """Return what ``shmio-supervisor status --json`` prints, from the answer of the call GetStatus."""
     return {
         "instance": found.instance,
         "mode": found.mode,
@@ -300,7 +300,7 @@ def replay_request(changes: ReplayChanges) -> Any:
 
 
 def replay_status(found: Any) -> list[ReplayStatus]:
-    """Convert the answer to Replay."""
+    """Return the state of the replay in the answer of the call Replay."""
     return [
         ReplayStatus(
             one.source, one.time_s, one.position_s, one.length_s, one.speed, one.paused, one.loop, one.over,

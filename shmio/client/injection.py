@@ -153,14 +153,14 @@ def declare_request(declarations: Iterable[Mapping[str, Any] | msgspec.Struct], 
 
 
 def declared(found: Any) -> tuple[Declared, ...]:
-    """Convert the first answer to Declare. Raise RemoteError if it is invalid."""
+    """Return the injections in the first answer of the call Declare. Raise RemoteError if it is invalid."""
     if found is None or not found.HasField("declared"):
         raise RemoteError("the endpoint's first answer to Declare is invalid")
     return tuple(Declared(one.source, one.number, one.name, one.seed) for one in found.declared.injections)
 
 
 def events(found: Any) -> list[InjectionEvent]:
-    """Convert the events in an answer to Declare."""
+    """Return the events in an answer of the call Declare."""
     known = wire.Happening.Kind.values()
     return [
         InjectionEvent(
@@ -173,12 +173,12 @@ def events(found: Any) -> list[InjectionEvent]:
 
 
 def lifted(found: Any) -> list[Lifted]:
-    """Convert the answer to LiftAll."""
+    """Return the lifted injections in the answer of the call LiftAll."""
     return [Lifted(one.source, one.number, one.name, one.failure) for one in found.lifted]
 
 
 def injections(found: Any) -> list[Injection[Mapping[str, Any]]]:
-    """Convert the answer to ListInjections."""
+    """Return the injections in the answer of the call ListInjections."""
     return [
         Injection(
             number=one.number,

@@ -216,7 +216,10 @@ class Rejoining:
         """
         outputs = {} if outputs is None else outputs
         if not isinstance(outputs, Mapping):
-            raise ValueRangeError(f"step returned {_shorten(repr(outputs))}, but must return outputs by their paths")
+            raise ValueRangeError(
+                f"step returned {_shorten(repr(outputs))}, but must return a mapping from the "
+                "paths of outputs to their values, or None"
+            )
         answer = part.done(work.step, outputs if self._sent else {**self._known, **outputs})
         self._known.update(outputs)
         self._sent, self._failure = True, ""

@@ -139,8 +139,11 @@ class Register(model.Register, frozen=True, gc=False, kw_only=True):
                 column=Column(found.column),
                 slot=found.slot,
             )
-        except ValueError as error:
-            raise RemoteError(f"{found.path}: {error}") from None
+        except ValueError:
+            raise RemoteError(
+                f"{found.path}: the endpoint sends this register's values in a form that this version of shmio does "
+                f"not know (column {found.column}); update the client"
+            ) from None
 
 
 def unknown(path: str, paths: Sequence[str], what: str) -> PathError:

@@ -340,7 +340,7 @@ class Sparkplug(Section):
 
     @property
     def patterns(self) -> list[str]:
-        """Globs that select the metrics, for paths that begin with the name of the source."""
+        """Globs that select the metrics; they are matched against paths that begin with the source's name."""
         return [self.match] if isinstance(self.match, str) else self.match
 
 

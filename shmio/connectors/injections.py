@@ -300,7 +300,7 @@ class DeclaredInjections:
         return program
 
     def rebind(self) -> None:
-        """Compile those conditions again that read sources that a reload has changed."""
+        """Recompile the conditions that read a source changed by a reload."""
         if not self.reads_other_sources:
             return
         blocks = dict(self._blocks_of())

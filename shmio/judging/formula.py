@@ -122,7 +122,9 @@ def check(tree: Tree) -> None:
         raise ConfigError("it must read a register")
     _check_bounds(tree, outer=True)
     if _changes(tree) > MAX_CHANGES:
-        raise ConfigError("temporal operators with bounds are nested more than 6 levels deep")
+        raise ConfigError(
+            "temporal operators with bounds are nested more than 6 levels deep, where each until counts as two"
+        )
     if horizon_ns(tree) > MAX_HORIZON_S * _NS:
         raise ConfigError(f"the formula's bounds add up to more than {MAX_HORIZON_S} s")
 

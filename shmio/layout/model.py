@@ -235,7 +235,7 @@ class Layout:
 
     @cached_property
     def own(self) -> tuple[Register, ...]:
-        """The registers that have bytes of their own: in address order, without overlaps."""
+        """The registers of the block itself, in address order and without overlaps; not those of tag tables over it."""
         count = len(self.registers)
         while count and self.registers[count - 1].over:
             count -= 1

@@ -22,8 +22,8 @@ class SnapshotInfo(msgspec.Struct, frozen=True):
         time_ns: The instance's clock, in ns.
         step: Number of the last step.
         size_bytes: Size of the file.
-        left_out: What is not in the snapshot: the reason by process. Empty if nothing is missing.
-        problem: Why the snapshot cannot be read; empty if it can. Then the other values are unknown.
+        left_out: For each process that is not in the snapshot, the reason. Empty if nothing is missing.
+        problem: Why the snapshot cannot be read; only ``name`` is valid then. Empty if it can be read.
     """
 
     name: str

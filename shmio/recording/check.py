@@ -215,7 +215,10 @@ class _Numbers:
     def _continue(self, key: tuple[str, int, str], first: int, last: int) -> None:
         if key not in self._last:
             if len(self._last) >= MAX_BLOCKS:
-                raise RecordingError(f"the file has messages and gaps of more than {MAX_BLOCKS} blocks")
+                raise RecordingError(
+                    f"the file is too large to check: it has more than {MAX_BLOCKS} series of frames or events (each "
+                    "block has one of each)"
+                )
             self._first[key] = first
         elif first != self._last[key] + 1:
             self._broken(key, self._last[key], first)

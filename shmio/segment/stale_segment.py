@@ -1,4 +1,7 @@
-"""Claim or clear a stale segment: one that a dead supervisor has left, perhaps with processes."""
+"""Claim or clear a stale segment: one whose supervisor is dead.
+
+Processes that the supervisor started may still run.
+"""
 
 from __future__ import annotations
 

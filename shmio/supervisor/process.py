@@ -214,9 +214,9 @@ def describe_end(code: int | None) -> str:
 def child_environment() -> dict[str, str]:
     """Return the environment of a child, in which it imports the same shmio as the supervisor.
 
-    ``-P`` keeps Python from importing modules from the current folder. If shmio is not installed,
-    its folder is therefore added to the path. (Adding site-packages would hide modules of the
-    standard library.)
+    Children run with ``-P``, so Python does not import from the current folder. If shmio is not in
+    site-packages, the folder that contains it is added to PYTHONPATH. (site-packages itself must not
+    be there: it would come before the standard library, and could hide its modules.)
     """
     environment = dict(os.environ, PYTHONFAULTHANDLER="1")
     # Otherwise gRPC prints a line for each bad handshake of any client, and the log would not rotate.

@@ -18,10 +18,10 @@ _STEP: Final = re.compile(
 
 
 def parse(text: str) -> Steps:
-    """Parse a path, which begins with ``$``.
+    """Parse a path. The caller has checked that it begins with ``$``.
 
     Raises:
-        ValueError: The path is wrong; the message says where.
+        ValueError: The path is wrong or has too many steps; the message says what is wrong.
 
     """
     steps: list[str | int] = []

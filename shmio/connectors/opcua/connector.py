@@ -586,8 +586,8 @@ def _credentials(options: OpcUaOptions) -> Credentials:
     uri = trust.application_uri(certificate)
     if uri is None:
         raise ConfigError(
-            f"certificate: {options.certificate}: this certificate has no application URI; OPC UA needs one as an "
-            "alternative name, such as URI:urn:cell:shmio"
+            f"certificate: {options.certificate}: this certificate has no application URI; add one to its "
+            "subject alternative names, such as URI:urn:cell:shmio (OPC UA requires it)"
         )
     user = None
     if options.user_certificate is not None and options.user_key is not None:

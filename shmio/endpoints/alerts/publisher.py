@@ -104,7 +104,10 @@ class Publisher:
 
 
 def queued(publisher: Publisher, alerts: Iterable[Alert], notices: Sequence[Notice]) -> None:
-    """Queue the notices that an earlier process could not publish, if their alerts still publish."""
+    """Queue the notices that an earlier process could not publish.
+
+    Drop those whose alert no longer exists, or has no MQTT topic any more.
+    """
     by_name = {alert.title: alert for alert in alerts if alert.mqtt_topic is not None}
     for notice in notices:
         if notice.alert in by_name:

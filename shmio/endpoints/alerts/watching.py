@@ -156,7 +156,7 @@ class ProcessWatch:
         return any(phase in self._states for phase, _ in self._present.values()) if self._present else None
 
     def describe(self, _followers: Followers) -> Finding:
-        """Describe the processes that are in one of the states; all processes if none is."""
+        """Describe the matching processes in one of the given states; if there is none, all that match."""
         met = {name: one for name, one in self._present.items() if one[0] in self._states} or self._present
         return Finding(
             "; ".join(f"{name} is in state {phase}{f': {note}' if note else ''}" for name, (phase, note) in met.items())

@@ -220,11 +220,11 @@ class Survey:
         """Add a gap.
 
         Raises:
-            RecordingError: There are gaps of more blocks than any recorder writes.
+            RecordingError: More series of frames or events have gaps than any recorder writes.
         """
         key = (gap.source, gap.block, gap.what)
         if key not in self.missed and len(self.missed) >= MAX_BLOCKS:
-            raise RecordingError(f"the file has gaps of more than {MAX_BLOCKS} blocks")
+            raise RecordingError(f"the file has gaps in more than {MAX_BLOCKS} series of frames or events")
         self.gap_count += 1
         self.missed[key] = self.missed.get(key, 0) + gap.count
         self.missed_to[key] = max(self.missed_to.get(key, 0), gap.last)

@@ -481,7 +481,7 @@ def test_a_function_computes_a_source(instance: str) -> None:
         ({"row": [1, 2, 3]}, "row: expected 2 times 3 elements, found 3"),
         ({"row": [[1], [2, 3]]}, "row: expected 2 times 3 elements"),
         ({"row": 5}, "row: expected 2 times 3 elements, found no"),
-        (7, "step returned 7, but must return outputs by their paths"),
+        (7, "step returned 7, but must return a mapping from the paths of outputs to their values, or None"),
     ],
 )
 def test_invalid_outputs_fail_the_step(
