@@ -12,10 +12,11 @@ from shmio import garbage
 
 @pytest.fixture(autouse=True)
 def collection() -> Iterator[None]:
-    """Restore the collector's state."""
+    """Enable the collector, which an earlier test of a worker may have paused, and restore its state."""
+    gc.enable()
     yield
     gc.enable()
-    gc.unfreeze()
+    gc.freeze()  # as tests/conftest.py does
 
 
 def test_nothing_is_collected_during_the_start_and_only_new_objects_after_it() -> None:
