@@ -60,8 +60,11 @@ class Example:
                 file.write_text(text)
 
     @contextmanager
-    def running(self) -> Iterator[str]:
-        """Start the example as its user does; at the end press Ctrl-C. Yield what it has printed."""
+    def running(self, *, kill: bool = False) -> Iterator[str]:
+        """Start the example as its user does; at the end press Ctrl-C, or kill the script. Yield what it has printed.
+
+        At the end, all its processes have ended: each of them has the pipe that is read to its end.
+        """
         with subprocess.Popen(
             [self.folder / "run"],
             env=environment(),
@@ -80,9 +83,12 @@ class Example:
                 assert "the instance is running" in printed, printed
                 yield printed
             finally:
-                os.killpg(script.pid, signal.SIGINT)
+                if kill:
+                    script.terminate()
+                else:
+                    os.killpg(script.pid, signal.SIGINT)
                 rest, _ = script.communicate(timeout=PATIENCE_S)
-        assert script.returncode == 0, rest
+        assert script.returncode == (-signal.SIGTERM if kill else 0), rest
 
     def shown(self, commands: str) -> str:
         """Return what a terminal shows, with the names and ports of the page."""
@@ -147,6 +153,12 @@ def test_the_program_meets_its_requirements_in_virtual_time(example: Example) ->
     late = example.shown(f"{commands.strip()} --for 15; echo $?\n")
     assert re.search(r"^failed +cool", late, re.MULTILINE)
     assert late.endswith("\n1\n")
+
+
+@pytest.mark.parametrize("example", ["commissioning"], indirect=True)
+def test_no_process_survives_a_killed_script(example: Example) -> None:
+    with example.running(kill=True):
+        pass
 
 
 @pytest.mark.parametrize("example", ["twin"], indirect=True)
