@@ -66,6 +66,11 @@ class _Comparison:
             yield f"{key}.{name}: is needed now"
         if was.get("items") and is_.get("items"):  # false if "prefixItems" has them all
             yield from self.of(was["items"], is_["items"], f"{key}[]")
+        for before, after in zip(was.get("prefixItems", ()), is_.get("prefixItems", ()), strict=False):
+            yield from self.of(before, after, f"{key}[]")
+        before, after = was.get("additionalProperties"), is_.get("additionalProperties")  # of tables with any names
+        if isinstance(before, dict) and isinstance(after, dict):
+            yield from self.of(before, after, f"{key}.*")
         for name, value in was.get("properties", {}).items():
             if name not in is_.get("properties", {}):
                 yield f"{key}.{name}: is gone"

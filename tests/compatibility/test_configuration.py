@@ -40,6 +40,10 @@ def test_stored_configurations_have_no_faults(baseline: Path) -> None:
         ({"period_ms": {"maximum": 1000}}, "supervisor.toml.source[].period_ms: maximum is 1000"),
         ({"period_ms": {"type": "integer"}}, "supervisor.toml.source[].period_ms: expects integer, not number"),
         ({"period_ms": {"enum": [20.0]}}, "supervisor.toml.source[].period_ms: takes [20.0], not None"),
+        (
+            {"texts": {"additionalProperties": {"type": "integer"}}},
+            "supervisor.toml.source[].texts.*: expects integer, not string",
+        ),
     ],
 )
 def test_each_kind_of_change_is_found(change: dict[str, Any], found: str) -> None:
