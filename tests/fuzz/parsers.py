@@ -5,9 +5,11 @@ A check lets only the errors pass that the parser promises. An input of several 
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import json
 import random
+import shutil
 import socket
 import struct
 import tempfile
@@ -323,7 +325,9 @@ def _check_grpc(data: bytes) -> None:
 
 @cache
 def _folder() -> Path:
-    return Path(tempfile.mkdtemp(prefix="fuzz-files-"))
+    made = tempfile.mkdtemp(prefix="fuzz-files-")
+    atexit.register(shutil.rmtree, made)
+    return Path(made)
 
 
 def _check_recording(data: bytes) -> None:
