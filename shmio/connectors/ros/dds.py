@@ -201,6 +201,7 @@ class Ros2Connector(Connector):
         """
         options = self._options
         self._discovered_s = time.monotonic() + DISCOVERY_S
+        discovered: set[str] = set()
         while not self._met(joined):
             if time.monotonic() > end_s:
                 joined.discover(DISCOVERIES_AT_END)
@@ -214,8 +215,10 @@ class Ros2Connector(Connector):
                     f"found no publisher or subscriber {fit} any topic in DDS {self._where} within {options.timeout} "
                     f"ms; {why}"
                 )
-            joined.discover(DISCOVERIES)
+            discovered |= joined.discover(DISCOVERIES)
             time.sleep(POLL_S)
+        for name in sorted(discovered):
+            self._report(joined, self._topics.by_name[name])
 
     def _met(self, joined: Participant) -> bool:
         """Return whether another participant publishes or subscribes to one of the topics."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, cast
 
@@ -82,6 +84,38 @@ def test_a_publisher_that_offers_too_little_is_reported_by_the_policy(
         peer.ask("withdraw", "x")
         peer.ask("offer", "x", "Float64", {"stored": True, "deadline": 50, "lease": 500})
         sent(source, peer, "x", 2.5)
+
+
+def test_a_publisher_that_does_not_fit_is_reported_if_it_was_discovered_before_the_others(
+    peer: Peer, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    participant = pytest.importorskip("shmio.connectors.ros.participant").Participant
+    discovered, discover = threading.Event(), participant.discover
+
+    def noticed(self: Any, most: int) -> set[str]:
+        found: set[str] = discover(self, most)
+        if f"/{peer.prefix}/x" in found:
+            discovered.set()
+        return found
+
+    monkeypatch.setattr(participant, "discover", noticed)
+    peer.ask("offer", "x", "Float64", {"reliability": "best_effort"})
+    layout = layout_of({
+        name: ("LREAL", peer.address(name, "std_msgs/Float64 data")) for name in ("x", "later")
+    })  # fmt: skip
+    options = Ros2Options(domain=DOMAIN, timeout=20_000, max_age=0, qos=QosKeys(reliability="reliable"))
+    connector = Ros2Connector(options, layout)
+    source = Source(connector, layout)
+    with ThreadPoolExecutor(1) as pool:
+        connecting = pool.submit(connector.connect)
+        assert discovered.wait(20)
+        peer.ask("offer", "later", "Float64", {})
+        connecting.result()
+    try:
+        source.until(lambda: source.code("x") == statuses.BAD_CONFIGURATION_ERROR)
+        assert "a publisher offers reliability best_effort" in caplog.text
+    finally:
+        connector.close()
 
 
 def test_a_source_whose_only_publisher_does_not_fit_says_why(peer: Peer) -> None:
