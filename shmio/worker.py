@@ -201,6 +201,7 @@ def main(run: Callable[[Worker], None]) -> int:
         logging.getLogger("shmio").exception("the process failed")
         raise
     finally:
+        garbage.resume()
         trail.close_trail()
     return 0
 

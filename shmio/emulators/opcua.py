@@ -225,7 +225,9 @@ class _Nodes:
 
     async def keep(self, variables: Iterable[_Variable]) -> None:
         """Delete the nodes that no register has, and those whose register has another type or length."""
-        wanted = {one.address: one.shape for one in variables}
+        wanted: dict[NodeAddress | BrowsePath, str] = {}
+        for one in variables:
+            wanted.setdefault(one.address, one.shape)  # the first register of a node has made it
         for address, (node, shape) in list(self._known.items()):
             if wanted.get(address) != shape:
                 del self._known[address]

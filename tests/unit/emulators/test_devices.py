@@ -290,6 +290,22 @@ def test_layouts_change_while_clients_are_connected(kind: str) -> None:
             until(lambda: values(other, before) == {"kept": 7, "moved": 41, "gone": 42}, "the first registers again")
 
 
+def test_a_node_of_two_types_keeps_its_value() -> None:
+    shared: dict[str, object] = {
+        "count": {"type": "INT", "address": "ns=2;s=n", "writable": True},
+        "wide": {"type": "DINT", "address": "ns=2;s=n"},
+    }
+    more = shared | {"new": {"type": "INT", "address": "ns=2;s=new"}}
+    count = table({"count": shared["count"]})
+    with device("opcua", [Served(table(shared))]) as (made, address), connected("opcua", address, count) as client:
+        until(lambda: values(client, count) == {"count": 0}, "the initial value")
+        assert write(client, count, "count", 7) == [""]
+        with made.cycle.held():
+            made.change([Served(table(more))])
+        with connected("opcua", address, count) as other:
+            until(lambda: values(other, count) == {"count": 7}, "the value that was written")
+
+
 def test_a_data_block_changes_by_names() -> None:
     """A register that gets another place in an S7 data block keeps its value."""
     source = "DATA_BLOCK DB5\nSTRUCT\n{}END_STRUCT;\nBEGIN\nEND_DATA_BLOCK\n"
