@@ -12,6 +12,7 @@ import hashlib
 import ipaddress
 import logging
 import re
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -42,7 +43,7 @@ def read_identity(certificate: Path, key: Path) -> tuple[x509.Certificate, rsa.R
         ConfigError: A file cannot be used, or the key does not belong to the certificate.
 
     """
-    return _identity("", certificate, key, _read("key", key))
+    return _identity("", certificate, key, lambda: _read("key", key))
 
 
 def read_user(certificate: Path, key: Path) -> tuple[x509.Certificate, rsa.RSAPrivateKey]:
@@ -52,20 +53,26 @@ def read_user(certificate: Path, key: Path) -> tuple[x509.Certificate, rsa.RSAPr
         ConfigError: A file cannot be used, or the key does not belong to the certificate.
 
     """
-    data = read_secret(f"user_key: {key}", str(key), MAX_FILE_BYTES + 1, instead="a new key and certificate")
-    if len(data) > MAX_FILE_BYTES:
-        raise ConfigError(f"user_key: {key}: {larger_than(MAX_FILE_BYTES)}")
-    return _identity("user_", certificate, key, data)
+
+    def read_key() -> bytes:
+        data = read_secret(f"user_key: {key}", str(key), MAX_FILE_BYTES + 1, instead="a new key and certificate")
+        if len(data) > MAX_FILE_BYTES:
+            raise ConfigError(f"user_key: {key}: {larger_than(MAX_FILE_BYTES)}")
+        return data
+
+    return _identity("user_", certificate, key, read_key)
 
 
-def _identity(prefix: str, certificate: Path, key: Path, data: bytes) -> tuple[x509.Certificate, rsa.RSAPrivateKey]:
+def _identity(
+    prefix: str, certificate: Path, key: Path, read_key: Callable[[], bytes]
+) -> tuple[x509.Certificate, rsa.RSAPrivateKey]:
     """Return a certificate and its key.
 
     Args:
         prefix: The beginning of the names of both keys in the configuration.
         certificate: The file of the certificate.
         key: The file of the key.
-        data: The contents of the latter.
+        read_key: Returns the contents of the latter. The certificate is read first, and its faults reported first.
 
     Raises:
         ConfigError: A file cannot be used, or the key does not belong to the certificate.
@@ -74,6 +81,7 @@ def _identity(prefix: str, certificate: Path, key: Path, data: bytes) -> tuple[x
     found = _certificates(_read(f"{prefix}certificate", certificate))
     if not found:
         raise ConfigError(f"{prefix}certificate: {certificate}: the file has no usable certificate in PEM or DER")
+    data = read_key()
     load = serialization.load_pem_private_key if b"-----BEGIN" in data else serialization.load_der_private_key
     try:
         private = load(data, password=None)
