@@ -46,7 +46,11 @@ def test_page_shows_a_source_whose_controller_freezes(make_cell: Callable[..., C
                 assert found["cell"]["reason"]
             finally:
                 os.kill(pid, signal.SIGCONT)
-            wait(lambda processes: processes["cell"]["recovered"][0] > 0)
+            before = wait(lambda processes: processes["cell"]["recovered"][0] > 0)["cell"]
+            os.kill(cell.processes()["cell"]["pid"], signal.SIGKILL)
+            wait(lambda processes: processes["cell"]["recovered"][0] > before["recovered"][0])
+            found = wait(lambda processes: processes["cell"]["quality"] == "good")
+            assert found["cell"]["lost"][0] == before["lost"][0] + 1
 
 
 def test_page_writes_a_register_and_overrides_it_until_it_is_closed(make_cell: Callable[..., Cell]) -> None:

@@ -15,7 +15,7 @@ from typing import Final
 
 from shmio.model.values import Quality
 from shmio.segment import Block, Segment
-from shmio.segment.events import ENDS, EventKind
+from shmio.segment.events import ENDS, Event, EventKind
 
 INTERVAL_S: Final = 0.5
 """Interval at which the rings are read, in s. A ring has room for at least some seconds."""
@@ -97,9 +97,10 @@ class SourceTiming:
             if before is not None and (before[0], before[1] + 1) == place[:2]:
                 self.period.add(frame.publish_ns - before[2])
         while (event := self._events.poll()) is not None:
-            if event.kind == EventKind.QUALITY and self._bad != (event.quality is Quality.BAD):
-                self._bad = not self._bad
-                self.connections.append((event.publish_ns / 1e9, self._bad))
+            if event.kind == EventKind.QUALITY:
+                self._changed(event, bad=event.quality is Quality.BAD)
+            elif event.kind == EventKind.STARTED and event.frame:  # the killed process before could not report its end
+                self._changed(event, bad=True)
             command = (event.writer, event.command)
             if event.kind == EventKind.ACCEPTED:
                 self._accepted.setdefault(command, event.publish_ns)
@@ -107,6 +108,11 @@ class SourceTiming:
                     self._accepted.popitem(last=False)
             elif event.kind in ENDS and (accepted_ns := self._accepted.pop(command, None)) is not None:
                 self.command.add(event.publish_ns - accepted_ns)
+
+    def _changed(self, event: Event, *, bad: bool) -> None:
+        if bad != self._bad:
+            self._bad = bad
+            self.connections.append((event.publish_ns / 1e9, bad))
 
     def wait(self) -> None:
         """Wait for the next frame, and count how long it took to wake up."""
