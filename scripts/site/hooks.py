@@ -35,6 +35,7 @@ ROW: Final = re.compile(r"^\| ([^|]+) \| (.*) \|$", re.MULTILINE)
 TITLED: Final = re.compile(r"\[([^\]]+)\]\(([^)#\s]+\.md)\)")
 CODE: Final = re.compile(r"`[^`\n]*`")
 FENCE: Final = re.compile(r"^( *)```.*?^\1```$", re.DOTALL | re.MULTILINE)
+ITEM: Final = re.compile(r" *(?:-|\d+\.) +(?=\S)")
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
@@ -74,7 +75,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
-    """Lead links out of docs to the site's copies; write pipes in tables as this Markdown needs them."""
+    """Lead links out of docs to the site's copies; write pipes in tables, and lists, as this Markdown needs them."""
     source = page.file.src_uri
     folder = posixpath.dirname({page: name for name, page in PAGES.items()}.get(source, f"docs/{source}"))
 
@@ -94,7 +95,7 @@ def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
     def line(text: str) -> str:
         return CODE.sub(lambda code: code[0].replace("\\|", "|"), text) if text.startswith("|") else text
 
-    parts = re.split(r"(^ *```.*?^ *```$)", markdown, flags=re.DOTALL | re.MULTILINE)
+    parts = re.split(r"(^ *```.*?^ *```$)", _indented(markdown), flags=re.DOTALL | re.MULTILINE)
     parts[::2] = [LINK.sub(moved, "\n".join(map(line, part.split("\n")))) for part in parts[::2]]
     return "".join(parts)
 
@@ -102,6 +103,24 @@ def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
 def on_page_content(html: str, **_: object) -> str:
     """Drop the roles of Sphinx, such as :func:, which docstrings have for editors."""
     return re.sub(r":\w+:(<code>)~?", r"\1", html)
+
+
+def _indented(markdown: str) -> str:
+    """Indent what belongs to an item of a list by four spaces; our pages do so by as many as its marker takes."""
+    columns = [(0, 0)]  # where the text of each open item begins: in the page, and here
+    fenced = False
+    lines = []
+    for line in markdown.split("\n"):
+        indent = len(line) - len(line.lstrip(" "))
+        while line and not fenced and indent < columns[-1][0]:
+            columns.pop()
+        before, after = columns[-1]
+        lines.append(" " * (after - before) + line if line else "")
+        if line.lstrip().startswith("```"):
+            fenced = not fenced
+        elif not fenced and (item := ITEM.match(line)):
+            columns.append((item.end(), indent + after - before + 4))
+    return "\n".join(lines)
 
 
 def _referred(docs: Path) -> set[Path]:
