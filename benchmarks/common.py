@@ -29,7 +29,7 @@ DB201 = ROOT / "shmio/cli/a50/db201.db"
 
 Samples = Mapping[str, Sequence[float]]
 PATIENCE_S = 20.0
-"""How long a client may wait for a value."""
+"""The longest time for which a client waits for a value."""
 
 
 # -- the run -----------------------------------------------------------------------------------------------------------

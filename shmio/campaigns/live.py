@@ -43,7 +43,7 @@ BY: Final = "shmio-campaign"
 
 @dataclass(frozen=True)
 class Plan:
-    """What one run of a campaign does.
+    """The settings of one run of a campaign.
 
     Attributes:
         injections: The declared injections, with their seeds; their times count from the run's start.

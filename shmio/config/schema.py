@@ -17,7 +17,7 @@ from shmio.config.scene import Scene
 _DRAFT: Final = "http://json-schema.org/draft-07/schema#"
 """The newest draft that all editors' plugins for TOML know."""
 _NO_CONTROL: Final = "^[^\\u0000-\\u001f\\u007f]*$"
-"""What :func:`shmio.config.read.text_faults` demands of each text."""
+"""The pattern of a text in which :func:`shmio.config.read.text_faults` finds no fault."""
 _DEFINITIONS: Final = "definitions"
 
 Schema = dict[str, Any]

@@ -60,7 +60,7 @@ ACCEPT(fmi2ExitInitializationMode)
 ACCEPT(fmi2Terminate)
 ACCEPT(fmi2SetDebugLogging)
 
-/* modelDescription.xml says that the motor has none of these; but all functions must exist. */
+/* An importer does not call these, because modelDescription.xml does not offer them. But FMI demands all functions. */
 #define REFUSE(name) fmi2Status name(void) { return fmi2Error; }
 REFUSE(fmi2Reset)
 REFUSE(fmi2GetInteger)
