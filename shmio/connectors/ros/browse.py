@@ -33,7 +33,6 @@ class Seen:
     Attributes:
         type: The type of its messages.
         published: Whether a node publishes on it.
-        subscribed: Whether a node subscribes to it.
         stored: Whether a publisher stores its last messages for late subscribers.
         message: A message; None if none has arrived.
 
@@ -41,7 +40,6 @@ class Seen:
 
     type: str
     published: bool = False
-    subscribed: bool = False
     stored: bool = False
     message: Any = None
 
@@ -51,9 +49,9 @@ class Seen:
         return plain(self.type) in DEFINITIONS
 
     @property
-    def sized(self) -> bool:
-        """Whether the type says everything, because it has no sequence."""
-        return self.known and not _has_sequence(plain(self.type))
+    def awaited(self) -> bool:
+        """Whether a message may come that says how long the sequences of the type are."""
+        return self.published and self.known and _has_sequence(plain(self.type))
 
 
 def _has_sequence(kind: str) -> bool:

@@ -362,10 +362,9 @@ def _survey(joined: Participant, wanted: Wanted, end_s: float) -> dict[str, Seen
                     if name and wanted.enters(levels(name)):
                         topic = seen.setdefault(name, Seen(ros_type(one.type)))
                         topic.published |= published
-                        topic.subscribed |= not published
                         topic.stored |= published and stores(one.qos)
         for name, found in seen.items():
-            if name not in read and found.published and found.known and not found.sized:
+            if name not in read and found.awaited:
                 read.add(name)
                 topic_read = Topic(name, found.type)
                 if found.stored:

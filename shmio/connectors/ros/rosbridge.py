@@ -96,7 +96,7 @@ class RosbridgeConnector(Connector):
         link = Link(options.full_url, options.address, timeout_s, options.max_message_bytes, ())
         try:
             seen, incomplete = _survey(link, wanted)
-            waiting = {name for name, one in seen.items() if one.known and one.published and not one.sized}
+            waiting = {name for name, one in seen.items() if one.awaited}
             link.keep(set(waiting))
             for name in waiting:
                 link.send(op="subscribe", id=f"subscribe:{name}", topic=name, type=seen[name].type, queue_length=1)
@@ -289,10 +289,8 @@ def _survey(link: Link, wanted: Wanted) -> tuple[dict[str, Seen], str]:
         if len(seen) == wanted.nodes:
             return seen, "there are more topics; select some of them by a PATTERN, or raise --limit"
         kind = types[at] if at < len(types) else _text(link.call("/rosapi/topic_type", {"topic": name}), "type")
-        published, subscribed = (
-            bool(_texts(link.call(f"/rosapi/{role}", {"topic": name}), role)) for role in ("publishers", "subscribers")
-        )
-        seen[name] = Seen(kind, published=published, subscribed=subscribed)
+        publishers = _texts(link.call("/rosapi/publishers", {"topic": name}), "publishers")
+        seen[name] = Seen(kind, published=bool(publishers))
     return seen, ""
 
 

@@ -42,7 +42,6 @@ const rosapi = {
   },
   '/rosapi/topic_type': ({ topic }) => ({ type: topics.get(topic)?.type ?? '' }),
   '/rosapi/publishers': ({ topic }) => ({ publishers: topics.get(topic)?.last ? ['/robot'] : [] }),
-  '/rosapi/subscribers': ({ topic }) => ({ subscribers: topics.get(topic)?.listens ? ['/robot'] : [] }),
 }
 let services = true
 
