@@ -6,7 +6,8 @@ import importlib.util
 import logging
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import msgspec
@@ -103,17 +104,9 @@ class Ros2Connector(Connector):
     def browse(cls, options: Ros2Options, wanted: Wanted) -> Browsed:
         """List the topics that DDS discovers within the time-out, and the fields of their messages."""
         _check_library()
-        from shmio.connectors.ros import participant  # noqa: PLC0415  its library is optional
-
-        configured = participant.configuration(
-            options.domain, options.interface, options.peers, options.max_message_bytes
-        )
-        timeout_s = options.timeout / 1000
-        joined = participant.Participant(
-            options.domain, configured, [], timeout_s, loopback=options.interface == "lo"
-        )  # fmt: skip
+        joined = _join(options, ())
         try:
-            seen = _survey(joined, wanted, time.monotonic() + timeout_s)
+            seen = _survey(joined, wanted, time.monotonic() + options.timeout / 1000)
             full = joined.discovery.full
         finally:
             joined.close()
@@ -162,21 +155,11 @@ class Ros2Connector(Connector):
             ConnectorError: No participant has done so within the time-out.
 
         """
-        from shmio.connectors.ros import participant  # noqa: PLC0415  its library is optional
-
         self.close()
         self._topics.reset()
         self._obstructed.clear()
-        options = self._options
-        timeout_s = options.timeout / 1000
-        end_s = time.monotonic() + timeout_s
-        configured = participant.configuration(
-            options.domain, options.interface, options.peers, options.max_message_bytes
-        )
-        joined = self._participant = participant.Participant(
-            options.domain, configured, self._topics.by_name.values(), timeout_s,
-            loopback=options.interface == "lo",
-        )  # fmt: skip
+        end_s = time.monotonic() + self._options.timeout / 1000
+        joined = self._participant = _join(self._options, self._topics.by_name.values())
         self._meet(joined, end_s)
 
     def take_over(self, other: Ros2Connector) -> bool:
@@ -322,12 +305,9 @@ class Ros2Connector(Connector):
             if not joined.subscribers(name):
                 if until_s < min(self._discovered_s, self._sending.until_s):
                     return None
-                reasons = joined.obstacles(name)
-                return (
-                    f"no node that fits subscribes to {name}: {'. '.join(reasons[:MAX_REASONS])}"
-                    if reasons
-                    else (f"no node subscribes to {name}: nobody would receive the message")
-                )
+                if reasons := joined.obstacles(name):
+                    return f"no node that fits subscribes to {name}: {'. '.join(reasons[:MAX_REASONS])}"
+                return f"no node subscribes to {name}: nobody would receive the message"
             if "header" in message and not stamped(self._topics, publication.topic):
                 message["header"]["stamp"] = _time(time.time_ns())
             publication.begun = True
@@ -342,6 +322,16 @@ class Ros2Connector(Connector):
 def _check_library() -> None:
     if importlib.util.find_spec("cyclonedds") is None:
         raise ConfigError("connector: ros2 needs another library; run pip install 'shmio[ros2]'")
+
+
+def _join(options: Ros2Options, topics: Collection[Topic]) -> Participant:
+    """Join the domain. Raise ConnectorError if that is not possible, or if a topic cannot be read."""
+    from shmio.connectors.ros import participant  # noqa: PLC0415  its library is optional
+
+    configured = participant.configuration(options.domain, options.interface, options.peers, options.max_message_bytes)
+    return participant.Participant(
+        options.domain, configured, topics, options.timeout / 1000, loopback=options.interface == "lo"
+    )
 
 
 def _survey(joined: Participant, wanted: Wanted, end_s: float) -> dict[str, Seen]:
@@ -369,7 +359,8 @@ def _survey(joined: Participant, wanted: Wanted, end_s: float) -> dict[str, Seen
                 topic_read = Topic(name, found.type)
                 if found.stored:
                     topic_read.qos = TopicQos("reliable", "transient_local")
-                joined.add([topic_read])
+                with suppress(ConnectorError):  # DDS refuses some names that ROS does not have
+                    joined.add([topic_read])
         for name, message in joined.take():
             seen[name].message = message
         time.sleep(POLL_S)

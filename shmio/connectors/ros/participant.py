@@ -20,7 +20,15 @@ from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic as DdsTopic
 
-from shmio.connectors.ros.dds_types import dds_topic, dds_type, ros_type, sample_type, to_message, to_sample
+from shmio.connectors.ros.dds_types import (
+    dds_topic,
+    dds_type,
+    ros_topic,
+    ros_type,
+    sample_type,
+    to_message,
+    to_sample,
+)
 from shmio.connectors.ros.discovery import POLICIES, Discovery, reader_qos, unmet, writer_qos
 from shmio.connectors.ros.messages import plain
 from shmio.connectors.ros.topics import Topic
@@ -169,10 +177,18 @@ class Participant:
             ) from None
 
     def add(self, topics: Iterable[Topic]) -> None:
-        """Read more topics, and write those of them that are writable."""
+        """Read more topics, and write those of them that are writable.
+
+        Raises:
+            ConnectorError: The library reports an error.
+
+        """
         for topic in topics:
             if topic.name not in self._endpoints:
-                self._endpoints[topic.name] = _Endpoint(self._participant, topic, self._blocking_ns)
+                try:
+                    self._endpoints[topic.name] = _Endpoint(self._participant, topic, self._blocking_ns)
+                except DDSException as error:
+                    raise ConnectorError(f"cannot read {topic.name}: {error}") from None
 
     def _watch(self) -> None:
         self.discovery.begin(self._participant, {dds_topic(name) for name in self._endpoints}, MAX_ENDPOINTS)
@@ -228,7 +244,7 @@ class Participant:
 
     def discover(self, most: int) -> set[str]:
         """Take note of what DDS has discovered, at most ``most`` changes; return the topics that have changed."""
-        return {name.removeprefix(dds_topic("")) for name in self.discovery.update(most)} & self._endpoints.keys()
+        return {ros_topic(name) for name in self.discovery.update(most)} & self._endpoints.keys()
 
     def obstacles(self, topic: str) -> list[str]:
         """Return why publishers and subscribers of a topic do not fit this participant's reader and writer."""

@@ -12,6 +12,7 @@ import pytest
 from shmio.cli import supervisor
 from shmio.connectors.base import Connector
 from shmio.connectors.ros.dds import Ros2Connector, Ros2Options
+from shmio.connectors.ros.qos import TopicQos
 from shmio.connectors.ros.rosbridge import RosbridgeConnector, RosbridgeOptions
 from shmio.layout.compiler import Source as SourceFile
 from shmio.layout.compiler import compile_sources
@@ -191,6 +192,22 @@ def test_the_topics_of_a_domain(peer: Peer, capsys: pytest.CaptureFixture[str], 
         assert [source.value(f"{peer.prefix}/{name}") for name in names] == [2.5, 0.5, [3, 4], "auto"]
 
     good(Ros2Connector(Ros2Options(domain=peer.domain, latched=[f"{own}/mode"]), layout), layout, then)
+
+
+def test_a_topic_that_the_library_refuses_is_listed_among_the_others(
+    peer: Peer, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A node of another vendor publishes on a topic whose name Cyclone DDS does not accept."""
+    discovery = pytest.importorskip("shmio.connectors.ros.discovery")
+    odd = discovery.Endpoint(
+        "rt/odd name", "std_msgs::msg::dds_::Int16MultiArray_", discovery.writer_qos(TopicQos(), 0)
+    )  # fmt: skip
+    publishers = discovery.Discovery.publishers
+    monkeypatch.setattr(discovery.Discovery, "publishers", lambda found: [*publishers(found), odd])
+    assert browse(f"ros2://{peer.domain}", "odd name", f"{peer.prefix}/speed") == 0
+    shown = capsys.readouterr().out.splitlines()
+    assert "odd name  (no message has arrived, so its length is unknown)" in shown
+    assert f"  speed  REAL  /{peer.prefix}/speed std_msgs/Float32 data" in shown
 
 
 @pytest.mark.parametrize(
