@@ -90,10 +90,10 @@ def bridge() -> Iterator[Bridge]:
             ("/speed", "std_msgs/Float32", {"data": 0.5}),
             ("/speed/limit", "std_msgs/Int16", {"data": 7}),
         ):  # fmt: skip
-            bridge.ask("declare", topic, kind, False)
+            bridge.ask("declare", topic, kind)
             bridge.ask("publish", topic, message)
-        bridge.ask("declare", "/cmd_vel", "geometry_msgs/Twist", True)
-        bridge.ask("declare", "/silent", "std_msgs/Float64MultiArray", True)
+        bridge.ask("declare", "/cmd_vel", "geometry_msgs/Twist")
+        bridge.ask("declare", "/silent", "std_msgs/Float64MultiArray")
         yield bridge
 
 

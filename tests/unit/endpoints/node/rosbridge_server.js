@@ -72,7 +72,7 @@ function handle(socket, client, { op, id, topic, type, msg, service, args }) {
 }
 
 const commands = {
-  declare: (topic, type, listens) => { Object.assign(topicOf(topic), { type, listens }) },
+  declare: (topic, type) => { topicOf(topic).type = type },
   services: on => { services = on },
   publish: (topic, msg) => deliver(topic, msg),
   raw: text => { for (const socket of clients.keys()) socket.send(text) },
