@@ -99,7 +99,7 @@ class RosbridgeConnector(Connector):
             waiting = {name for name, one in seen.items() if one.awaited}
             link.keep(set(waiting))
             for name in waiting:
-                link.send(op="subscribe", id=f"subscribe:{name}", topic=name, type=seen[name].type, queue_length=1)
+                _subscribe(link, name, seen[name].type)
             end_s = time.monotonic() + timeout_s
             while waiting and time.monotonic() < end_s:
                 link.check()
@@ -139,7 +139,7 @@ class RosbridgeConnector(Connector):
         )
         try:
             for topic in self._topics.by_name.values():
-                self._subscribe(link, topic)
+                _subscribe(link, topic.name, topic.type, options.throttle_ms)
                 if topic.writable:
                     _advertise(link, topic)
             link.wait_newest(time.monotonic() + min(FIRST_S, options.timeout / 1000))
@@ -170,16 +170,10 @@ class RosbridgeConnector(Connector):
         for name, topic in after.items():
             there = before.get(name)
             if not (there and there.type == topic.type and same_rate):
-                self._subscribe(link, topic)
+                _subscribe(link, name, topic.type, self._options.throttle_ms)
             if topic.writable and not (there and there.writable and there.type == topic.type):
                 _advertise(link, topic)
         return True
-
-    def _subscribe(self, link: Link, topic: Topic) -> None:
-        link.send(
-            op="subscribe", id=f"subscribe:{topic.name}", topic=topic.name, type=topic.type, queue_length=1,
-            throttle_rate=self._options.throttle_ms,
-        )  # fmt: skip
 
     def read(self) -> bytes:
         """Return the image of the newest messages, after checking that the server still answers.
@@ -302,6 +296,12 @@ def _texts(answer: Any, name: str) -> list[str]:
 def _text(answer: Any, name: str) -> str:
     found = answer.get(name) if isinstance(answer, dict) else None
     return found if isinstance(found, str) else ""
+
+
+def _subscribe(link: Link, name: str, kind: str, throttle_ms: int = 0) -> None:
+    link.send(
+        op="subscribe", id=f"subscribe:{name}", topic=name, type=kind, queue_length=1, throttle_rate=throttle_ms
+    )  # fmt: skip
 
 
 def _advertise(link: Link, topic: Topic) -> None:
