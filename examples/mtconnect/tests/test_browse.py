@@ -70,9 +70,7 @@ def test_the_tree_and_the_table(tmp_path: Path, instance: str, capsys: pytest.Ca
         try:
             connector.connect()
             end = time.monotonic() + 10
-            while any(
-                StatusArea(layout).get(image := connector.read(), at).code for at in range(len(layout.registers))
-            ):
+            while not good(layout, image := connector.read()):
                 assert time.monotonic() < end
             found = {one.path: codec(one, "little").decode(image) for one in layout.registers}
         finally:

@@ -55,7 +55,7 @@ class ValueConverter:
             raise ValueError(f"a {base} cannot be read from MQTT; use BOOL, whole numbers, REAL, LREAL or STRING[n]")
         self._register, self._base, self._scale, self._texts = register, base, register.scale, texts
         self._is_plain = base in _REALS and self._scale is None and not register.dims
-        """Whether a finite number is the register's value without a conversion."""
+        """True if a finite number is the register's value as it is."""
         self._bools = _BOOLS | {texts[0].casefold(): False, texts[1].casefold(): True}
 
     # -- reading -------------------------------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ LEVELS: Final = {"Normal": 0, "Warning": 1, "Fault": 2}
 MAX_ACTIVE: Final = 1000
 """Most conditions of one data item that are kept as active at once."""
 MAX_NUMBER: Final = 80
-"""Longest text, in characters, that is a number at a glance."""
+"""Longest text, in characters, that the connector first tries to read as a plain number."""
 _NUMBER = re.compile(r"[+-]?([0-9]{1,40}\.?[0-9]{0,40}|\.[0-9]{1,40})([eE][+-]?[0-9]{1,3})?", re.ASCII)
 _BOOLS: Final = {
     "TRUE": True,
