@@ -34,6 +34,8 @@ expect: Any = pytest.importorskip("playwright.sync_api").expect
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
 LEFT_PX = 70
 """Left margin of a plot."""
+DOWNLOAD_MS = 100
+"""Time between downloads. Chromium silently ignores the eleventh within a second."""
 BIT = "cell/Outputs/500.%X0"
 SCENE = f"""
 [[body]]
@@ -81,6 +83,7 @@ def page(cell: Cell, address: str, browser: Any) -> Iterator[Any]:
 
 def saved_table(page: Any) -> list[list[str]]:
     """Return the rows of the table that the page saves, with its head."""
+    page.wait_for_timeout(DOWNLOAD_MS)
     with page.expect_download() as download:
         page.get_by_role("button", name="Save CSV").click()
     return [line.split(",") for line in download.value.path().read_text().splitlines()]
