@@ -102,11 +102,10 @@ class Attachment:
         """Saves and restores snapshots."""
         from shmio.local.snapshots import Snapshots  # noqa: PLC0415
 
+        self._segment.require_running()
         return Snapshots(self._segment, self._time, self._states, self._snapshot_folder)
 
     def _blocks(self) -> dict[str, Block]:
-        if self._segment.closed:
-            raise SegmentError(f"detached from instance {self.instance!r}")
         self._segment.refresh()
         return self._segment.blocks
 
@@ -615,7 +614,6 @@ class Attachment:
         Raises:
             SnapshotError: The folder of the snapshots cannot be read.
         """
-        self._segment.require_running()
         return self._snapshots.all()
 
     def delete_snapshot(self, name: str) -> None:
@@ -624,7 +622,6 @@ class Attachment:
         Raises:
             SnapshotError: There is no such snapshot, or it cannot be deleted.
         """
-        self._segment.require_running()
         self._snapshots.delete(name)
 
     def _source_writer(self, block: Block) -> SourceWriter:

@@ -61,15 +61,15 @@ class Following(Generic[Item]):
                 for relay in self._relays.values():
                     relay.acknowledge()  # before reading
                 found = self._take()
+                now_s = time.monotonic()
+                if found is None and now_s > self._checked_s + TURN_S:
+                    self._segment.require_running()  # within the lock: end() comes before the segment is closed
+                    self._checked_s = now_s
                 poll = select.poll()
                 for relay in self._relays.values():
                     poll.register(relay.descriptor, select.POLLIN)
             if found is not None:
                 return found
-            now_s = time.monotonic()
-            if now_s > self._checked_s + TURN_S:
-                self._segment.require_running()
-                self._checked_s = now_s
             poll.poll(1000 * max(0.0, min(TURN_S, self._due_s - now_s)))
 
     def _take(self) -> Item | None:

@@ -513,7 +513,9 @@ class Segment:
 
         Raises:
             FormatError: A block is inconsistent.
+            SegmentError: :meth:`close` was called.
         """
+        self._require_open()
         with self._lock:
             if not self.outdated:
                 return False
@@ -621,9 +623,14 @@ class Segment:
         return self.shared.locked(SUPERVISOR_LOCK)
 
     def require_running(self) -> None:
-        """Raise NotRunningError if the instance has stopped."""
+        """Raise NotRunningError if the instance has stopped, and SegmentError if :meth:`close` was called."""
+        self._require_open()
         if not self.shared.current():
             raise NotRunningError(f"instance {self.instance!r} has stopped")
+
+    def _require_open(self) -> None:
+        if self.closed:
+            raise SegmentError(f"detached from instance {self.instance!r}")
 
     def set_state(self, pid: int, state: State, note: str = "") -> None:
         """Write the supervisor's pid, the instance's state and a note.

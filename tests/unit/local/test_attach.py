@@ -46,20 +46,39 @@ def cell(instance: str, writer: BlockWriter) -> Iterator[Attachment]:
         yield cell
 
 
+def calls_of(cell: Attachment) -> list[Callable[[], object]]:
+    """Return a call of each method that needs a running instance."""
+    return [
+        cell.layouts, cell.get, cell.real_sources, cell.injections, cell.lift_all, cell.replay, cell.step,
+        cell.play, cell.pause, cell.release, cell.snapshots,
+        lambda: cell.set({"cell/on": True}),
+        lambda: cell.inject("cell/on"),
+        lambda: cell.declare([{"name": "x", "target": "cell/on", "operation": "set", "value": 1}]),
+        lambda: cell.lift("cell", 1),
+        lambda: cell.save_snapshot("a"),
+        lambda: cell.restore_snapshot("a"),
+        lambda: cell.delete_snapshot("a"),
+    ]  # fmt: skip
+
+
 def test_every_method_reports_a_stopped_instance(instance: str, writer: BlockWriter) -> None:
     with shmio.attach(instance, writable=True) as cell:
         Path(f"/dev/shm/shmio-{instance}").unlink()
-        calls: list[Callable[[], object]] = [
-            cell.layouts, cell.get, cell.real_sources, cell.injections, cell.lift_all, cell.replay, cell.step,
-            cell.pause, cell.release,
-            lambda: cell.set({"cell/on": True}),
-            lambda: cell.inject("cell/on"),
-            lambda: cell.declare([{"name": "x", "target": "cell/on", "operation": "set", "value": 1}]),
-            lambda: cell.lift("cell", 1),
-        ]  # fmt: skip
-        for call in calls:
+        for call in calls_of(cell):
             with pytest.raises(NotRunningError, match="has stopped"):
                 call()
+
+
+@pytest.mark.parametrize("stepped", [False, True])
+def test_every_method_reports_a_closed_attachment(instance: str, writer: BlockWriter, stepped: bool) -> None:
+    """The object that moves time exists only if the program has moved time before."""
+    cell = shmio.attach(instance, writable=True)
+    if stepped:
+        cell.pause()
+    cell.close()
+    for call in calls_of(cell):
+        with pytest.raises(SegmentError, match="detached"):
+            call()
 
 
 def test_a_program_reads_only_the_layouts_that_it_needs(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
