@@ -341,6 +341,7 @@ _NEEDED: Final[Mapping[str, str]] = {
     "AioServer": "_make_request_call_future _request_call add_registered_method_handlers is_running shutdown",
     "_ServicerContext": "abort",
     "_RequestCallError": "",
+    "asyncio": "wait",
     "get_working_loop": "",
 }
 _NO_CALL: Final = "there is no such call; reflection lists the services"
@@ -362,7 +363,7 @@ def check_version() -> None:
     if missing:
         raise EndpointError(
             f"grpcio {grpc.__version__} does not have {', '.join(missing)}, without which unknown calls could stop the "
-            "endpoint; install another version (tested: 1.84.0 to 1.85.1)"
+            "endpoint; install another version (tested: 1.84.0 to 1.85.3)"
         )
 
 
@@ -378,7 +379,7 @@ class _CoreAsyncio:
 
     def wait(self, futures: Collection[asyncio.Future[Any]], **options: Any) -> Any:
         """Wait for requests of a core, or as ``asyncio.wait`` does."""
-        core = _requests.get(next(iter(futures)))
+        core = next((_requests.get(one) for one in futures), None)  # all are of the same core, or none is
         return asyncio.wait(futures, **options) if core is None else core.wait_for_calls()
 
 
@@ -393,17 +394,13 @@ class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]
         super().__init__(*arguments)
         self._asking: set[asyncio.Task[Any]] = set()  # asyncio itself holds tasks only weakly
         self._came: set[asyncio.Future[Any]] = set()
-        self._waiter: asyncio.Future[None] | None = None
+        self._coming = asyncio.Event()
         cygrpc.asyncio = _CoreAsyncio()
 
     async def wait_for_calls(self) -> tuple[set[asyncio.Future[Any]], set[asyncio.Future[Any]]]:
         """Wait until a call has come. Return the requests that are done, and an empty set."""
-        if not self._came:
-            self._waiter = asyncio.get_running_loop().create_future()
-            try:
-                await self._waiter
-            finally:
-                self._waiter = None
+        await self._coming.wait()
+        self._coming.clear()
         came, self._came = self._came, set()
         return came, set()
 
@@ -420,8 +417,7 @@ class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]
         else:
             request.set_result(done.result())
         self._came.add(request)
-        if self._waiter is not None and not self._waiter.done():
-            self._waiter.set_result(None)
+        self._coming.set()
 
     def start_workers(self) -> None:
         """Start the workers that refuse calls with unknown names."""
