@@ -319,8 +319,8 @@ class Fleet:
             if managed.life.state is State.STARTING:
                 self._evict(managed)
             late = managed.life.state is State.STARTING and now_ns >= (managed.life.due_ns or now_ns)
-            late = late or quiet_ns >= self._limits.hang_s * 1e9
-            waited_ns = managed.waited_ns() if late else 0
+            hangs = quiet_ns >= self._limits.hang_s * 1e9
+            waited_ns = managed.waited_ns() if late or hangs else 0
             event = policy.due(
                 managed.life,
                 now_ns,

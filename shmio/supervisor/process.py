@@ -161,10 +161,12 @@ class AdoptedProcess:
 
 
 def _waited_ns(pid: int) -> int:
+    """Return the sum for all threads: while a thread waits for another one's lock, only the other counts as waiting."""
     waited_ns = 0
-    for figures in Path("/proc").glob(f"{pid}/task/*/schedstat"):  # proc(5): a kernel may lack the file
-        with suppress(OSError, IndexError, ValueError):
-            waited_ns += int(figures.read_text().split()[1])
+    with suppress(OSError):  # the process has ended
+        for thread in Path(f"/proc/{pid}/task").iterdir():
+            with suppress(OSError, IndexError, ValueError):  # the thread has ended; or proc(5): a kernel lacks the file
+                waited_ns += int((thread / "schedstat").read_text().split()[1])
     return waited_ns
 
 
