@@ -12,6 +12,7 @@ from pathlib import Path
 
 from shmio.cli.common import (
     add_json,
+    add_verbs,
     at_least,
     complete,
     exit_on_signals,
@@ -51,7 +52,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog="Exit status: 0: all expectations passed; 1: one failed; 2: wrong usage or campaign; 3: inconclusive.",
     )
     parser.add_argument("--version", action="version", version=f"shmio {__version__}")
-    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    verbs = add_verbs(parser)
 
     def verb(name: str, text: str) -> argparse.ArgumentParser:
         return verbs.add_parser(name, help=text, description=text)

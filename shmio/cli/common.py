@@ -88,6 +88,22 @@ def load(command: str) -> Callable[[argparse.Namespace], int]:
     return execute
 
 
+class _VerbParser(argparse.ArgumentParser):
+    """The parser of a verb. It refuses words that it does not know, so that the error shows the verb's own usage."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse the words. No unknown words remain."""
+        found, rest = super().parse_known_args(args, namespace)
+        if rest:
+            self.error(f"unrecognized arguments: {' '.join(rest)}")
+        return found, rest
+
+
+def add_verbs(parser: argparse.ArgumentParser) -> argparse._SubParsersAction[argparse.ArgumentParser]:
+    """Return what adds verbs to a command."""
+    return parser.add_subparsers(dest="verb", required=True, metavar="VERB", parser_class=_VerbParser)
+
+
 def complete(parser: argparse.ArgumentParser) -> None:
     """If a shell asks for completions, print them and exit; otherwise do nothing."""
     if "_ARGCOMPLETE" in os.environ:

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from shmio.cli.common import add_json, at_least, complete, load, milliseconds, moment, run
+from shmio.cli.common import add_json, add_verbs, at_least, complete, load, milliseconds, moment, run
 from shmio.control import ANSWERS
 from shmio.version import __version__
 
@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog=PROGRAM, description="Start, watch and stop an instance.")
     parser.add_argument("--version", action="version", version=f"shmio {__version__}")
-    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    verbs = add_verbs(parser)
 
     file = argparse.ArgumentParser(add_help=False)
     file.add_argument("-c", dest="config", type=Path, metavar="FILE", help="configuration (default: supervisor.toml)")

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from shmio.cli import completion, inject, read, replay, snapshot, step
 from shmio.cli import set as set_verb
-from shmio.cli.common import add_json, complete, ended_by_interrupt, run
+from shmio.cli.common import add_json, add_verbs, complete, ended_by_interrupt, run
 from shmio.config.address import UNIX, Address
 from shmio.errors import ConfigError, UnknownClientError
 from shmio.layout.spelling import may_be_tia_spelling, topic_path
@@ -167,7 +167,7 @@ def _parser() -> argparse.ArgumentParser:
     common.add_argument(
         "--token-in-plain-text", action="store_true", help="send the token to another host even without TLS"
     )
-    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    verbs = add_verbs(parser)
     for name, verb in VERBS.items():
         sub = verbs.add_parser(name, parents=[common], help=verb.help, description=verb.help)
         verb.arguments(sub)

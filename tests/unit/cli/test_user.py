@@ -102,6 +102,16 @@ def test_step_size_and_rate_have_limits(
     assert problem in capsys.readouterr().err
 
 
+def test_an_unknown_word_shows_the_usage_of_the_verb(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["step", "200"])
+    assert stop.value.code == 2
+    said = capsys.readouterr().err
+    assert "usage: shmio step " in said
+    assert "--count N" in said
+    assert "unrecognized arguments: 200" in said
+
+
 class Keyboard(io.StringIO):
     """A stand-in for standard input from a terminal."""
 
