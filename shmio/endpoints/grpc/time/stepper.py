@@ -365,14 +365,10 @@ class Stepper:
 
     async def _make(self, dt_ns: int | None) -> Step:
         """Make a step and deliver it."""
-        async with self._lock:
-            try:
-                await self._begin_move()
-                step = await self._driver.step(dt_ns)
-                await self.timeline.deliver(step)
-                return step
-            finally:
-                self._end_move()
+        async with self._moved():
+            step = await self._driver.step(dt_ns)
+            await self.timeline.deliver(step)
+            return step
 
     async def _change(self, call: Callable[[], None], *, end: bool = False) -> None:
         """Take control of time, and call a method of the coordinator that changes how time moves."""
@@ -384,25 +380,19 @@ class Stepper:
     async def _moved(self) -> AsyncIterator[None]:
         """Take control of time. Until the block ends, no other client of this endpoint can move time."""
         async with self._lock:
+            self._moving, self.timeline.steered = asyncio.current_task(), True
             try:
-                await self._begin_move()
+                if self._segment.outdated:
+                    await asyncio.to_thread(self._segment.refresh)
+                if not self._owns:
+                    self._coordinator.take_over()
+                    self._own(True)
+                    self.timeline.update()
                 yield
             finally:
-                self._end_move()
-
-    async def _begin_move(self) -> None:
-        self._moving, self.timeline.steered = asyncio.current_task(), True
-        if self._segment.outdated:
-            await asyncio.to_thread(self._segment.refresh)
-        if not self._owns:
-            self._coordinator.take_over()
-            self._own(True)
-            self.timeline.update()
-
-    def _end_move(self) -> None:
-        self._moving, self.timeline.steered = None, False
-        self.timeline.update()
-        self._set_rest()
+                self._moving, self.timeline.steered = None, False
+                self.timeline.update()
+                self._set_rest()
 
     def _own(self, owns: bool) -> None:
         self._owns = owns
