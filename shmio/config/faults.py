@@ -10,28 +10,13 @@ from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from tomllib import TOMLDecodeError
-from typing import Any, Final, get_args
+from types import UnionType
+from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 
-from msgspec import ValidationError
-from msgspec.inspect import DictType, ListType, LiteralType, Metadata, StructType, UnionType, type_info
+from msgspec import Struct, ValidationError
+from msgspec.structs import fields
 
-from shmio.config.model import (
-    NAME_PATTERN,
-    NAME_RULE,
-    AlongName,
-    BrokerName,
-    ClockName,
-    DistributionName,
-    FormName,
-    JointTypeName,
-    OperationName,
-    PayloadName,
-    ProcessState,
-    QualityName,
-    ReplayedInjections,
-    Severity,
-    UnitName,
-)
+from shmio.config.model import NAME_PATTERN, NAME_RULE
 from shmio.config.tokens import TOKEN
 from shmio.errors import ConfigError, LayoutError
 from shmio.wording import unknown
@@ -58,22 +43,6 @@ _IN_TOML: Final = re.compile(r"\(at line (\d{1,9}), column \d+\)")
 _NUMBERED: Final = re.compile(r"(\d{1,9}): ")
 _BARE: Final = re.compile(r"[^\s,=#\[\]{}\"']+")
 _TEXT: Final = re.compile(r"[^\W\d].*|.*[:/].*|\d+(?:\.\d+){2,}")  # a name, a path or an address
-_WORDS: Final = {
-    "along": AlongName,
-    "broker": BrokerName,
-    "clock": ClockName,
-    "distribution": DistributionName,
-    "form": FormName,
-    "injections": ReplayedInjections,
-    "operation": OperationName,
-    "payload": PayloadName,
-    "quality": QualityName,
-    "severity": Severity,
-    "state": ProcessState,
-    "type": JointTypeName,
-    "unit": UnitName,
-}
-"""The keys whose value must be one of a few words, with the type that lists these words."""
 _TYPES: Final = {
     "int": "a whole number",
     "float": "a number",
@@ -196,13 +165,13 @@ def _bare(token: str) -> str:
     return token
 
 
-def explain(error: ValidationError, key: str = "", kind: Any = None) -> str:
+def explain(error: ValidationError, key: str, kind: Any) -> str:
     """Return msgspec's error as ``key: what is wrong``.
 
     Args:
         error: The error.
-        key: The key of the converted value.
-        kind: The type to which it was converted, if it is not one of shmio's configuration.
+        key: The key of the converted value; empty for a whole file or table.
+        kind: The type to which it was converted.
 
     """
     text, _, at = str(error).partition(" - at `$")
@@ -214,8 +183,7 @@ def explain(error: ValidationError, key: str = "", kind: Any = None) -> str:
         text = f"expected a name: {NAME_RULE}"
     elif word := re.fullmatch(r"Invalid enum value '(.*)'", text):
         name = path.rpartition(".")[2].partition("[")[0]
-        words = get_args(_WORDS[name]) if kind is None else tuple(_words(type_info(kind), at.rstrip("`")))
-        text = unknown(name, word[1], words)
+        text = unknown(name, word[1], _words(kind, at.rstrip("`")))
     elif field := re.search(r"unknown field `([^`]*)`", text):
         text = f"unknown key {field[1]!r}"
     elif text.endswith("of length >= 1"):
@@ -227,21 +195,21 @@ def explain(error: ValidationError, key: str = "", kind: Any = None) -> str:
 
 def _words(kind: Any, at: str) -> Iterator[str]:
     """Yield the words that a type allows at a place in its values, such as ``.name[...]``."""
-    match kind:
-        case LiteralType(values=values):
-            yield from map(str, values)
-        case UnionType(types=kinds):
-            for one in kinds:
-                yield from _words(one, at)
-        case Metadata(type=inner):
-            yield from _words(inner, at)
-        case DictType(value_type=inner) | ListType(item_type=inner) if at.startswith("["):
-            yield from _words(inner, at.partition("]")[2])
-        case StructType(fields=fields) if at.startswith("."):
-            name = re.split(r"[.[]", at[1:])[0]
-            for field in fields:
-                if field.encode_name == name:
-                    yield from _words(field.type, at[1 + len(name) :])
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is Literal and not at:
+        yield from map(str, parts)
+    elif origin in (Union, UnionType):
+        for one in parts:
+            yield from _words(one, at)
+    elif origin is Annotated:
+        yield from _words(parts[0], at)
+    elif origin in (list, dict) and at.startswith("["):
+        yield from _words(parts[-1], at.partition("]")[2])
+    elif isinstance(kind, type) and issubclass(kind, Struct) and at.startswith("."):
+        name = re.split(r"[.[]", at[1:])[0]
+        for field in fields(kind):
+            if field.encode_name == name:
+                yield from _words(field.type, at[1 + len(name) :])
 
 
 def _types(match: re.Match[str]) -> str:

@@ -388,7 +388,7 @@ class Structure:
         try:
             msgspec.convert(value, kind)
         except msgspec.ValidationError as error:
-            self._faults.add(explain(error, key))
+            self._faults.add(explain(error, key, kind))
             return False
         return True
 
@@ -473,7 +473,7 @@ def convert(tables: dict[str, Any], kind: type[_Table]) -> _Table:
         path = at.rstrip("`").lstrip(".")
         unknown = re.search(r"unknown field `([^`]*)`", text)
         if unknown is None:
-            raise ConfigError(explain(error)) from None
+            raise ConfigError(explain(error, "", kind)) from None
         table = re.sub(r"\[[^]]*\]", "", path)
         known = kind if not table else _TABLES.get(table)
         raise ConfigError(

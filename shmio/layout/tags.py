@@ -172,7 +172,7 @@ def _read(file: str, data: bytes, report: Report, kind: type[_Read]) -> _Read | 
     try:
         return msgspec.convert(tomllib.loads(text), kind)
     except msgspec.ValidationError as error:
-        report.add(Diagnostic(file, 1, 1, f"the file is not a tag table: {explain(error)}"))
+        report.add(Diagnostic(file, 1, 1, f"the file is not a tag table: {explain(error, '', kind)}"))
     except (ValueError, RecursionError) as error:
         report.add(_syntax_error(file, text, error))
     return None
@@ -362,7 +362,7 @@ def _tag(key: str, given: object) -> _Tag:
             raise ValueError(
                 "initial: expected one flat list, in which the last index runs fastest, found nested lists"
             ) from None
-        raise ValueError(explain(error)) from None
+        raise ValueError(explain(error, "", _Tag)) from None
 
 
 def _is_nested(initial: object) -> bool:

@@ -62,4 +62,4 @@ def test_msgspec_words_its_errors_as_explain_expects(value: Any, words: str, wan
     assert str(caught.value) == words, (
         "this msgspec words its errors differently: adapt shmio/config/faults.py, then the cap in pyproject.toml"
     )
-    assert explain(caught.value) == wanted
+    assert explain(caught.value, "", Sample) == wanted

@@ -97,7 +97,7 @@ def test_each_connector_to_a_device_keeps_its_connection_in_a_reload(name: str) 
     ("name", "keys", "words"),
     [
         ("opcua", {"url": "opc.tcp://plc", "mode": "pol"}, "mode: unknown mode 'pol'; did you mean 'poll'"),
-        ("mqtt", {"url": "mqtt://broker", "version": "7"}, "version: unknown version '7'; valid: 3.1.1"),
+        ("mqtt", {"url": "mqtt://broker", "version": "7"}, "version: unknown version '7'; valid: auto, 5, 3.1.1"),
         ("ros2", {"qos": {"reliability": "firm"}}, "qos.reliability: .*best_effort"),
     ],
 )
