@@ -64,7 +64,7 @@ MODULES: Final[Mapping[str, str]] = {
 """The module that each kind of process runs."""
 
 EMULATED: Final = ("layouts", "options")
-"""The keys that say what an emulator serves. The emulator can change this while clients are connected."""
+"""The keys that say what an emulator serves. The emulator can change what it serves while clients are connected."""
 
 RULES: Final[Mapping[str, tuple[str, ...]]] = {"grpc": ("token", "client")}
 """By kind of process, the keys of its section that the process can read again while it runs."""
@@ -97,7 +97,7 @@ class Job:
     audit: AuditSettings | None = None
     """The audit log, to which the process writes who did what; None if there is none."""
     connection: dict[str, Any] | None = None
-    """Return the part of a section that says how a source connects to its device, or how an emulator listens.
+    """The part of a section that says how a source connects to its device, or how an emulator listens.
 
     While this part stays the same, the process can follow other changes without a new connection.
     None if the process must be restarted for each change.
