@@ -40,6 +40,10 @@ def check_listening(config: Config) -> None:
         listening.append(("mqtt.listen", config.mqtt.listen))
     if config.opcua:
         listening.append(("opcua.listen", config.opcua.listen))
+    if config.web:
+        listening.append(("web.listen", config.web.listen))
+    if config.metrics:
+        listening.append(("metrics.listen", config.metrics.listen))
     seen: list[tuple[str, str, int, set[str]]] = []
     sockets: dict[UnixAddress, str] = {}
     for key, text in listening:

@@ -594,6 +594,8 @@ TAKEN = "is already the port of emulator[0].listen (127.0.0.1:1102); choose anot
         ('kind = "s7"', 'kind = "s8"', "emulator[0].kind: unknown kind 's8'; valid: s7"),
         ('program = "a50"', 'program = "a51"', "emulator[0].program: unknown program 'a51'; did you mean 'a50'?"),
         ('"127.0.0.1:8090"', '"127.0.0.1:1102"', f"grpc.listen[1]: 127.0.0.1:1102 {TAKEN}"),
+        ("[recorder]", '[web]\nlisten = "127.0.0.1:1102"\n[recorder]', f"web.listen: 127.0.0.1:1102 {TAKEN}"),
+        ("[recorder]", '[metrics]\nlisten = "127.0.0.1:1102"\n[recorder]', f"metrics.listen: 127.0.0.1:1102 {TAKEN}"),
         ('"127.0.0.1:8090"', '"localhost:1102"', f"grpc.listen[1]: localhost:1102 {TAKEN}"),
         ('"127.0.0.1:8090"]', '"0.0.0.0:1102"]\ninsecure = true', f"grpc.listen[1]: 0.0.0.0:1102 {TAKEN}"),
         ('"127.0.0.1:8090"]', '"[::]:1102"]\ninsecure = true', f"grpc.listen[1]: [::]:1102 {TAKEN}"),
