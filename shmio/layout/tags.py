@@ -61,7 +61,7 @@ from shmio.layout.source.lexer import MAX_SOURCE_BYTES
 from shmio.layout.topic import MAX_TOPIC, canonical_path, shorten
 from shmio.layout.values.literal import parse_literal, split_array
 from shmio.logs import printable
-from shmio.wording import larger_than, near, unknown
+from shmio.wording import did_you_mean, larger_than, near, unknown
 
 SUFFIXES: Final = (".toml", *tag_sheets.SUFFIXES)
 _MAX_ALIGN: Final = 8
@@ -74,6 +74,8 @@ _ARRAY = re.compile(r"ARRAY\s*\[([^\]]*)\]\s*OF\s+(\S+)", re.IGNORECASE)
 _BOUNDS = re.compile(r"\s*(-?[0-9]{1,9})\s*\.\.\s*(-?[0-9]{1,9})\s*")
 _PATH = re.compile(r"[/.%]")
 _TEXTS: Final = frozenset({"STRING", "WSTRING", "CHAR", "WCHAR"})
+_COMMON: Final = (*NUMBERS, *_TEXTS, "BOOL", "TIME", "LTIME", "DATE", *CONTENTS)
+"""The types that a misspelled one may stand for."""
 _Scalar = bool | int | float | str
 _Read = TypeVar("_Read")
 
@@ -398,11 +400,20 @@ def parse_type(text: str) -> tuple[ElementType, Dims]:
             'block\'s source: layout = "cell.db" and tags = "names.toml"'
         )
     if element is None:
-        raise ValueError(
-            f"unknown type {text!r}; valid: BOOL, INT, DINT, REAL, LREAL, STRING[20] and similar, and the "
-            f"structures {', '.join(CONTENTS)}"
+        remedy = did_you_mean(_meant(text)) or (
+            f"valid: BOOL, INT, DINT, REAL, LREAL, STRING[20] and similar, and the structures {', '.join(CONTENTS)}"
         )
+        raise ValueError(f"unknown type {text!r}; {remedy}")
     return element, tuple(dims)
+
+
+def _meant(text: str) -> list[str]:
+    """Return the type that a misspelled one resembles, if any.
+
+    For a name with a size, such as INT32, there is none: INT is similar, but has another size.
+    """
+    name = text.strip().partition("[")[0]
+    return near(name, _COMMON) if name.isalpha() and element_type(name) is None else []
 
 
 def _align(element: ElementType) -> int:
