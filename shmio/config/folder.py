@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Final
 
 _PROBE: Final = bytes(4096)  # an empty file fits even on a full disk
-_FULL: Final = (errno.ENOSPC, errno.EDQUOT)
+FULL: Final = (errno.ENOSPC, errno.EDQUOT)
+"""The errors of a full disk."""
 _NO_UNNAMED: Final = (errno.EOPNOTSUPP, errno.EISDIR)
 _MEANING: Final = {
     errno.ENOENT: "its file system accepts no files; choose another folder",
@@ -52,7 +53,7 @@ def unwritable(folder: Path) -> Obstacle | None:
         _write(place)
     except OSError as error:
         what = f"{folder} cannot be written" if place == folder else f"{folder} cannot be created in {place}"
-        return Obstacle(f"{what}: {_MEANING.get(error.errno or 0, error.strerror)}", error.errno in _FULL)
+        return Obstacle(f"{what}: {_MEANING.get(error.errno or 0, error.strerror)}", error.errno in FULL)
     return None
 
 

@@ -12,6 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
+from shmio.config.folder import FULL
 from shmio.errors import RecordingError
 
 RETRY_S: Final = 0.5
@@ -226,7 +227,8 @@ class Output:
             while at < len(piece):
                 at += os.pwrite(self._fd, view[at:], self.written + at)
         except OSError as error:
-            self.error = error.strerror or str(error)
+            remedy = "; make room, and the recorder continues" if error.errno in FULL else ""
+            self.error = f"{error.strerror or error}{remedy}"
             with suppress(OSError):
                 os.ftruncate(self._fd, self.written)
             return False

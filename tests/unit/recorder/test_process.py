@@ -411,7 +411,8 @@ def test_a_full_disk_is_reported_until_there_is_room(segment: Segment, tmp_path:
             return process.counts("missed") > 0
 
         until(costs, "lost frames")
-        until(lambda: "No space left on device" in process.slot.report.note, "the reason in the status")
+        full = "No space left on device; make room, and the recorder continues"
+        until(lambda: full in process.slot.report.note, "the reason in the status")
         ballast.unlink()
         until(lambda: ready(process), "a status without a problem")
         process.stop()
