@@ -45,6 +45,10 @@ BROWSED = {
 """The connectors that can browse a device, by the form of the device's URL."""
 
 
+_SEPARATE = {"mtconnect": "is a separate package; in a clone of shmio, run pip install ./examples/mtconnect"}
+"""Where to find the connectors that users of shmio need to install."""
+
+
 def names() -> list[str]:
     """Return all valid values of ``connector = "…"``, sorted."""
     return sorted({*BUILT_IN, *(point.name for point in _offered())})
@@ -93,7 +97,8 @@ def load(name: str) -> type[Connector] | type[Computed] | type[Replayed]:
     else:
         points = [point for point in _offered() if point.name == name]
         if not points:
-            raise ConfigError(unknown("connector", name, names()))
+            remedy = _SEPARATE.get(name)
+            raise ConfigError(f"connector {name!r} {remedy}" if remedy else unknown("connector", name, names()))
         if len(points) > 1:
             raise ConfigError(clash(name) or f"the package {_package(points[0])} offers the connector {name!r} twice")
         try:

@@ -10,7 +10,16 @@ from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeoutError
 from typing import Any
 
+from shmio.errors import ConnectorError
+
 Place = tuple[socket.AddressFamily, socket.SocketKind, int, str, Any]
+
+
+def refused(peer: object) -> ConnectorError:
+    """Return the error for a device that refuses connections, with the remedy."""
+    return ConnectorError(
+        f"connection refused by {peer}: no program listens there; check the address, and that the device runs"
+    )
 
 
 def look_up(host: str, port: int, timeout_s: float) -> Sequence[Place]:

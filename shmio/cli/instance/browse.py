@@ -72,7 +72,7 @@ def _name(url: str) -> str:
         return scheme
     raise ConfigError(
         f"{url}: shmio cannot browse a device with this kind of URL; valid: {', '.join(registry.BROWSED)}; "
-        "for a connector of another package, add --connector NAME"
+        "for a connector of another package, add --connector NAME, such as --connector mtconnect for http://HOST:PORT"
     )
 
 

@@ -219,7 +219,7 @@ class ModbusClient:
         if isinstance(error, TimeoutError):
             return ConnectorError(f"no answer within {self._timeout_ms} ms from {self.peer}")
         if isinstance(error, ConnectionRefusedError):
-            return ConnectorError(f"connection refused by {self.peer}")
+            return tcp.refused(self.peer)
         if isinstance(error, socket.gaierror):
             return ConnectorError(f"host name {self._host!r} cannot be resolved: {error.strerror}")
         if isinstance(error, ConnectionError):

@@ -270,6 +270,8 @@ class Link:
             opened = tcp.connect(places, max(0.001, self._soon(until_s) - time.monotonic()))
         except TimeoutError:
             raise ConnectorError(f"no answer within {self._options.timeout} ms from {peer}") from None
+        except ConnectionRefusedError:
+            raise tcp.refused(peer) from None
         except OSError as error:
             raise ConnectorError(f"cannot connect to {peer}: {error.strerror or error}") from None
         if self._context is None:

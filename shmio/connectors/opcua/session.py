@@ -27,6 +27,7 @@ from asyncua.common.utils import Buffer
 from asyncua.crypto import security_policies
 from asyncua.ua import ua_binary
 
+from shmio.connectors import tcp
 from shmio.connectors.opcua import decode
 from shmio.connectors.opcua.data_types import DataTypes, Structures
 from shmio.connectors.opcua.decode import FaultError, MalformedError, Publication, Sample
@@ -343,7 +344,7 @@ class Session:
         if isinstance(error, TimeoutError):
             return ConnectorError(f"no answer within {options.timeout} ms from {peer}")
         if isinstance(error, ConnectionRefusedError):
-            return ConnectorError(f"connection refused by {peer}")
+            return tcp.refused(peer)
         if isinstance(error, ua.UaStatusCodeError):
             return ConnectorError(_explained_code(error.code, options))
         if isinstance(error, OSError):

@@ -99,6 +99,8 @@ class Link:
             channel = tcp.connect(tcp.look_up(peer.host, peer.port, timeout_s), timeout_s)
         except TimeoutError:
             raise ConnectorError(f"no answer within {timeout_s * 1000:.0f} ms from {peer}") from None
+        except ConnectionRefusedError:
+            raise tcp.refused(peer) from None
         except OSError as error:
             raise ConnectorError(f"cannot connect to {peer}: {error.strerror or error}") from None
         try:

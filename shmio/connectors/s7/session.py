@@ -18,6 +18,7 @@ from typing import Annotated, Literal, Protocol
 
 import msgspec
 
+from shmio.connectors import tcp
 from shmio.connectors.base import Lost, WriteLostError
 from shmio.connectors.s7 import pdu
 from shmio.connectors.s7.blocks import BlockWrite, ends
@@ -505,7 +506,7 @@ def _named(error: BaseException, options: S7Options, *, opening: bool = False) -
     if isinstance(error, TimeoutError):
         return ConnectorError(f"no answer within {options.timeout} ms from {peer}")
     if isinstance(error, ConnectionRefusedError):
-        return ConnectorError(f"connection refused by {peer}")
+        return tcp.refused(peer)
     if isinstance(error, (EOFError, ConnectionError)):
         text = f"{peer} closed the connection"
         if opening:

@@ -76,6 +76,14 @@ def test_a_package_with_the_name_of_a_built_in_connector(offer: Offer, check: Ch
     assert check("memory", "") == "", "other connectors are not concerned"
 
 
+def test_a_connector_that_needs_a_package_of_its_own(check: Check) -> None:
+    errors = check("mtconnect", "")
+    assert "source[0].connector: connector 'mtconnect' is a separate package" in errors
+    assert "pip install ./examples/mtconnect" in errors
+    with pytest.raises(ConfigError, match=r"pip install \./examples/mtconnect"):
+        registry.load("mtconnect")
+
+
 def test_two_packages_with_the_same_connector(offer: Offer, check: Check) -> None:
     offer("beta", "fieldbus")
     offer("alpha", "fieldbus")

@@ -154,6 +154,7 @@ def test_long_names_take_no_more_memory_than_allowed(
     ("arguments", "words"),
     [
         (["http://localhost"], "cannot browse a device with this kind of URL; valid: opc.tcp://HOST:PORT"),
+        (["http://localhost"], "such as --connector mtconnect for http://HOST:PORT"),
         (["opc.tcp://user@localhost"], "without a user"),
         (
             ["opc.tcp://127.0.0.1:1", "--set", "timeuot=3"],
@@ -164,7 +165,9 @@ def test_long_names_take_no_more_memory_than_allowed(
         (["opc.tcp://127.0.0.1:1", "--set", "security=Sign"], "certificate: this key is needed"),
         (["opc.tcp://127.0.0.1:1", "a//b"], "the pattern has an empty segment"),
         (["opc.tcp://127.0.0.1:1", "-o", "tags.csv"], "choose a name that ends in .toml"),
-        (["opc.tcp://127.0.0.1:1"], "connection refused by 127.0.0.1:1"),
+        (["opc.tcp://127.0.0.1:1"], "connection refused by 127.0.0.1:1: no program listens there; check the address"),
+        (["ws://127.0.0.1:1"], "connection refused by 127.0.0.1:1: no program listens there; check the address"),
+        (["mqtt://127.0.0.1:1"], "connection refused by 127.0.0.1:1: no program listens there; check the address"),
     ],
 )
 def test_faults_are_named(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
