@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterable, Sequence
 from typing import Final
 
@@ -67,6 +68,18 @@ NOT_TOML: Final = "a tag table is TOML; choose a name that ends in .toml"
 EMPTY: Final = "the recording is empty"
 PLAIN_REMEDY: Final = "give certificate and key, or write insecure = true in the same section"
 """The remedy against plain text in the sections that have a certificate of their own."""
+
+
+_NOT_LISTENING: Final = {
+    errno.EADDRINUSE: "; another program, which ss -ltnp shows, has this port: end it, or choose another port",
+    errno.EADDRNOTAVAIL: "; choose an address of this host, which ip address shows",
+    errno.EACCES: "; choose a port from 1024 on, or allow this program the lower ones (CAP_NET_BIND_SERVICE)",
+}
+
+
+def cannot_listen(address: object, error: OSError) -> str:
+    """Return the message about an address at which this process cannot listen, with the remedy."""
+    return f"cannot listen on {address}: {error.strerror or error}{_NOT_LISTENING.get(error.errno or 0, '')}"
 
 
 def larger_than(most_bytes: int) -> str:

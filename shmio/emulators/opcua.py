@@ -20,6 +20,7 @@ from shmio.layout.image import initial_frame
 from shmio.layout.model import NUMBERS, Register
 from shmio.layout.values import calendar
 from shmio.layout.values.codec import codec, flatten, nest
+from shmio.wording import cannot_listen
 
 if TYPE_CHECKING:
     from asyncua import Server, ua
@@ -179,7 +180,7 @@ class OpcUaEmulator:
             await server.start()
         except OSError as error:
             await server.stop()
-            raise EndpointError(f"cannot listen on {self.address}: {error.strerror}") from None
+            raise EndpointError(cannot_listen(self.address, error)) from None
         self._server = server
 
     async def _replace(self, tables: Sequence[Sequence[_Variable]], frames: Sequence[bytearray]) -> None:

@@ -24,6 +24,7 @@ from typing import Self
 from shmio.config.address import Address
 from shmio.emulators.ports import reserved_port
 from shmio.errors import EndpointError
+from shmio.wording import cannot_listen
 
 Edit = Callable[[bytes], bytes | None]
 Framing = Callable[[bytes | bytearray], int]
@@ -240,7 +241,7 @@ class FaultProxy:
             self._listener: socket.socket | None = _listener(self.address)
         except OSError as error:
             self._cleanup.close()
-            raise EndpointError(f"cannot listen on {listen}: {error.strerror}") from None
+            raise EndpointError(cannot_listen(listen, error)) from None
         self._running = True
         self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._wake_out, self._wake_in = socket.socketpair()

@@ -17,7 +17,6 @@ the operating mode, cuts answers that do not fit a PDU into parts, and replaces:
 from __future__ import annotations
 
 import contextlib
-import errno
 import logging
 import socket
 import struct
@@ -35,6 +34,7 @@ from snap7.type import SrvArea
 
 from shmio.config.address import Address
 from shmio.errors import ConfigError, EndpointError, ShmioError
+from shmio.wording import cannot_listen
 
 MAX_JOBS = 32
 MAX_PDU_SIZE = 960
@@ -450,15 +450,14 @@ class S7Server(Server):
             )[0]
             listener = socket.socket(family, kind, protocol)
         except OSError as error:
-            raise EndpointError(f"cannot listen on {wanted}: {error.strerror}") from None
+            raise EndpointError(cannot_listen(wanted, error)) from None
         try:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind(place)
             listener.listen()  # the largest backlog, so that excess clients are refused at once
         except OSError as error:
             listener.close()
-            taken = ": another program, maybe a running instance, has it" if error.errno == errno.EADDRINUSE else ""
-            raise EndpointError(f"cannot listen on {wanted}: {error.strerror}{taken}") from None
+            raise EndpointError(cannot_listen(wanted, error)) from None
         self.server_socket = listener
         self.running = True
         self.state = ServerState.RUNNING

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import re
+
 import pytest
 
-from shmio.wording import MAX_HINTED, did_you_mean, listed, name_one, unknown
+from shmio.wording import MAX_HINTED, cannot_listen, did_you_mean, listed, name_one, unknown
 
 
 @pytest.mark.parametrize(
@@ -35,3 +39,18 @@ def test_a_long_list_is_cut() -> None:
 def test_a_name_is_asked_for_only_where_there_is_something_to_name() -> None:
     assert name_one("source", ["cell", "press"]) == "there are several sources; name one of them: cell, press"
     assert name_one("source", []) == "there is no source"
+
+
+@pytest.mark.parametrize(
+    ("number", "remedy"),
+    [
+        (errno.EADDRINUSE, r"in use; another program, which ss -ltnp shows, has this port: end it, or choose another"),
+        (errno.EADDRNOTAVAIL, r"; choose an address of this host, which ip address shows$"),
+        (errno.EACCES, r"; choose a port from 1024 on, or allow .*CAP_NET_BIND_SERVICE"),
+        (errno.ENOMEM, r"Cannot allocate memory$"),
+    ],
+)
+def test_an_address_that_cannot_be_used_comes_with_the_remedy(number: int, remedy: str) -> None:
+    told = cannot_listen("127.0.0.1:80", OSError(number, os.strerror(number)))
+    assert told.startswith(f"cannot listen on 127.0.0.1:80: {os.strerror(number)}")
+    assert re.search(remedy, told)

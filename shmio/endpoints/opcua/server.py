@@ -36,6 +36,7 @@ from shmio.endpoints.opcua.space import Space
 from shmio.endpoints.opcua.subscriptions import Subscriptions
 from shmio.errors import EndpointError
 from shmio.version import __version__
+from shmio.wording import cannot_listen
 
 _ENCRYPTING: Final = (
     ua.SecurityPolicyType.Aes256Sha256RsaPss_SignAndEncrypt,
@@ -227,7 +228,7 @@ class Server(Library):
             await listener.start()
         except OSError as error:
             await self.iserver.stop()
-            raise EndpointError(f"cannot listen on {self.address}: {error.strerror}") from None
+            raise EndpointError(cannot_listen(self.address, error)) from None
         self.bserver = listener
 
     @property

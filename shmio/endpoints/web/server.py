@@ -18,6 +18,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from shmio.config import Address
 from shmio.errors import EndpointError
+from shmio.wording import cannot_listen
 
 MAX_CONNECTIONS: Final = 512
 """Maximum number of connections. If there are more, the server closes the one longest without a request."""
@@ -278,7 +279,7 @@ class HttpServer:
             listening.listen(BACKLOG)
         except OSError as error:
             listening.close()
-            raise EndpointError(f"cannot listen on {self.address}: {error.strerror}") from None
+            raise EndpointError(cannot_listen(self.address, error)) from None
         self.port: int = listening.getsockname()[1]
         self._serving = asyncio.get_running_loop().create_task(self._server.serve([listening]))
         ready = asyncio.get_running_loop().create_task(self._server.ready.wait())

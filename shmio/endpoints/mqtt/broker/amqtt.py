@@ -19,6 +19,7 @@ from amqtt.broker import Broker
 from shmio.config import Address, Mqtt
 from shmio.endpoints.mqtt.broker.directory import SOCKET, new_secret
 from shmio.errors import EndpointError
+from shmio.wording import cannot_listen
 from shmio.worker import BEAT_S, Worker
 
 GREETING_S: Final = 10.0
@@ -56,7 +57,7 @@ async def serve(worker: Worker, settings: Mqtt, place: Path) -> None:
         try:
             servers.append(await asyncio.start_server(take, address.host, address.port))
         except OSError as error:
-            raise EndpointError(f"cannot listen on {address}: {error.strerror}") from None
+            raise EndpointError(cannot_listen(address, error)) from None
         worker.running()
         stopping = asyncio.Event()
         loop = asyncio.get_running_loop()
