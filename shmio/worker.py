@@ -183,6 +183,44 @@ class Worker:
             self._on_stop()
 
 
+class Reload:
+    """A reload, from the moment at which this process has read its new configuration.
+
+    Create it before you stop any work, so that it notices if the supervisor ends meanwhile.
+    """
+
+    def __init__(self, worker: Worker, woken: threading.Event) -> None:
+        """Begin to wait for the supervisor.
+
+        Args:
+            worker: This process.
+            woken: An event that is set at each SIGHUP, and perhaps at a stop.
+
+        """
+        self._worker, self._woken = worker, woken
+        self._digest, self._supervisor = worker.slot.digest, worker.segment.supervisor[0]
+
+    def permitted(self, begun: Callable[[], bool] = lambda: False) -> bool:
+        """Wait until the supervisor permits the change, or until ``begun`` says that it has begun to change things.
+
+        Returns:
+            False if the supervisor has ended before, or if this process must stop. Then change nothing.
+
+        """
+        worker = self._worker
+        worker.report(activity=Activity.PAUSED)
+        while worker.slot.digest == self._digest and not begun():
+            if worker.stopping.is_set():
+                return False
+            if not worker.segment.supervised or worker.segment.supervisor[0] != self._supervisor:
+                worker.log.warning("the supervisor ended during a reload; the %s continues as before", worker.kind)
+                return False
+            self._woken.wait(BEAT_S)
+            self._woken.clear()
+            worker.report()
+        return not worker.stopping.is_set()
+
+
 def main(run: Callable[[Worker], None]) -> int:
     """Run a worker until it ends, and return the exit status of the process."""
     worker = None

@@ -19,8 +19,8 @@ from shmio.connectors.models.stepped import PageClock, SteppedLoop, connected_in
 from shmio.connectors.poll_loop import Schedule, SourceLoop, WallClock
 from shmio.errors import ConfigError, ConnectorError
 from shmio.local.state_requests import StateRequests
-from shmio.segment import Activity, Segment
-from shmio.worker import BEAT_S, Worker
+from shmio.segment import Segment
+from shmio.worker import BEAT_S, Reload, Worker
 
 if TYPE_CHECKING:
     from shmio.connectors.replay.loop import ReplayLoop
@@ -140,26 +140,19 @@ def _replaced(
         ConnectorError: The loop does not end.
 
     """
-    block, digest, supervisor = worker.segment.blocks[worker.name], worker.slot.digest, worker.segment.supervisor[0]
+    block, reload = worker.segment.blocks[worker.name], Reload(worker, woken)
     loop.keep()
     if not running.stop(worker.report):
         raise ConnectorError("the device did not answer in time for the reload; the process starts again")
-    worker.report(counters=running.counters(rate), note=loop.unkept, activity=Activity.PAUSED)
-    while not (block.retired or worker.slot.digest != digest):
-        if worker.stopping.is_set():
-            break
-        if not worker.segment.supervised or worker.segment.supervisor[0] != supervisor:
-            worker.log.warning("the supervisor ended during a reload; the source continues as before")
-            return _loop_of(worker, loop)
-        woken.wait(BEAT_S)
-        woken.clear()
-        worker.report()
+    worker.report(counters=running.counters(rate), note=loop.unkept)
+    permitted = reload.permitted(lambda: block.retired)
     if worker.stopping.is_set():
         if loop.kept is not None:
             loop.kept.close()
         return None
-    worker.config = config
-    worker.segment.refresh()
+    if permitted:
+        worker.config = config
+        worker.segment.refresh()
     return _loop_of(worker, loop)
 
 

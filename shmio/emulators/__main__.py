@@ -23,9 +23,8 @@ from shmio.errors import ShmioError
 from shmio.layout.document import load_layout
 from shmio.local.state_requests import StateRequests
 from shmio.logs import fields
-from shmio.segment import Activity
 from shmio.segment.doorbell import Relay
-from shmio.worker import BEAT_S, Worker
+from shmio.worker import BEAT_S, Reload, Worker
 
 if TYPE_CHECKING:
     from shmio.emulators.faults import FaultControl
@@ -77,24 +76,12 @@ def run(worker: Worker) -> None:
 
 
 def _change(worker: Worker, device: Device, config: dict[str, Any], woken: threading.Event) -> None:
-    """Wait until the supervisor permits it, and serve other layouts. Until then the device continues as before.
-
-    If the supervisor dies before that, nothing changes.
-    """
-    served, digest, supervisor = _served(config), worker.slot.digest, worker.segment.supervisor[0]
-    worker.report(activity=Activity.PAUSED)
-    while worker.slot.digest == digest and not worker.stopping.is_set():
-        if not worker.segment.supervised or worker.segment.supervisor[0] != supervisor:
-            worker.log.warning("the supervisor ended during a reload; the emulator continues as before")
-            break
-        woken.wait(BEAT_S)
-        woken.clear()
-        worker.report()
-    else:
-        if not worker.stopping.is_set():
-            worker.config = config
-            with device.cycle.held():
-                _beating(worker, lambda: device.change(served))
+    """Serve other layouts once the supervisor permits it. Until then, the device continues as before."""
+    served = _served(config)
+    if Reload(worker, woken).permitted():
+        worker.config = config
+        with device.cycle.held():
+            _beating(worker, lambda: device.change(served))
     worker.running()
 
 
