@@ -25,6 +25,7 @@ from shmio.testing.conformance import Rig, Run, connect
 from shmio.testing.table_conformance import TableConformance, Tags, connected, value_of
 from shmio.testing.write_conformance import SPARE, WriteConformance, Writer, WriteRig, write
 from tests.unit.connectors.ros.dds_peer import Peer
+from tests.unit.connectors.ros.std_topics import STD_TOPICS
 
 COUNTS = 20
 
@@ -110,11 +111,6 @@ class Ros2Rig:
         return self.area.get(frame.raw, self._at).code == 0
 
 
-_TYPES = {
-    "BOOL": "Bool", "SINT": "Int8", "INT": "Int16", "DINT": "Int32", "LINT": "Int64", "USINT": "UInt8",
-    "UINT": "UInt16", "UDINT": "UInt32", "ULINT": "UInt64", "BYTE": "UInt8", "WORD": "UInt16", "DWORD": "UInt32",
-    "LWORD": "UInt64", "REAL": "Float32", "LREAL": "Float64", "STRING[20]": "String",
-}  # fmt: skip
 MANY, EACH = 40, 5
 
 
@@ -125,17 +121,10 @@ class Ros2Table:
 
     def __init__(self, peer: Peer) -> None:
         self.peer = peer
-        self.kinds = {f"one_{kind[:6]}": name for kind, name in _TYPES.items()}
-        self.kinds |= {f"all_{kind[:6]}": f"{_TYPES[kind]}MultiArray" for kind in _TYPES if self._has_arrays(kind)}
         self.types: Tags = {
-            topic: {
-                "type": f"ARRAY[1..3] OF {kind}" if name.endswith("MultiArray") else kind,
-                "address": peer.address(topic, f"std_msgs/msg/{name} data"), "writable": True,
-            }
-            for kind in _TYPES
-            for topic in (f"one_{kind[:6]}", f"all_{kind[:6]}")
-            if (name := self.kinds.get(topic))
-        }  # fmt: skip
+            topic: {"type": kind, "address": peer.address(topic, f"std_msgs/msg/{name} data"), "writable": True}
+            for topic, (kind, name) in STD_TOPICS.items()
+        }
         self.many: Tags = {
             f"v{at}_{place}": {
                 "type": "INT", "address": peer.address(f"many{at}", f"std_msgs/Int16MultiArray data[{place}]"),
@@ -145,10 +134,6 @@ class Ros2Table:
             for place in range(EACH)
         }  # fmt: skip
 
-    @staticmethod
-    def _has_arrays(kind: str) -> bool:
-        return kind not in ("BOOL", "STRING[20]")
-
     def connector(self, layout: Layout) -> Connector:
         return Ros2Connector(Ros2Options(domain=self.peer.domain, timeout=5000), layout)
 
@@ -157,9 +142,9 @@ class Ros2Table:
 def wide() -> Iterator[Ros2Table]:
     """A node with many topics, whose discovery would delay the other tests."""
     with Peer() as peer:
-        table = Ros2Table(peer)
-        peer.ask("open", table.kinds | {f"many{at}": "Int16MultiArray" for at in range(MANY)})
-        yield table
+        kinds = {topic: name for topic, (_, name) in STD_TOPICS.items()}
+        peer.ask("open", kinds | {f"many{at}": "Int16MultiArray" for at in range(MANY)})
+        yield Ros2Table(peer)
 
 
 @pytest.fixture(scope="module")

@@ -20,6 +20,7 @@ from shmio.testing.proxy import FaultProxy
 from shmio.testing.table_conformance import TableConformance, Tags, connected, value_of
 from shmio.testing.write_conformance import SPARE, WriteConformance, Writer, WriteRig
 from tests.unit.connectors.ros.bridge import Bridge, framing
+from tests.unit.connectors.ros.std_topics import STD_TOPICS
 
 COUNTS = 20
 ARRAY = {"layout": {"dim": [], "data_offset": 0}}
@@ -67,11 +68,6 @@ class RosbridgeRig:
         return int(numbers.pop())
 
 
-_TYPES = {
-    "BOOL": "Bool", "SINT": "Int8", "INT": "Int16", "DINT": "Int32", "LINT": "Int64", "USINT": "UInt8",
-    "UINT": "UInt16", "UDINT": "UInt32", "ULINT": "UInt64", "BYTE": "UInt8", "WORD": "UInt16", "DWORD": "UInt32",
-    "LWORD": "UInt64", "REAL": "Float32", "LREAL": "Float64", "STRING[20]": "String",
-}  # fmt: skip
 MANY = 200
 
 
@@ -80,19 +76,9 @@ class RosbridgeTable:
 
     unknown: ClassVar[Mapping[str, object]] = {"type": "INT", "address": "/nowhere std_msgs/Int16 data"}
     types: ClassVar[Tags] = {
-        **{
-            f"one/{kind[:6]}": {"type": kind, "address": f"/one/{kind[:6]} std_msgs/{name} data", "writable": True}
-            for kind, name in _TYPES.items()
-        },
-        **{
-            f"all/{kind[:6]}": {
-                "type": f"ARRAY[1..3] OF {kind}", "address": f"/all/{kind[:6]} std_msgs/{name}MultiArray data",
-                "writable": True,
-            }
-            for kind, name in _TYPES.items()
-            if name not in ("Bool", "String")
-        },
-    }  # fmt: skip
+        topic: {"type": kind, "address": f"/{topic} std_msgs/{name} data", "writable": True}
+        for topic, (kind, name) in STD_TOPICS.items()
+    }
     many: ClassVar[Tags] = {
         f"v{at}": {"type": "INT", "address": f"/many{at} std_msgs/Int16 data", "writable": True} for at in range(MANY)
     }
