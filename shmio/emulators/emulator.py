@@ -30,8 +30,9 @@ AREAS: Final[Mapping[Area, SrvArea]] = {
     Area.MARKER: SrvArea.MK,
     Area.TIMER: SrvArea.TM,
     Area.COUNTER: SrvArea.CT,
+    Area.BLOCK: SrvArea.DB,
 }
-"""The areas that are not data blocks, with python-snap7's names."""
+"""The areas, with python-snap7's names."""
 
 
 class Emulator:
@@ -116,10 +117,10 @@ class Emulator:
         with self._server.lock:
             contents.adopt(self._contents)
             for area, number in self._contents.memory.keys() - contents.memory.keys():
-                self._server.remove(AREAS.get(area, SrvArea.DB), number)
+                self._server.remove(AREAS[area], number)
             for (area, number), data in contents.memory.items():
                 if (area, number) in self._contents.memory:
-                    self._server.replace(AREAS.get(area, SrvArea.DB), number, data)
+                    self._server.replace(AREAS[area], number, data)
                 else:
                     self._serve(area, number, data)
             self._contents = contents

@@ -6,13 +6,13 @@ import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from shmio.config.address import Address
 from shmio.emulators.cycle import Cycle
 from shmio.emulators.device import Served
 from shmio.emulators.loop_thread import LoopThread
-from shmio.emulators.programs import BUILT_IN, Idle, UserCode, program
+from shmio.emulators.programs import BUILT_IN, Idle, Program, UserCode, program
 from shmio.errors import ConfigError, EndpointError, SnapshotError, ValueRangeError
 from shmio.layout.addresses import siemens
 from shmio.layout.addresses.opcua import BrowsePath, NodeAddress, parse
@@ -95,6 +95,14 @@ class _Variable:
         return value
 
 
+class _Contents(NamedTuple):
+    """What an emulator serves: for each layout, its variables and an image; and the program, which has the first."""
+
+    program: Program
+    tables: Sequence[Sequence[_Variable]]
+    frames: Sequence[bytearray]
+
+
 class OpcUaEmulator:
     """Runs a program on one layout, and serves its nodes and those of further layouts.
 
@@ -120,13 +128,11 @@ class OpcUaEmulator:
         """
         self.address = listen
         self._code, self._program_name = code, program_name
-        self._program = program(program_name, served[0].layout, code)
-        self._tables = [list(_variables(one)) for one in served]
-        self._frames = [bytearray(initial_frame(one.layout)[0]) for one in served]
+        self._contents = self._made(served)
         self._nodes: _Nodes | None = None
         self._loop = LoopThread("opcua-server")
         self._server: Server | None = None
-        self.cycle = Cycle(self._program.period_ms / 1000, self._step, f"program-{program_name}")
+        self.cycle = Cycle(self._contents.program.period_ms / 1000, self._step, f"program-{program_name}")
 
     def start(self) -> None:
         """Run the first cycle, listen, and continue in threads. This takes some seconds.
@@ -135,7 +141,7 @@ class OpcUaEmulator:
             EndpointError: The address is not available.
 
         """
-        self._program.step(0, self._frames[0])
+        self._contents.program.step(0, self._contents.frames[0])
         self._loop.start()
         self._loop.run(self._serve)
         self.cycle.start()
@@ -149,11 +155,9 @@ class OpcUaEmulator:
 
     def change(self, served: Sequence[Served]) -> None:
         """Serve other layouts from now on. Nodes that both have keep their values."""
-        made = program(self._program_name, served[0].layout, self._code)
-        tables = [list(_variables(one)) for one in served]
-        frames = [bytearray(initial_frame(one.layout)[0]) for one in served]
-        self._loop.run(self._replace, tables, frames)
-        self._program, self._tables, self._frames = made, tables, frames
+        contents = self._made(served)
+        self._loop.run(self._replace, contents)
+        self._contents = contents
 
     def save(self) -> bytes:
         """Raise SnapshotError, because the server's nodes cannot be saved."""
@@ -162,6 +166,13 @@ class OpcUaEmulator:
     def prepare_restore(self, data: bytes) -> Callable[[], None]:  # noqa: ARG002
         """Raise SnapshotError, because the server's nodes cannot be restored."""
         raise SnapshotError("the emulator of OPC UA servers does not support snapshots")
+
+    def _made(self, served: Sequence[Served]) -> _Contents:
+        return _Contents(
+            program(self._program_name, served[0].layout, self._code),
+            [list(_variables(one)) for one in served],
+            [bytearray(initial_frame(one.layout)[0]) for one in served],
+        )
 
     async def _serve(self) -> None:
         from asyncua import Server, ua  # noqa: PLC0415  it needs the extra
@@ -175,7 +186,7 @@ class OpcUaEmulator:
         server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
         server.iserver.max_connections = MAX_CLIENTS
         self._nodes = _Nodes(server)
-        await self._replace(self._tables, self._frames)
+        await self._replace(self._contents)
         try:
             await server.start()
         except OSError as error:
@@ -183,31 +194,31 @@ class OpcUaEmulator:
             raise EndpointError(cannot_listen(self.address, error)) from None
         self._server = server
 
-    async def _replace(self, tables: Sequence[Sequence[_Variable]], frames: Sequence[bytearray]) -> None:
-        """Create the nodes of tables that do not exist yet, and delete the others."""
+    async def _replace(self, contents: _Contents) -> None:
+        """Delete the nodes that the contents do not have, and create those that do not exist yet."""
         from asyncua import ua  # noqa: PLC0415  it needs the extra
 
         assert self._nodes is not None  # noqa: S101 - for the type checker
-        await self._nodes.keep(variable for variables in tables for variable in variables)
-        for variables, frame in zip(tables, frames, strict=True):
+        await self._nodes.keep(variable for variables in contents.tables for variable in variables)
+        for variables, frame in zip(contents.tables, contents.frames, strict=True):
             for variable in variables:
                 value = ua.Variant(variable.there(frame), getattr(ua.VariantType, variable.kind))
                 variable.node = await self._nodes.variable(variable, value)
 
     def _step(self, time_s: float) -> None:
-        if not isinstance(self._program, Idle):
+        if not isinstance(self._contents.program, Idle):
             self._loop.run(self._in_loop, time_s)
 
     async def _in_loop(self, time_s: float) -> None:
         """Read the nodes, run a cycle, and write the changed nodes. Clients must wait in the meantime."""
         from asyncua import ua  # noqa: PLC0415  it needs the extra
 
-        frame, variables = self._frames[0], self._tables[0]
+        frame, variables = self._contents.frames[0], self._contents.tables[0]
         for variable in variables:
             with suppress(ValueRangeError):
                 variable.here(await variable.node.read_value(), frame)
         before = bytes(frame)
-        self._program.step(time_s, frame)
+        self._contents.program.step(time_s, frame)
         now = datetime.now(UTC)
         for variable in variables:
             span = slice(variable.register.offset, variable.register.offset + variable.register.size)
