@@ -132,11 +132,14 @@ class _TableImage:
 
         """
         frame, _ = initial_frame(self.layout)
-        unknown = [place.key not in known for place in self.places]
-        given = [place.register.initial is not None for place in self.places]
-        new = [place.stop > sizes.get(place.where, 0) for place in self.places]
-        self._store(words, frame, [a and b and not c for a, b, c in zip(new, unknown, given, strict=True)])
-        self._store(words, frame, [a and b for a, b in zip(unknown, given, strict=True)])
+        for given in (False, True):
+            chosen = [
+                place.key not in known
+                and (place.register.initial is not None) is given
+                and (given or place.stop > sizes.get(place.where, 0))
+                for place in self.places
+            ]
+            self._store(words, frame, chosen)
 
     def load(self, frame: bytearray, words: Words) -> None:
         """Copy the values of the device to an image."""
