@@ -10,6 +10,7 @@ import base64
 import math
 import re
 from collections.abc import Mapping
+from functools import lru_cache
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -84,6 +85,8 @@ def default(kind: str) -> Any:
 
 def from_json(message: Any, kind: str) -> Any:
     """Return a message of a known type with lists of numbers for sequences of uint8, which JSON has as base64."""
+    if not _has_bytes(kind):
+        return message
     if kind == "uint8[]" and isinstance(message, str):
         try:
             return list(base64.b64decode(message, validate=True))
@@ -91,7 +94,16 @@ def from_json(message: Any, kind: str) -> Any:
             return message
     if kind in DEFINITIONS and isinstance(message, dict):
         return {name: from_json(one, DEFINITIONS[kind].get(name, "")) for name, one in message.items()}
+    if kind.removesuffix("[]") in DEFINITIONS and isinstance(message, list):
+        return [from_json(one, kind.removesuffix("[]")) for one in message]
     return message
+
+
+@lru_cache(maxsize=256)
+def _has_bytes(kind: str) -> bool:
+    """Return whether a type has a sequence of uint8 at any depth. Most have none, so their messages need no copy."""
+    fields = DEFINITIONS.get(kind.removesuffix("[]"), {})
+    return kind == "uint8[]" or any(map(_has_bytes, fields.values()))
 
 
 def conforms(message: Any, kind: str) -> bool:

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from shmio.connectors.ros import messages
 from shmio.connectors.ros.addresses import Address, FieldError, Step, extract, getter, leaf_type, parse
 from shmio.connectors.ros.messages import DEFINITIONS, PRIMITIVES, conforms, default
 
@@ -79,6 +80,15 @@ def test_a_getter_finds_what_the_extraction_finds(field: str, value: object) -> 
     message = {"name": ["a", "b"], "position": [1.0, 2.0], "inner": {"data": 3, "list": ["x"]}}
     address = parse(f"/t std_msgs/M {field}")
     assert (getter(address)(message), extract(message, address)) == (value, value)
+
+
+def test_base64_becomes_numbers_at_any_depth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A server sends a sequence of uint8 as base64, also in a sequence of messages."""
+    added = {"test_msgs/Image": {"data": "uint8[]", "text": "string"}, "test_msgs/Images": {"all": "test_msgs/Image[]"}}
+    monkeypatch.setattr(messages, "DEFINITIONS", {**DEFINITIONS, **added})
+    image, there = {"data": "AQL/", "text": "AQL/"}, {"data": [1, 2, 255], "text": "AQL/"}
+    assert messages.from_json({"all": [image, image]}, "test_msgs/Images") == {"all": [there, there]}
+    assert messages.from_json({"all": [{"data": "*"}, 7]}, "test_msgs/Images") == {"all": [{"data": "*"}, 7]}
 
 
 @pytest.mark.parametrize("kind", DEFINITIONS)
