@@ -27,6 +27,7 @@ from shmio.model.statuses import BAD_CONFIGURATION_ERROR, BAD_NO_COMMUNICATION, 
 from shmio.wording import counted, unknown
 
 if TYPE_CHECKING:
+    from shmio.connectors.ros.discovery import Discovery
     from shmio.connectors.ros.participant import Participant
 
 POLL_S: Final = 0.005
@@ -35,7 +36,9 @@ POLL_S: Final = 0.005
 DISCOVERIES: Final = 4
 """Largest number of discovered publishers and subscribers to examine in a cycle; each takes about 0.2 ms."""
 DISCOVERIES_AT_END: Final = 1000
+"""The same, where no cycle waits: in ``browse``, and before an error."""
 MAX_REASONS: Final = 3
+"""Largest number of reasons in a message to the user."""
 DISCOVERY_S: Final = 1.0
 """Time in s, from the creation of readers and writers, for which a write waits until a subscriber is discovered."""
 
@@ -238,7 +241,10 @@ class Ros2Connector(Connector):
         obstacles = joined.obstacles(topic.name)
         for one in obstacles:
             self._topics.report(topic.registers[0], f"{topic.name}: {one}")
-        (self._obstructed.add if obstacles else self._obstructed.discard)(topic.name)
+        if obstacles:
+            self._obstructed.add(topic.name)
+        else:
+            self._obstructed.discard(topic.name)
 
     def _pull(self, joined: Participant) -> None:
         for name, message in joined.take():
@@ -336,35 +342,38 @@ def _join(options: Ros2Options, topics: Collection[Topic]) -> Participant:
 
 def _survey(joined: Participant, wanted: Wanted, end_s: float) -> dict[str, Seen]:
     """Return the topics that are discovered by ``end_s``, a time of CLOCK_MONOTONIC, with their newest messages."""
-    from shmio.connectors.ros.dds_types import ros_topic, ros_type  # noqa: PLC0415  its library is optional
-    from shmio.connectors.ros.discovery import stores  # noqa: PLC0415
-
     seen: dict[str, Seen] = {}
     read: set[str] = set()
     joined.watch_all(wanted.nodes)
     while time.monotonic() < end_s:
         if joined.discovery.update(DISCOVERIES_AT_END):
-            for published, endpoints in (
-                (True, joined.discovery.publishers()), (False, joined.discovery.subscribers())
-            ):  # fmt: skip
-                for one in endpoints:
-                    name = ros_topic(one.topic)
-                    if name and wanted.enters(levels(name)):
-                        topic = seen.setdefault(name, Seen(ros_type(one.type)))
-                        topic.published |= published
-                        topic.stored |= published and stores(one.qos)
+            _note(joined.discovery, wanted, seen)
         for name, found in seen.items():
             if name not in read and found.awaited:
                 read.add(name)
-                topic_read = Topic(name, found.type)
+                topic = Topic(name, found.type)
                 if found.stored:
-                    topic_read.qos = TopicQos("reliable", "transient_local")
+                    topic.qos = TopicQos("reliable", "transient_local")
                 with suppress(ConnectorError):  # DDS refuses some names that ROS does not have
-                    joined.add([topic_read])
+                    joined.add([topic])
         for name, message in joined.take():
             seen[name].message = message
         time.sleep(POLL_S)
     return seen
+
+
+def _note(discovery: Discovery, wanted: Wanted, seen: dict[str, Seen]) -> None:
+    """Add the topics of all publishers and subscribers to ``seen``."""
+    from shmio.connectors.ros.dds_types import ros_topic, ros_type  # noqa: PLC0415  its library is optional
+    from shmio.connectors.ros.discovery import stores  # noqa: PLC0415
+
+    for published, endpoints in ((True, discovery.publishers()), (False, discovery.subscribers())):
+        for one in endpoints:
+            name = ros_topic(one.topic)
+            if name and wanted.enters(levels(name)):
+                topic = seen.setdefault(name, Seen(ros_type(one.type)))
+                topic.published |= published
+                topic.stored |= published and stores(one.qos)
 
 
 def _time(utc_ns: int) -> dict[str, Any]:
