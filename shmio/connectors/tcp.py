@@ -22,6 +22,13 @@ def refused(peer: object) -> ConnectorError:
     )
 
 
+def unresolved(host: str, error: socket.gaierror) -> ConnectorError:
+    """Return the error for a host name without an address, with the remedy."""
+    return ConnectorError(
+        f"host name {host!r} cannot be resolved: {error.strerror}; correct the name, or give the address"
+    )
+
+
 def look_up(host: str, port: int, timeout_s: float) -> Sequence[Place]:
     """Return the addresses of a host, as ``socket.getaddrinfo`` does.
 

@@ -37,9 +37,8 @@ def browse(arguments: argparse.Namespace) -> int:
     if found.incomplete:
         print(printable(f"this list is incomplete: {found.incomplete}"), file=sys.stderr)
     elif not found.offers:
-        raise ConfigError(
-            f"{arguments.url}: the device offers nothing{' that matches the patterns' if arguments.paths else ''}"
-        )
+        remedy = " that matches the patterns; browse without patterns lists all; write %2F for a / inside a name"
+        raise ConfigError(f"{arguments.url}: the device offers nothing{remedy if arguments.paths else ''}")
     return 1 if found.incomplete else 0
 
 

@@ -221,7 +221,7 @@ class ModbusClient:
         if isinstance(error, ConnectionRefusedError):
             return tcp.refused(self.peer)
         if isinstance(error, socket.gaierror):
-            return ConnectorError(f"host name {self._host!r} cannot be resolved: {error.strerror}")
+            return tcp.unresolved(self._host, error)
         if isinstance(error, ConnectionError):
             return ConnectorError(f"{self.peer} closed the connection")
         return ConnectorError(f"{self.peer} cannot be reached: {error.strerror or error}")

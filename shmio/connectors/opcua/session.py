@@ -11,6 +11,7 @@ import asyncio
 import contextlib
 import logging
 import math
+import socket
 import struct
 import time
 from collections import deque
@@ -290,7 +291,7 @@ class Session:
             return self.fail(refusal)
         reason = getattr(self._protocol, "reason", "")
         peer = self._options.peer
-        why = str(error or self._stage)
+        why = getattr(error, "strerror", None) or error or self._stage
         return self.fail(ConnectorError(reason or f"{peer} closed the connection{f': {why}' if why else ''}"))
 
     @property
@@ -347,10 +348,12 @@ class Session:
             return tcp.refused(peer)
         if isinstance(error, ua.UaStatusCodeError):
             return ConnectorError(_explained_code(error.code, options))
+        if isinstance(error, socket.gaierror):
+            return tcp.unresolved(options.address.host, error)
         if isinstance(error, OSError):
             closed = f"{peer} closed the connection" + (f": {self._stage}" if self._stage else "")
             return ConnectorError(
-                closed if isinstance(error, ConnectionError) else f"{peer} cannot be reached: {error}"
+                closed if isinstance(error, ConnectionError) else f"{peer} cannot be reached: {error.strerror or error}"
             )
         if isinstance(error, ua.UaError | ValueError | struct.error | TypeError | AttributeError | LookupError):
             return ConnectorError(

@@ -516,7 +516,7 @@ def _named(error: BaseException, options: S7Options, *, opening: bool = False) -
             )
         return ConnectorError(text)
     if isinstance(error, socket.gaierror):
-        return ConnectorError(f"host name {options.host!r} cannot be resolved: {error.strerror}")
+        return tcp.unresolved(options.host, error)
     if isinstance(error, OSError):
         return ConnectorError(f"{peer} cannot be reached: {error.strerror or error}")
     return None

@@ -59,7 +59,10 @@ def test_the_tree(server: Device, capsys: pytest.CaptureFixture[str]) -> None:
     shown = capsys.readouterr().out
     assert [line.split()[0] for line in shown.splitlines()] == ["Device", "open", "Axis", "speed/now"]
     assert browse(server.url, "Device/nothing") == 1
-    assert "the device offers nothing that matches the patterns" in capsys.readouterr().err
+    assert "the device offers nothing that matches the patterns; browse without patterns" in capsys.readouterr().err
+    assert browse(server.url, "Device/Axis/speed/now") == 1
+    assert "write %2F for a / inside a name" in capsys.readouterr().err
+    assert browse(server.url, "Device/Axis/speed%2Fnow") == 0
 
 
 def test_a_tag_table_is_a_layout_at_once(server: Device, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -166,6 +169,7 @@ def test_long_names_take_no_more_memory_than_allowed(
         (["opc.tcp://127.0.0.1:1", "a//b"], "the pattern has an empty segment"),
         (["opc.tcp://127.0.0.1:1", "-o", "tags.csv"], "choose a name that ends in .toml"),
         (["opc.tcp://127.0.0.1:1"], "connection refused by 127.0.0.1:1: no program listens there; check the address"),
+        (["opc.tcp://no.such.host.invalid:1"], "host name 'no.such.host.invalid' cannot be resolved"),
         (["ws://127.0.0.1:1"], "connection refused by 127.0.0.1:1: no program listens there; check the address"),
         (["mqtt://127.0.0.1:1"], "connection refused by 127.0.0.1:1: no program listens there; check the address"),
     ],
