@@ -201,10 +201,15 @@ class Reload:
         self._digest, self._supervisor = worker.slot.digest, worker.segment.supervisor[0]
 
     def permitted(self, begun: Callable[[], bool] = lambda: False) -> bool:
-        """Wait until the supervisor permits the change, or until ``begun`` says that it has begun to change things.
+        """Wait until the supervisor permits the change.
+
+        Args:
+            begun: Returns whether the supervisor has already changed this process's part of the
+                segment, which is a permission as well.
 
         Returns:
-            False if the supervisor has ended before, or if this process must stop. Then change nothing.
+            Whether to change. False if the supervisor has ended before it has permitted the change,
+            or if this process must stop.
 
         """
         worker = self._worker

@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 
-from shmio.segment import Activity, ProcessSpec, Segment
+from shmio.segment import Activity, ProcessSpec, Segment, State
 from shmio.testing.cell import until
 
 WORK = """
-import gc, os, signal, sys
+import gc, os, signal, sys, threading
 from shmio import worker
 from shmio.errors import ConfigError, ConnectorError
 
@@ -37,6 +37,9 @@ def run(w):
         w.stopping.wait(0.2)
     if what.startswith("reread"):
         w.on_reread(lambda: told.append("anew"))
+    if what.startswith("reload"):
+        reload = worker.Reload(w, threading.Event())
+        told.append(f"permitted: {reload.permitted(lambda: what == 'reload begun')}")
     if what == "collect":
         told.append(f"collects: {started}, then {gc.isenabled()}")
     while not w.stopping.wait(0.01):
@@ -138,6 +141,33 @@ def test_a_sighup_before_it_can_read_again_is_not_lost(segment: Segment, tmp_pat
         until(lambda: slot.report.note.startswith("at work anew"), "it reads anew")
         worker.process.terminate()
         assert worker.end() == (0, "")
+
+
+def test_a_reload_waits_for_the_permission(segment: Segment, tmp_path: Path) -> None:
+    slot = segment.processes.find("cell")
+    with Started(segment, tmp_path, "reload"):
+        until(lambda: slot.report.activity is Activity.PAUSED, "the pause")
+        for _ in range(2):
+            beat = slot.heartbeat_ns
+            until(lambda beat=beat: slot.heartbeat_ns > beat, "a heartbeat")  # type: ignore[misc]
+        assert slot.report.note == ""
+        slot.digest = b"x" * 32
+        until(lambda: slot.report.note == "at work permitted: True", "the permission")
+
+
+def test_a_reload_goes_on_if_the_segment_has_changed(segment: Segment, tmp_path: Path) -> None:
+    slot = segment.processes.find("cell")
+    with Started(segment, tmp_path, "reload begun"):
+        until(lambda: slot.report.note == "at work permitted: True", "the end of the wait")
+
+
+def test_a_reload_whose_supervisor_ends_changes_nothing(segment: Segment, tmp_path: Path) -> None:
+    slot = segment.processes.find("cell")
+    with Started(segment, tmp_path, "reload") as worker:
+        until(lambda: slot.report.activity is Activity.PAUSED, "the pause")
+        segment.set_state(segment.supervisor[0] + 1, State.RUNNING)  # another supervisor has taken over
+        until(lambda: slot.report.note == "at work permitted: False", "the end of the wait")
+    assert "continues as before" in worker.log.read_text()
 
 
 @pytest.mark.parametrize(
