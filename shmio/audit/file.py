@@ -1,4 +1,4 @@
-"""Writes an instance's audit files. Several processes append and rotate without losing a line."""
+"""Writes an instance's audit files. Several processes can append and rotate without losing a line."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from typing import Final
 import msgspec
 
 LOCK_S: Final = 2.0
-"""Maximum time in s to wait for the lock of another process on the file. Each lock is brief."""
+"""Maximum time in s to wait while another process holds the lock on the file. A write holds it briefly."""
 _LOCK_TURN_S: Final = 0.002
 
 
 class AuditSettings(msgspec.Struct, frozen=True):
-    """Where the audit log is, and how much of it is kept.
+    """Where the audit log is, and how many files are kept.
 
     Attributes:
         path: The newest file.
-        max_bytes: Size in bytes above which a new file is started.
-        files: Number of files, including the newest.
+        max_bytes: Size in bytes up to which the newest file grows before a new one is started.
+        files: Number of files to keep, including the newest.
 
     """
 
@@ -33,16 +33,16 @@ class AuditSettings(msgspec.Struct, frozen=True):
 
 
 def file_paths(newest: Path, files: int) -> list[Path]:
-    """Return the paths of an audit log's files, the newest first."""
+    """Return the paths that an audit log of ``files`` files uses, the newest first."""
     return [newest, *(newest.with_name(f"{newest.name}.{number}") for number in range(1, files))]
 
 
 class AuditFile:
     """Appends lines to the newest file of an audit log. Use it from one thread.
 
-    Each write holds a lock on the file, so that lines of several processes do not mix, and that only
-    one process rotates. The kernel releases the lock of a process that is killed. A failed write
-    leaves nothing behind, not even a part of a line.
+    Each write holds a lock on the file, so that lines of several processes do not mix, and that
+    only one process rotates. If a process is killed, the kernel releases its lock. A failed write
+    leaves the file as it was, without a part of a line.
     """
 
     def __init__(self, settings: AuditSettings) -> None:
@@ -55,7 +55,8 @@ class AuditFile:
         """Append complete lines.
 
         Raises:
-            OSError: The disk is full, for example. Nothing was written.
+            OSError: The lines could not be written, for example because the disk is full. The file
+                is unchanged.
 
         """
         self._lock()
@@ -70,7 +71,7 @@ class AuditFile:
                 fcntl.flock(self._fd, fcntl.LOCK_UN)
 
     def close(self) -> None:
-        """Close the file. The next write opens it again."""
+        """Close the file. The next :meth:`append` opens it again."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1

@@ -14,14 +14,14 @@ import msgspec
 from shmio.audit.trail import Entry
 
 SUPERVISOR: Final = "supervisor"
-"""Name of the supervisor's process. It also writes the entries for programs on this host."""
+"""Process name of the supervisor, which also writes the entries for programs on this host."""
 MAX_LINE_BYTES: Final = 1 << 16
 
 _decode: Final = msgspec.json.Decoder(Entry).decode
 
 
 def present_files(newest: Path) -> list[Path]:
-    """Return the files of an audit log that exist, the oldest first."""
+    """Return the existing files of an audit log, the oldest first."""
     numbered = {
         int(number): path
         for path in newest.parent.glob(f"{newest.name}.*")
@@ -32,7 +32,7 @@ def present_files(newest: Path) -> list[Path]:
 
 
 def parse_entry(line: bytes) -> Entry | None:
-    """Return the entry of a line; None if the line is damaged."""
+    """Return the entry that a line contains; None if the line is damaged."""
     try:
         return _decode(line)
     except (msgspec.MsgspecError, UnicodeDecodeError):
@@ -44,8 +44,8 @@ def entries(newest: Path, since_s: float = 0.0) -> Iterator[Entry]:
 
     Args:
         newest: The newest file.
-        since_s: UNIX time in s. Files last written before this time are not read. Earlier entries
-            of newer files are yielded.
+        since_s: UNIX time in s. Files last written before this time are skipped. Files written
+            later can still yield earlier entries.
 
     Raises:
         OSError: A file cannot be read.
@@ -66,10 +66,10 @@ class EntryFilter:
     """Selects entries of an audit log. An empty field matches every entry.
 
     Attributes:
-        since: Earliest time, in the format of the entries.
-        who: Pattern for the name or the kind of the actor.
-        action: The action.
-        pattern: Pattern for a path or another word in :attr:`Entry.what`.
+        since: Earliest time, in the format of :attr:`Entry.time`.
+        who: Pattern that the name or the kind of the actor must match.
+        action: The action that the entry must have.
+        pattern: Pattern that a path or another word in :attr:`Entry.what` must match.
 
     """
 
@@ -79,7 +79,7 @@ class EntryFilter:
     pattern: str = ""
 
     def chooses(self, entry: Entry) -> bool:
-        """Return whether the filter selects an entry."""
+        """Return whether the filter selects this entry."""
         return (
             entry.time >= self.since
             and (not self.who or fnmatchcase(entry.who, self.who) or fnmatchcase(entry.kind, self.who))
@@ -101,7 +101,10 @@ def _words(what: Any) -> Iterator[str]:
 
 
 def last_events(newest: Path, since: str) -> dict[str, int]:
-    """Return the number of each source's last event that the supervisor has recorded since a time."""
+    """Return the highest event number that the supervisor has recorded since a time, by source.
+
+    The result is empty if a file cannot be read.
+    """
     found: dict[str, int] = {}
     try:
         for entry in entries(newest):
@@ -114,7 +117,7 @@ def last_events(newest: Path, since: str) -> dict[str, int]:
 
 
 def source_of(entry: Entry) -> str:
-    """Return the source that an entry is about; empty if the entry is about no source."""
+    """Return the source that an entry is about; empty if there is none."""
     if not isinstance(entry.what, Mapping) or not entry.what:
         return ""
     named = entry.what.get("source")

@@ -2,10 +2,11 @@
 
 A module calls :func:`record`, or creates an :class:`Attempt` and ends it when the outcome is known.
 Neither waits for the disk: a thread encodes the entries and writes them to the file. In a process
-without an audit log, such as a test or a user's program, they do nothing.
+without an audit log, such as a test or a user's program, both do nothing.
 
-A context variable holds the actor, so that functions need not pass it on. The code that identifies
-a client sets the variable (:func:`acting`). New tasks and ``asyncio.to_thread`` inherit it.
+A context variable holds the actor, so that functions need not pass the actor on. The code that
+identifies a client sets the variable (:func:`acting`). New tasks and ``asyncio.to_thread`` inherit
+it.
 """
 
 from __future__ import annotations
@@ -32,29 +33,29 @@ from shmio.errors import ShmioError
 from shmio.logs import stamp
 
 MAX_WAITING: Final = 10_000
-"""Maximum number of entries that wait to be written. Further entries are only counted."""
+"""Maximum number of entries that wait to be written. Further entries are discarded, and only counted."""
 MAX_NAMED: Final = 32
-"""Maximum number of values in an entry. Further values are only counted."""
+"""Maximum number of values in an entry. Further values are left out, and only counted."""
 MAX_ELEMENTS: Final = 16
-"""Maximum number of an array's elements in an entry."""
+"""Maximum number of elements that an entry shows of an array."""
 MAX_TEXT: Final = 200
-"""Maximum number of characters of a text in an entry."""
+"""Maximum number of characters that an entry shows of a text."""
 MAX_REASON: Final = 500
-"""Maximum number of characters of a reason."""
+"""Maximum number of characters that an entry shows of a reason."""
 MAX_BATCH: Final = 500
-"""Maximum number of entries that are written at once."""
+"""Maximum number of entries that are written in one go."""
 MERGED: Final = frozenset({"feed", "read", "sign in", "step"})
 """Actions that a client can repeat many times a second. Repetitions within a second share one entry.
 
-A ``read`` has an entry only if it is denied.
+A ``read`` is recorded only if it is denied.
 """
 MERGE_S: Final = 1.0
 MAX_MERGED: Final = 1000
-"""Maximum number of different actions whose repetitions share an entry at a time."""
+"""Maximum number of different actions whose repetitions are being merged at the same time."""
 RETRY_S: Final = 1.0
-"""Pause before a failed write is repeated, in s."""
+"""Pause in s before a failed write is retried."""
 CLOSE_S: Final = 2.0
-"""Maximum time in s for which a process that ends waits until its last entries are written."""
+"""Maximum time in s for which a process waits at its end until the last entries are written."""
 
 log = logging.getLogger("shmio.audit")
 
@@ -63,9 +64,11 @@ class Actor(NamedTuple):
     """Who acts, and from where.
 
     Attributes:
-        kind: How the actor is known: ``token``, ``certificate``, ``account``, ``uid``, ``host`` (of
-            Sparkplug), ``process`` (of the instance), ``signal``, or ``anonymous``.
-        name: Name of the token or account, first name in the certificate, or number of the user.
+        kind: How the actor was identified: ``token``, ``certificate``, ``account``, ``uid``,
+            ``host`` (a Sparkplug host application), ``process`` (of the instance), ``signal``, or
+            ``anonymous``.
+        name: Name of the token or account, first name in the certificate, or number of the user;
+            empty if unknown.
         origin: Address of the client, or the program and its pid.
 
     """
@@ -77,9 +80,9 @@ class Actor(NamedTuple):
 
 @dataclass(slots=True)
 class Acting:
-    """An actor and the endpoint that the actor uses, for example during a call.
+    """An actor, and the endpoint through which the actor acts, for example during one call.
 
-    ``refused`` is True if a refusal has been recorded, so that no other layer records it again.
+    ``refused`` is True once a refusal has been recorded, so that no other layer records it again.
     """
 
     actor: Actor
@@ -91,7 +94,7 @@ _present: ContextVar[Acting | None] = ContextVar("acting", default=None)
 
 
 def act(actor: Actor, endpoint: str) -> Acting:
-    """Make ``actor`` the actor of this task or thread from now on."""
+    """Make ``actor`` the actor of this task or thread from now on. Return the new :class:`Acting`."""
     found = Acting(actor, endpoint)
     _present.set(found)
     return found
@@ -99,7 +102,7 @@ def act(actor: Actor, endpoint: str) -> Acting:
 
 @contextmanager
 def acting(actor: Actor, endpoint: str) -> Iterator[Acting]:
-    """Make ``actor`` the actor within a ``with`` block."""
+    """Make ``actor`` the actor of this task or thread within a ``with`` block."""
     found = Acting(actor, endpoint)
     before = _present.set(found)
     try:
@@ -109,12 +112,12 @@ def acting(actor: Actor, endpoint: str) -> Iterator[Acting]:
 
 
 def uid_actor(uid: int | None, origin: str) -> Actor:
-    """Return the actor for a user of this host. If ``uid`` is None, the user is unknown."""
+    """Return the actor for a user of this host, by user id; None: the user is unknown."""
     return Actor("uid", "" if uid is None else str(uid), origin)
 
 
 def program_of(pid: int) -> str:
-    """Return the name of a process's program; empty if the process has ended."""
+    """Return the name of the program that a process runs; empty if the process has ended."""
     try:
         return Path(f"/proc/{pid}/comm").read_text(errors="replace").strip()
     except OSError:
@@ -186,17 +189,18 @@ def record(
     event: int = 0,
     count: int = 1,
 ) -> None:
-    """Add an entry to the audit log. This never waits, and never fails.
+    """Add an entry to the audit log. This never waits for the disk, and never fails.
 
     Args:
         action: What was done or attempted, such as ``write``.
         what: What the action is about: values by path or by name, or a function that returns them.
-            The audit thread calls the function.
+            The thread that writes the log calls the function.
         outcome: The outcome, such as ``written`` or ``denied``.
-        reason: The reason of the outcome; empty for a success.
-        who: The actor; None: the actor of this task or thread.
-        command: Number of the command; 0: none.
-        event: Number of the source's event that ended the command; 0: none, or not known.
+        reason: The reason for the outcome; empty for a success.
+        who: The actor; None for the actor of this task or thread, or else this process itself.
+        command: Number of the command; 0 if there is none.
+        event: Number of the source's event that ended the command; 0 if there is none, or it is not
+            known.
         count: How many times this was done.
 
     """
@@ -208,7 +212,7 @@ def record(
 
 
 class Attempt:
-    """An action whose outcome is not known yet. Only the first call of :meth:`end` has an effect.
+    """An action whose outcome is not known yet.
 
     In a ``with`` block, an exception ends the attempt. Without an exception, the attempt stays open
     after the block, because the outcome may come later.
@@ -239,11 +243,11 @@ class Attempt:
         self.end("refused" if expected else "cancelled", reason, refused=expected)
 
     def end(self, outcome: str, reason: str = "", *, refused: bool = False) -> None:
-        """Record the outcome in the audit log.
+        """Record the outcome in the audit log. Only the first call has an effect.
 
         Args:
             outcome: The outcome.
-            reason: The reason of the outcome; empty for a success.
+            reason: The reason for the outcome; empty for a success.
             refused: Whether this entry records a refusal. Then no other layer records it again.
 
         """
@@ -256,7 +260,7 @@ class Attempt:
 
 
 def values_of(source: str, values: Mapping[str, Any]) -> What:
-    """Return the values for an entry: their paths begin with ``source``."""
+    """Return a source's values in the form that :func:`record` expects: by path, including the source."""
     first = {f"{source}/{path}": _cut(value) for path, value in islice(values.items(), MAX_NAMED)}
     return _Cut(first, max(0, len(values) - MAX_NAMED))
 
@@ -295,7 +299,7 @@ def _cut(value: Any, most: int = MAX_TEXT) -> Any:
 
 
 class Trail:
-    """Writes the entries of one process, in a thread."""
+    """Writes the entries of one process, in a thread of its own."""
 
     def __init__(self, settings: AuditSettings, instance: str, process: str) -> None:
         self.process = process
@@ -314,7 +318,7 @@ class Trail:
         self._thread.start()
 
     def add(self, entry: _Waiting) -> None:
-        """Add an entry. Any thread may call this. A repetition does not wake the thread that writes."""
+        """Queue an entry. Any thread may call this. A repetition does not wake the thread that writes."""
         kind = entry.kind
         if kind is not None and kind in self._repeated:
             with self._merging:
@@ -329,7 +333,7 @@ class Trail:
                 self._lost += 1
 
     def close(self) -> None:
-        """Write the waiting entries, for at most ``CLOSE_S``."""
+        """Wait at most ``CLOSE_S`` until the waiting entries are written, and stop."""
         self._closing.set()
         self._waiting.put(None)
         self._thread.join(CLOSE_S)
@@ -449,7 +453,7 @@ def open_trail(settings: AuditSettings | None, instance: str, process: str) -> N
 
 
 def close_trail() -> None:
-    """Write the waiting entries, and stop."""
+    """Write the waiting entries, and stop recording. This waits at most ``CLOSE_S``."""
     global _trail
     trail, _trail = _trail, None
     if trail is not None:

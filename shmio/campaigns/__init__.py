@@ -1,1 +1,1 @@
-"""Runs campaigns on an instance, and judges what they expect."""
+"""Runs campaigns on an instance, and judges whether their expectations are met."""

@@ -1,4 +1,4 @@
-"""Digests of what a run depends on: its configuration, its models and its layouts."""
+"""Computes digests of what a run depends on: its campaign, configuration, models and layouts."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from shmio.layout.model import Layout
 from shmio.simulation.fmu import is_fmu
 
 MAX_BYTES: Final = 64 << 20
-"""Files larger than this have no digest."""
+"""Maximum size in bytes of a file to compute the digest of."""
 
 
 def of_file(file: Path) -> str:
-    """Return the SHA-256 of a file, or why there is none."""
+    """Return the SHA-256 of a file in hexadecimal, or a text that says why there is none."""
     try:
         with file.open("rb") as stream:
             data = stream.read(MAX_BYTES + 1)
@@ -28,20 +28,20 @@ def of_file(file: Path) -> str:
 
 
 def of_campaign(file: Path, expectations: Iterable[Expectation]) -> Iterator[tuple[str, str]]:
-    """Yield a label and the digest of a campaign file, and of each recording that it names."""
+    """Yield a label and a text with the digest: for a campaign file, and for each recording that it names."""
     yield "campaign", f"{file}, sha256 {of_file(file)}"
     for name in dict.fromkeys(one.like for one in expectations if one.like is not None):
         yield "like", f"{name}, sha256 {of_file(file.parent / name)}"
 
 
 def of_layouts(layouts: Mapping[str, Layout]) -> Iterator[tuple[str, str]]:
-    """Yield a label and the digest of each layout."""
+    """Yield a label and the digest for each layout. ``layouts`` are by source."""
     for source, layout in layouts.items():
         yield f"layout of {source}", layout.hash.hex()
 
 
 def of_configuration(file: Path) -> Iterator[tuple[str, str]]:
-    """Yield a label and the digest of a ``supervisor.toml``, and of the file of each of its models."""
+    """Yield a label and a text with the digest: for a ``supervisor.toml``, and for the file of each model in it."""
     yield "configuration", f"{file}, sha256 {of_file(file)}"
     try:
         sources = load(file).source

@@ -1,4 +1,4 @@
-"""Runs a campaign on a running instance of this host, and judges it meanwhile."""
+"""Runs a campaign on a running instance of this host, and judges it at the same time."""
 
 from __future__ import annotations
 
@@ -30,11 +30,14 @@ from shmio.segment import Block, Event, Frame, Segment
 from shmio.segment.block import Layouts
 
 MAX_STEPS: Final = 256
-"""Maximum number of steps of virtual time between two turns of the judge."""
+"""Maximum number of steps of virtual time after which the judge evaluates the new frames."""
 STOP_STEPS: Final = 64
-"""Maximum number of steps between two turns, and so after the failure, if the run stops at the first failure."""
+"""Maximum number of steps between two turns of the judge if the run stops at the first failure.
+
+It is therefore also the maximum number of steps after the failure.
+"""
 GOOD_S: Final = 10.0
-"""Maximum time in s to wait at the start until the sources that the expectations read are good."""
+"""Maximum time in s to wait at the start until all sources that the expectations read have good quality."""
 LOOK_S: Final = 0.02
 BUFFER_BYTES: Final = 256 << 20
 """Maximum number of bytes of the recording that may wait for the disk."""
@@ -46,16 +49,16 @@ class Plan:
     """The settings of one run of a campaign.
 
     Attributes:
-        injections: The declared injections, with their seeds; their times count from the run's start.
+        injections: The declared injections, with their seeds; their times count from the run's
+            start.
         expectations: The expectations.
-        duration_s: Duration on the instance's clock.
+        duration_s: Duration of the run in s, on the instance's clock.
         folder: Folder of the campaign file; paths in the campaign are relative to this folder.
-        step_s: Length of a step in s; if None, the shortest period of the sources.
+        step_s: Length of a step in s; None for the shortest period of the sources.
         real_time: Whether to run in real time, even if all sources could be stepped.
         stop: Whether to stop at the first failure.
-        record: The file to create for a recording; if None, nothing is recorded.
-        start: Name of a snapshot to restore before the run; if None, the run begins in the present
-            state.
+        record: The file to create for a recording; None to record nothing.
+        start: Name of a snapshot to restore before the run; None to start in the present state.
     """
 
     injections: Sequence[Declaration]
@@ -113,16 +116,16 @@ class LiveRun:
         self._blocks: dict[str, Block] = {source: blocks[source] for source in self.judge.sources}
 
     def run(self, over: threading.Event, begun: Callable[[], None] = lambda: None) -> None:
-        """Run until the end or until ``over`` is set; with the plan's ``stop``, also until the first failure.
+        """Run to the end or until ``over`` is set; with :attr:`Plan.stop`, at most to the first failure.
 
         Args:
-            over: Ends the run when it is set.
-            begun: Called when the run has begun.
+            over: Set this event to end the run.
+            begun: Called when the run has started.
 
         Raises:
             ConfigError: An injection is invalid, or the instance does not allow the plan's
                 ``step_s``, ``real_time`` or ``start``.
-            CommandError: A source refuses an injection.
+            CommandError: A source refused an injection.
             RecordingError: The file of the recording cannot be created or completed.
             SnapshotError: The snapshot cannot be restored.
         """
@@ -247,7 +250,7 @@ class LiveRun:
 
 
 def frames_of(frames: Sequence[Frame], size: int, *, raws: bool) -> Frames:
-    """Return frames as arrays for a judge.
+    """Return frames as arrays, as :meth:`Judge.add` expects them.
 
     Args:
         frames: Frames of one block.

@@ -1,1 +1,1 @@
-"""What expectations mean: formulas over signals, their verdicts and robustness."""
+"""Judges expectations: formulas over signals, their verdicts and their robustness."""

@@ -1,4 +1,4 @@
-"""Turns expectations of a campaign file into formulas."""
+"""Turns the expectations of a campaign file into formulas."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from shmio.judging.source import Signal
 from shmio.layout.model import Layout
 
 MAX_SIGNALS: Final = 64
-"""Maximum number of registers in one expectation."""
+"""Maximum number of signals that one expectation may read."""
 _NS: Final = 1_000_000_000
 
 
@@ -25,12 +25,12 @@ class Formula:
 
     Attributes:
         expectation: The expectation.
-        tree: The formula, whose truth at the start of the judged time is the verdict; None if the
-            signals must be like those of a recording.
+        tree: The formula, whose truth at the start of the judged time is the verdict; None for an
+            expectation with ``like``, which compares signals with a recording.
         trigger: A condition that must become true at least once, or else the verdict is
             inconclusive; None if there is no such condition.
-        signals: What the formula reads.
-        failure: What a failure means, as text.
+        signals: The signals that the formula reads.
+        failure: Text that says what a failure means.
     """
 
     expectation: Expectation
@@ -41,7 +41,7 @@ class Formula:
 
     @property
     def horizon_ns(self) -> int:
-        """How far, in ns, the formula looks ahead or back from each moment that it judges."""
+        """How far the formula looks ahead or back, at most, from each moment that it judges, in ns."""
         return 0 if self.tree is None else _reach_ns(self.tree)
 
 
@@ -75,10 +75,10 @@ def read_expectations(
 
 
 def check_texts(expectations: Sequence[Expectation]) -> None:
-    """Parse all texts of expectations, without looking up their registers.
+    """Parse the formulas and conditions of expectations, without looking up their registers.
 
     Raises:
-        ConfigError: A text is invalid; the message starts as ``expect[0].formula: …``.
+        ConfigError: One of them is invalid; the message starts as ``expect[0].formula: …``.
 
     """
     for index, expectation in enumerate(expectations):

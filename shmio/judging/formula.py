@@ -1,4 +1,4 @@
-"""Turns formulas into networks of operators; equal parts of several formulas share their nodes."""
+"""Turns formulas into networks of operators. Equal parts of several formulas share their nodes."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ from shmio.layout.glob import choose
 from shmio.layout.model import Layout, Register
 
 MAX_HORIZON_S: Final = 1_000_000
-"""The longest time in s by which a formula, with all its parts, may look ahead or back."""
+"""Maximum time in s by which a formula may look ahead or back; the bounds of nested operators add up."""
 MAX_CHANGES: Final = 64
-"""Maximum factor by which nested temporal operators may multiply the number of changes of a signal."""
+"""Maximum factor by which nested temporal operators may multiply the changes of a signal."""
 ASPECTS: Final = ("quality", "age", "raw")
 _LOGIC: Final = frozenset({"and", "or", "not", "implies"})
 _EDGES: Final = frozenset({"rise", "fall", "rising", "falling", "changed"})
@@ -61,6 +61,10 @@ class Registers:
     def signal(self, reference: Reference, aspect: str = "value") -> Signal:
         """Return the signal of a register.
 
+        Args:
+            reference: The register, as the formula names it.
+            aspect: How the formula reads the register; see :class:`Signal`.
+
         Raises:
             ConfigError: There is no such register, or it is neither a number nor a BOOL.
 
@@ -77,7 +81,7 @@ class Registers:
         return signal
 
     def several(self, text: str) -> list[Signal]:
-        """Return the signals of all numbers and BOOLs that a path, a structure or a pattern names.
+        """Return the signals of all numbers and BOOLs that a text names: a path, a structure or a pattern.
 
         Raises:
             ConfigError: The text names no such register.
@@ -98,10 +102,11 @@ class Registers:
 
 
 def check(tree: Tree) -> None:
-    """Check the rules for formulas that the grammar cannot express.
+    """Check a formula for errors that the grammar allows.
 
     Raises:
-        ConfigError: A part of the formula has no meaning, or needs bounds.
+        ConfigError: A part of the formula has no meaning, a temporal operator needs bounds, or the
+            formula exceeds a limit.
 
     """
     for node in nodes(tree):
@@ -152,17 +157,17 @@ def _changes(tree: Tree) -> int:
 
 
 def temporal(tree: Tree, operators: Collection[str] = TEMPORAL) -> bool:
-    """Return whether a tree has one of ``operators``; by default, any temporal operator."""
+    """Return whether a tree contains one of ``operators``; by default, any temporal operator."""
     return any(isinstance(node, Operation) and node.name in operators for node in nodes(tree))
 
 
 def constant(tree: Tree) -> bool:
-    """Return whether a tree reads no register."""
+    """Return whether a tree is constant: whether it reads no register."""
     return not any(isinstance(node, Reference) for node in nodes(tree))
 
 
 def horizon_ns(tree: Tree) -> int:
-    """Return how far a tree looks ahead or back, at most, in ns."""
+    """Return how far a tree looks ahead or back, at most, in ns. Operators without bounds count as 0."""
     if not isinstance(tree, Operation):
         return 0
     own = tree.bounds_ns[1] if tree.bounds_ns else 0
@@ -170,7 +175,7 @@ def horizon_ns(tree: Tree) -> int:
 
 
 class Network:
-    """The nodes of several formulas, each after its operands."""
+    """The operator nodes of several formulas. Each node comes after its operands."""
 
     def __init__(self, registers: Registers, input_of: Callable[[Signal], Node]) -> None:
         """Create an empty network.
@@ -184,12 +189,12 @@ class Network:
         self._nodes: dict[tuple[object, ...], Node] = {}
 
     def turn(self) -> None:
-        """Let each node read what has become known of its operands."""
+        """Let each node process what has become known of its operands."""
         for node in self._nodes.values():
             node.turn()
 
     def top_level(self, tree: Tree) -> TopLevel:
-        """Return the top level of a formula, whose truth at the start is the verdict."""
+        """Return the outermost part of a formula. Its truth at the start of the judged time is the verdict."""
         if not isinstance(tree, Operation) or tree.name not in {*_LOGIC, "always", "eventually", "until"}:
             return TopLevelInitial(self.truth(tree))
         if tree.name == "not":
@@ -210,16 +215,21 @@ class Network:
         return TopLevelExtremum(_extremum(tree.name), self.truth(tree.operands[0]), tree.bounds_ns)
 
     def like(self, signal: Signal, golden: Piece, tolerance: float, tolerance_ns: int) -> tuple[TopLevel, Tube]:
-        """Return the part that compares a signal with a golden signal, up to the end of the golden signal.
+        """Return the comparison of a signal with a golden signal, and its node.
 
-        The times of ``golden`` count from the start; its last value is unknown.
+        Args:
+            signal: The signal to compare.
+            golden: The golden signal; times count from the start of the judged time, and the last
+                value is unknown. The comparison ends with this signal.
+            tolerance: Tolerance of the value.
+            tolerance_ns: Tolerance in time, in both directions.
         """
         node = Tube(self._input_of(signal), *tube(golden, tolerance, tolerance_ns))
         self._nodes["like", node] = node
         return TopLevelExtremum(np.minimum, node, (0, max(int(golden.time[-1]) - 1, 0))), node
 
     def truth(self, tree: Tree) -> Node:
-        """Return the node for the truth of a tree; a number is true if it is not 0."""
+        """Return the node for the truth of a tree. A number is true if it is not 0."""
         if isinstance(tree, Operation) and tree.name in _TRUTH:
             return self._operation(tree)
         number = self.number(tree)
@@ -228,7 +238,10 @@ class Network:
         return self._shared(("truth", number), lambda: Truth(function, (number,)))
 
     def number(self, tree: Tree) -> Node | float:
-        """Return the node for the number of a tree, or its constant value; a truth counts as 1 or 0."""
+        """Return the node for the number that a tree computes, or the number itself if it is constant.
+
+        A truth counts as 1 or 0.
+        """
         match tree:
             case Constant(value):
                 return float(value)
@@ -328,7 +341,7 @@ def _extremum(name: str) -> np.ufunc:
 
 
 def signals(tree: Tree, registers: Registers) -> Iterator[Signal]:
-    """Iterate over the signals that a tree reads, once each.
+    """Yield each signal that a tree reads, once.
 
     Raises:
         ConfigError: A register does not exist, or is neither a number nor a BOOL.

@@ -1,4 +1,4 @@
-"""Gives verdicts on expectations from the frames of the sources that they read."""
+"""Reaches verdicts on expectations from the frames of the sources that the expectations read."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from shmio.judging.verdict import All, Outcome, TopLevel, TopLevelExtremum, Verd
 from shmio.layout.model import Layout, Register
 
 AROUND: Final = 3
-"""Number of values that a verdict has before the moment of a failure, and after it."""
+"""Number of values before a failure, and after it, that a verdict shows."""
 
 
 Golden = Callable[[str, Sequence[Signal]], Sequence[Piece]]
-"""Reads signals of a recording.
+"""Function that reads signals of a recording.
 
-The arguments are the file, as the campaign names it, and the signals. The function returns the
-signals from time 0 on; the last value of each is unknown (NaN), at the end of the recording. It
+Its arguments are the file, as the campaign names it, and the signals. It returns the signals from
+time 0 on. The last value of each is unknown (NaN), from the end of the recording on. The function
 raises ConfigError if the recording cannot be read, or lacks a signal.
 """
 
@@ -36,9 +36,9 @@ raises ConfigError if the recording cannot be read, or lacks a signal.
 class Judge:
     """Judges expectations while frames arrive, or from a recording.
 
-    The judged time begins when each source that the expectations read has a frame, and ends with
-    the newest frame. Add frames in any portions, and call :meth:`turn` whenever you like: the
-    verdicts are the same.
+    The judged time begins when every source that the expectations read has had a frame, and ends
+    with the newest frame. You may add frames in portions of any size, and call :meth:`turn` at any
+    time: the verdicts are the same.
     """
 
     def __init__(
@@ -90,11 +90,11 @@ class Judge:
 
     @property
     def begin_ns(self) -> int | None:
-        """Start of the judged time on the instance's clock; None while a source has no frame."""
+        """Start of the judged time on the instance's clock, in ns; None until every source has had a frame."""
         return self._origin_ns
 
     def needs_raw(self, source: str) -> bool:
-        """Return whether an expectation reads what a source delivered, without injections."""
+        """Return whether an expectation reads values of a source as delivered, without injections."""
         return self._sources[source].needs_raw
 
     def signals(self, source: str) -> tuple[Signal, ...]:
@@ -102,22 +102,35 @@ class Judge:
         return self._sources[source].signals
 
     def read_by(self, index: int) -> tuple[Signal, ...]:
-        """Return the signals that the expectation with this index reads."""
+        """Return the signals that the expectation at this index reads."""
         return self._cases[index].formula.signals
 
     def limits(self, index: int, signal: Signal) -> tuple[Piece, Piece] | None:
-        """Return the lower and the upper limit of a signal, if the expectation has ``like``; else None."""
+        """Return the lower and the upper limit of a signal.
+
+        Args:
+            index: Index of the expectation.
+            signal: A signal that the expectation reads.
+
+        Returns:
+            The limits; None if the expectation has no ``like``.
+        """
         case = self._cases[index]
         return case.tubes[case.formula.signals.index(signal)].limits if case.tubes else None
 
     def troubles(self, source: str) -> Sequence[Trouble]:
-        """Return the spans of time in which values of a source were unknown, and why."""
+        """Return the spans of time in which values of a source were unknown, and the reasons."""
         return self._sources[source].troubles
 
     def follow(self, name: str, layout: Layout, stale_ns: int) -> None:
-        """Set the block from which the next frames of a source come, such as after a reload.
+        """Set the block that the next frames of a source come from; call this after a reload, for example.
 
         Values of registers that the block does not have are unknown.
+
+        Args:
+            name: Name of the source.
+            layout: The layout of the block.
+            stale_ns: Age in ns from which a frame is stale.
         """
         source = self._sources[name]
         found = {}
@@ -131,11 +144,19 @@ class Judge:
         self._sources[source].add(frames)
 
     def turn(self) -> dict[str, Rows]:
-        """Judge the added frames as far as possible, and return the new values of the signals by source."""
+        """Judge the added frames as far as possible.
+
+        Returns:
+            The values of the signals that have become known, by source.
+        """
         return self._turn(None)
 
     def finish(self) -> dict[str, Rows]:
-        """Judge the rest, because no more frames follow. Return the same as :meth:`turn`."""
+        """Judge the rest, because no more frames will come.
+
+        Returns:
+            The same as :meth:`turn`.
+        """
         self.end_ns = max((source.newest_ns for source in self._sources.values()), default=0) + 1
         for case in self._cases:
             case.finish(self.end_ns)
@@ -177,12 +198,12 @@ class Judge:
 
     @property
     def failed(self) -> bool:
-        """True if an expectation has failed, whatever follows."""
+        """True if an expectation has failed, whatever frames may follow."""
         return any(case.failed for case in self._cases)
 
     @property
     def verdicts(self) -> list[Verdict]:
-        """The verdicts; before :meth:`finish`, from what is known up to now."""
+        """The verdicts. Before :meth:`finish`, they follow from what is known so far."""
         return [self._verdict(case) for case in self._cases]
 
     def _verdict(self, case: _Case) -> Verdict:

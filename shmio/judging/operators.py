@@ -1,9 +1,9 @@
 """The operators of formulas, as nodes of a network through which the pieces of signals pass.
 
-In each turn, a node reads what has become known of its operands, and computes what that makes known
-of its own signal.
-The result does not depend on how a signal is divided into pieces. So the same nodes serve a
-live cell, which brings a few frames at a time, and a recording, which brings thousands.
+In each turn, a node reads the newly known parts of its operands, and computes the part of its own
+signal that they determine. The result does not depend on how a signal is divided into pieces. So
+the same nodes serve a live cell, which delivers a few frames at a time, and a recording, which
+delivers thousands.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ import numpy as np
 from shmio.judging.pieces import FAR_NS, NOTHING, TINY, Alignment, Piece, Times, Values, cut, join
 
 Numeric = Callable[..., Values]
-"""Computes numbers from numbers: arrays, or constants."""
+"""Function that computes numbers from numbers: arrays, or constants."""
 
 
 class Node:
-    """A signal. ``out`` is the part of the signal that has become known in the present turn."""
+    """A node of the network. ``out`` is the part of its signal that has become known in the present turn."""
 
     out: Piece = NOTHING
 
     def turn(self) -> None:
-        """Read what has become known of the operands, and set ``out``."""
+        """Read the newly known parts of the operands, and set ``out``."""
         raise NotImplementedError
 
 
 class Input(Node):
-    """A signal that frames bring. Its source sets ``out``."""
+    """A signal that comes from frames. Its source sets ``out``."""
 
     def turn(self) -> None:
-        """Leave ``out`` as it is."""
+        """Do nothing, because the source has set ``out`` already."""
 
 
 # -- at each moment on its own -----------------------------------------------------------------------------------------
@@ -59,7 +59,7 @@ class _Pointwise(Node):
 
 
 class Arithmetic(_Pointwise):
-    """A number that is computed from numbers; NaN if one of them is unknown."""
+    """A number that is computed from other numbers; NaN if one of them is unknown."""
 
     def __init__(self, function: Numeric, operands: Sequence[Node | float]) -> None:
         super().__init__([operand for operand in operands if isinstance(operand, Node)])
@@ -67,7 +67,7 @@ class Arithmetic(_Pointwise):
         self._constants = [None if isinstance(operand, Node) else operand for operand in operands]
 
     def combine(self, pieces: list[Piece]) -> Piece:
-        """Return the number at each time."""
+        """Compute the number at each time."""
         values = iter(pieces)
         arguments = [next(values).low if constant is None else constant for constant in self._constants]
         with np.errstate(all="ignore"):
@@ -76,10 +76,10 @@ class Arithmetic(_Pointwise):
 
 
 class Truth(Arithmetic):
-    """Turns numbers into truth: the function gives the distance, with the sign of the truth."""
+    """The truth of numbers. The function computes the distance: positive is true, negative is false."""
 
     def combine(self, pieces: list[Piece]) -> Piece:
-        """Return the truth at each time."""
+        """Compute the truth at each time."""
         time, distance, _, end = super().combine(pieces)
         unknown = np.isnan(distance)
         if not unknown.any():
@@ -88,23 +88,23 @@ class Truth(Arithmetic):
 
 
 class Constantly(_Pointwise):
-    """A truth that is always the same, with the times of another signal."""
+    """A constant truth, with the times of another signal."""
 
     def __init__(self, value: float, other: Node) -> None:
         super().__init__((other,))
         self._value = value
 
     def combine(self, pieces: list[Piece]) -> Piece:
-        """Return the value at each time."""
+        """Return the constant at each time."""
         values = np.full(len(pieces[0].time), self._value)
         return Piece(pieces[0].time, values, values, pieces[0].end)
 
 
 class Digit(_Pointwise):
-    """Turns truth into a number: 1 is true, 0 is false, NaN is unknown."""
+    """A truth as a number: 1 is true, 0 is false, NaN is unknown."""
 
     def combine(self, pieces: list[Piece]) -> Piece:
-        """Return 1, 0 or NaN at each time."""
+        """Compute 1, 0 or NaN at each time."""
         time, low, high, end = pieces[0]
         found = np.where(low > 0, 1.0, np.where(high < 0, 0.0, np.nan))
         return Piece(time, found, found, end)
@@ -114,21 +114,21 @@ class Not(_Pointwise):
     """The negation of a truth."""
 
     def combine(self, pieces: list[Piece]) -> Piece:
-        """Return the opposite at each time."""
+        """Compute the opposite at each time."""
         time, low, high, end = pieces[0]
         opposite = -low
         return Piece(time, opposite if high is low else -high, opposite, end)
 
 
 class Extremum(_Pointwise):
-    """The least of several signals (and), or the greatest (or)."""
+    """The least value of several truths (``and``), or the greatest (``or``)."""
 
     def __init__(self, function: np.ufunc, operands: Sequence[Node]) -> None:
         super().__init__(operands)
         self._function = function
 
     def combine(self, pieces: list[Piece]) -> Piece:
-        """Return the extremum at each time."""
+        """Compute the least or the greatest value at each time."""
         found = pieces[0]
         for piece in pieces[1:]:
             low = self._function(found.low, piece.low)
@@ -141,11 +141,11 @@ class Extremum(_Pointwise):
 
 
 class Edge(Node):
-    """Whether a signal has become true since the previous frame. :class:`Moment` makes this an event.
+    """Whether a truth has become true since the previous frame. :class:`Moment` turns this into an event.
 
     Args:
-        operand: The signal.
-        first: Whether a signal that is true from the first frame on has become true there.
+        operand: The truth.
+        first: Whether a truth that is already true in the first frame has become true there.
     """
 
     def __init__(self, operand: Node, *, first: bool) -> None:
@@ -166,11 +166,12 @@ class Edge(Node):
 
 
 class Moment(Node):
-    """Makes an event of a comparison with the previous frame: true at most at the moment of the frame.
+    """Turns a comparison with the previous frame into an event, which is true only at the frame's own moment.
 
     Args:
         edge: The comparison.
-        operand: What it compares. Where that is unknown, the event may come at any moment.
+        operand: The signal that ``edge`` compares. Where it is unknown, the event may come at any
+            moment.
     """
 
     def __init__(self, edge: Node, operand: Node) -> None:
@@ -178,7 +179,7 @@ class Moment(Node):
         self._operand = operand
 
     def turn(self) -> None:
-        """Put a false value directly after each moment."""
+        """Add a false value directly after the moment of each frame."""
         time, low, high, end = self._edge.out
         if not len(time):
             self.out = NOTHING
@@ -200,7 +201,7 @@ class Moment(Node):
 class Difference(Node):
     """The difference between a number and its value in the previous frame; 0 in the first frame.
 
-    With ``per_second``, the difference is divided by the time in s between the frames.
+    With ``per_second``, it is divided by the time in s between the frames.
     """
 
     def __init__(self, operand: Node, *, per_second: bool) -> None:
@@ -239,22 +240,22 @@ def _shifted(values: Values, before: float) -> Values:
 class Window(Node):
     """The greatest or the least value of a signal between ``t + begin`` and ``t + end``, at each t.
 
-    This is a temporal operator within another operator; ``verdict.TopLevelExtremum`` computes one at
-    the top level of a formula.
+    This is a temporal operator within another operator. At the top level of a formula,
+    ``verdict.TopLevelExtremum`` takes its place.
 
-    A window reaches into the future (``begin`` and ``end`` from 0 on: eventually, always) or into
-    the past (both up to 0: once, historically). In a window that ends before the judged time
-    begins, ``once`` is false, and ``historically`` is true.
+    A window reaches into the future (``begin`` and ``end`` are at least 0: ``eventually``,
+    ``always``) or into the past (both are at most 0: ``once``, ``historically``). If a window ends
+    before the judged time begins, ``once`` is false there, and ``historically`` is true.
 
-    The node keeps only what can still decide a future result. Each future window reaches at least up
-    to now. For the greatest value, it is therefore enough to keep, at each moment, the greatest of
-    the values from this moment up to now.
+    The node keeps only the values that can still decide a future result. Each window that is not
+    computed yet reaches at least up to the newest value. For the greatest value, the node therefore
+    needs to keep, for each moment, only the greatest value from this moment up to the newest.
 
     Args:
         function: ``np.maximum`` or ``np.minimum``.
         operand: The signal.
         begin_ns: Start of the window relative to t.
-        end_ns: End of the window relative to t; it belongs to the window.
+        end_ns: End of the window relative to t, inclusive.
     """
 
     def __init__(self, function: np.ufunc, operand: Node, begin_ns: int, end_ns: int) -> None:
@@ -339,7 +340,7 @@ class Window(Node):
 
 
 class History(Node):
-    """The greatest or the least value of a signal from the start up to each moment."""
+    """The greatest or the least value of a signal from the start of the judged time up to each moment."""
 
     def __init__(self, function: np.ufunc, operand: Node) -> None:
         self._function = function
@@ -348,7 +349,7 @@ class History(Node):
         self._before: tuple[float, float] = (self._neutral, self._neutral)
 
     def turn(self) -> None:
-        """Continue the extremum."""
+        """Extend the greatest or the least value with the new values."""
         time, low, high, end = self._operand.out
         if not len(time):
             self.out = NOTHING
@@ -361,14 +362,14 @@ class History(Node):
 
 
 UNTIL_SHARE: Final = 8
-"""The :class:`Until` node waits until one in so many of its values is new."""
+"""The :class:`Until` node computes only when at least one in this many of its values is new."""
 
 
 class Until(Node):
-    """At each t: whether ``right`` is true at a moment in [t + begin, t + end], and ``left`` until then.
+    """Whether, at each t, ``right`` is true at a moment s in [t + begin, t + end], and ``left`` from t until s.
 
-    The value is the greatest, over these moments s, of the least of ``right`` at s and of ``left``
-    from t up to, but not at, s. The node computes its whole window anew, so it waits until one in
+    The value is the greatest, over all such s, of the least of ``right`` at s and of ``left`` from
+    t up to s, exclusive. The node computes its whole window anew. It therefore waits until one in
     :data:`UNTIL_SHARE` of the values is new.
     """
 
@@ -381,7 +382,7 @@ class Until(Node):
         self._done_ns: int | None = None
 
     def turn(self) -> None:
-        """Compute the windows that have become known completely, when enough has come."""
+        """Compute the windows that have become known completely, once enough values are new."""
         left, right = self._alignment.align([operand.out for operand in self._operands])
         if not len(left.time):
             self.out = NOTHING
@@ -453,12 +454,12 @@ def _continue(found: tuple[Values, Values], p: Values, q: Values, begin: Times, 
 
 
 class Tube(Node):
-    """How far a number is inside the band between two other signals; negative outside.
+    """How far a number is inside the band between two limits; negative if it is outside.
 
     Args:
         operand: The number.
         lower: The lower limit; its times count from the start of the judged time.
-        upper: The upper limit.
+        upper: The upper limit, with the same times.
     """
 
     def __init__(self, operand: Node, lower: Piece, upper: Piece) -> None:
@@ -468,7 +469,7 @@ class Tube(Node):
         self._begun = False
 
     def turn(self) -> None:
-        """Compare each value with the limits at each moment."""
+        """Compare the number with the limits at each moment."""
         piece = self._operand.out
         if not len(piece.time):
             self.out = NOTHING
@@ -493,9 +494,9 @@ class Tube(Node):
 
 
 def tube(golden: Piece, tolerance: float, tolerance_ns: int) -> tuple[Piece, Piece]:
-    """Return the lower and the upper limit around a signal.
+    """Return the lower and the upper limit of the band around a signal.
 
-    Before the start and after the end of the signal, its first and its last value count.
+    Before its start, the signal counts as having its first value; after its end, its last value.
 
     Args:
         golden: The signal, up to :data:`FAR_NS`; NaN where it is unknown.
@@ -557,10 +558,10 @@ NUMBERS: Final[dict[str, Numeric]] = {
 
 
 def from_bool(values: Values) -> Values:
-    """Return the truth of BOOLs: 1 or -1."""
+    """Return the truths of BOOLs, given as 1 and 0: 1 is true, -1 is false."""
     return 2.0 * values - 1.0
 
 
 def from_number(values: Values) -> Values:
-    """Return the truth of numbers, which are true if they are not 0."""
+    """Return the truths of numbers: a number is true if it is not 0."""
     return _strict(np.abs(values))

@@ -1,8 +1,8 @@
-"""Pieces of signals: values that are constant between the times at which they change.
+"""Pieces of signals. A signal's value is constant between the times at which it changes.
 
 A signal is a number or a degree of truth for each moment of the judged time. An unknown number is
 NaN. A degree of truth is an interval from ``low`` to ``high``: positive is true, negative is false,
-and the distance from zero is the robustness. Both bounds are the same where everything is known. An
+and the distance from zero is the robustness. Both bounds are equal where everything is known. An
 unknown truth reaches from minus to plus infinity.
 """
 
@@ -18,9 +18,9 @@ Times = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
 FAR_NS: Final = 1 << 61
-"""A time in ns after any judged time. From the end of the run to this time, everything is unknown."""
+"""A time in ns that is later than any judged time. From the end of the run to this time, all values are unknown."""
 TINY: Final = 5e-324
-"""The smallest positive number. A truth at the distance 0 has this value, with the sign of the truth."""
+"""The smallest positive number. A truth whose distance is 0 has this value: positive if it is true, else negative."""
 
 
 class Piece(NamedTuple):
@@ -28,9 +28,10 @@ class Piece(NamedTuple):
 
     Attributes:
         time: The moments from which the values hold, in ns, strictly ascending, int64, shape (n,).
-        low: Lower bounds; for numbers, the values; float64, shape (n,).
-        high: Upper bounds. The same object as ``low`` if nothing is unknown, and for numbers.
-        end: The moment, in ns, up to which the last value holds.
+        low: The numbers, or the lower bounds of the truths; float64, shape (n,).
+        high: The upper bounds of the truths. For numbers, or if nothing is unknown, the same object
+            as ``low``.
+        end: The moment, in ns, at which the last value ends, exclusive.
     """
 
     time: Times
@@ -45,7 +46,7 @@ NOTHING: Final = Piece(NO_TIMES, NO_VALUES, NO_VALUES, 0)
 
 
 def join(first: Piece, second: Piece) -> Piece:
-    """Return two consecutive pieces as one."""
+    """Join two consecutive pieces. Either may be empty."""
     if not len(first.time):
         return second
     if not len(second.time):
@@ -57,7 +58,10 @@ def join(first: Piece, second: Piece) -> Piece:
 
 
 def cut(piece: Piece, at_ns: int) -> Piece:
-    """Return the part of a piece from a moment on. The moment must not be before the piece's start."""
+    """Return the part of a piece from ``at_ns`` on; empty if the piece has ended by then.
+
+    ``at_ns`` must not be before the piece's start.
+    """
     if at_ns >= piece.end:
         return NOTHING
     first = int(piece.time.searchsorted(at_ns, "right")) - 1
@@ -69,7 +73,7 @@ def cut(piece: Piece, at_ns: int) -> Piece:
 
 
 def head(piece: Piece, until_ns: int) -> Piece:
-    """Return the part of a piece before a moment."""
+    """Return the part of a piece before ``until_ns``; empty if the piece starts later."""
     if until_ns >= piece.end:
         return piece
     count = int(piece.time.searchsorted(until_ns))
@@ -80,16 +84,16 @@ def head(piece: Piece, until_ns: int) -> Piece:
 
 
 class Alignment:
-    """Brings the pieces of several signals to the same times.
+    """Gives the pieces of several signals the same times.
 
-    The object stores the parts that are not known of all signals yet.
+    It keeps the parts that are not yet known for all signals.
     """
 
     def __init__(self, count: int) -> None:
         self._rests = [NOTHING] * count
 
     def align(self, pieces: Sequence[Piece]) -> list[Piece]:
-        """Add the next piece of each signal, and return the part that is known of all.
+        """Add the next piece of each signal, and return the part that is known for all signals.
 
         All returned pieces have the same times and the same end.
         """

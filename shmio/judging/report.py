@@ -1,4 +1,4 @@
-"""Reports on verdicts: one HTML page without scripts or other files, and JUnit XML."""
+"""Writes reports on verdicts: as one self-contained HTML page without scripts, or as JUnit XML."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ svg { display: block; margin: .4em 0 } svg text { font: 11px system-ui, sans-ser
 
 
 class Span(NamedTuple):
-    """A span of the instance's time in which an injection was active; ``end_ns`` is None if that was to the end."""
+    """When an injection was active, in ns of instance time; ``end_ns`` is None if it was active to the end."""
 
     name: str
     source: str
@@ -54,7 +54,7 @@ class Drawn:
     plot: Plot
     troubles: Sequence[Trouble] = ()
     limits: tuple[Piece, Piece] | None = None
-    """The lower and the upper limit, if the signal has to be like that of a recording."""
+    """The lower and the upper limit of the signal; None if the expectation has no ``like``."""
 
 
 @dataclass(frozen=True)
@@ -64,11 +64,11 @@ class Report:
     Attributes:
         title: The heading.
         facts: Names and values, such as the seed and digests.
-        command: The command that repeats the run.
-        begin_ns: Start of the judged time; None if it never began.
-        end_ns: End of the judged time.
+        command: The command line that repeats the run.
+        begin_ns: Start of the judged time, in ns; None if it never began.
+        end_ns: End of the judged time, in ns.
         verdicts: The verdicts.
-        signals: The signals of each verdict's expectation.
+        signals: For each verdict, the signals that its expectation reads.
         injections: When injections were active.
     """
 
@@ -83,7 +83,7 @@ class Report:
 
 
 def describe(expectation: Expectation) -> str:
-    """Return what an expectation expects, as keys and values."""
+    """Return what is expected, as lines of the form ``key = value``."""
     left_out = ("name", "severity", "text", "requirement")
     keys = {key: value for key, value in msgspec.to_builtins(expectation).items() if key not in left_out}
     return "\n".join(f"{key} = {msgspec.json.encode(value).decode()}" for key, value in keys.items())

@@ -25,10 +25,10 @@ class Frames(NamedTuple):
     """Consecutive frames of one block.
 
     Attributes:
-        number: Numbers of the frames, uint64, shape (n,). A jump means that frames were missed.
-        clock_ns: The instance's clock at their publication, int64, shape (n,).
+        number: Numbers of the frames, uint64, shape (n,). A gap means that frames were missed.
+        clock_ns: The instance's clock when each frame was published, int64, shape (n,).
         quality: 0 bad, 1 uncertain, 2 good; uint8, shape (n,).
-        delay_us: Maximum age of the images at publication, uint32, shape (n,).
+        delay_us: Maximum age of each image when it was published, uint32, shape (n,).
         images: The images that consumers saw, uint8, shape (n, size).
         raws: The images that the source delivered, of the same shape; None if they are unknown, or
             the same as ``images``.
@@ -44,13 +44,14 @@ class Frames(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Signal:
-    """An input of a formula: a register, seen in one of several ways.
+    """An input of a formula: a register, and the aspect of it that the formula reads.
 
     Attributes:
         source: Name of the source.
         path: Path of the register within the source.
-        aspect: ``value``: as consumers see it; ``raw``: as the source delivered it; ``quality``: 0
-            bad, 1 uncertain, 2 good; ``age``: its age in s, directly before the next frame came.
+        aspect: ``value``: the value as consumers see it; ``raw``: as the source delivered it;
+            ``quality``: 0 bad, 1 uncertain, 2 good; ``age``: the value's age in s, directly before
+            the next frame came.
     """
 
     source: str
@@ -59,13 +60,13 @@ class Signal:
 
     @property
     def name(self) -> str:
-        """The signal as formulas name it."""
+        """The signal, as formulas write it."""
         path = f"{self.source}/{self.path}"
         return path if self.aspect == "value" else f"{self.aspect}({path})"
 
 
 class Trouble(NamedTuple):
-    """A span of time in which values of a source are unknown, and why."""
+    """A span of time in which values of a source are unknown, and the reason. Times are in ns."""
 
     begin_ns: int
     end_ns: int
@@ -78,7 +79,7 @@ class Rows(NamedTuple):
     Attributes:
         time: The moments from which the values hold, in ns, int64, shape (n,).
         values: The values, NaN where unknown, float64, shape (signals, n).
-        end: The moment up to which the last values hold.
+        end: The moment, in ns, at which the last values end, exclusive.
     """
 
     time: Times
@@ -152,8 +153,8 @@ class _Waiting(NamedTuple):
 class Source:
     """The signals of one source.
 
-    A value holds from its frame until the next frame. It is unknown while the quality is bad, after
-    it has become stale, and between frames that were missed.
+    A value holds from its frame until the next frame. It is unknown while the quality is bad, once
+    it is stale, and in gaps where frames were missed.
     """
 
     def __init__(self, name: str, signals: Sequence[Signal]) -> None:
@@ -184,15 +185,16 @@ class Source:
 
     @property
     def needs_raw(self) -> bool:
-        """True if a formula reads what the source delivered, without injections."""
+        """True if a formula reads values of this source as delivered, without injections."""
         return any(signal.aspect == "raw" for signal in self.signals)
 
     def follow(self, layout: Layout, registers: Mapping[str, Register], stale_ns: int) -> None:
-        """Set the block from which the next frames come.
+        """Set the block that the next frames come from.
 
         Args:
             layout: The layout of the block.
-            registers: The registers of the signals, by path. If one is missing, its values are unknown.
+            registers: The registers of the signals, by path. If one is missing, its values are
+                unknown.
             stale_ns: Age in ns from which a frame is stale.
         """
         self._decoder = _Decoder(layout, registers, self.signals)
@@ -200,7 +202,7 @@ class Source:
         self._number = None
 
     def add(self, frames: Frames) -> None:
-        """Add the next frames. Of frames with the same time, the last one counts."""
+        """Add the next frames. If several frames have the same time, the last one counts."""
         if not len(frames.number) or self._decoder is None:
             return
         time, number = frames.clock_ns, frames.number
@@ -216,11 +218,11 @@ class Source:
         self._waiting.append(_Waiting(time, self._decoder.decode(frames), frames.quality == 0, missed, fresh_ns))
 
     def turn(self, origin_ns: int, end_ns: int | None = None) -> None:
-        """Set the output of each input, and ``rows``, to what the added frames make known.
+        """Set ``rows`` and the output of each input to the values that the added frames make known.
 
         Args:
             origin_ns: Start of the judged time.
-            end_ns: The end of the judged time, if no more frames follow; else None.
+            end_ns: End of the judged time if no more frames follow; else None.
         """
         rows = self._known(end_ns)
         if len(rows.time) and not self._begun:

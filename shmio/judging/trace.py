@@ -1,4 +1,4 @@
-"""Keeps signals for plots, within a limit of memory."""
+"""Keeps the signals of a run for plots, in a limited amount of memory."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ MAX_POINTS: Final = 2000
 
 
 class Plot(NamedTuple):
-    """A signal for a plot: the least and the greatest value from each time to the next, shape (n,).
+    """The data of a signal's plot: the least and the greatest value from each time to the next, shape (n,).
 
-    Both are NaN where the value was unknown the whole time.
+    Both are NaN if the value was unknown all that time.
     """
 
     time_ns: Times
@@ -26,7 +26,7 @@ class Plot(NamedTuple):
 
 
 class Traces:
-    """Collects the signals of a run. Neighbouring values are joined when there are too many."""
+    """Collects signals of a run for plots. When there are too many values, it joins neighbouring ones."""
 
     def __init__(self, signals: Mapping[str, Sequence[Signal]], chosen: Collection[Signal]) -> None:
         """Prepare to collect signals.
@@ -51,7 +51,7 @@ class Traces:
                 self._traces[source].add(some._replace(values=some.values[self._places[source]]))
 
     def plot(self, signal: Signal) -> Plot:
-        """Return the plot of a signal that was chosen."""
+        """Return the plot of a signal, which must be one of those to collect."""
         return self._traces[signal.source].plot(self._index[signal])
 
 
@@ -104,7 +104,13 @@ def _joined(points: _Points, count: int) -> _Points:
 
 
 def compressed(time_ns: Times, least: Values, greatest: Values) -> Plot:
-    """Return a plot of a whole signal, with at most :data:`MAX_POINTS` points."""
+    """Return a plot of a whole signal, with at most :data:`MAX_POINTS` points.
+
+    Args:
+        time_ns: The times from which the values hold, in ns, shape (n,).
+        least: The least value from each time to the next.
+        greatest: The greatest value from each time to the next.
+    """
     count = -(-len(time_ns) // MAX_POINTS)
     time, low, high = _joined((time_ns, least[None, :], greatest[None, :]), count)
     return Plot(time, low[0], high[0])

@@ -1,4 +1,4 @@
-"""Evaluates formulas at the start of the judged time, and describes the verdicts on expectations."""
+"""Evaluates formulas at the start of the judged time, and defines the verdicts on expectations."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from shmio.judging.pieces import NOTHING, TINY, Alignment, Piece, Values, cut, h
 
 
 class Outcome(StrEnum):
-    """What a verdict says."""
+    """The outcome of a verdict."""
 
     PASSED = "passed"
     FAILED = "failed"
@@ -23,29 +23,29 @@ class Outcome(StrEnum):
 
 
 class TopLevel:
-    """An outermost part of a formula, which is evaluated only at the start of the judged time.
+    """An outermost part of a formula. It is evaluated only at the start of the judged time.
 
-    ``low`` and ``high`` are the bounds of its truth, from what is known up to now.
+    ``low`` and ``high`` are the bounds of its truth, from what is known so far.
     """
 
     low: float = -np.inf
     high: float = np.inf
     extreme_ns: int | None = None
-    """The moment of the value that is closest to changing the decision; None if it is unknown."""
+    """The moment of the value that is closest to changing the outcome; None if it is not known."""
 
     def turn(self) -> None:
-        """Read what has become known of the operands."""
+        """Read the newly known parts of the operands."""
         raise NotImplementedError
 
     def finish(self, end_ns: int) -> None:
-        """Set the end of the judged time. One last turn follows, with the rest of the signals."""
+        """Set the end of the judged time. One last :meth:`turn` follows, with the rest of the signals."""
 
     def decided_ns(self) -> int | None:
-        """Return the moment at which the truth was decided, on the instance's clock; None if unknown."""
+        """Return the moment, in instance time, at which the truth was decided; None if it is not known."""
         raise NotImplementedError
 
     def unknown_ns(self) -> int | None:
-        """Return the first moment whose unknown value leaves the truth undecided; None if there is none."""
+        """Return the first moment at which an unknown value leaves the truth undecided; None if there is none."""
         raise NotImplementedError
 
 
@@ -57,28 +57,29 @@ class TopLevelInitial(TopLevel):
         self._at_ns: int | None = None
 
     def turn(self) -> None:
-        """Read the first value."""
+        """Read the first value of the signal."""
         piece = self._operand.out
         if self._at_ns is None and len(piece.time):
             self._at_ns = int(piece.time[0])
             self.low, self.high = float(piece.low[0]), float(piece.high[0])
 
     def decided_ns(self) -> int | None:
-        """Return the start of the judged time."""
+        """Return the start of the judged time; None if the signal has no value yet."""
         return self._at_ns
 
     def unknown_ns(self) -> int | None:
-        """Return the start of the judged time."""
+        """Return the start of the judged time; None if the signal has no value yet."""
         return self._at_ns
 
 
 class TopLevelExtremum(TopLevel):
-    """The least or the greatest value of a signal in a span of time: always, or eventually.
+    """The least value of a signal in a span of time (``always``), or the greatest (``eventually``).
 
     Args:
-        function: ``np.minimum`` for always, ``np.maximum`` for eventually.
+        function: ``np.minimum`` for ``always``, ``np.maximum`` for ``eventually``.
         operand: The signal.
-        bounds_ns: The span, relative to the start; None if it is the whole judged time.
+        bounds_ns: Start and end of the span, relative to the start of the judged time; None for the
+            whole judged time.
     """
 
     def __init__(self, function: np.ufunc, operand: Node, bounds_ns: tuple[int, int] | None) -> None:
@@ -93,7 +94,7 @@ class TopLevelExtremum(TopLevel):
         self._unknown_ns: int | None = None
 
     def turn(self) -> None:
-        """Add the values in the span."""
+        """Include the newly known values in the span."""
         piece = self._operand.out
         if self._over or not len(piece.time):
             return
@@ -133,11 +134,11 @@ class TopLevelExtremum(TopLevel):
                 self._unknown_ns = int(time[unknown.argmax()])
 
     def finish(self, end_ns: int) -> None:
-        """Set the end of the judged time, which ends the span if it has no bounds."""
+        """Set the end of the judged time. A span without bounds ends there."""
         self._end_ns = end_ns
 
     def decided_ns(self) -> int | None:
-        """Return the first moment that decides the truth, or the end of the span."""
+        """Return the first moment that decides the truth, or else the end of the span; None if it has no end yet."""
         if self._decided_ns is not None:
             return self._decided_ns
         if self._range is None:
@@ -146,7 +147,7 @@ class TopLevelExtremum(TopLevel):
         return None if end is None else end - 1
 
     def unknown_ns(self) -> int | None:
-        """Return the first moment at which the signal is unknown."""
+        """Return the first moment in the span at which the truth of the signal is unknown; None if there is none."""
         return self._unknown_ns
 
 
@@ -163,7 +164,7 @@ class UntilEnd(TopLevel):
         self._unknown_ns: int | None = None
 
     def turn(self) -> None:
-        """Add the values that have become known."""
+        """Include the newly known values."""
         left, right = self._alignment.align([operand.out for operand in self._operands])
         if self._end_ns is not None and len(left.time):
             if left.time[0] >= self._end_ns:
@@ -192,16 +193,19 @@ class UntilEnd(TopLevel):
         self._end_ns = end_ns
 
     def decided_ns(self) -> int | None:
-        """Return the first moment that decides the truth, or the end."""
+        """Return the first moment that decides the truth, or else the end of the judged time.
+
+        Return None while the judged time has no end.
+        """
         return self._decided_ns if self._decided_ns is not None or self._end_ns is None else self._end_ns - 1
 
     def unknown_ns(self) -> int | None:
-        """Return the first moment at which the truth is unknown."""
+        """Return the first moment at which the truth is unknown; None if there is none."""
         return self._unknown_ns
 
 
 class Opposite(TopLevel):
-    """The opposite of another part."""
+    """The negation of another part."""
 
     def __init__(self, operand: TopLevel) -> None:
         self._operand = operand
@@ -212,15 +216,15 @@ class Opposite(TopLevel):
         self.low, self.high = -self._operand.high, -self._operand.low
 
     def finish(self, end_ns: int) -> None:
-        """Pass on the end of the judged time."""
+        """Pass the end of the judged time to the operand."""
         self._operand.finish(end_ns)
 
     def decided_ns(self) -> int | None:
-        """Return the moment of the operand."""
+        """Return the moment at which the operand was decided."""
         return self._operand.decided_ns()
 
     def unknown_ns(self) -> int | None:
-        """Return the moment of the operand."""
+        """Return the first moment that leaves the operand undecided."""
         return self._operand.unknown_ns()
 
 
@@ -231,19 +235,19 @@ class All(TopLevel):
         self._operands = operands
 
     def turn(self) -> None:
-        """Compute the bounds: the least ones of the parts."""
+        """Set each bound to the least of the parts' bounds."""
         for operand in self._operands:
             operand.turn()
         self.low = min(operand.low for operand in self._operands)
         self.high = min(operand.high for operand in self._operands)
 
     def finish(self, end_ns: int) -> None:
-        """Pass on the end of the judged time."""
+        """Pass the end of the judged time to all parts."""
         for operand in self._operands:
             operand.finish(end_ns)
 
     def decided_ns(self) -> int | None:
-        """Return the first moment at which a part is false, or the last moment if all parts are true."""
+        """Return the first moment at which a part became false, or else the last moment at which a part was decided."""
         false = [operand.decided_ns() for operand in self._operands if operand.high < 0]
         moments = [moment for moment in false or [one.decided_ns() for one in self._operands] if moment is not None]
         if not moments:
@@ -251,7 +255,7 @@ class All(TopLevel):
         return min(moments) if false else max(moments)
 
     def unknown_ns(self) -> int | None:
-        """Return the first moment whose unknown value leaves a part undecided; None if there is none."""
+        """Return the first moment at which an unknown value leaves a part undecided; None if there is none."""
         moments = [one.unknown_ns() for one in self._operands if one.low < 0 < one.high]
         return min((moment for moment in moments if moment is not None), default=None)
 
@@ -263,14 +267,15 @@ class Verdict:
     Attributes:
         expectation: The expectation.
         outcome: Passed, failed or inconclusive.
-        reason: Why the outcome is not passed; else empty.
+        reason: Why the expectation has not passed; empty if it has.
         low: Lower bound of the robustness.
-        high: Upper bound of the robustness. Both bounds are the same if all that matters was known.
-        moment_ns: First moment at which the expectation was not met; None if there is none.
+        high: Upper bound of the robustness. Equal to ``low`` if everything that matters was known.
+        moment_ns: First moment at which the expectation was not met; None if it has not failed, or
+            the moment is not known.
         extreme_ns: Moment at which the expectation was closest to failing, or furthest from being
-            met; None: unknown.
-        around: Values before and after ``moment_ns``, by signal: pairs of a time and a value, which is
-            None if it was unknown.
+            met; None if it is not known.
+        around: For each signal, its values before and after ``moment_ns``, as pairs of a time and a
+            value; the value is None where it was unknown.
     """
 
     expectation: Expectation
@@ -284,9 +289,9 @@ class Verdict:
 
     @property
     def robustness(self) -> float | None:
-        """The distance to failing: negative if failed, None if inconclusive or without a limit.
+        """The distance to failing: negative if failed; None if the verdict is inconclusive or there is no limit.
 
-        If the distance is not known exactly, this is the bound that is closer to 0.
+        If the exact distance is not known, this is the bound that is closer to 0.
         """
         if self.outcome is Outcome.INCONCLUSIVE:
             return None
@@ -295,7 +300,7 @@ class Verdict:
 
 
 def distance(bound: float) -> float | None:
-    """Return a bound of the robustness as reports show it: 0 for the least distance, None if it is infinite."""
+    """Return a bound of the robustness as reports show it: 0 for the least distance, None if infinite."""
     if not isfinite(bound):
         return None
     return 0.0 if abs(bound) == TINY else bound
