@@ -1,1 +1,1 @@
-"""The command-line tools: a thin layer over the library. The library never imports them."""
+"""The command-line tools: a thin layer over the library, which never imports them."""

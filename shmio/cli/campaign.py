@@ -1,4 +1,4 @@
-"""``shmio-campaign``: judges what a campaign expects, live or over a recording.
+"""``shmio-campaign``: judges the expectations of a campaign, live or over a recording.
 
 The verbs are in ``shmio.cli.campaigns``.
 """

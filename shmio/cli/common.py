@@ -24,13 +24,13 @@ from shmio.logs import printable
 
 MAX_SECONDS = 86_400
 SHOWN_CHARACTERS = 60
-"""Largest number of characters of a value on a terminal."""
+"""Maximum number of characters of a value that a terminal shows."""
 
 
 class PartlyDoneError(CommandError):
-    """A command failed after it had done a part of its work.
+    """A command failed after it had done part of its work.
 
-    ``found`` describes that part for the JSON output.
+    ``found`` describes that part, as keys of the JSON output.
     """
 
     def __init__(self, message: str, found: Mapping[str, object]) -> None:
@@ -44,12 +44,18 @@ def run(
     options: argparse.Namespace,
     status_of: Callable[[Exception], int] = lambda _error: 1,
 ) -> int:
-    """Run a command and return its exit status.
+    """Run a command, print its error, and return its exit status.
 
-    The status is 0 for success, 1 for a failure, with a line on standard error, and 128 + n after
-    signal n, as in shells. argparse exits with 2 for wrong usage. With ``--json`` every command
-    also prints a failure on standard output, as ``{"error": "…"}``. A command for which 1 has
-    another meaning passes ``status_of``, which returns the status for an error.
+    The status is 0 for success, 1 for a failure, and 128 + n after signal n, as in shells. argparse
+    exits with 2 for wrong usage. An error is printed on standard error; with ``--json`` also on
+    standard output, as ``{"error": "…"}``.
+
+    Args:
+        program: Name of the program, for error messages.
+        command: Runs the command. It returns the exit status, or None for 0.
+        options: The parsed arguments.
+        status_of: Returns the exit status for an error, for a command that uses 1 for something
+            else.
     """
     as_json = getattr(options, "json", False)
     if isinstance(sys.stdout, io.TextIOWrapper):
@@ -77,10 +83,13 @@ def run(
 
 
 def load(command: str) -> Callable[[argparse.Namespace], int]:
-    """Import the function of a verb, such as ``shmio.cli.instance.status:status``.
+    """Import and return the function of a verb.
 
     Only the modules that this verb needs are imported. During the import, Ctrl-C ends the process
     at once.
+
+    Args:
+        command: Module and function of the verb, such as ``shmio.cli.instance.status:status``.
     """
     module, _, function = command.partition(":")
     with ended_by_interrupt():
@@ -100,12 +109,12 @@ class _VerbParser(argparse.ArgumentParser):
 
 
 def add_verbs(parser: argparse.ArgumentParser) -> argparse._SubParsersAction[argparse.ArgumentParser]:
-    """Return what adds verbs to a command."""
+    """Return the object with which to add verbs to a command."""
     return parser.add_subparsers(dest="verb", required=True, metavar="VERB", parser_class=_VerbParser)
 
 
 def complete(parser: argparse.ArgumentParser) -> None:
-    """If a shell asks for completions, print them and exit; otherwise do nothing."""
+    """If the shell asks for completions, print them and exit; otherwise do nothing."""
     if "_ARGCOMPLETE" in os.environ:
         from shmio.cli.completion import answer  # noqa: PLC0415  only for a shell
 
@@ -113,13 +122,13 @@ def complete(parser: argparse.ArgumentParser) -> None:
 
 
 def say(line: str, stream: TextIO | None = None) -> None:
-    """Print a line at once. A closed terminal does not stop the command."""
+    """Print a line without delay. If the terminal is closed, do nothing."""
     with suppress(OSError):
         print(printable(line), file=stream or sys.stdout, flush=True)
 
 
 def say_json(value: Any) -> None:
-    """Print an object as one line of JSON at once. A closed terminal does not stop the command."""
+    """Print an object as one line of JSON without delay. If the terminal is closed, do nothing."""
     with suppress(OSError):
         print(dumps(value), flush=True)
 
@@ -139,7 +148,7 @@ def _give_up_output() -> None:
 
 
 def at_least(least: int) -> Callable[[str], int]:
-    """Return an argparse type for whole numbers from ``least`` on."""
+    """Return an argparse type that accepts whole numbers from ``least`` on."""
 
     def convert(text: str) -> int:
         if not text.isascii() or not text.isdecimal() or len(text) > 7 or int(text) < least:
@@ -150,7 +159,7 @@ def at_least(least: int) -> Callable[[str], int]:
 
 
 def seconds(text: str) -> float:
-    """Convert an argument that is a time in s."""
+    """Convert an argument that is a time in s. This is an argparse type."""
     try:
         seconds = float(text)
     except ValueError:
@@ -161,7 +170,7 @@ def seconds(text: str) -> float:
 
 
 def milliseconds(text: str) -> float:
-    """Convert an argument that is a time in ms."""
+    """Convert an argument that is a time in ms. This is an argparse type."""
     try:
         found = float(text)
     except ValueError:
@@ -176,7 +185,7 @@ _UNITS_S: Final = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
 
 
 def moment(text: str) -> float:
-    """Convert an argument that is a date and time, or a time before now such as ``10m``.
+    """Convert an argument that is a date and time, or a duration before now, such as ``10m``.
 
     Returns:
         UNIX time in s.
@@ -192,34 +201,39 @@ def moment(text: str) -> float:
 
 
 def seed_number(text: str) -> int:
-    """Convert an argument that is a seed."""
+    """Convert an argument that is a seed. This is an argparse type."""
     if not text.isascii() or not text.isdecimal() or len(text) > 19 or int(text) >= 2**63:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0 to {2**63 - 1}")
     return int(text)
 
 
 def add_json(parser: argparse._ActionsContainer, text: str = "print one JSON object") -> None:
-    """Add the option ``--json``, which also makes :func:`run` print errors as JSON."""
+    """Add the option ``--json``, with ``text`` as its help. It also makes :func:`run` print errors as JSON."""
     parser.add_argument("--json", action="store_true", help=f"{text}; an error, too")
 
 
 def add_full(parser: argparse.ArgumentParser) -> None:
-    """Add ``--full``."""
+    """Add the option ``--full``, which prints long values completely."""
     parser.add_argument(
         "--full", action="store_true", help="print long arrays and texts completely, even on a terminal"
     )
 
 
 def room(options: argparse.Namespace) -> int | None:
-    """Return the largest number of characters to print of a value; None if there is no limit.
+    """Return the maximum number of characters to print of a value; None if there is no limit.
 
-    There is no limit with ``--full``, or if the output is not a terminal.
+    There is no limit with ``--full``, or if standard output is not a terminal.
     """
     return None if options.full or not sys.stdout.isatty() else SHOWN_CHARACTERS
 
 
 def dumps(value: Any, indent: int | None = None) -> str:
-    """Return JSON that contains only characters that standard output can encode."""
+    """Return a value as JSON that contains only characters that standard output can encode.
+
+    Args:
+        value: The value.
+        indent: Number of spaces by which to indent each level; None for a single line.
+    """
     utf8 = (sys.stdout.encoding or "").lower().replace("-", "") == "utf8"
     return json.dumps(value, indent=indent, ensure_ascii=not utf8)
 
@@ -249,7 +263,10 @@ def stop_on_signals() -> Iterator[threading.Event]:
 
 @contextmanager
 def ended_by_interrupt() -> Iterator[None]:
-    """Let Ctrl-C end the process at once and silently. An exception would interrupt an import."""
+    """Within a ``with`` block, let Ctrl-C end the process at once and silently.
+
+    An exception would leave an import unfinished.
+    """
     main = threading.current_thread() is threading.main_thread()
     heeded = main and signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if heeded:
@@ -263,10 +280,10 @@ def ended_by_interrupt() -> Iterator[None]:
 
 @contextmanager
 def exit_on_signals() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP raise SystemExit, so that unfinished work is undone.
+    """Within a ``with`` block, let SIGTERM and SIGHUP raise SystemExit, so that unfinished work is undone.
 
     The exit status is 128 + n, as in shells. Signals that are ignored, such as SIGHUP under nohup,
-    are still ignored.
+    stay ignored.
     """
 
     def end(number: int, _frame: FrameType | None) -> None:

@@ -1,7 +1,7 @@
 """Completes command lines with argcomplete. The shell runs the command, which prints the choices.
 
-argcomplete itself completes options, verbs and choices. This module completes other arguments,
-chosen by the ``dest`` of the argument.
+argcomplete itself completes options, verbs and choices. This module completes the other arguments,
+by their ``dest``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Completer = Callable[..., Iterable[str]]
 
 
 def script(shell: str) -> str:
-    """Return the code that a shell runs at its start.
+    """Return the code that a shell must run at its start to complete the commands of shmio.
 
     Raises:
         MissingLibraryError: argcomplete is not installed.

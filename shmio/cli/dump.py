@@ -17,12 +17,12 @@ from shmio.wording import unknown
 
 PROGRAM = "shmio-dump"
 MODULES = {"info": "examine", "verify": "examine", "cut": "rewrite", "merge": "rewrite", "recover": "rewrite"}
-"""The module of each verb whose module has another name than the verb."""
+"""The module of each verb whose module has a different name."""
 SOME_FILES = "print JSON: one object, or a list for several files"
 IGNORABLE = ("times", "cycle", "reason", "events", "ends")
-"""Choices of ``diff --ignore``.
+"""Valid values of ``diff --ignore``.
 
-They are copied from shmio.recording.compare to avoid its import.
+They are a copy of those in shmio.recording.compare, so that this module need not import it.
 """
 
 

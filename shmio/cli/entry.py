@@ -1,4 +1,4 @@
-"""The console scripts. They import little, so that Ctrl-C ends a command at once while it loads.
+"""The console scripts. They import little at first, so that Ctrl-C ends a command at once while it loads.
 
 Ctrl-C does not raise an exception while the command loads. An exception during an import would
 leave a library half loaded, and C code that uses such a library crashes.

@@ -1,4 +1,4 @@
-"""``shmio inject``: overrides values while the command runs, one by one or by a campaign file."""
+"""``shmio inject``: overrides values while the command runs: values from the command line, or a campaign file."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ from shmio.model.injection import InjectionEvent
 from shmio.wording import unknown
 
 TURN_S: Final = 0.2
-"""Interval in s at which to check for a campaign's events, signals and the end of the time."""
+"""Interval in s at which the command checks for events, signals and the end of its time."""
 SEED_BITS: Final = 32
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the verb's own arguments."""
+    """Add the arguments of ``inject``."""
     parser.epilog = (
         "An injection over PATH or PATH/out shows VALUE to consumers. An injection over PATH/in gives VALUE to the "
         "device, instead of what others write. VALUE is JSON or an S7 literal. Without PATH, this command lists the "
@@ -199,14 +199,14 @@ def _running(running: dict[str, Any] | None) -> str:
 
 
 def run_campaign(cell: Cell, options: argparse.Namespace) -> int:
-    """Run a campaign until all its injections have ended, the time is up, or a signal arrives.
+    """Run a campaign until all its injections have ended, its time is up, or a signal arrives.
 
-    With ``keep``, return as soon as the campaign has started.
+    With ``--keep``, return as soon as the campaign has started.
 
     Raises:
-        ConfigError: The file is wrong. Nothing was started.
-        CommandError: A source refused an injection, or the time of an injection has passed. Nothing
-            was started.
+        ConfigError: The campaign file is invalid. Nothing was started.
+        CommandError: A source refused an injection, or the start time of an injection has passed.
+            Nothing was started.
 
     """
     from shmio.config.campaign import read_campaign  # noqa: PLC0415  only for a file

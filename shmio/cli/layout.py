@@ -22,7 +22,7 @@ _HEADINGS = ("offset", "size", "type", "path", "over", "initial", "comment")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command. Return its exit status: 0 success, 1 failure, 2 wrong usage."""
+    """Run ``shmio-layout``. Return its exit status: 0 for success, 1 for a failure, 2 for wrong usage."""
     given = sys.argv[1:] if arguments is None else arguments
     if given[:1] == ["import"]:
         return layout_import.main(given[1:])

@@ -1,4 +1,4 @@
-"""``shmio-layout import``: converts a plant's tag list into a tag table."""
+"""``shmio-layout import``: converts another tool's tag list into a tag table."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from shmio.wording import EXISTS, NOT_TOML
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command. Return its exit status: 0 success, 1 failure, 2 wrong usage."""
+    """Run ``shmio-layout import``. Return its exit status: 0 for success, 1 for a failure, 2 for wrong usage."""
     parser = parser_of_import()
     options = parser.parse_args(arguments)
     return run(parser.prog, lambda: _import(options.file, options.output, writable=options.writable), options)

@@ -69,7 +69,7 @@ def get_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def get(cell: Cell, options: argparse.Namespace) -> int:
-    """Print present values. All values of a source are from the same frame."""
+    """Print the present values. All values of a source are from the same frame."""
     found = cell.get(*options.patterns)
     _load_numpy(found)
     if options.json:
@@ -240,10 +240,10 @@ def _line(reading: Reading, width: int, limit: int | None) -> str:
 
 
 def shown(value: Value, register: Register, limit: int | None) -> str:
-    """Return a value as text; ``-`` if there is no value, ``""`` if it is an empty text.
+    """Return a value as text; ``-`` if there is no value, ``""`` for an empty text.
 
-    ``limit`` is the largest number of characters; None for no limit. A longer text is cut; a hint
-    at its end says how to see all of it.
+    ``limit`` is the maximum number of characters; None for no limit. A longer text is cut, and ends
+    with a hint how to see all of it.
     """
     text = "-" if value is None else printable(literal_text(value, register)) or '""'
     return text if limit is None or len(text) <= limit else f"{text[: max(limit - len(CUT), 0)]}{CUT}"

@@ -29,7 +29,7 @@ _ALONE: Final = ("status", "pause", "play")
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the verb's own arguments."""
+    """Add the arguments of ``replay``."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     lines = "\n".join(f"  {verb:<10} {text}" for verb, text in _VERBS.items())
     parser.description = (

@@ -20,13 +20,13 @@ from shmio.model.values import WRITE_MIN_PERIODS, WRITE_TIMEOUT_S, Outcome, Outc
 from shmio.wording import unknown
 
 MATCHES = 3
-"""Number of matching registers that the error about a pattern names."""
+"""Number of matching registers that an error about a pattern lists."""
 
 _NEGATIVE = re.compile(r"-(?:\.?[0-9]|Infinity\Z)")
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the verb's own arguments."""
+    """Add the arguments of ``set``."""
     parser.epilog = (
         "VALUE is JSON or an S7 literal: 5, -1.5e-3, true, 16#FF, T#1s500ms, TOD#12:00:00, D#2026-11-22, '\"text\"'."
     )
@@ -41,7 +41,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def shield(words: Sequence[str]) -> list[str]:
-    """Put a space before words that look like negative numbers but that argparse takes for options.
+    """Put a space before each word that is a negative number but that argparse would take for an option.
 
     argparse itself recognizes ``-1.5``, but not ``-1.5e-3``, ``-16#FF`` or ``-Infinity``.
     """
@@ -49,7 +49,7 @@ def shield(words: Sequence[str]) -> list[str]:
 
 
 class Pairs(argparse.Action):
-    """Reads the arguments PATH VALUE, which may be repeated."""
+    """The argparse action for the arguments PATH VALUE, which may be repeated."""
 
     def __call__(
         self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: object, _: str | None = None
@@ -62,7 +62,7 @@ class Pairs(argparse.Action):
 
 
 def execute(cell: Cell, options: argparse.Namespace) -> int:
-    """Write all values of each source as one command.
+    """Write all values for each source as one command.
 
     Raises:
         CommandError: A write failed; the message is about the first failure.

@@ -23,7 +23,7 @@ _ACTIONS: Final = {
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the verb's own arguments."""
+    """Add the arguments of ``snapshot``."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     lines = "\n".join(f"  {action:<8} {text}" for action, text in _ACTIONS.items())
     parser.description = f"{parser.description}\n\nACTION is one of\n{lines}"
@@ -36,11 +36,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(cell: Cell, options: argparse.Namespace) -> int:
-    """Carry out the action, and print the snapshots that it is about.
+    """Save, restore, list or delete snapshots, and print the snapshots concerned.
 
     Raises:
         SnapshotError: The snapshot cannot be saved, restored or deleted.
-        TimeError: Time is real, or another program owns it.
+        TimeError: The clock is in real time, or another program controls it.
     """
     action, name = options.action, options.name
     if (name is None) != (action == "list"):

@@ -17,7 +17,7 @@ LOOK_S = 0.2
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the verb's own arguments."""
+    """Add the arguments of ``step``."""
     parser.add_argument("--dt-ms", type=_dt_ms, metavar="N", help="length of a step (default: the step size, 50)")
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--count", type=at_least(1), default=1, metavar="N", help="number of steps (default: 1)")
@@ -42,7 +42,7 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
     """Step, play, pause or release the clock, and print its new state.
 
     Raises:
-        CommandError: The options contradict each other, or the user declined.
+        CommandError: The options contradict each other, or the user did not confirm.
         TimeError: The clock cannot be moved, or a step failed.
         ValueRangeError: A step or rate is out of range.
 
@@ -68,7 +68,9 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
 def clock_line(clock: ClockStatus, dt_ms: float | None = None) -> str:
     """Return the state of the clock as text.
 
-    ``dt_ms`` is the length of the steps that were just made; None for the clock's step size.
+    Args:
+        clock: The state.
+        dt_ms: Length of the steps that were just made, in ms; None for the clock's step size.
     """
     if clock.mode == str(ClockMode.WALL):
         return f"real time {clock.time_s:.3f} s"

@@ -18,13 +18,13 @@ DEFAULT_CONFIG = Path("supervisor.toml")
 
 
 def config_file(arguments: argparse.Namespace) -> Path:
-    """Return the configuration file that a verb reads."""
+    """Return the configuration file that the arguments name, or else the default file."""
     return arguments.config or DEFAULT_CONFIG
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """The instance on which a verb acts, and the configuration that names it, if any."""
+    """The instance on which a verb acts, and the configuration that names it; ``file`` is None if there is none."""
 
     name: str
     file: Path | None = None
@@ -33,7 +33,7 @@ class Target:
         """Open the instance's segment.
 
         Raises:
-            SegmentError: The segment cannot be opened, as for Segment.open.
+            SegmentError: The segment cannot be opened; see :meth:`Segment.open`.
             WrongInstanceError: The instance was started from another file.
 
         """
@@ -60,9 +60,9 @@ def target(arguments: argparse.Namespace) -> Target:
     """Return the instance that an option or the configuration names, or else the only running one.
 
     Raises:
-        ConfigError: The name is invalid or missing in the file.
-        NotRunningError: No instance is running.
-        ControlError: Several instances are running.
+        ConfigError: The name is invalid, or missing in the file.
+        NotRunningError: Nothing names an instance, and none is running.
+        ControlError: Nothing names an instance, and several are running.
 
     """
     if arguments.instance is not None:
@@ -79,10 +79,11 @@ def target(arguments: argparse.Namespace) -> Target:
 
 
 def config_option(arguments: argparse.Namespace) -> str | None:
-    """Return the option that selects this command's configuration; "" for the default file.
+    """Return the option with which another command selects this command's configuration.
 
-    Return None if the configuration is unknown, because ``--instance`` names the instance or the
-    command found it running.
+    Returns:
+        The option; "" for the default file; None if the configuration is unknown, because
+        ``--instance`` named the instance, or the command found the running instance.
     """
     if getattr(arguments, "instance", None) is not None:
         return None
@@ -92,7 +93,7 @@ def config_option(arguments: argparse.Namespace) -> str | None:
 
 
 def option_for(file: Path) -> str:
-    """Return the option that selects a configuration; "" for the default file."""
+    """Return the option with which a command selects a configuration; "" for the default file."""
     return "" if file == DEFAULT_CONFIG else f"-c {shlex.quote(str(file))}"
 
 

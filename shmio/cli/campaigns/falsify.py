@@ -1,4 +1,4 @@
-"""``shmio-campaign falsify``: searches the ranges of a campaign for values at which an expectation fails."""
+"""``shmio-campaign falsify``: searches a campaign's ranges for values with which an expectation fails."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ from shmio.version import __version__
 
 MAX_JOBS: Final = 64
 EACH_S: Final = 0.2
-"""Interval in s between two updates of the line on a terminal."""
+"""Interval in s at which the progress line on a terminal is updated."""
 LINES_S: Final = 10.0
-"""Interval in s between two lines if standard error is not a terminal."""
+"""Interval in s between two progress lines if standard error is not a terminal."""
 FAILED, UNDECIDED = 1, 3
 
 
 def falsify(arguments: argparse.Namespace) -> int:
-    """Search for failing values, shrink and store what fails, and print what was found.
+    """Search for values with which an expectation fails, simplify and store them, and print the result.
 
     Raises:
-        ConfigError: The campaign or the configuration is wrong.
-        MissingLibraryError: The library of the strategy is not installed.
+        ConfigError: The campaign or the configuration is invalid.
+        MissingLibraryError: The library of the search strategy is not installed.
         RecordingError: A file cannot be written.
 
     """

@@ -19,7 +19,7 @@ def judge(arguments: argparse.Namespace) -> int:
     """Judge a recording, and print the verdicts.
 
     Raises:
-        ConfigError: The campaign is wrong.
+        ConfigError: The campaign is invalid.
         RecordingError: A file is not a recording.
 
     """

@@ -14,11 +14,11 @@ from shmio.judging.source import Rows, Signal
 from shmio.judging.trace import Traces
 
 MAX_PLOTS: Final = 500
-"""Largest number of plots in a report; further plots are left out."""
+"""Maximum number of plots in a report; further plots are left out."""
 
 
 class Reports:
-    """The reports that a command line asks for. They collect signals only if they have plots."""
+    """The reports that the command line asks for. They collect signals only if a report has plots."""
 
     def __init__(self, arguments: argparse.Namespace) -> None:
         """Create the reports; ``arguments.report`` and ``arguments.junit`` are files or None."""
@@ -27,7 +27,11 @@ class Reports:
         self._traces: Traces | None = None
 
     def collector(self, judge: Callable[[], Judge]) -> Callable[[Mapping[str, Rows]], None]:
-        """Return a function that collects signals. Its first call gets the judge from ``judge``."""
+        """Return a function that collects the signals' new values for the plots.
+
+        Args:
+            judge: Returns the judge. The first call of the returned function calls it.
+        """
         if self._html is None:
             return lambda _rows: None
 
@@ -48,7 +52,14 @@ class Reports:
         command: str,
         injections: Sequence[Span],
     ) -> None:
-        """Write the reports.
+        """Write the reports that the command line asks for.
+
+        Args:
+            judge: The judge, after the end of the run.
+            title: The heading.
+            facts: Names and values to show, such as the seed and digests.
+            command: The command line that repeats the run.
+            injections: When injections were active.
 
         Raises:
             RecordingError: A file cannot be written.

@@ -1,4 +1,4 @@
-"""``shmio-campaign run``: runs a campaign on an instance or in a laboratory, and judges what it expects."""
+"""``shmio-campaign run``: runs a campaign on an instance or in a laboratory, and judges its expectations."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run a campaign, print the verdicts, and write the reports.
 
     Raises:
-        ConfigError: The campaign or the configuration is wrong.
+        ConfigError: The campaign or the configuration is invalid.
         ShmioError: The instance does not start, does not run, or cannot be controlled.
 
     """
@@ -104,10 +104,10 @@ def configuration_of(file: Path, campaign: Campaign) -> Path | None:
 
 
 def duration_of(arguments: argparse.Namespace, campaign: Campaign) -> float:
-    """Return how long a campaign runs, in s.
+    """Return how long to run a campaign, in s.
 
     Raises:
-        ConfigError: Neither the file nor the command line says it.
+        ConfigError: Neither the campaign file nor the command line gives the duration.
 
     """
     duration_s: float | None = arguments.for_s or campaign.duration_s

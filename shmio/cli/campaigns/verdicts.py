@@ -23,7 +23,13 @@ def exit_status(verdicts: Sequence[Verdict]) -> int:
 
 
 def tell(judge: Judge, found: dict[str, Any], *, as_json: bool) -> int:
-    """Print all verdicts, and return the exit status. ``found`` are further keys of the JSON object."""
+    """Print all verdicts, and return the exit status.
+
+    Args:
+        judge: The judge, after the end of the run.
+        found: Further keys of the JSON object.
+        as_json: Whether to print one JSON object instead of lines of text.
+    """
     verdicts = judge.verdicts
     if as_json:
         begin, end = judge.begin_ns, judge.end_ns
@@ -43,7 +49,7 @@ def tell(judge: Judge, found: dict[str, Any], *, as_json: bool) -> int:
 
 
 def as_table(verdict: Verdict) -> dict[str, Any]:
-    """Return a verdict for JSON. Times are in s of the instance's clock."""
+    """Return a verdict as a JSON object. Times are instance times, in s."""
     expectation = msgspec.to_builtins(verdict.expectation)
     return {
         "name": verdict.expectation.name,
@@ -66,7 +72,7 @@ def as_table(verdict: Verdict) -> dict[str, Any]:
 
 
 def lines(verdict: Verdict, width: int = 0) -> list[str]:
-    """Return the lines to print about a verdict. ``width`` is the width of the column of names."""
+    """Return a verdict as lines of text. ``width`` is the width of the column of names, in characters."""
     expectation = verdict.expectation
     of = f" [{expectation.requirement}]" if expectation.requirement else ""
     robustness = "" if verdict.robustness is None else f"  robustness {verdict.robustness:.6g}"

@@ -27,7 +27,7 @@ WHERE_S: Final = 5.0
 
 
 def audit(arguments: argparse.Namespace) -> int:
-    """Print the last entries that match the options; with ``-f``, also new ones until Ctrl-C."""
+    """Print the last entries that match the options; with ``-f``, also new entries until Ctrl-C."""
     newest = _where(arguments) / AUDIT_FILE
     since_s = arguments.since or 0.0
     wanted = EntryFilter(

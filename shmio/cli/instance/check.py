@@ -1,4 +1,4 @@
-"""``shmio-supervisor check``: validates a configuration and the files it names; starts nothing."""
+"""``shmio-supervisor check``: validates a configuration and the files that it names. It starts nothing."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from shmio.segment import PREFIX, BlockSpec, Segment
 from shmio.wording import counted
 
 MAX_PATTERNS: Final = 200
-"""Largest number of characters that a line shows of a source's patterns."""
+"""Maximum number of characters of a source's patterns that are printed in a line."""
 
 
 def check(arguments: argparse.Namespace) -> int:

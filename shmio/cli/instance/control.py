@@ -34,13 +34,13 @@ PREVIEWED: Final[Mapping[str, str]] = {
     "reread": "would reload the tokens and roles of",
     "keep": "would keep",
 }
-"""Headings for the lists in the answer of a dry run."""
+"""The words with which ``reload --dry-run`` prints each kind of change."""
 
 
 def down(arguments: argparse.Namespace) -> int:
     """Ask the supervisor to stop the instance, and wait until the supervisor has ended.
 
-    If the supervisor is dead, remove what it left behind.
+    If the supervisor is dead, clear what it left behind.
     """
     wanted = target(arguments)
     name = wanted.name
@@ -94,9 +94,9 @@ def _pidfd(pid: int) -> int | None:
 
 
 def reload(arguments: argparse.Namespace) -> int:
-    """Apply the changes of the configuration; return 1 if a changed process does not run.
+    """Apply the changes of the configuration file; return 1 if a changed process does not run.
 
-    With ``--dry-run``, print the changes; return 1 if they would be refused.
+    With ``--dry-run``, only print what would change; return 1 if the changes would be refused.
     """
     if arguments.dry_run:
         return _preview(arguments)
@@ -140,7 +140,7 @@ def _preview(arguments: argparse.Namespace) -> int:
 
 
 def restart(arguments: argparse.Namespace) -> int:
-    """Stop and start one process; return when it runs again."""
+    """Stop and start one process; return once it runs again."""
     with target(arguments).open_supervised() as segment:
         ask_supervisor(segment, control.Restart(arguments.name), RESTART_S)
         print(f"{arguments.name} runs again")

@@ -1,6 +1,6 @@
 """``shmio-supervisor up --detach``: starts an instance in another process, and waits until it runs.
 
-This process only waits. It therefore does not import the modules that start an instance.
+This process only waits, so it does not import the modules that start an instance.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from shmio.segment import PREFIX
 from shmio.supervisor.process import child_environment
 
 DETACH_S = 120.0
-"""Time-out in s for the start of a detached instance."""
+"""Maximum time in s that the start of a detached instance may take."""
 _OPTIONS: Final = ("from", "start", "end", "speed", "injections")
 _FLAGS: Final = ("loop", "paused", "record")
 
 
 class Configured(msgspec.Struct, tag=True):
-    """Message that the detached supervisor has read its configuration."""
+    """Message of a detached supervisor: it has read its configuration."""
 
     log_file: str
     warnings: tuple[str, ...]
 
 
 class Started(msgspec.Struct, tag=True):
-    """Message that the instance of the detached supervisor runs.
+    """Message of a detached supervisor: its instance runs.
 
     ``history`` says what an earlier supervisor left behind; ``processes`` has a line for each
     process.
@@ -50,17 +50,17 @@ class Started(msgspec.Struct, tag=True):
 
 
 class Failed(msgspec.Struct, tag=True):
-    """Message that the start of the detached supervisor has failed."""
+    """Message of a detached supervisor: the instance cannot be started."""
 
     error: str
 
 
 StartMessage = Configured | Started | Failed
-"""A message about the start, sent as one line of JSON without control characters."""
+"""A message about the start of an instance, sent as one line of JSON without control characters."""
 
 
 def detach(arguments: argparse.Namespace) -> int:
-    """Start the instance in another process; return when it runs."""
+    """Start the instance in another process, and return once it runs."""
     file, mode = config_file(arguments), arguments.mode
     log_file, started = start(file, mode, replay_words(replay_keys(arguments)))
     for line in started.history:
@@ -79,10 +79,10 @@ def start(file: Path, mode: str, words: Sequence[str] = ()) -> tuple[str, Starte
     Args:
         file: The configuration.
         mode: The mode of the instance.
-        words: More options for ``shmio-supervisor up``.
+        words: Further options for ``shmio-supervisor up``.
 
     Returns:
-        The supervisor's log file, and its message.
+        Path of the supervisor's log file, and the supervisor's message.
 
     Raises:
         ControlError: The start failed.
@@ -111,19 +111,24 @@ def start(file: Path, mode: str, words: Sequence[str] = ()) -> tuple[str, Starte
 
 
 def headline(instance: str, mode: str, segment_bytes: int | None, log_dir: Path) -> str:
-    """Return the first line to print about an instance.
+    """Return the first line to print about an instance that has started.
 
-    ``segment_bytes`` is None if an earlier segment is taken over, whose size is not known yet.
+    Args:
+        instance: Name of the instance.
+        mode: The mode in which it runs.
+        segment_bytes: Size of the segment in bytes; None if an earlier segment is taken over, whose
+            size is not known yet.
+        log_dir: The directory of its log files.
     """
     size = "" if segment_bytes is None else f" ({segment_bytes / 1e6:.1f} MB)"
     return f"{instance}: mode {mode}, segment {PREFIX}{instance}{size}, logs in {log_dir}"
 
 
 def replay_keys(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the keys of ``[replay]`` that the command line gives.
+    """Return the keys of ``[replay]`` that the command line sets.
 
     Raises:
-        ConfigError: The command line gives such keys, but the mode is not ``replay``.
+        ConfigError: The command line sets such keys, but the mode is not ``replay``.
 
     """
     found = {name: getattr(arguments, name) for name in (*_OPTIONS, *_FLAGS) if getattr(arguments, name) is not None}

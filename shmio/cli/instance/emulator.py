@@ -15,7 +15,7 @@ DELAY_MS: Final = 100.0
 
 
 def emulator(arguments: argparse.Namespace) -> int:
-    """Tell an emulator how to answer from now on."""
+    """Set how an emulator answers its clients from now on."""
     name, answers = arguments.name, arguments.answers
     delay_ms = (arguments.delay_ms or DELAY_MS) if answers == "delay" else 0.0
     with target(arguments).open_supervised() as segment:

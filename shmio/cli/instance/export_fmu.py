@@ -1,4 +1,4 @@
-"""``shmio-supervisor export-fmu``: writes an instance as an FMU for co-simulation."""
+"""``shmio-supervisor export-fmu``: exports an instance as an FMU for co-simulation."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ SHOWN = 10
 
 
 def export_fmu(arguments: argparse.Namespace) -> int:
-    """Write the FMU, and say what is in it.
+    """Write the FMU, and print what it contains.
 
     Raises:
         ConfigError: The instance cannot be exported.
         LayoutError: A layout cannot be compiled.
-        PathError: A pattern names nothing.
+        PathError: A pattern matches no register.
 
     """
     file: Path = arguments.output

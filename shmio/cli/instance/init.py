@@ -1,6 +1,6 @@
 """``shmio-supervisor init``: writes a first configuration.
 
-This is the A50 example, or a configuration for the files of a controller.
+The configuration is the A50 example, or is made for a controller from its files.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ S7_PORTS = range(1102, 1202)
 MAX_SOURCES = 50
 """Maximum number of sources of a new configuration.
 
-With more data blocks, the user must choose one.
+If the controller has more data blocks, the user must choose one.
 """
 RESERVED = RESERVED_SOURCES | SECTION_PROCESSES | {"plc"}
 _DB_NUMBER = re.compile(r"[0-9]{1,5}", re.ASCII)
@@ -59,11 +59,11 @@ _UMLAUTS: Final = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss"}
 _NAME = re.compile(r"[^A-Za-z0-9_-]+")
 MAX_LENGTH: Final = 40
 MAX_FILES: Final = 500
-"""Maximum number of nearby configurations whose instance names are read."""
+"""Maximum number of configurations nearby that are searched for names in use."""
 
 
 def init(arguments: argparse.Namespace) -> int:
-    """Write the files. If one exists already, write none."""
+    """Write the files of a first configuration. If one of them exists already, write none."""
     file = config_file(arguments)
     _refuse_present(file)
     text, missing = None, dict[Path, list[str]]()
@@ -115,7 +115,7 @@ def _example(file: Path, left_out: list[str]) -> dict[Path, str]:
 
 
 def comment_out(config: str, section: str) -> str:
-    """Return a configuration whose ``[section]`` and ``[[section.*]]`` tables are comments.
+    """Return a configuration in which the tables ``[section]`` and ``[[section.*]]`` are comments.
 
     Args:
         config: Text of a configuration with an empty line before each table.
@@ -152,7 +152,7 @@ def _write(files: dict[Path, str]) -> None:
 
 
 class NewConfig(NamedTuple):
-    """A first configuration."""
+    """A first configuration, and what to tell the user about it."""
 
     text: str
     missing: dict[Path, list[str]]
@@ -410,9 +410,10 @@ def _toml(value: str | list[str]) -> str:
 
 
 def vacant_name(name: str, file: Path) -> str:
-    """Return a name that no instance or nearby configuration has: ``name``, ``name-2`` and so on.
+    """Return a name that is not in use: ``name``, ``name-2`` and so on.
 
-    ``file`` is where the new configuration will be written.
+    A name is in use if an instance or a configuration near ``file`` has it. ``file`` is where the
+    new configuration will be written.
     """
     taken = {*instances(), *_configured(file)}
     numbered = (f"{name[: MAX_LENGTH - len(end)]}{end}" for end in (f"-{number}" for number in count(2)))

@@ -24,7 +24,7 @@ SUPERVISOR = "supervisor"
 
 
 def logs(arguments: argparse.Namespace) -> int:
-    """Print the last lines; with ``-f``, also new lines until Ctrl-C."""
+    """Print the last lines of the logs; with ``-f``, also new lines until Ctrl-C."""
     folder, processes = _where(arguments)
     names = [SUPERVISOR, *processes]
     if arguments.name is not None:

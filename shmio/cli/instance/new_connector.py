@@ -29,11 +29,11 @@ _FILES: Final = {
     "tests/device.py": "device.py",
     "tests/test_{part}.py": "test_fieldbus.py",
 }
-"""Templates by the path in the new folder. In the templates, the connector is called fieldbus."""
+"""Templates by the path of the new file. In the templates, the connector is called ``fieldbus``."""
 
 
 def new_connector(arguments: argparse.Namespace) -> int:
-    """Write the package into a new folder."""
+    """Write the package to a new folder."""
     name: str = arguments.connector
     _check_name(name)
     folder: Path = arguments.directory or Path(f"shmio-{name.replace('_', '-')}")
@@ -51,7 +51,7 @@ def new_connector(arguments: argparse.Namespace) -> int:
 
 
 def package(name: str) -> dict[str, str]:
-    """Return the files of a new package, by path."""
+    """Return the files of a package with a new connector: their texts, by path."""
     part = name.replace("-", "_")
     module = f"shmio_{part}"
     letters = "".join(word.capitalize() for word in part.split("_"))

@@ -12,13 +12,18 @@ from shmio.emulators.kinds import KINDS
 
 
 def schema(arguments: argparse.Namespace) -> int:
-    """Print the schema. That of ``supervisor.toml`` has the keys of all installed connectors."""
+    """Print the schema. For ``supervisor.toml``, it includes the keys of all installed connectors."""
     print(dumps(schema_of(arguments.file, names()), indent=2))
     return 0
 
 
 def schema_of(file: str, connectors: Iterable[str]) -> Schema:
-    """Return the schema of a kind of file: supervisor, campaign or scene."""
+    """Return the schema of a kind of configuration file.
+
+    Args:
+        file: The kind: supervisor, campaign or scene.
+        connectors: Names of the connectors whose keys the schema includes.
+    """
     if file == "campaign":
         return campaign_schema()
     if file == "scene":

@@ -1,4 +1,4 @@
-"""``shmio-supervisor status`` and ``list``: print the state of one instance, or all instances here."""
+"""``shmio-supervisor status`` and ``list``: print the state of one instance, or of all on this host."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ _HEADINGS = ("NAME", "KIND", "STATE", "PID", "RESTARTS", "UPTIME", "")
 _LIST_HEADINGS = ("NAME", "STATE", "FILE", "LISTENS ON")
 WHERE_S = 2.0
 LATE_S = 1.0
-"""A reader that is at least this time in s behind is shown beside its source."""
+"""The status shows each reader that is at least this time behind its source, in s."""
 
 
 def status(arguments: argparse.Namespace) -> int:
-    """Print the status; return 1 if the instance does not run."""
+    """Print the status of an instance; return 1 if it does not run."""
     try:
         wanted = target(arguments)
         found = read_status(wanted.name, config_option(arguments), wanted.file)
@@ -107,10 +107,11 @@ def _duration(seconds: float) -> str:
 
 
 class Listed(msgspec.Struct):
-    """An instance in the list.
+    """A row of ``list``: one instance.
 
-    ``file`` is the configuration from which it was started. ``listen`` has the addresses by
-    process. Both are empty if they are not known. ``note`` is a remark for the user.
+    ``file`` is the configuration from which the instance was started. ``listen`` has the addresses
+    on which each process listens. Either is empty if it is not known. ``note`` is a remark for the
+    user.
     """
 
     name: str

@@ -31,7 +31,7 @@ from shmio.wording import counted
 
 
 def up(arguments: argparse.Namespace) -> int:
-    """Run an instance until it has stopped.
+    """Start an instance, and return once it has stopped.
 
     With ``--report``, act as the child process of ``up --detach``.
     """

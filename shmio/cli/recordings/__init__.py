@@ -1,1 +1,1 @@
-"""Verbs of ``shmio-dump``: functions of the arguments that return the exit status."""
+"""Verbs of ``shmio-dump``: functions that take the parsed arguments and return the exit status."""

@@ -16,7 +16,7 @@ from shmio.recording.rewriting import new_file
 
 
 def campaign(arguments: argparse.Namespace) -> int:
-    """Write the injections in files of one run; report injections that cannot be declared."""
+    """Write the injections in the files of one run as a campaign; report those that a campaign cannot declare."""
     report = DamageReport()
     with report.open(arguments.files) as dump:
         found = derive(dump)

@@ -36,11 +36,11 @@ from shmio.segment.explain import ABOUT, Explained, Explainer, cells_of, kind_of
 from shmio.wording import EMPTY
 
 MAX_PLACES: Final = 4
-"""Maximum number of registers that the text output shows of an event."""
+"""Maximum number of an event's registers that the text output shows."""
 
 
 def cat(arguments: argparse.Namespace) -> int:
-    """Print a line for each frame in which a chosen value or the quality changed.
+    """Print a line for each frame in which a chosen value or the quality has changed.
 
     Events, gaps and steps have lines of their own. If parts of the recording are damaged, report
     each in its place, print the rest, and return 1.
@@ -184,7 +184,7 @@ def _lines(
 
 
 class View:
-    """The chosen registers of one block, and the frame that was printed last."""
+    """The chosen registers of one block, and the last frame that was printed."""
 
     def __init__(self, channel: Channel, layout: Layout, registers: Sequence[Register]) -> None:
         self.source = channel.source
@@ -194,9 +194,9 @@ class View:
         self._shown: Frame | None = None
 
     def take(self, frame: Frame) -> bool:
-        """Return whether a value or the quality differs from those in the frame printed last.
+        """Return whether a value or the quality differs from the last frame that was printed.
 
-        If so, this frame becomes the one printed last.
+        If so, ``frame`` counts as printed.
         """
         shown = self._shown
         same = shown is not None and (shown.quality, shown.reason) == (frame.quality, frame.reason)
@@ -213,13 +213,13 @@ class Printer(Protocol):
         """Format the chosen values of a frame."""
 
     def event(self, time_ns: int, source: str, event: Event, explained: Explained) -> str:
-        """Format an event with its registers and values."""
+        """Format an event, with its registers and their values."""
 
     def gap(self, time_ns: int, gap: Gap) -> str:
         """Format a gap."""
 
     def step(self, time_ns: int, mark: StepMark) -> str:
-        """Format the end of a step."""
+        """Format a step of virtual time."""
 
     def process(self, time_ns: int, change: ProcessChange) -> str:
         """Format a change of a process."""
@@ -244,12 +244,12 @@ def _definition(definition: dict[str, Any]) -> str:
 
 
 class JsonLines:
-    """Formats entries as lines with one JSON object each, with times in UTC."""
+    """Formats each entry as a line with one JSON object, with times in UTC."""
 
     def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
-        """Format a frame with ``values`` by path.
+        """Format a frame, with its ``values`` by path.
 
-        All values are null before the source's first value.
+        All values are null until the source has its first value.
         """
         known = frame.source_ns != 0
         values = {
@@ -288,14 +288,14 @@ class JsonLines:
         )
 
     def step(self, time_ns: int, mark: StepMark) -> str:
-        """Format a step, which has no source.
+        """Format a step, which belongs to no source.
 
         ``step`` is its number, ``clock_ns`` the time after it.
         """
         return dumps({"time": iso(time_ns), "step": mark.step, "clock_ns": mark.time_ns, "dt_ns": mark.dt_ns})
 
     def process(self, time_ns: int, change: ProcessChange) -> str:
-        """Format a change of a process, with the keys that the recording has."""
+        """Format a change of a process, with the keys that the change has in the recording."""
         return dumps({"time": iso(time_ns), "process": msgspec.to_builtins(change)})
 
     def _line(self, time_ns: int, source: str, **fields: Any) -> str:
@@ -303,7 +303,7 @@ class JsonLines:
 
 
 class Table:
-    """Formats entries as lines with columns. Headings are printed whenever the block changes."""
+    """Formats each entry as a line with columns. It prints headings whenever the block changes."""
 
     def __init__(self, room: int | None) -> None:
         """Set the largest number of characters of a value; None for no limit."""
@@ -359,11 +359,11 @@ class Table:
 
 
 class Csv:
-    """Formats entries as CSV rows (RFC 4180) with one heading row and times in UTC.
+    """Formats each entry as a CSV row (RFC 4180), with one heading row and times in UTC.
 
-    There is a column for each register of all blocks. Its name begins with the source if there are
-    several sources, or another column has the same name. Arrays are JSON. A field is empty if the
-    source has had no value yet, or if the register belongs to another block.
+    Each register of each block has a column. The column's name includes the source if there are
+    several sources, or if another column has the same name. Arrays are JSON. A field is empty if
+    the source has had no value yet, or if the register belongs to another block.
     """
 
     OWN = ("time", "source", "what", "number", "quality", "text", *ABOUT)
@@ -382,7 +382,7 @@ class Csv:
         self._begun = False
 
     def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
-        """Format a frame as a row: the column ``what`` contains ``frame``, ``text`` the reason."""
+        """Format a frame: the column ``what`` is ``frame``, ``text`` is the reason for its quality."""
         values = [""] * len(self._columns)
         if frame.source_ns != 0:
             names = self._names[self._views.index(view)]
@@ -391,20 +391,20 @@ class Csv:
         yield self._row(time_ns, view.source, "frame", frame.number, str(frame.quality), frame.reason, values)
 
     def event(self, time_ns: int, source: str, event: Event, explained: Explained) -> str:
-        """Format an event: column ``what`` is the kind of the event."""
+        """Format an event: the column ``what`` is the kind of the event."""
         row = time_ns, source, kind_of(event), event.number, str(event.quality), event.text
         return self._row(*row, about=cells_of(explained, dumps))
 
     def gap(self, time_ns: int, gap: Gap) -> str:
-        """Format a gap: column ``number`` is the number of the first missing frame or event."""
+        """Format a gap: the column ``number`` is the number of the first missing frame or event."""
         return self._row(time_ns, gap.source, f"missed {gap.count} {gap.what}", gap.first, "", str(gap.reason))
 
     def step(self, time_ns: int, mark: StepMark) -> str:
-        """Format a step, which has no source."""
+        """Format a step, which belongs to no source."""
         return self._row(time_ns, "", "step", mark.step, "", "")
 
     def process(self, time_ns: int, change: ProcessChange) -> str:
-        """Format a change of a process: ``number`` is its pid, ``text`` its name and the reason."""
+        """Format a change of a process: the column ``number`` is its pid, ``text`` its name and the reason."""
         text = f"{change.name}: {change.why}" if change.why else change.name
         return self._row(time_ns, "", f"process {change.what}", change.pid, "", text)
 

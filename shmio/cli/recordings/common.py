@@ -35,32 +35,30 @@ class DamageReport:
         return bool(self.texts)
 
     def open(self, files: Sequence[Path]) -> Dump:
-        """Open a recording, and report its damage. It raises the errors of ``open_dump``."""
+        """Open a recording, and report its damage. This raises the same errors as ``open_dump``."""
         dump = open_dump(files, self.damage)
         for text in dump.damage:
             self.say(text)
         return dump
 
     def damage(self, file: Path, damage: Damage) -> None:
-        """Report that a part of a file is lost."""
+        """Report that a part of a file is damaged."""
         self.say(f"{file}: {lost(damage)}")
 
     def say(self, text: str) -> None:
-        """Report a line of text; the exit status will be 1."""
+        """Report a line of text. The command's exit status will be 1."""
         self.texts.append(text)
         sys.stdout.flush()
         print(printable(text), file=sys.stderr, flush=True)
 
 
 def not_closed(end: str) -> str:
-    """Return a text that says that a file was not closed. ``end`` says how the file ends."""
+    """Return a text which says that a file was not closed. ``end`` says how the file ends."""
     return f"not closed ({end}): it is still being written, or its recorder was killed"
 
 
 class Progress:
-    """Shows progress in a line on standard error, if standard error is a terminal.
-
-    The line is removed at the end.
+    """Shows progress on standard error in a line that is removed at the end, if standard error is a terminal.
 
     Use it as a context manager.
     """
@@ -74,7 +72,7 @@ class Progress:
         self._next_s = time.monotonic() + FIRST_S if sys.stderr.isatty() and not silent else float("inf")
 
     def at(self, done: int) -> None:
-        """Show which share of the work is done."""
+        """Show the progress. ``done`` is the amount of work done, in the unit of :attr:`total`."""
         if time.monotonic() >= self._next_s:
             self._next_s = time.monotonic() + EACH_S
             share = f"{min(done / self.total, 1):4.0%}" if self.total else ""
@@ -95,15 +93,17 @@ class Progress:
 
 
 def time_range(arguments: argparse.Namespace, start_ns: int) -> tuple[int, int]:
-    """Return the times of ``--from`` and ``--to`` in ns.
+    """Return the times given by ``--from`` and ``--to``, in ns. An omitted option does not limit the range.
 
-    An omitted option does not limit the range.
-
-    The options are seconds from the recording's start, or ISO 8601. A time without an offset is
+    The options are in s from the recording's start, or in ISO 8601. A time without an offset is
     local.
 
+    Args:
+        arguments: The parsed arguments.
+        start_ns: Start of the recording.
+
     Raises:
-        RecordingError: A time is invalid, or the end is before the beginning.
+        RecordingError: A time is invalid, or the end is before the start.
 
     """
     begin, end = arguments.begin, arguments.end

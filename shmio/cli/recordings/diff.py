@@ -16,7 +16,7 @@ from shmio.recording.dump import open_dump
 from shmio.recording.times import iso, local
 
 MAX_SHOWN = 50
-"""Maximum number of registers, and of details, in the text output; ``--json`` prints all."""
+"""Maximum number of registers, and of details, that the text output shows; ``--json`` prints all."""
 
 
 def diff(arguments: argparse.Namespace) -> int:

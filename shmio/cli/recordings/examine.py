@@ -22,7 +22,7 @@ from shmio.wording import EMPTY, counted
 
 
 def info(arguments: argparse.Namespace) -> int:
-    """Describe each file; return 1 if one is damaged or not a recording."""
+    """Describe each file; return 1 if a file is damaged or not a recording."""
     return _each(arguments, describe, lambda found: _folded(_lines(found)))
 
 
@@ -71,12 +71,12 @@ def _gap(gap: dict[str, Any]) -> str:
 
 
 def verify(arguments: argparse.Namespace) -> int:
-    """Read each file completely; return 1 if one is damaged or not a recording."""
+    """Check each file completely; return 1 if a file is damaged or not a recording."""
     return _each(arguments, checked, checked_lines)
 
 
 def checked(file: Path) -> dict[str, Any]:
-    """Read a file completely and return the result.
+    """Check a file completely, and return what was found, as keys and values for JSON.
 
     Raises:
         OSError: The file cannot be read.
@@ -97,7 +97,7 @@ def checked(file: Path) -> dict[str, Any]:
 
 
 def checked_lines(found: dict[str, Any]) -> list[str]:
-    """Return the result as lines of text."""
+    """Return the result of :func:`checked` as lines of text."""
     whole = f"{found['chunks']} chunks and {found['messages']} messages are whole"
     if not found["chunks"]:
         whole = EMPTY

@@ -23,11 +23,11 @@ SHEETS: Final = frozenset({"ods", "xls", "xlsx"})
 OTHERS: Final = frozenset(
     {"arrow", "db", "duckdb", "feather", "h5", "hdf5", "json", "jsonl", "mat", "mem", "tsv", "txt"}
 )
-"""File name endings of formats that ``export`` cannot write; such names are refused."""
+"""File name endings that ``export`` refuses, because it cannot write these formats."""
 
 
 def export(arguments: argparse.Namespace) -> int:
-    """Write tables, one file for each block, or a single MCAP file for viewers."""
+    """Write a recording as tables, one file for each block, or as a single MCAP file for viewers."""
     report = DamageReport()
     named, form = _form(arguments.output, arguments.format)
     if arguments.events and (not named or form not in TABLES):

@@ -1,4 +1,4 @@
-"""``shmio-dump note``: puts a note into the events of a running instance."""
+"""``shmio-dump note``: adds a note to the events of a running instance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``shmio-dump record``: records a running instance from outside."""
+"""``shmio-dump record``: records a running instance, from outside the instance."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from shmio.segment import Segment
 BY = "shmio-dump"
 WHERE_S = 2.0
 LOOK_S = 0.5
-"""Interval in s at which the instance and the disk are checked."""
+"""Interval in s at which the instance and the output are checked."""
 
 
 def record(arguments: argparse.Namespace) -> int:
@@ -125,13 +125,19 @@ def _name(file: Path | None) -> str | None:
 
 
 class Reporter:
-    """Reports events of the recording: lines on standard error, or JSON lines on standard output."""
+    """Reports what happens to the recording: as text on standard error, or as JSON on standard output."""
 
     def __init__(self, *, as_json: bool) -> None:
         self._as_json = as_json
 
     def report(self, what: str, line: str, **fields: Any) -> None:
-        """Report an event; a closed terminal does not end the recording."""
+        """Report what has happened. A closed terminal does not end the recording.
+
+        Args:
+            what: The kind of event, for JSON.
+            line: The text.
+            fields: Further keys, for JSON.
+        """
         if self._as_json:
             say_json({"what": what, **fields})
         else:

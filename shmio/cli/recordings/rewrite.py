@@ -1,4 +1,4 @@
-"""``shmio-dump cut``, ``merge`` and ``recover``: write a new recording, and verify it."""
+"""``shmio-dump cut``, ``merge`` and ``recover``: write a new recording, and check it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MAX_TOLD = 1000
 
 
 def cut(arguments: argparse.Namespace) -> int:
-    """Write the entries between two times, of all or some sources and registers, to a new file."""
+    """Write the entries between two times to a new file, for the chosen sources and registers; by default, for all."""
     report = DamageReport()
     with report.open(arguments.files) as dump:
         from_ns, to_ns = time_range(arguments, dump.begin_ns)
@@ -40,7 +40,7 @@ def cut(arguments: argparse.Namespace) -> int:
 
 
 def merge(arguments: argparse.Namespace) -> int:
-    """Write the contents of all files to a new file, in the order of time and without duplicates."""
+    """Write the contents of all files to a new file, in order of time and without duplicates."""
     report = DamageReport()
     with report.open(arguments.files) as dump:
         work = _rewrite(dump, arguments.output, "shmio-dump merge", dump.items())
@@ -51,7 +51,7 @@ def merge(arguments: argparse.Namespace) -> int:
 
 
 def recover(arguments: argparse.Namespace) -> int:
-    """Write all messages in intact chunks to a new, closed file; report what was lost."""
+    """Write all messages of intact chunks to a new, closed file; report what was lost."""
     file: Path = arguments.file
     path = arguments.output or file.parent / f"{file.stem}-recovered{file.suffix}"
     places: list[str] = []
