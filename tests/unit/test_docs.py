@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 from functools import cache
 from pathlib import Path
 
@@ -46,3 +47,16 @@ def test_every_picture_is_shown() -> None:
     text = "".join(page.read_text() for page in PAGES)
     for picture in (ROOT / "docs/images").iterdir():
         assert f"images/{picture.name})" in text, f"no page shows {picture}"
+
+
+def test_the_badges_are_true() -> None:
+    badges = runpy.run_path(str(ROOT / "scripts/make-badges"))
+    again = "run scripts/make-badges"
+    assert badges["PICTURE"].read_text() == badges["picture"](), again
+    assert f"![{badges['description']()}](docs/images/badges.svg)" in (ROOT / "README.md").read_text(), again
+
+
+def test_the_tour_is_short() -> None:
+    """Two screens: the tour ends within 60 lines of text, output and commands."""
+    before, _, _ = (ROOT / "README.md").read_text().partition("## Three scenarios")
+    assert len([line for line in before.splitlines() if line and not line.startswith("```")]) <= 60
