@@ -1,1 +1,1 @@
-"""Endpoints: the processes that serve the segment to remote programs."""
+"""Endpoints: the processes that give remote programs access to an instance's shared memory."""

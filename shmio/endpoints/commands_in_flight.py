@@ -1,4 +1,4 @@
-"""The commands in flight to one source, whose outcomes are not known yet."""
+"""The commands in flight to one source: commands whose outcomes are not known yet."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from shmio.segment.commands import CommandOutcomes, End, worst
 from shmio.segment.events import EVENT_DATA_SIZE
 
 MAX_OPEN: Final = 512
-"""Maximum number of events that commands in flight may still cause.
+"""Maximum number of events that all commands in flight may still cause.
 
 The limit is a quarter of the event ring, so that no event is overwritten before it is read.
 """
 
 SUCCESS: Final = DONE | {EventKind.ACCEPTED, EventKind.INJECTED, EventKind.LIFTED, EventKind.NOTED}
-"""Outcomes that are a success, for commands of any kind."""
+"""The outcomes that are a success, for commands of any kind."""
 
 Done = Callable[[Sequence[End]], None]
 """Function that is called once for each command, with the outcome of each of its values."""
@@ -33,7 +33,7 @@ def in_words(end: End) -> str:
 
 
 class CommandCost(NamedTuple):
-    """Upper bounds of what a command needs: bytes in the queue, and number of events."""
+    """Upper bounds of what a command needs: bytes in the command queue, and number of events."""
 
     record_bytes: int
     events: int
@@ -43,8 +43,8 @@ class CommandCost(NamedTuple):
         """Return the cost of a command.
 
         Args:
-            sizes: Size of each item, in bytes.
-            name: Name of the injection, if the command creates one.
+            sizes: Size of each item of the command, in bytes.
+            name: Name of the injection if the command creates one; else empty.
 
         """
         events = sum(2 + size // EVENT_DATA_SIZE for size in sizes)
@@ -58,12 +58,13 @@ class InFlightCommand:
     Attributes:
         incarnation: How many times the source's process had been started when the command was sent.
         until_ns: Deadline for the outcomes, in ns of the monotonic clock.
-        cost: The queue space and the events that the command may need.
+        cost: The queue space and the number of events that the command may need.
         values: For each value, the indices of its items in the command.
         outcomes: The outcomes of the items.
         done: Called once, with the outcome of each value.
-        accepted: Called once, if the source accepts the command.
-        attempt: The command's entry in the audit log, which gets the outcome.
+        accepted: Called once, if the source accepts the command; None to call nothing.
+        attempt: The command's entry in the audit log, which gets the outcome; None if there is
+            none.
         paths: The path of each value.
 
     """
@@ -83,7 +84,7 @@ class InFlightCommand:
     """Maximum number of events that the command may still cause."""
 
     def on_event(self, event: Event) -> bool:
-        """Process an event of the command, and return whether all outcomes are known."""
+        """Process an event about the command. Return whether all outcomes are known now."""
         if not self.taken and event.kind == EventKind.ACCEPTED and self.accepted is not None:
             self.accepted()
         self.taken = True
@@ -123,7 +124,7 @@ class InFlightTable:
 
     @property
     def due_ns(self) -> int | None:
-        """The earliest deadline, in ns of the monotonic clock; None if no command is in flight."""
+        """The earliest deadline of a command, in ns of the monotonic clock; None if no command is in flight."""
         return min((pending.until_ns for pending in self._by_number.values()), default=None)
 
     def add(
@@ -140,11 +141,12 @@ class InFlightTable:
 
         Args:
             ticket: The sent command, as the source's writer returned it.
-            cost: The queue space and the events that the command may need.
+            cost: The queue space and the number of events that the command may need.
             done: Called once, with the outcome of each value.
-            accepted: Called once, if the source accepts the command.
-            attempt: The command's entry in the audit log, which gets the outcome.
-            until_accepted: Whether the command ends as soon as the source accepts it.
+            accepted: Called once, if the source accepts the command; None to call nothing.
+            attempt: The command's entry in the audit log, which gets the outcome; None if there is
+                none.
+            until_accepted: Whether the acceptance by the source is already the outcome.
 
         """
         values = ticket.values
@@ -162,7 +164,7 @@ class InFlightTable:
         """Process an event of the source.
 
         Returns:
-            True if the event is about one of these commands, or about the start of the source.
+            True if the event is about one of these commands, or is the start of the source.
 
         """
         if event.kind == EventKind.STARTED:
@@ -181,14 +183,14 @@ class InFlightTable:
         return True
 
     def shorten_timeouts(self) -> None:
-        """Shorten all time-outs, because events were missed that may have contained outcomes."""
+        """Shorten all time-outs, because missed events may have contained outcomes."""
         self._shorten(self._by_number.values())
 
     def expire(self) -> bool:
-        """End the commands whose deadline has passed.
+        """End the commands whose deadline has passed. Their outcomes are unknown.
 
         Returns:
-            True if at least one of them is still in the source's queue.
+            True if the source has not yet taken at least one of them from its queue.
 
         """
         now_ns = time.monotonic_ns()

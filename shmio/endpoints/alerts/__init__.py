@@ -1,1 +1,1 @@
-"""The alerts: a process that watches conditions, and notifies people and programs."""
+"""Alerts: a process that watches conditions, and notifies people and programs."""

@@ -1,4 +1,4 @@
-"""The process of the alerts."""
+"""The process that evaluates the alerts."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from shmio.segment.doorbell import Relay
 from shmio.worker import BEAT_S, Worker
 
 MAX_NOTE: Final = 300
-"""Maximum length of the status note, in characters."""
+"""Maximum length of the note that the process shows in its status, in characters."""
 WRITE_S: Final = 1.0
 """Maximum time, in s, that :meth:`Alerts.close` waits for the disk."""
 
@@ -38,7 +38,7 @@ class Settings(msgspec.Struct):
 
 
 class Alerts:
-    """Evaluates the alerts, and delivers their notices.
+    """Evaluates all alerts, and delivers their notices.
 
     Use it from one thread: call :meth:`run_once` repeatedly, then :meth:`close`.
     """
@@ -70,7 +70,7 @@ class Alerts:
             os.eventfd_write(self._wakeup, 1)
 
     def run_once(self) -> None:
-        """Wait until something happens, and handle it."""
+        """Wait until there is something to do, and do it."""
         for key, events in self._selector.select(self._rest_s):
             key.data(events)
         notices, more = self._monitor.run_once()
@@ -88,7 +88,7 @@ class Alerts:
             self.report()
 
     def report(self) -> None:
-        """Write the counters and the status note to the process table."""
+        """Write the counters and the status note of this process to the process table."""
         monitor, dispatcher = self._monitor, self._dispatcher
         active = [one.alert.title for one in monitor.alerts if one.active]
         counters = (
@@ -100,7 +100,7 @@ class Alerts:
         self._worker.report_readers(monitor.readers)
 
     def close(self) -> None:
-        """End all actions, and write the state."""
+        """End all actions, and save the state of the alerts."""
         self._clock.abstain(self._slot)
         self._monitor.close()
         self._dispatcher.close()
@@ -127,7 +127,7 @@ class Alerts:
 
 
 def run(worker: Worker) -> None:
-    """Evaluate the alerts, and deliver their notices, until the worker is stopped."""
+    """Evaluate the alerts and deliver their notices, until the worker is stopped."""
     rate_limit = LogRateLimit()
     log.addFilter(rate_limit)
     try:

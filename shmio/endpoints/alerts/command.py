@@ -18,20 +18,20 @@ from shmio.endpoints.alerts.sender import DeliveryError
 from shmio.logs import printable
 
 MAX_AT_ONCE: Final = 4
-"""Maximum number of commands, of all alerts together, that run at the same time."""
+"""Maximum number of commands that run at the same time, for all alerts together."""
 MAX_OUTPUT_BYTES: Final = 8192
-"""Maximum amount of a command's output that goes to the log. The rest is discarded."""
+"""Maximum size in bytes of a command's output that is logged. The rest is discarded."""
 LEAVE_S: Final = 1.0
-"""Maximum time for which a running command may continue when this process stops, in s."""
+"""Maximum time in s for which a running command may continue when this process stops."""
 
 log = logging.getLogger("shmio.alerts")
 
 
 class Command:
-    """Runs a program that gets the notice as JSON on its standard input, and as environment variables.
+    """An action that runs a program, and passes the notice to it.
 
-    The program runs in a session of its own. If it takes too long, its whole process group is
-    killed.
+    The program gets the notice as JSON on its standard input, and as environment variables. It runs
+    in a session of its own. If it takes too long, its whole process group is killed.
     """
 
     once = True  # nobody knows what an interrupted program has already done
@@ -44,7 +44,7 @@ class Command:
         self._stop = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
 
     def stop(self) -> None:
-        """Let a running command continue for at most ``LEAVE_S``."""
+        """Make :meth:`deliver` kill a running command unless it ends within ``LEAVE_S``. Any thread may call this."""
         self._stopping.set()
         os.eventfd_write(self._stop, 1)
 

@@ -1,4 +1,4 @@
-"""Passes notices to the actions of their alerts, and collects the problems of these actions."""
+"""Passes notices to the actions of their alerts, and collects the problems of the actions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from shmio.endpoints.alerts.webhook import Webhook
 from shmio.segment import Segment
 
 LEAVE_S: Final = 2.0
-"""Maximum time for which actions may continue when the process stops, in s."""
+"""Maximum time in s for which actions may continue when the process stops."""
 
 
 class Dispatcher:
@@ -68,12 +68,12 @@ class Dispatcher:
             self._publisher.put(alert, notice)
 
     def run_once(self) -> float:
-        """Do what is due. Return the time in s after which to call this again."""
+        """Do the work that is due. Return the time in s after which to call this method again."""
         return 1.0 if self._publisher is None else self._publisher.run_once()
 
     @property
     def waiting(self) -> Waiting:
-        """The notices that are not delivered yet."""
+        """The notices that have not been delivered yet."""
         return Waiting(
             [notice for sender in self._commands.values() for notice in sender.waiting],
             [] if self._publisher is None else self._publisher.waiting,
@@ -93,7 +93,7 @@ class Dispatcher:
 
     @property
     def problem(self) -> str:
-        """The present problems of the actions, as text; empty if there are none."""
+        """The present problems of all actions, as text; empty if there are none."""
         problems = [sender.problem for sender in self._senders()]
         return "; ".join(filter(None, [*problems, self._publisher.problem if self._publisher else ""]))
 

@@ -1,4 +1,4 @@
-"""Decides when an alert becomes active, when it ends, and which of these changes a notice reports.
+"""Decides when an alert becomes active, when it ends, and which of these changes to announce by a notice.
 
 This module does no I/O and reads no clock.
 """
@@ -13,52 +13,56 @@ import msgspec
 
 
 class Change(StrEnum):
-    """The change of an alert that a notice reports."""
+    """The change of an alert that a notice announces."""
 
     ACTIVE = "active"
     RESOLVED = "resolved"
 
 
 class Progress(msgspec.Struct):
-    """The part of an alert's state that must survive a restart of the process. Times are instance times."""
+    """The part of an alert's state that must survive a restart of the process. Times are in ns of instance time."""
 
     active: bool = False
     since_ns: int = 0
     """When the alert last became active."""
     announced: bool = False
-    """True if a notice has reported the present activation."""
+    """True if a notice has announced the present activation."""
     notice_ns: int | None = None
-    """When the last notice of an activation was made."""
+    """When the last notice of an activation was made; None if there was none."""
     suppressed: int = 0
-    """Number of activations without a notice since :attr:`notice_ns`."""
+    """Number of activations without a notice of their own since :attr:`notice_ns`."""
     notices: int = 0
-    """Number of notices so far, of both kinds."""
+    """Number of notices so far: of activations and of ends."""
 
 
 @dataclass(slots=True)
 class Lifecycle:
     """The state of one alert.
 
-    An alert becomes active when its condition has been true for ``for_ns``, and ends when it is
-    false. An unknown condition (None) changes nothing, but interrupts ``for_ns``. Two notices of
-    activations are at least ``every_ns`` apart. An activation that comes sooner is announced at the
-    end of this interval, if the alert is still active then. Otherwise it only counts as suppressed.
+    An alert becomes active once its condition has been true for ``for_ns``, and ends when its
+    condition is false. An unknown condition (None) changes nothing, but restarts ``for_ns``. There
+    are at least ``every_ns`` between two notices of activations. An activation that comes sooner is
+    announced at the end of this interval, if the alert is still active then. Otherwise it only
+    counts as suppressed.
     """
 
     for_ns: int
     every_ns: int
     resolved: bool
-    """True if a notice also reports the end of an announced activation."""
+    """True if the end of an announced activation gets a notice, too."""
     progress: Progress
     held_ns: int | None = None
-    """Instance time since which the condition has been true; None: it is not, or the alert is active already."""
+    """Instance time since which the condition has been true, in ns.
+
+    None if the condition is not true, or if the alert is active already.
+    """
 
     def observe(self, holds: bool | None, now_ns: int) -> Iterator[Change]:
-        """Process the condition's present value, and yield the changes to report.
+        """Process the present value of the condition, and yield the changes to announce.
 
         Args:
-            holds: Whether the condition is true; None: unknown.
-            now_ns: The present instance time.
+            holds: Whether the condition is true; None if that is unknown.
+            now_ns: The present instance time, in ns.
 
         """
         yield from self.advance(now_ns)
@@ -80,7 +84,11 @@ class Lifecycle:
         progress.announced = False
 
     def advance(self, now_ns: int) -> Iterator[Change]:
-        """Process the time that has passed, and yield the changes to report."""
+        """Process the time that has passed, and yield the changes to announce.
+
+        Args:
+            now_ns: The present instance time, in ns.
+        """
         progress = self.progress
         if self.held_ns is not None and now_ns >= self.held_ns + self.for_ns:
             self.held_ns, progress.active, progress.since_ns = None, True, now_ns
@@ -92,7 +100,7 @@ class Lifecycle:
 
     @property
     def due_ns(self) -> int | None:
-        """Instance time at which to call :meth:`advance` next, in ns; None: no call is needed."""
+        """Instance time at which to call :meth:`advance` next, in ns; None if no call is needed."""
         progress = self.progress
         if self.held_ns is not None:
             return self.held_ns + self.for_ns

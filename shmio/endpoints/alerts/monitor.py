@@ -22,17 +22,17 @@ from shmio.segment.doorbell import TURN_NS, Relay
 
 TURN_S: Final = TURN_NS / 1e9
 LOOK_S: Final = 0.1
-"""Interval in s at which the monitor checks the process table, because no doorbell announces its changes."""
+"""Interval in s at which the monitor checks the process table, because changes of the table ring no doorbell."""
 CATCH_UP_S: Final = 2.0
 """If a source's unread frames span more than this time, in s, the monitor skips to the newest frame."""
 BATCH: Final = 500
-"""Maximum number of frames that one turn reads from one source."""
+"""Maximum number of frames that one turn reads from a source."""
 
 log = logging.getLogger("shmio.alerts")
 
 
 class WatchedAlert:
-    """One alert: its configuration, what it watches, and its state."""
+    """An alert: its configuration, what it watches, and its state."""
 
     def __init__(self, alert: Alert, progress: Progress, watch: Watch) -> None:
         self.alert = alert
@@ -91,16 +91,20 @@ class Monitor:
 
     @property
     def missed(self) -> int:
-        """Number of frames that were overwritten or skipped before they could be evaluated."""
+        """Number of frames that were overwritten or skipped before the monitor could evaluate them."""
         return self._missed + sum(follower.missed for follower in self._followers.values())
 
     @property
     def readers(self) -> Iterator[tuple[Block, int]]:
-        """The blocks that the monitor follows, each with the number of the last frame read."""
+        """The blocks that the monitor follows, each with the number of the last frame that it has read."""
         return ((follower.block, follower.last) for follower in self._followers.values())
 
     def run_once(self) -> tuple[list[tuple[WatchedAlert, Notice]], bool]:
-        """Evaluate new frames and states. Return the new notices, and whether more frames are waiting."""
+        """Evaluate new frames and process states.
+
+        Returns:
+            The new notices with their alerts, and whether more frames are waiting.
+        """
         clock = self._segment.clock.read()  # before the frames, so that they include all of a finished step
         if self._segment.refresh() or self._blocks is not self._segment.blocks:
             self._bind()
@@ -120,7 +124,7 @@ class Monitor:
         return notices, more
 
     def pause_s(self) -> float:
-        """Return how long to wait, in s, before the next :meth:`run_once` if no source publishes."""
+        """Return the maximum time in s to wait before the next :meth:`run_once` if no source publishes a frame."""
         clock = self._segment.clock.read()
         due_ns = min((due for one in self.alerts if (due := one.lifecycle.due_ns) is not None), default=None)
         if due_ns is None or clock.virtual:

@@ -1,4 +1,4 @@
-"""The content of a notice, as JSON and as environment variables."""
+"""Notices of alerts: their content, as JSON and as environment variables."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import msgspec
 from shmio.endpoints.alerts.lifecycle import Change
 
 MAX_REASON: Final = 1000
-"""Maximum length of the reason, in characters."""
+"""Maximum length of a notice's ``reason``, in characters."""
 
 
 class Notice(msgspec.Struct, kw_only=True, frozen=True):
-    """A report that an alert has become active, or has ended.
+    """A notice that an alert has become active, or has ended.
 
     Attributes:
         id: Identifies the notice, so that a receiver can ignore a notice that arrives twice.
         instance: Name of the instance.
         alert: Name of the alert.
-        state: Whether the alert is active, or has ended.
+        state: Whether the alert has become active, or has ended.
         severity: Severity of the alert, as configured.
         text: Text of the alert, as configured.
         watches: What the alert watches: its condition, processes or sources.
@@ -28,10 +28,11 @@ class Notice(msgspec.Struct, kw_only=True, frozen=True):
         values: Values of the registers in the condition, by path.
         injected: True if an injection has changed one of these values.
         provenance: Where the values come from.
-        clock_s: The instance's clock at the change, in s.
-        since_s: The instance's clock when the alert became active, in s.
+        clock_s: Instance time of the change, in s.
+        since_s: Instance time at which the alert became active, in s.
         time: When the notice was made, in UTC (RFC 3339).
-        suppressed: Number of activations without a notice since the last notice of an activation.
+        suppressed: Number of activations without a notice of their own since the last notice of an
+            activation.
 
     """
 
@@ -56,7 +57,7 @@ class Notice(msgspec.Struct, kw_only=True, frozen=True):
         return msgspec.json.encode(self)
 
     def environment(self) -> dict[str, str]:
-        """Return the notice as environment variables; ``SHMIO_ALERT_VALUES`` is JSON."""
+        """Return the notice as environment variables. ``SHMIO_ALERT_VALUES`` is a JSON object."""
         fields: dict[str, Any] = msgspec.to_builtins(self)
         fields["name"] = fields.pop("alert")
         return {f"SHMIO_ALERT_{name.upper()}": _variable(value) for name, value in fields.items()}

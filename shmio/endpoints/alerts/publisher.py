@@ -65,7 +65,7 @@ class Publisher:
 
     @property
     def waiting(self) -> list[Notice]:
-        """The notices that the broker has not acknowledged."""
+        """The notices that the broker has not acknowledged yet, the oldest first."""
         return [entry.notice for entry in (*self._sent, *self._queue)]
 
     @property
@@ -74,7 +74,7 @@ class Publisher:
         return len(self._sent) + len(self._queue)
 
     def put(self, alert: Alert, notice: Notice) -> None:
-        """Queue a notice. If too many are queued, drop the oldest."""
+        """Queue a notice for the topic of its alert. If too many are queued, drop the oldest."""
         if len(self._queue) == MAX_WAITING:
             self._queue.popleft()
             self._dropped += 1
@@ -82,7 +82,7 @@ class Publisher:
         self._queue.append(_Entry(notice, message))
 
     def run_once(self) -> float:
-        """Do what is due. Return the time in s after which to call this again."""
+        """Do the work that is due. Return the time in s after which to call this method again."""
         connection = self._connection
         rest_s = connection.run_once()
         while self._sent and not connection.is_unacknowledged(self._sent[0].message):
@@ -99,14 +99,14 @@ class Publisher:
         self._sent.clear()
 
     def close(self) -> None:
-        """Disconnect."""
+        """Disconnect from the broker."""
         self._connection.close()
 
 
 def queued(publisher: Publisher, alerts: Iterable[Alert], notices: Sequence[Notice]) -> None:
     """Queue the notices that an earlier process could not publish.
 
-    Drop those whose alert no longer exists, or has no MQTT topic any more.
+    Drop those whose alert no longer exists, or no longer has an MQTT topic.
     """
     by_name = {alert.title: alert for alert in alerts if alert.mqtt_topic is not None}
     for notice in notices:

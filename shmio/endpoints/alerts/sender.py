@@ -1,4 +1,4 @@
-"""Delivers notices in order. Each action has its own thread, so that no action waits for another."""
+"""Delivers notices in order. Each action has its own thread, so that no action has to wait for another."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from shmio.endpoints.alerts.notice import Notice
 from shmio.errors import EndpointError
 
 MAX_WAITING: Final = 100
-"""Maximum number of notices that wait for one action. If there are more, the oldest is dropped."""
+"""Maximum number of notices that wait for one action. If one more comes, the oldest is dropped."""
 RETRY: Final = Backoff(1.0, 60.0, jitter=0.2)
-"""Waiting times before further attempts to deliver a notice."""
+"""Waiting times between attempts to deliver a notice."""
 GIVE_UP_S: Final = 3600.0
-"""A notice that cannot be delivered within this time, in s, is dropped."""
+"""Time in s after which a notice that cannot be delivered is dropped."""
 
 log = logging.getLogger("shmio.alerts")
 
 
 class DeliveryError(EndpointError):
-    """A notice could not be delivered. If ``again`` is True, a later attempt may succeed."""
+    """A notice could not be delivered. ``again`` is True if a later attempt may succeed."""
 
     def __init__(self, message: str, *, again: bool = False) -> None:
         super().__init__(message)
@@ -36,13 +36,13 @@ class Action(Protocol):
     """A way to deliver the notices of an alert, such as a command or a webhook."""
 
     text: str
-    """Description of the action for messages; it contains no secrets."""
+    """Description of the action, for messages. It contains no secrets."""
 
     once: bool
-    """True if no notice may be delivered twice, even if nobody knows whether the first attempt succeeded."""
+    """True if no notice may be delivered twice, even if it is not known whether the first attempt has succeeded."""
 
     def deliver(self, notice: Notice) -> None:
-        """Deliver a notice, or fail within a limited time.
+        """Deliver a notice, or fail, within a limited time.
 
         Raises:
             DeliveryError: The notice could not be delivered.
@@ -50,7 +50,7 @@ class Action(Protocol):
         """
 
     def stop(self) -> None:
-        """Make a running :meth:`deliver` end soon. Any thread may call this."""
+        """Make a running :meth:`deliver` return soon. Any thread may call this."""
 
 
 class Sender:
@@ -88,7 +88,7 @@ class Sender:
 
     @property
     def waiting(self) -> list[Notice]:
-        """The notices that are not delivered yet, the oldest first."""
+        """The notices that have not been delivered yet, the oldest first."""
         with self._condition:
             return list(self._waiting)
 

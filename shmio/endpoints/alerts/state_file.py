@@ -1,4 +1,4 @@
-"""The file that keeps the state of the alerts, so that a restart of their process repeats no notice.
+"""The file with the state of the alerts. With it, a restart of their process repeats no notice.
 
 The web page and the metrics for Prometheus read this file, too.
 """
@@ -22,14 +22,14 @@ from shmio.endpoints.alerts.notice import Notice
 from shmio.segment import Segment
 
 FILE_NAME: Final = "alerts.json"
-"""Name of the file, in the directory of the logs."""
+"""Name of the file, in the directory of the log files."""
 MAX_BYTES: Final = 64 << 20
 
 log = logging.getLogger("shmio.alerts")
 
 
 class AlertState(msgspec.Struct):
-    """The state of one alert. ``digest`` identifies what the alert watches."""
+    """The state of one alert. ``digest`` is the :func:`digest` of the alert's configuration."""
 
     digest: str
     severity: str
@@ -39,7 +39,7 @@ class AlertState(msgspec.Struct):
 
 
 class Waiting(msgspec.Struct):
-    """Notices that are not delivered yet, by the kind of action."""
+    """The notices that have not been delivered yet, for each kind of action."""
 
     command: list[Notice] = []
     mqtt: list[Notice] = []
@@ -47,14 +47,20 @@ class Waiting(msgspec.Struct):
 
 
 class State(msgspec.Struct):
-    """The state of all alerts, by name, in one run of the instance. ``epoch`` identifies the run."""
+    """The state of all alerts of one run of the instance.
+
+    Attributes:
+        epoch: Identifies the run.
+        alerts: The state of each alert, by name.
+        waiting: The notices that have not been delivered yet.
+    """
 
     epoch: int = 0
     alerts: dict[str, AlertState] = {}
     waiting: Waiting = msgspec.field(default_factory=Waiting)
 
     def progress(self, alerts: list[Alert]) -> dict[str, Progress]:
-        """Return the saved progress, by name, of the alerts that still watch the same as when it was saved."""
+        """Return the saved progress of each alert, by name; without alerts that now watch something else."""
         return {
             alert.title: self.alerts[alert.title].progress
             for alert in alerts
@@ -66,13 +72,18 @@ _DECODER: Final = msgspec.json.Decoder(State)
 
 
 def digest(alert: Alert) -> str:
-    """Return a hash of what the alert watches, so that a changed configuration can be detected."""
+    """Return a hash of what the alert watches. It shows whether the configuration has changed."""
     watched = alert.when, alert.processes, alert.states, alert.sources, alert.qualities
     return hashlib.sha256(msgspec.json.encode(watched)).hexdigest()[:16]
 
 
 def read_state(file: Path, epoch: int) -> State:
-    """Return the state in a file; an empty state if the file is missing, damaged, or of another run."""
+    """Return the state in a file; an empty state if the file is missing, damaged, or from another run.
+
+    Args:
+        file: The file.
+        epoch: Identifies the present run.
+    """
     with suppress(OSError, msgspec.MsgspecError):
         with file.open("rb") as stream:
             state = _DECODER.decode(stream.read(MAX_BYTES))
@@ -82,7 +93,7 @@ def read_state(file: Path, epoch: int) -> State:
 
 
 class StateWriter:
-    """Writes the newest state to the file. A thread does this, because a disk may hang."""
+    """Writes the newest state to the file, in a thread, because a disk may hang."""
 
     def __init__(self, file: Path) -> None:
         self.problem = ""
@@ -95,14 +106,14 @@ class StateWriter:
         self._thread.start()
 
     def write(self, state: State) -> None:
-        """Make the thread write this state soon. It replaces a state that is not written yet."""
+        """Make the thread write this state soon. If an earlier state is not written yet, this one replaces it."""
         data = msgspec.json.encode(state)
         with self._condition:
             self._newest = data
             self._condition.notify()
 
     def close(self, timeout_s: float) -> None:
-        """Let the thread write the last state and end; wait for that at most ``timeout_s``."""
+        """Let the thread write the last state and end. Wait for it at most ``timeout_s``."""
         with self._condition:
             self._stopping = True
             self._condition.notify()
@@ -136,7 +147,9 @@ def _replace(file: Path, data: bytes) -> None:
 
 
 def alert_states(folders: Mapping[str, str], segment: Segment) -> Mapping[str, AlertState]:
-    """Return the state of all alerts, by name, as their process last wrote it.
+    """Return the state of all alerts, by name, as their process last saved it.
+
+    The result is empty if the instance has no alerts, or their state cannot be read.
 
     Args:
         folders: The directories in which the instance writes files, by purpose.

@@ -1,4 +1,4 @@
-"""What an alert watches: a condition over registers, the quality of sources, or the state of processes."""
+"""What an alert watches: a condition on registers, the quality of sources, or the state of processes."""
 
 from __future__ import annotations
 
@@ -19,11 +19,14 @@ from shmio.segment.block import FrameFollower, Layouts
 log = logging.getLogger("shmio.alerts")
 
 Followers = Mapping[str, FrameFollower]
-"""The follower of each source that any alert watches, by name. Its ``frame`` is the frame to evaluate."""
+"""The follower of each source that any alert watches, by source name.
+
+``frame`` of a follower is the frame to evaluate.
+"""
 
 
 class Finding(NamedTuple):
-    """What an alert saw, in the fields that its notices have. ``reason`` describes it as text."""
+    """What an alert saw, in fields of a :class:`Notice`."""
 
     reason: str = ""
     values: Mapping[str, Number | None] = {}
@@ -32,15 +35,15 @@ class Finding(NamedTuple):
 
 
 class Watch(Protocol):
-    """Watches something for an alert, and tells whether the alert's condition is true."""
+    """Something that an alert watches, with a condition that is true, false or unknown."""
 
     sources: Collection[str]
     """Names of the sources whose frames :meth:`evaluate` needs."""
 
     def evaluate(self, followers: Followers) -> bool | None:
-        """Return whether the alert's condition is true; None: unknown.
+        """Return whether the condition is true; None if that is unknown.
 
-        For a condition over registers, call it once for each frame of its sources.
+        For a condition on registers, call this once for each new frame of the sources.
         """
 
     def describe(self, followers: Followers) -> Finding:
@@ -48,7 +51,7 @@ class Watch(Protocol):
 
 
 class RegisterWatch:
-    """Watches a condition over registers, with the values that consumers see.
+    """Watches a condition on registers, with the values that consumers see.
 
     The values of a source with bad quality are unknown.
     """
@@ -64,7 +67,7 @@ class RegisterWatch:
         self._values: list[Number | None] = []
 
     def evaluate(self, followers: Followers) -> bool | None:
-        """Evaluate the condition with the values of the present frames."""
+        """Return whether the condition is true for the present frames; None if that is unknown."""
         if self._condition is None:
             return None
         values: list[Number | None] = []
@@ -98,7 +101,7 @@ def _known(follower: FrameFollower | None) -> Frame | None:
 
 
 class QualityWatch:
-    """Watches the quality of sources. The condition is true if any of them has one of the given qualities."""
+    """Watches the quality of sources. The condition is true if any source has one of the given qualities."""
 
     def __init__(self, patterns: Collection[str], qualities: Collection[str], blocks: Mapping[str, Block]) -> None:
         globs = [Glob(pattern) for pattern in patterns]
@@ -106,11 +109,11 @@ class QualityWatch:
         self._qualities = qualities
 
     def evaluate(self, followers: Followers) -> bool | None:
-        """Return whether any source has one of the qualities; None: no source matches."""
+        """Return whether any source has one of the given qualities; None if no source matches the patterns."""
         return any(self._meets(followers[name]) for name in self.sources) if self.sources else None
 
     def describe(self, followers: Followers) -> Finding:
-        """Describe the sources that have one of the qualities; all sources if none has."""
+        """Describe the sources that have one of the given qualities; if none has, all sources."""
         present = {name: followers[name] for name in self.sources}
         met = {name: one for name, one in present.items() if self._meets(one)} or present
         texts = (f"{name} is {one.quality}{f': {one.reason}' if one.reason else ''}" for name, one in met.items())
@@ -122,9 +125,9 @@ class QualityWatch:
 
 
 class ProcessWatch:
-    """Watches the state of processes. The condition is true if any of them is in one of the given states.
+    """Watches the state of processes. The condition is true if any process is in one of the given states.
 
-    A crashed process counts as in ``backoff`` until it runs again, even while it is starting.
+    A crashed process counts as being in ``backoff`` until it runs again, even while it is starting.
     """
 
     sources: Collection[str] = ()
@@ -137,7 +140,7 @@ class ProcessWatch:
         """State and note of each process, by name."""
 
     def evaluate(self, _followers: Followers) -> bool | None:
-        """Return whether any process is in one of the states; None: no process matches."""
+        """Return whether any process is in one of the given states; None if no process matches the patterns."""
         supervised = self._segment.supervised
         self._present = {}
         for slot in self._segment.processes:
@@ -156,7 +159,7 @@ class ProcessWatch:
         return any(phase in self._states for phase, _ in self._present.values()) if self._present else None
 
     def describe(self, _followers: Followers) -> Finding:
-        """Describe the matching processes in one of the given states; if there is none, all that match."""
+        """Describe the processes that are in one of the given states; if none is, all processes that match."""
         met = {name: one for name, one in self._present.items() if one[0] in self._states} or self._present
         return Finding(
             "; ".join(f"{name} is in state {phase}{f': {note}' if note else ''}" for name, (phase, note) in met.items())
@@ -164,7 +167,7 @@ class ProcessWatch:
 
 
 RESTARTING: Final = "restarting"
-"""The supervisor's note about a process that somebody has requested to restart."""
+"""The supervisor's note about a process whose restart somebody has requested."""
 
 
 def make_watch(alert: Alert, segment: Segment) -> Watch:

@@ -23,7 +23,7 @@ _AGAIN: Final = frozenset({408, 425, 429})
 
 
 class Webhook:
-    """Posts notices to one URL. It never follows a redirect."""
+    """An action that posts notices to one URL, as JSON. It never follows a redirect."""
 
     once = False
 
@@ -38,15 +38,15 @@ class Webhook:
         self._stopping = False
 
     def stop(self) -> None:
-        """End a request in progress."""
+        """Abort a request in progress."""
         self._stopping = True
         self._shut_down()
 
     def deliver(self, notice: Notice) -> None:
-        """Post a notice, and read the status of the answer.
+        """Post a notice, and check the status of the response.
 
         Raises:
-            DeliveryError: The server cannot be reached or does not accept the notice.
+            DeliveryError: The server cannot be reached, or does not accept the notice.
 
         """
         timeout_s = self._alert.webhook_timeout_s

@@ -26,7 +26,7 @@ from shmio.worker import BEAT_S, Worker
 
 CALLS_S: Final = 1.0
 FOREIGN_LOGGERS: Final = ("asyncio", "grpc._cython.cygrpc")
-"""Loggers of libraries whose log lines clients can cause; the rate of these lines is limited."""
+"""Loggers of libraries whose log lines clients can cause. The rate of these lines is limited."""
 
 
 def run(worker: Worker) -> None:

@@ -1,1 +1,1 @@
-"""Sends commands to a block's source, returns their outcomes, and passes on the source's events."""
+"""Sends commands to a block's source, returns their outcomes, and passes the source's events on."""

@@ -40,7 +40,7 @@ log = logging.getLogger("shmio.grpc")
 class CommandClient:
     """Sends commands to a block's source in order, and reports their outcomes.
 
-    It waits while the commands in flight could cause more events than the event ring can buffer.
+    It waits while the commands in flight might cause more events than the event ring can buffer.
     Use it only in the event loop's thread.
     """
 
@@ -78,12 +78,12 @@ class CommandClient:
 
     @property
     def alive(self) -> bool:
-        """True while the client follows the block's events, or if a reload retired the block."""
+        """True while the client follows the block's events, and also once a reload has retired the block."""
         return self._reader.alive or self.block.retired
 
     @property
     def over(self) -> bool:
-        """True if the client has stopped, and has no commands in flight, subscribers or listeners."""
+        """True if the client has stopped, and nobody needs it: no command in flight, subscriber or listener."""
         return not (
             self._reader.alive
             or self._in_flight
@@ -103,13 +103,13 @@ class CommandClient:
             self._timer.cancel()
 
     def catch_up(self) -> None:
-        """Process all events so far, and deliver the writes among them to subscribers."""
+        """Process all events published so far, and deliver the writes among them to subscribers."""
         newest = self.block.events.head()
         while self._reader.alive and self._events.last < newest:
             self._reader.read()
 
     def ready(self, values: Mapping[str, object]) -> bool:
-        """Return whether :meth:`send` and :meth:`give` would send these values without waiting."""
+        """Return whether :meth:`send` would send these values without waiting. The same is true of :meth:`give`."""
         return self._prepared and not self._lock.locked() and self._has_room(self._cost(values))
 
     async def writable(self, registers: Iterable[Register]) -> bool:
@@ -126,16 +126,17 @@ class CommandClient:
         timeout_s: float | None = None,
         until_accepted: bool = False,
     ) -> None:
-        """Send values of registers as one command; wait for room if necessary.
+        """Send values of registers as one command. Wait first until there is room for it.
 
-        After an error nothing was sent, and neither ``done`` nor ``accepted`` is called.
+        If this fails, nothing was sent, and neither ``done`` nor ``accepted`` is called.
 
         Args:
             values: Values by register path.
             done: Called once within a bounded time, with the outcome of each value.
-            accepted: Called before ``done``, if the source accepts the command.
-            timeout_s: How long to wait for outcomes, in s; None: the default.
-            until_accepted: Whether the command ends as soon as the source accepts it.
+            accepted: Called before ``done``, if the source accepts the command; None to call
+                nothing.
+            timeout_s: How long to wait for the outcomes, in s; None for the default.
+            until_accepted: Whether the acceptance by the source is already the outcome.
 
         Raises:
             CommandError: A register is not writable, or the source does not answer.
@@ -155,17 +156,17 @@ class CommandClient:
         *,
         raw: Sequence[Write] = (),
     ) -> None:
-        """Give values to an injection of this process; wait for room if necessary.
+        """Give values to an injection of this process. Wait first until there is room for the command.
 
-        After an error nothing was sent, and neither ``done`` nor ``accepted`` is called.
+        If this fails, nothing was sent, and neither ``done`` nor ``accepted`` is called.
 
         Args:
             injection: Number of the injection.
             values: Values by register path.
-            done: Called once, with the outcome of each write, not of each value.
-            accepted: Called before ``done``, if the injection is over ``/in`` and the source accepts
-                the command.
-            raw: Bytes to give in addition to the values.
+            done: Called once, with the outcome of each write. A write may contain several values.
+            accepted: Called before ``done``, if the injection is over ``/in`` and the source
+                accepts the command; None to call nothing.
+            raw: Writes of raw bytes to give in addition to the values.
 
         Raises:
             CommandError: The source does not answer.
@@ -181,7 +182,7 @@ class CommandClient:
         """Ask the source to create an injection, without waiting for the outcome.
 
         Args:
-            bits: Mask of the block in which the bits that the injection covers are set.
+            bits: An image-sized mask in which the bits that the injection covers are set.
             follower: Receives the injection's events.
             done: Called once, with the outcome.
             options: Options of the injection, such as its name and priority.
@@ -205,7 +206,7 @@ class CommandClient:
             declaration: The injection, which the source runs itself.
             follower: Receives the injection's events.
             done: Called once, with the outcome.
-            keep: Whether to keep the injection after this process has ended.
+            keep: Whether the injection continues after this process has ended.
 
         Returns:
             The injection's number.
@@ -230,6 +231,10 @@ class CommandClient:
 
     def lift(self, injection: int, done: Done) -> None:
         """Ask the source to lift an injection, without waiting for the outcome.
+
+        Args:
+            injection: Number of the injection.
+            done: Called once, with the outcome.
 
         Raises:
             CommandError: The command was not sent.
@@ -368,13 +373,13 @@ def _described(block: Block, writes: Sequence[Write], options: InjectionOptions)
 
 
 class Answer:
-    """An awaitable for the outcomes of a command."""
+    """The outcomes of a command, as an awaitable."""
 
     def __init__(self) -> None:
         self._ends: asyncio.Future[Sequence[End]] = asyncio.get_running_loop().create_future()
 
     def done(self, ends: Sequence[End]) -> None:
-        """Set the outcomes; pass this method as ``done`` to :class:`CommandClient`."""
+        """Set the outcomes. Pass this method as ``done`` to a method of :class:`CommandClient`."""
         if not self._ends.done():
             self._ends.set_result(ends)
 
@@ -391,7 +396,13 @@ async def write(
 ) -> Sequence[End]:
     """Write values by path as one command, and wait for the outcome of each.
 
-    After an error nothing was sent.
+    If this fails, nothing was sent.
+
+    Args:
+        commands: The client of the source.
+        values: Values by register path.
+        timeout_s: How long to wait for the outcomes, in s; None for the default.
+        until_accepted: Whether the acceptance by the source is already the outcome.
 
     Raises:
         PathError: There is no such register.
@@ -409,7 +420,7 @@ async def give(
 ) -> Sequence[End]:
     """Give values and raw bytes to an injection, and wait for the outcomes.
 
-    Adjacent writes share one outcome.
+    Adjacent values and bytes are written together, and share one outcome.
     """
     answer = Answer()
     await commands.give(injection, values, answer.done, raw=raw)
@@ -422,17 +433,26 @@ async def inject(
     """Create an injection, wait until the source has done so, and return its number.
 
     Raises:
-        CommandError: The source refuses the injection, or does not answer.
+        CommandError: The source refused the injection, or does not answer.
 
     """
     return await _created(commands, lambda done: commands.inject(bits, follower, done, **options))
 
 
 async def declare(commands: CommandClient, declaration: Declaration, follower: InjectionFollower, *, keep: bool) -> int:
-    """Create a declared injection, which the source runs itself; return its number.
+    """Create a declared injection, which the source runs itself.
+
+    Args:
+        commands: The client of the source.
+        declaration: The injection.
+        follower: Receives the injection's events.
+        keep: Whether the injection continues after this process has ended.
+
+    Returns:
+        The injection's number.
 
     Raises:
-        CommandError: The source refuses the injection, or does not answer.
+        CommandError: The source refused the injection, or does not answer.
 
     """
     return await _created(commands, lambda done: commands.declare(declaration, follower, done, keep=keep))
@@ -456,7 +476,7 @@ async def _created(commands: CommandClient, send: Callable[[Done], int]) -> int:
 
 
 async def lift(commands: CommandClient, injection: int) -> str:
-    """Lift an injection. Return why that failed; empty if it succeeded."""
+    """Lift an injection. Return the reason if that failed; else an empty text."""
     try:
         _check(commands)
         answer = Answer()
@@ -468,7 +488,7 @@ async def lift(commands: CommandClient, injection: int) -> str:
 
 
 async def have_lifted(commands: CommandClient, injection: int, name: str) -> None:
-    """Lift an injection of this process, and retry until the source has done so.
+    """Lift an injection of this process, and retry until that has succeeded.
 
     The retries are necessary because no other process lifts the injection while this process lives.
     The injection's follower gets no more events.
@@ -487,7 +507,7 @@ async def have_lifted(commands: CommandClient, injection: int, name: str) -> Non
 
 
 def stands(commands: CommandClient, injection: int) -> bool:
-    """Return whether the client's source still has this injection."""
+    """Return whether an injection still exists on the client's source."""
     present = commands.block.injections.read()
     return not commands.block.retired and any(one.number == injection and not one.lifted for one in present)
 

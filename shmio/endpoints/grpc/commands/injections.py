@@ -1,4 +1,4 @@
-"""Injections on one block: their followers, and the image that an injection replaces."""
+"""Injections on one block: their followers, and the images whose values they replace."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ _STACKED: Final = frozenset({EventKind.INJECTED, EventKind.LIFTED, EventKind.ACT
 
 
 class InjectionFollower:
-    """Receives the events of one injection; subclasses override what they need.
+    """Receives the events of one injection. Subclasses override the methods that they need.
 
-    The event loop's thread calls the methods.
+    The methods are called in the event loop's thread.
     """
 
     def on_event(self, event: Event) -> None:
         """Handle an event: the injection was created, activated, deactivated or lifted."""
 
     def divert(self, diverted: CommandWrites) -> None:
-        """Handle a command whose values the injection diverted."""
+        """Handle a command whose values were diverted to the injection."""
 
     def restack(self) -> None:
         """Handle a change of another injection on the source.
@@ -41,21 +41,21 @@ class InjectionFollower:
         """
 
     def fail(self, reason: str) -> None:
-        """Handle missed events, some of which may have been about the injection."""
+        """Handle the loss of events, some of which may have been about the injection."""
 
 
 class WriteListener(Protocol):
-    """Receives accepted writes. The event loop's thread calls the methods."""
+    """Receives accepted writes. The methods are called in the event loop's thread."""
 
     def accept(self, event: Event) -> None:
-        """Handle a part of a command that the source has accepted."""
+        """Handle an event with accepted writes: one part of a command."""
 
     def fail(self, reason: str) -> None:
-        """Handle missed events: some writes will be missing."""
+        """Handle the loss of events: some writes are missing."""
 
 
 class InjectionFollowers:
-    """The followers of a block's injections, by injection number, and the block's write listeners."""
+    """The followers of a block's injections, and the listeners to the block's writes."""
 
     def __init__(self) -> None:
         self._followers: dict[int, InjectionFollower] = {}
@@ -63,7 +63,7 @@ class InjectionFollowers:
         self._assembler = CommandAssembler()
 
     def follow(self, event: Event) -> None:
-        """Pass an event to the followers and listeners that it concerns."""
+        """Pass an event to the followers and listeners that need it."""
         for diverted in self._assembler.follow(event):
             if follower := self._followers.get(diverted.injection):
                 follower.divert(diverted)
@@ -80,7 +80,7 @@ class InjectionFollowers:
                 follower.restack()
 
     def skip(self) -> None:
-        """Forget incomplete commands, because events were missed."""
+        """Forget the command that is incomplete because events were missed."""
         self._assembler = CommandAssembler()
 
     def add(self, injection: int, follower: InjectionFollower) -> None:
@@ -96,7 +96,7 @@ class InjectionFollowers:
         self._listeners[listener] = None
 
     def leave(self, listener: WriteListener) -> None:
-        """Remove a listener."""
+        """Remove a listener to writes."""
         self._listeners.pop(listener, None)
 
     @property
@@ -105,7 +105,7 @@ class InjectionFollowers:
         return bool(self._listeners)
 
     def fail(self, reason: str) -> None:
-        """Report missed events to all followers and listeners."""
+        """Report the loss of events to all followers and listeners."""
         for follower in list(self._followers.values()):
             follower.fail(reason)
         for listener in list(self._listeners):
@@ -119,7 +119,7 @@ class InjectionFollowers:
 
 
 class InjectionBase:
-    """The image that an injection replaces: the source's image with inner injections applied."""
+    """The image whose values an injection replaces: the source's image with all inner injections applied."""
 
     def __init__(self, block: Block, image: bytes = b"") -> None:
         """Start without inner injections.
@@ -139,14 +139,14 @@ class InjectionBase:
         self._inner: tuple[bytes, bytes] | None = None  # bits that inner layers set, and their values
 
     def divert(self, writes: Iterable[Write]) -> None:
-        """Apply values that were diverted to the injection."""
+        """Apply values that were diverted to the injection by inner injections."""
         apply(self.given, writes)
 
     def restack(self) -> bool:
-        """Look up the inner injections again.
+        """Read again which inner injections are active.
 
         Returns:
-            True if the image that the injection replaces has changed.
+            True if that changes the image which the injection replaces.
 
         """
         before = self._inner
@@ -161,7 +161,7 @@ class InjectionBase:
         return self._inner != before
 
     def image(self, raw: bytes) -> bytes:
-        """Return the image that the injection replaces.
+        """Return the image whose values the injection replaces.
 
         Args:
             raw: The image as the source delivered it.

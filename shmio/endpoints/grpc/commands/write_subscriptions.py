@@ -1,4 +1,4 @@
-"""Delivers accepted writes to the subscribers to registers' ``/in``."""
+"""Delivers accepted writes to clients that have subscribed to the ``/in`` of registers."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from shmio.segment.commands import NO_COMMAND, apply
 
 
 class PendingImage:
-    """A frame's image with the effects of all commands that were accepted after the frame.
+    """The image of a frame with the effects of all commands that were accepted after that frame.
 
-    In ``mask``, the bits that the current command writes are set.
+    In ``mask``, the bits that the current command has written are set.
     """
 
     def __init__(self, block: Block) -> None:
@@ -26,7 +26,8 @@ class PendingImage:
     def begin(self, number: int) -> None:
         """Start a command that was accepted after frame ``number``.
 
-        A new frame that arrives between the parts of the command does not change the image.
+        The image stays based on this frame, even if a new frame arrives between the parts of the
+        command.
         """
         if number != self._frame:
             frame = self._block.read(number) or self._block.latest()
@@ -37,22 +38,22 @@ class PendingImage:
         self.mask = bytearray(len(self.mask))
 
     def put(self, event: Event) -> None:
-        """Apply a part of the command."""
+        """Apply one part of the command."""
         apply(self.image, (Write(event.offset, event.mask, event.data),))
         apply(self.mask, (ones(event),))
 
     def forget(self) -> None:
-        """Discard the image, because a part of a command is missing."""
+        """Discard the image, because a part of the command is missing."""
         self._frame = -1
 
 
 def ones(event: Event) -> Write:
-    """Return a write that sets every bit that this part of a command writes."""
+    """Return a write that sets each bit that this part of a command writes."""
     return Write(event.offset, event.mask, b"\xff" * len(event.data))
 
 
 class Listener(Protocol):
-    """A stream's subscription to writes. The event loop's thread calls the methods."""
+    """A stream's subscription to writes. The methods are called in the event loop's thread."""
 
     def deliver(self, message: Sized) -> None:
         """Add one message to the stream."""
@@ -78,10 +79,10 @@ Message = tuple[InChannel, Sized]
 class WriteSubscriptions:
     """Turns the accepted writes of all writers into messages, in the order of acceptance.
 
-    A subject is delivered as soon as a command has written all of it. If a command writes only a
-    part, such as one array element, the subject is delivered at the end of the command. The rest of
-    its value then comes from the frame before the command. A command whose first events were missed
-    is skipped.
+    A subject's message is delivered as soon as a command has written the whole subject. If a
+    command writes only a part, such as one array element, the message is delivered at the end of
+    the command. The rest of the value then comes from the frame before the command. A command whose
+    first events were missed is skipped.
     """
 
     def __init__(self, block: Block, stamp: Callable[[Event], tuple[int, int]]) -> None:
@@ -110,7 +111,7 @@ class WriteSubscriptions:
         channel.listeners[listener] = None
 
     def leave(self, subject: Subject, listener: Listener) -> None:
-        """Remove a listener. The last listener's removal ends the channel."""
+        """Remove a listener. If it was the last listener to the subject, the channel ends."""
         channel = self._channels[subject]
         channel.listeners.pop(listener, None)
         if not channel.listeners:
@@ -119,17 +120,17 @@ class WriteSubscriptions:
 
     @property
     def busy(self) -> bool:
-        """True if somebody listens."""
+        """True if there are listeners."""
         return bool(self._channels)
 
     def fail(self, reason: str) -> None:
-        """End the streams of all listeners."""
+        """End the streams of all listeners, because writes were missed."""
         for channel in self._table:
             for listener in channel.listeners:
                 listener.fail(reason)
 
     def skip(self) -> None:
-        """Forget the current command, because events were missed."""
+        """Discard the current command, because events were missed."""
         self._command, self._whole = NO_COMMAND, False
         self._pending_image.forget()
         self._partly.clear()
