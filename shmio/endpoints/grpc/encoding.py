@@ -1,7 +1,7 @@
-"""Encodes images of blocks as messages in Protobuf's wire format.
+"""Encodes images of blocks as messages, in Protobuf's wire format.
 
-Serialised fields may be concatenated to a message (protobuf.dev, "Encoding"). So messages are built
-from parts that all listeners share.
+A message may be the concatenation of serialised fields (protobuf.dev, "Encoding"). So messages are
+built from parts that all listeners share.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ class BlockImage(Protocol):
 
     @property
     def number(self) -> int:
-        """Number of the frame or step."""
+        """Number of the frame, step or write."""
 
     @property
     def clock_ns(self) -> int:
-        """Time of the instance's clock, in ns."""
+        """Instance time of the image, in ns."""
 
     @property
     def image(self) -> bytes:
-        """The block's bytes as consumers see them."""
+        """The block's bytes, as consumers see them."""
 
 
 class ShownImage(NamedTuple):
@@ -51,7 +51,7 @@ class SourceImage(BlockImage, Protocol):
 
 
 Encode = Callable[[BlockImage], Sized | None]
-"""Function that encodes an image as a message, or returns None if the bytes are not a valid value.
+"""Function that encodes an image as a message; it returns None if the bytes are not a valid value.
 
 ``len`` of the message is its size in bytes.
 """
@@ -67,9 +67,9 @@ class Subject:
         wire: Name of the encoding.
         path: Canonical path in the block.
         registers: The registers of the subject.
-        encode: Encodes an image of the block as a message.
-        changed: Returns whether the subject differs between two images; None: compare the registers
-            as consumers see them.
+        encode: Encodes the subject, from an image of the block, as a message.
+        changed: Returns whether the subject differs between two images; if None, the registers are
+            compared as consumers see them.
 
     """
 
@@ -83,7 +83,13 @@ class Subject:
 def unless_bad(
     encode: Callable[[BlockImage], M | None], registers: Sequence[Register], layout: Layout
 ) -> Callable[[BlockImage], M | None]:
-    """Return a function like ``encode``. It also returns None if one of the registers is bad."""
+    """Return a function that encodes like ``encode``, but returns None if the quality of a register is bad.
+
+    Args:
+        encode: Encodes an image as a message.
+        registers: The registers whose quality counts.
+        layout: The layout of the block.
+    """
     area = status_area(layout)
     if area is None:
         return encode
@@ -115,12 +121,12 @@ def varint(number: int) -> bytes:
 
 
 def delimited(data: bytes) -> bytes:
-    """Encode bytes, preceded by their length."""
+    """Return bytes, preceded by their length as a varint."""
     return varint(len(data)) + data
 
 
 def field(field_number: int, data: bytes) -> bytes:
-    """Encode a field of type bytes, text or message, or a field of packed numbers."""
+    """Encode a field of bytes, of text, of packed numbers, or with a message."""
     return varint(field_number << 3 | 2) + varint(len(data)) + data
 
 

@@ -1,1 +1,1 @@
-"""The gRPC server: listeners, TLS, the guard that checks every call, access control, and health."""
+"""The gRPC server: listeners, TLS, the guard that checks each call, access control, and health."""

@@ -59,7 +59,7 @@ def _calls() -> Iterator[tuple[str, str]]:
 
 
 NEEDS: Final[Mapping[str, str]] = dict(_calls())
-"""The role that a call needs, by the call's full name."""
+"""The role that each call needs, by the call's full name."""
 
 _ACTIONS: Final[Mapping[str, str]] = {
     "setStepSize": "step size",
@@ -74,7 +74,7 @@ _ACTIONS: Final[Mapping[str, str]] = {
 
 
 def action_of(method: str) -> str:
-    """Return the action of a call in the audit log, from the call's full name."""
+    """Return the name that a call's action has in the audit log, from the call's full name."""
     if NEEDS.get(method) == READ:
         return "read"
     name = method.rpartition("/")[2]
@@ -87,7 +87,7 @@ _LOCAL: Final = ("unix:", "ipv4:127.", "ipv6:%5B::1%5D:", "ipv6:[::1]:")
 
 
 class DeniedError(ShmioError):
-    """The server refuses a call before the call does anything; the message says what to do."""
+    """The server refuses a call before the call has any effect. The message says what to do."""
 
     def __init__(self, code: grpc.StatusCode, message: str) -> None:
         super().__init__(message)
@@ -126,14 +126,14 @@ class Credentials(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Keys:
-    """The configured tokens and certificate name patterns; a reload replaces the object."""
+    """The configured tokens, and the configured patterns for names in certificates. A reload replaces the object."""
 
     secrets: Sequence[Secret] = ()
     clients: Sequence[Client] = ()
 
     @classmethod
     def of(cls, config: Grpc) -> Keys:
-        """Read tokens and patterns.
+        """Read the tokens and patterns of a configuration.
 
         Raises:
             ConfigError: The file of a token is not usable.
@@ -142,9 +142,9 @@ class Keys:
         return cls(read_tokens(config.token), tuple(config.client))
 
     def secret(self, shown: bytes) -> Secret | None:
-        """Return the token with this hash, or None.
+        """Return the token with this hash; None if there is none.
 
-        The time that this takes does not depend on the hash.
+        The duration of the search does not depend on the hash.
         """
         found = None
         for secret in self.secrets:
@@ -163,7 +163,10 @@ class Keys:
 
 
 class ListenerAccess:
-    """Decides who may call what at one listening address; ``keys`` may be replaced at any time."""
+    """Decides which calls a client may make at one listening address.
+
+    ``keys`` may be replaced at any time.
+    """
 
     def __init__(self, keys: Keys, anonymous: Iterable[str] = ROLES, *, takes_tokens: bool = True) -> None:
         """Create the access rules of one address.
@@ -180,10 +183,14 @@ class ListenerAccess:
         self._takes_tokens = takes_tokens
 
     def admit(self, method: str, shown: Credentials) -> str | None:
-        """Check a call against the access rules.
+        """Check whether a client may make a call.
+
+        Args:
+            method: The full name of the call.
+            shown: The client's credentials.
 
         Returns:
-            The name of the client's token, or None.
+            The name of the client's token; None if it has no configured token.
 
         Raises:
             DeniedError: The client may not make this call.
@@ -201,7 +208,7 @@ class ListenerAccess:
         raise self._denial(method, needed, secret, shown, by_name)
 
     def actor(self, shown: Credentials, peer: str) -> Actor:
-        """Return a client's identity for the audit log. Its token may be unknown, or lack roles."""
+        """Return a client's identity for the audit log, even if its token is unknown or lacks a role."""
         secret = None if shown.token is None else self.keys.secret(shown.token)
         if secret is not None:
             return Actor("token", secret.name, peer)
@@ -253,10 +260,10 @@ class ListenerAccess:
 def holder_of(
     peer: str, metadata: Iterable[tuple[str, str | bytes]], shown: Mapping[str, Iterable[bytes]] | None
 ) -> object:
-    """Return a client's identity, which owns the names that the client chooses.
+    """Return the identity of a client, as the owner of the names that it chooses.
 
-    The identity is the client's credentials, or without credentials its host. All connections of
-    a client have equal identities, whatever their ports.
+    The identity is the client's credentials or, without credentials, the client's host. All
+    connections of a client therefore have equal identities, whatever their ports.
     """
     credentials = Credentials.of(metadata, shown)
     if credentials.token or credentials.names:
@@ -283,7 +290,7 @@ def _listed(roles: Iterable[str]) -> str:
 
 
 class Listener(NamedTuple):
-    """A listening address and its access rules."""
+    """A listening address, its access rules, and whether it is encrypted."""
 
     address: Address | UnixAddress
     access: ListenerAccess
@@ -291,7 +298,7 @@ class Listener(NamedTuple):
 
 
 class Listeners:
-    """All listening addresses; they share tokens and certificate patterns."""
+    """All listening addresses. They share the tokens and certificate patterns."""
 
     def __init__(self, config: Grpc) -> None:
         """Read the configuration.
@@ -316,7 +323,7 @@ class Listeners:
         return list(self._listeners.values())
 
     def take(self, config: Grpc) -> None:
-        """Adopt new tokens, clients and roles.
+        """Adopt the tokens, clients and roles of a changed configuration.
 
         Raises:
             ConfigError: The file of a token is not usable. The previous settings remain in effect.

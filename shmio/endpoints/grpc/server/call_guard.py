@@ -36,9 +36,9 @@ from shmio.layout.topic import shorten
 from shmio.logs import fields
 
 TURN_S: Final = 10.0
-"""Period for which log lines are counted, in s."""
+"""Length of the periods in which log lines are counted, in s."""
 LINES: Final = 10
-"""Maximum number of log lines in ``TURN_S``. One more line reports how many were left out."""
+"""Maximum number of log lines in a period. One more line reports how many were left out."""
 
 log = logging.getLogger("shmio.grpc")
 
@@ -62,7 +62,13 @@ class Refusals:
         self._in_turn = 0
 
     def add(self, reason: str, name: str, peer: str) -> None:
-        """Count a refusal, and log it unless too many lines were logged already."""
+        """Count a refusal, and log it unless this period has enough log lines already.
+
+        Args:
+            reason: Why it was refused.
+            name: What was refused, such as the topic.
+            peer: The client.
+        """
         self.count += 1
         self._in_turn += 1
         if self._in_turn == 1:
@@ -83,10 +89,10 @@ Encode = Callable[[Any], bytes]
 
 @dataclass(frozen=True, slots=True)
 class CallLimits:
-    """Limits on open connections and calls, on all addresses together.
+    """Limits on open connections and calls, for all addresses together.
 
     When fewer than ``reserve`` calls are free, only clients with fewer than ``share`` calls may
-    open another call. So a client that opens thousands of calls leaves room for the others.
+    open another call. So a client that opens thousands of calls leaves room for others.
     """
 
     connections: int = 2048
@@ -94,7 +100,7 @@ class CallLimits:
     reserve: int = 1024
     share: int = 64
     message_s: float = 10.0
-    """Time limit for the client to send the request of a call that has a single request, in s."""
+    """Maximum time in s in which the client must send the only message of a call without a request stream."""
 
 
 class _Call:
@@ -140,7 +146,12 @@ class OpenCalls:
         return len(self._open)
 
     def enter(self, method: str, access: ListenerAccess, context: Context) -> _Call:
-        """Admit a call. The caller must call :meth:`leave` when the call has ended.
+        """Admit a call, or refuse it. The caller must call :meth:`leave` when an admitted call has ended.
+
+        Args:
+            method: The full name of the call.
+            access: The access rules of the address.
+            context: The context of the call.
 
         Raises:
             DeniedError: The call is refused.
@@ -172,7 +183,7 @@ class OpenCalls:
             del self._by_client[call.client]
 
     async def message(self, call: _Call, context: Context) -> Any:
-        """Return a call's single message, or EOF. End the call if no message comes in time."""
+        """Return the only message of a call, or EOF. End the call if the message does not come in time."""
         loop = asyncio.get_running_loop()
         self._silent[call] = due_s = loop.time() + self.limits.message_s
         if self._timer is None:  # one timer for all calls, because nearly every message is there at once
@@ -194,7 +205,7 @@ class OpenCalls:
             call.end(DeniedError(grpc.StatusCode.DEADLINE_EXCEEDED, f"{call.method}: {limit}"))
 
     def review(self) -> int:
-        """End the calls that the present rules no longer allow, and return their number."""
+        """End the calls that the present access rules no longer allow. Return their number."""
         ended = 0
         for call in self._open:
             try:
@@ -223,8 +234,8 @@ class OpenCalls:
 class CallGuard(grpc.aio.ServerInterceptor):
     """Checks every call at one listening address.
 
-    To gRPC, it declares every call as a call with a stream of requests. So it can check and count a
-    call before the first message arrives. An invalid message then ends the call with a status, and
+    It declares to gRPC that each call has a stream of requests. So it can check and count a call
+    before the first message arrives. An invalid message then ends the call with a status, and
     leaves no traceback in the log.
     """
 
@@ -335,7 +346,7 @@ cygrpc: Any = import_module("grpc._cython.cygrpc")
 AioServer: Any = import_module("grpc.aio._server").Server
 
 WORKERS: Final = 8
-"""Number of calls with unknown names that are refused concurrently."""
+"""Maximum number of calls with unknown names that are refused at the same time."""
 
 _NEEDED: Final[Mapping[str, str]] = {
     "AioServer": "_make_request_call_future _request_call add_registered_method_handlers is_running shutdown",
@@ -384,11 +395,11 @@ class _CoreAsyncio:
 
 
 _requests: Final[WeakKeyDictionary[asyncio.Future[Any], Core]] = WeakKeyDictionary()
-"""The requests for calls of all cores."""
+"""The core that made each request for a call."""
 
 
 class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]
-    """A gRPC core that passes only calls of registered methods to its serving task."""
+    """A gRPC core that passes to its serving task only calls of methods that exist."""
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
@@ -398,7 +409,11 @@ class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]
         cygrpc.asyncio = _CoreAsyncio()
 
     async def wait_for_calls(self) -> tuple[set[asyncio.Future[Any]], set[asyncio.Future[Any]]]:
-        """Wait until a call has come. Return the requests that are done, and an empty set."""
+        """Wait until a call has come.
+
+        Returns:
+            The requests that are done, and an empty set, as ``asyncio.wait`` returns them.
+        """
         await self._coming.wait()
         self._coming.clear()
         came, self._came = self._came, set()
@@ -429,7 +444,7 @@ class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]
     def alive(self) -> bool:
         """True while the core serves.
 
-        A core that has stopped cannot serve again, so the process has to end.
+        A core that has stopped cannot serve again, so the process must end.
         """
         return bool(self.is_running()) and not any(worker.done() for worker in self._workers)
 
@@ -478,7 +493,7 @@ class CoreServer(AioServer):  # type: ignore[misc]
 
     @property
     def refused(self) -> int:
-        """Number of calls with unknown names since the start."""
+        """Number of calls with unknown names that were refused since the start."""
         return int(self._server.refused)
 
     async def start(self) -> None:

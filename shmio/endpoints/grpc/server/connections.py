@@ -22,10 +22,10 @@ Peer = tuple[IPv4Address | IPv6Address, int]
 
 
 def peer_of(text: str) -> Peer | None:
-    """Parse gRPC's name of a client, such as ``ipv4:127.0.0.1:5000`` or ``ipv6:%5B::1%5D:5000``.
+    """Parse the name that gRPC gives a client, such as ``ipv4:127.0.0.1:5000`` or ``ipv6:%5B::1%5D:5000``.
 
     Returns:
-        The client's address and port, or None if the connection is not TCP.
+        The client's address and port; None if the connection is not TCP.
 
     """
     match = _PEER.fullmatch(unquote(text))

@@ -1,8 +1,8 @@
 """Serves the health (``grpc.health.v1``) of the endpoint, its services and its sources.
 
-The servicer of grpcio-health-checking is not suitable. It sends to watchers while it holds a lock
-that changes of a status need. A watcher that does not read would block all changes of that service,
-and the end of the process.
+The servicer of grpcio-health-checking is not suitable: while it sends a status to a watcher, it
+holds a lock that each change of a status needs. A watcher that does not read would therefore block
+all changes of that service, and also the end of the process.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from shmio.layout.topic import shorten
 
 
 class Health(health_pb2_grpc.HealthServicer):
-    """Serves the status of services; a slow watcher gets only the newest status.
+    """Serves the health of services. A slow watcher gets only the newest status.
 
     Use it only in the event loop's thread.
     """
@@ -37,7 +37,7 @@ class Health(health_pb2_grpc.HealthServicer):
                 changed.set()
 
     def end(self) -> None:
-        """Set all services to not serving, permanently."""
+        """Set all services to not serving. This cannot be undone."""
         for service in list(self._serving):
             self.set(service, serving=False)
         self._over = True

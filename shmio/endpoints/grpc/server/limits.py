@@ -12,15 +12,20 @@ from typing import Any, Final, TypeVar
 # ---- file descriptors ------------------------------------------------------------------------------------
 
 OWN: Final = 256
-"""Number of file descriptors that are reserved for everything but connections; more than needed."""
+"""Number of file descriptors that are reserved for everything except connections. It is generous."""
 EACH: Final = 1
 """Number of file descriptors that are reserved for each connection."""
 FEW: Final = 64
-"""The endpoint reports a shortage if it can serve fewer connections than this."""
+"""Number of connections below which the endpoint reports a shortage."""
 
 
 def shortage(connections: int, wanted: int) -> str:
-    """Return a note for ``status`` if too few connections are possible, otherwise an empty text."""
+    """Return a note for ``shmio-supervisor status`` if too few connections are possible; else an empty text.
+
+    Args:
+        connections: Number of possible connections.
+        wanted: Number of connections that the configuration allows.
+    """
     if connections >= min(FEW, wanted):
         return ""
     files = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
@@ -33,7 +38,14 @@ def shortage(connections: int, wanted: int) -> str:
 
 
 def room(wanted: int) -> int:
-    """Raise the limit of open files as far as needed, and return how many connections it allows."""
+    """Raise the limit on open files as far as necessary and possible.
+
+    Args:
+        wanted: Number of connections to make possible.
+
+    Returns:
+        Number of connections that the limit allows, at most ``wanted``.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     needed = OWN + EACH * wanted
     if soft != resource.RLIM_INFINITY and soft < needed:
@@ -53,23 +65,23 @@ ARENAS: Final = 2
 By default each thread has its own arena, and no other thread uses the free memory in it.
 """
 FLOOD_CALLS: Final = 1000
-"""Number of refused calls that count as a flood, after which free memory is returned to the kernel."""
+"""Number of newly refused calls that count as a flood, during which free memory is returned to the kernel."""
 EVERY_S: Final = 5.0
-"""Interval at which free memory is returned to the kernel, in s."""
+"""Interval in s at which free memory is returned to the kernel."""
 AFTER_S: Final = 60.0
-"""Time after a flood during which free memory is still returned, in s."""
+"""Time in s for which free memory is still returned after a flood."""
 
 
 def limit_arenas() -> None:
-    """Limit the number of malloc arenas, for all threads. Call this before you start threads."""
+    """Limit the number of malloc arenas of this process. Call this before you start threads."""
     if (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
         mallopt(M_ARENA_MAX, ARENAS)
 
 
 class Trimmer:
-    """Returns free memory to the kernel during floods of calls.
+    """Returns free memory to the kernel during floods of refused calls.
 
-    It continues for a while after a flood, because gRPC frees the memory of a call later.
+    It continues for a while after a flood, because gRPC frees the memory of a call late.
     """
 
     def __init__(
@@ -98,7 +110,7 @@ class Trimmer:
 # ---- the event loop's time -------------------------------------------------------------------------------
 
 HELD_S: Final = 0.005
-"""Longest time for which the work of one request may block the event loop, in s."""
+"""Maximum time in s for which the work for one request may block the event loop."""
 
 T = TypeVar("T")
 

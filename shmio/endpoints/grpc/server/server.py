@@ -24,9 +24,9 @@ from shmio.wording import IN_USE
 
 MAX_REQUEST_BYTES = 1 << 20
 GRACE_S: Final = 0.2
-"""Time that open calls have to end by themselves when the endpoint stops, in s."""
+"""Time in s that open calls have to end by themselves when the endpoint stops."""
 STOP_S: Final = 2.5
-"""Maximum duration of a stop, in s. After a longer time, the supervisor kills the process."""
+"""Maximum duration of a stop, in s. If a stop takes longer, the supervisor kills the process."""
 
 log = logging.getLogger("shmio.grpc")
 
@@ -43,7 +43,7 @@ OPTIONS = [
 
 
 class Server:
-    """Serves all services on each listening address, where a :class:`CallGuard` checks the calls."""
+    """Serves all services at each listening address. A :class:`CallGuard` checks the calls."""
 
     def __init__(
         self, services: Mapping[str, dict[str, grpc.RpcMethodHandler[Any, Any]]], calls: OpenCalls | None = None
@@ -70,22 +70,23 @@ class Server:
     def alive(self) -> bool:
         """True if all addresses are served.
 
-        If not, the process has to end: a second server in the process would corrupt its memory.
+        If not, the process must end, because a second server in the same process would corrupt its
+        memory.
         """
         return all(server.alive for server in self._servers)
 
     @property
     def unknown(self) -> int:
-        """Number of calls with unknown names since the start. All were refused."""
+        """Number of calls with unknown names since the start. All of them were refused."""
         return sum(server.refused for server in self._servers)
 
     async def start(self, listeners: Sequence[Listener], tls: Tls | None = None, gid: int | None = None) -> list[int]:
-        """Listen on all addresses, and return their ports.
+        """Listen at all addresses, and return their ports.
 
         Args:
-            listeners: The addresses; port 0 means any free port.
-            tls: Certificate and key for encrypted addresses.
-            gid: A group whose members may also open UNIX sockets.
+            listeners: The addresses; port 0 stands for any free port.
+            tls: Certificate and key for encrypted addresses; None if no address is encrypted.
+            gid: A group whose members may also open UNIX sockets; None for no group.
 
         Raises:
             ConfigError: A file of ``tls`` cannot be used.
@@ -115,11 +116,11 @@ class Server:
         return ports
 
     async def set_source(self, source: str, good: bool) -> None:
-        """Set the health of ``source.<name>``, which is serving while the source's quality is good."""
+        """Set the health of ``source.<name>``: it is serving while the source's quality is good."""
         self._health.set(f"source.{source}", serving=good)
 
     async def stop(self) -> None:
-        """Set the health to not serving, end all calls, and close. This takes at most ``STOP_S``."""
+        """Set the health of all services to not serving, end all calls, and close. This takes at most ``STOP_S``."""
         self._health.end()
         ends = [asyncio.create_task(server.stop(GRACE_S)) for server in self._servers]
         if ends and (await asyncio.wait(ends, timeout=STOP_S))[1]:

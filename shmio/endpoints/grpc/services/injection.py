@@ -1,7 +1,7 @@
 """Injections of SimlogAPI clients.
 
-Clients use an injection's shadow topics to read the values that it diverts, and to give other
-values.
+An injection has shadow topics. From one, clients read the values that the injection diverts; to the
+other, they write the values to give instead.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from shmio.segment.changed_registers import ChangeScan
 from shmio.segment.commands import CommandWrites, End, apply, worst
 
 MAX_INJECTIONS: Final = 64
-"""Maximum number of this endpoint's injections on one source."""
+"""Maximum number of injections that this endpoint may have on one source."""
 MAX_PATH: Final = 1024
-"""Maximum length of a shadow topic's path, or of a prefix, in characters."""
+"""Maximum length of the path or the prefix of a shadow topic, in characters."""
 LOOK_S: Final = 0.25
-"""Interval of the checks for disconnected clients, in s. Their injections end within a second."""
+"""Interval in s of the checks for disconnected clients. The injections of such a client end within a second."""
 UNSEEN_S: Final = 10.0
-"""Lifetime of an injection without a stream, in s, if the kernel does not list its client's connection."""
+"""Lifetime in s of an injection that no stream uses, if the kernel does not list its client's connection."""
 
 _TIME_TOPICS: Final = frozenset(topic.value for topic in TimeTopic)
 _SCHEME: Final = re.compile(r"^[^/:]*://")
@@ -84,9 +84,9 @@ class Injection(InjectionFollower):
     """An injection over the registers of ``shape``, from its creation to its end.
 
     ``shape`` has the registers that ``target`` names in the layout of ``feed``. The *originals* of
-    an injection are the values that it diverts. Over ``/out``, the source or inner injections
-    deliver them; over ``/in``, writers do. The *given values* are those that the injection's
-    clients send instead. Use it only in the event loop's thread.
+    an injection are the values that it diverts: over ``/out``, those that the source or inner
+    injections deliver; over ``/in``, those that writers send. The *given values* are those that
+    clients send to the injection to replace the originals. Use it only in the event loop's thread.
     """
 
     def __init__(self, target: Topic, shape: Shape, feed: Feed, name: str) -> None:
@@ -123,7 +123,7 @@ class Injection(InjectionFollower):
         """Wait until the source has created the injection.
 
         Raises:
-            CommandError: The source refuses the injection, or does not answer.
+            CommandError: The source refused the injection, or does not answer.
 
         """
         await asyncio.shield(self._creating)
@@ -175,12 +175,12 @@ class Injection(InjectionFollower):
         return self._creating.done() and self.feed.commands.ready(values)
 
     async def give(self, values: Mapping[str, object], done: Done, accepted: Callable[[], None] | None = None) -> None:
-        """Send values to the source as the given values of this injection.
+        """Send given values of this injection to the source.
 
         Args:
             values: Values by register path.
             done: Called once, with the outcome of each write.
-            accepted: Called if the source accepts the command.
+            accepted: Called if the source accepts the command; None to call nothing.
 
         Raises:
             PathError: The injection has ended.
@@ -219,15 +219,22 @@ class Injection(InjectionFollower):
             self._given.show(ShownImage(now.number, now.clock_ns, bytes(self._given_image)))
 
     def given_values(self, wire: str, encode: Encode, lane: EventLane) -> Leave:
-        """Listen to values given from now on. Return the function that ends the subscription."""
+        """Listen to the values that are given from now on.
+
+        Args:
+            wire: Name of the encoding.
+            encode: Encodes an image as a message.
+            lane: Gets the messages.
+
+        Returns:
+            The function that ends the subscription.
+        """
         return self._given.listen(wire, encode, lane)
 
     # ---- originals ---------------------------------------------------------------------------
 
     def originals(self, wire: str, encode: Encode, outbox: Outbox, path: str, finish: Finish = bytes) -> Leave:
-        """Listen to the originals. Return the function that ends the subscription.
-
-        Over ``/out`` the listener first gets the present value.
+        """Listen to the originals. Over ``/out``, the listener gets the present value first.
 
         Args:
             wire: Name of the encoding.
@@ -235,6 +242,9 @@ class Injection(InjectionFollower):
             outbox: The stream that gets the messages.
             path: Path of the topic, for the text of a failure.
             finish: Completes a message when it is sent.
+
+        Returns:
+            The function that ends the subscription.
 
         """
         if self.inward:
@@ -252,10 +262,10 @@ class Injection(InjectionFollower):
         return partial(self.feed.leave, subject, lane)
 
     def present(self) -> ShownImage | None:
-        """Return the present original of an injection over ``/out``.
+        """Return the present originals of an injection over ``/out``.
 
         Returns:
-            The original, or None if it is not good, or if the injection is over ``/in``.
+            The image; None if the quality is not good, or if the injection is over ``/in``.
 
         """
         frame = None if self.inward else self.feed.present()
@@ -274,7 +284,7 @@ class Injection(InjectionFollower):
     # ---- events of the source ----------------------------------------------------------------
 
     def divert(self, diverted: CommandWrites) -> None:
-        """Handle a command whose values the injection diverted."""
+        """Handle a command whose values were diverted to the injection."""
         self._base.divert(diverted.writes)
         if self.inward:
             self._diverted.show(ShownImage(*self.feed.commands.stamp(diverted.event), bytes(self._base.given)))
@@ -288,7 +298,7 @@ class Injection(InjectionFollower):
             self._tell_again()
 
     def lifted(self, reason: str) -> None:
-        """Handle an end of the injection that this endpoint did not request."""
+        """Handle the end of an injection that another program has lifted, or that ended with its source."""
         self._finish(f"it was lifted: {reason}" if reason != "lifted" else "another program has lifted it")
 
     def fail(self, reason: str) -> None:
@@ -300,13 +310,13 @@ class ShadowKind(Enum):
     """The kinds of shadow topics."""
 
     GIVEN = "gifts"
-    """The topic of the given values: clients write to it, and read what all clients have written."""
+    """The topic of the given values. Clients write to it, and read what all clients have written."""
     ORIGINALS = "originals"
-    """The topic of the originals: clients read from it what the injection diverts."""
+    """The topic of the originals. Clients read from it the values that the injection diverts."""
 
 
 class Shadow(NamedTuple):
-    """A shadow topic of an injection."""
+    """A shadow topic: the injection that it belongs to, and its kind."""
 
     injection: Injection
     kind: ShadowKind
@@ -325,7 +335,7 @@ class _Client:
 
 
 class Shadows:
-    """All shadow topics and their injections. An injection that no client uses is lifted."""
+    """All shadow topics and their injections. An injection is lifted when no client uses it any more."""
 
     def __init__(self, topics: Topics) -> None:
         self._topics = topics
@@ -334,18 +344,18 @@ class Shadows:
         self._releasing: asyncio.Task[None] | None = None
 
     def find(self, path: str) -> Shadow | None:
-        """Return the shadow topic that a path names, or None."""
+        """Return the shadow topic that a path names; None if there is none."""
         return self._named.get(self._topics.name(path)) if self._named else None
 
     async def create(
         self, target: Topic, shape: Shape, kinds: Mapping[str, ShadowKind], user: object, peer: str
     ) -> Injection:
-        """Create an injection with these shadow topics, or join the one that has them.
+        """Create an injection with these shadow topics, or join the injection that has them already.
 
         Args:
             target: The topic to create the injection over.
             shape: The registers that the target names.
-            kinds: The shadow topics, by path.
+            kinds: The kind of each shadow topic, by path.
             user: The object that keeps the injection alive until :meth:`release`.
             peer: The client, for the list of all injections.
 
@@ -353,7 +363,7 @@ class Shadows:
             ValueRangeError: A shadow topic is the target itself.
             ConflictError: A path is in use for another target.
             EndpointError: There are too many injections.
-            CommandError: The source refuses the injection.
+            CommandError: The source refused the injection.
             PathError: A reload has removed the source.
 
         """
@@ -380,7 +390,7 @@ class Shadows:
     async def lay_for_client(
         self, target: Topic, shape: Shape, kinds: Mapping[str, ShadowKind], peer: str
     ) -> Injection:
-        """Create an injection as :meth:`create` does.
+        """Create or join an injection, as :meth:`create` does, for a client that has no stream for it yet.
 
         The client's connection keeps the injection alive until a stream takes it over.
         """
@@ -400,7 +410,7 @@ class Shadows:
         users.add(stream)
 
     def release(self, injection: Injection, user: object) -> None:
-        """End the use of an injection by a client. The end of the last use lifts the injection."""
+        """End a client's use of an injection. The injection is lifted when its last use ends."""
         users = self._users.get(injection, set())
         if user in users:
             users.remove(user)
@@ -408,7 +418,7 @@ class Shadows:
                 injection.end("no client uses the injection any more")
 
     def on_sources_replaced(self, sources: Collection[str]) -> None:
-        """End the injections on sources whose blocks a reload has replaced."""
+        """End the injections on these sources, because a reload has replaced their blocks."""
         for injection in list(self._users):
             if injection.target.source in sources:
                 injection.end(RETIRED)
@@ -456,7 +466,7 @@ class Shadows:
 
 
 def shadow_path(path: str) -> str:
-    """Check the path that a client wants for a shadow topic, and return it.
+    """Return the path that a client wants for a shadow topic, if it is usable.
 
     Raises:
         ValueRangeError: The path is not usable.

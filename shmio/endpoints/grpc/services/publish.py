@@ -23,24 +23,25 @@ from shmio.segment import DONE, EventKind
 from shmio.segment.commands import End, worst
 
 TURNS: Final = 3
-"""Number of passes through gRPC's queue to wait for.
+"""Number of times that the barrier passes through gRPC's queue.
 
-Several passes are necessary because one of gRPC's threads may pass on a message late.
+Several times are necessary because one of gRPC's threads may pass a message on late.
 """
 
 
 class ReceiveBarrier:
-    """Waits until the handlers have all messages that gRPC has received so far.
+    """Waits until the handlers have received all messages that gRPC has received so far.
 
-    Received messages pass through a queue to the event loop. To wait, the barrier appends an
-    operation that ends at once to this queue: a check of an unused channel's state.
+    gRPC passes received messages to the event loop through a queue. The barrier appends an
+    operation to this queue, and waits for its end. The operation ends at once: it checks the state
+    of an unused channel.
     """
 
     def __init__(self) -> None:
         self._channel: grpc.aio.Channel | None = None
 
     async def handled(self) -> None:
-        """Wait until the handlers have all messages that were received before this call."""
+        """Wait until the handlers have received all messages that gRPC received before this call."""
         if self._channel is None:
             self._channel = grpc.aio.insecure_channel("unix:///dev/null")
         for _ in range(TURNS):
@@ -53,11 +54,11 @@ class ReceiveBarrier:
 
 
 SETTLE_S: Final = 5.0
-"""Longest time for which a step waits for a client's values while the client sends more, in s."""
+"""Maximum time in s for which a step waits for a client that continues to send values."""
 MAX_VALUES: Final = 256
-"""Maximum number of registers in one structure: as many as a source writes in one cycle."""
+"""Maximum number of registers in a structure: as many as a source writes in one cycle."""
 LARGE_ELEMENTS: Final = 1024
-"""Arrays with at least this many elements are read in a thread, because reading them takes time."""
+"""Number of elements from which an array is read in a thread, because reading it takes time."""
 
 
 class _Destination(NamedTuple):
@@ -71,7 +72,7 @@ class _Destination(NamedTuple):
 
 
 class Request(NamedTuple):
-    """A value for a topic.
+    """A client's request to write a value to a topic.
 
     ``read`` returns the values by register path, or raises ValueRangeError.
     """
@@ -81,7 +82,7 @@ class Request(NamedTuple):
 
 
 Parse = Callable[[bytes], Request]
-"""Function that parses a message, and raises DecodeError if the message is not valid."""
+"""Function that parses a message; it raises DecodeError if the message is not valid."""
 
 
 class _PublishCall:
@@ -147,9 +148,8 @@ async def _read(request: Request, found: Shape) -> Mapping[str, object]:
 class Publisher:
     """Serves Publish and Write.
 
-    An invalid message of a stream is counted, logged and skipped, and the stream continues. Each
-    message is finally counted as ``published`` if the device has the value, otherwise as
-    ``refused``.
+    An invalid message in a stream is counted, logged and skipped; the stream continues. A message
+    counts as ``published`` once the device has its value, otherwise as ``refused``.
     """
 
     def __init__(self, topics: Topics, shadows: Shadows) -> None:
@@ -169,7 +169,12 @@ class Publisher:
     async def publish(self, messages: AsyncIterator[bytes], parse: Parse, peer: str) -> Empty:
         """Write the values of a stream in order. Return when all outcomes are known.
 
-        Values that were received are written even if the client disconnects.
+        Even if the client disconnects, the values received until then are written.
+
+        Args:
+            messages: The serialised messages of the stream.
+            parse: Parses a message.
+            peer: The client.
         """
         stream = _PublishCall()
         streams = self._streams.setdefault(peer, set())
@@ -214,9 +219,9 @@ class Publisher:
             await asyncio.shield(self._keep(sending))
 
     async def settle(self, peer: str) -> None:
-        """Wait until sources have accepted or refused all values received from a client.
+        """Wait until sources have accepted or refused all values received so far from a client.
 
-        This includes values that gRPC has received and the handler has not read yet. If the client
+        This includes values that gRPC has received, but the handler has not read yet. If the client
         continues to send, the wait ends after ``SETTLE_S``.
         """
         if peer not in self._streams:
@@ -231,10 +236,10 @@ class Publisher:
                     await self._arrivals.handled()
 
     async def write(self, request: Request, peer: str) -> tuple[EventKind, str]:
-        """Write one value. Return when its source has accepted it.
+        """Write one value. Return when its source has accepted or refused it.
 
-        If the device later does not take the accepted value, a log line says so. After an error
-        nothing was sent.
+        If the device does not take a value that was accepted, a log line says so later. If this
+        raises an error, nothing was sent.
 
         Returns:
             ``(ACCEPTED, "")``, or the outcome and its reason if the source did not accept the

@@ -69,7 +69,7 @@ class Services:
 
     @property
     def counters(self) -> tuple[int, int, int, int]:
-        """Numbers of open streams, dropped messages, published values and refused values.
+        """Numbers of open streams, dropped messages, published values, and refused values.
 
         The endpoint drops messages for clients that are too slow.
         """
@@ -86,7 +86,7 @@ class Services:
 
     @property
     def readers(self) -> Iterator[tuple[Block, int]]:
-        """The blocks that clients read frame by frame, each with the number of the last frame sent."""
+        """The blocks that clients of ``shmio.v1`` read frame by frame, each with the number of the last frame sent."""
         return self._shmio_v1.subscribe_calls.readers
 
     @property

@@ -1,8 +1,8 @@
 """Serves SimlogAPI version 1, package ``simulation.server``, with values as ROSMessages.
 
-The value of a register is sent as a text. A structure of a known type has its own message type.
-Serialised fields may be concatenated, so constant fields are encoded once, and the time once for
-each frame.
+The value of a register is sent as a text. A structure of a known type has its own message type. A
+message is built by concatenating serialised fields: constant fields are encoded once, and the time
+once for each frame.
 """
 
 from __future__ import annotations
@@ -58,9 +58,9 @@ def message_type(found: Shape) -> str:
 
 
 def encoder(found: Shape, layout: Layout) -> Encode:
-    """Return a function that encodes an image as a ROSMessage.
+    """Return a function that encodes a topic as a ROSMessage, from an image.
 
-    The function returns None for invalid bytes, and if the source reports a register as bad.
+    The function returns None if the bytes are invalid, or if the source reports a register as bad.
 
     Raises:
         ValueRangeError: The topic is a structure without a message type.
@@ -214,7 +214,7 @@ def _filled(values: Sequence[object], register: Register) -> list[object]:
 
 
 class InjectCalls:
-    """The calls of version 1 that concern injections."""
+    """The calls of version 1 about injections."""
 
     def __init__(
         self,
@@ -235,7 +235,7 @@ class InjectCalls:
         self._resolve = resolve
 
     async def find(self, path: str, context: Context) -> Injection | None:
-        """Return the injection whose shadow topic a path names, or None.
+        """Return the injection whose shadow topic a path names; None if there is none.
 
         Statuses:
             INVALID_ARGUMENT: The injection is over a structure without a message type.
@@ -250,7 +250,7 @@ class InjectCalls:
         return shadow.injection
 
     async def inject(self, request: wire.InjectRequest, context: Context) -> AsyncIterator[bytes]:
-        """Create or join an injection that lasts while the stream is open, and stream its originals.
+        """Create or join an injection, and stream its originals. The injection lasts while a stream is open.
 
         Over ``/in``, the originals are the written values, which no longer reach the source. Over
         ``/out``, or without suffix, they are the source's values, beginning with the present value.
@@ -316,7 +316,7 @@ class InjectCalls:
 
 
 class SimlogV1:
-    """Serves the registers of all sources as texts, and structures of known types as messages."""
+    """Serves registers of all sources as texts, and structures of known types as messages."""
 
     name = SERVICE
 
@@ -347,7 +347,7 @@ class SimlogV1:
         return calls
 
     async def set_step_size(self, request: wire.StepSizeRequest, context: Context) -> Empty:
-        """Set the step size, in ms; time becomes virtual.
+        """Set the step size, in ms. Time becomes virtual.
 
         Statuses:
             INVALID_ARGUMENT: The step size is out of range.
@@ -362,8 +362,8 @@ class SimlogV1:
     async def step(self, _: wire.StepRequest, context: Context) -> wire.StepResponse:
         """Make a step. Answer when all streams have its values.
 
-        Values that this client published before are written first. The code of the answer is 0, or
-        -1 if the step failed. A log line then says why.
+        Values that this client has published before are written first. The code of the answer is 0,
+        or -1 if the step failed; then a log line says why.
         """
         try:
             await self._stepper.step(peer=context.peer())
@@ -387,12 +387,12 @@ class SimlogV1:
         return wire.TopicDescriptor(path=request.path, msgType=message_type(found))
 
     async def subscribe(self, request: wire.TopicDescriptor, context: Context) -> AsyncIterator[bytes]:
-        """Stream a topic's current value, if it is good, and its changes; for ``/in``, its writes.
+        """Stream a topic's present value, if it is good, and its changes; for ``/in``, its writes.
 
         Nothing is sent while the quality is bad. When the quality recovers, the value is sent
-        again. For a slow client the newest value replaces those that wait. A slow client's stream
-        of ``/in`` ends, because no write replaces another. After a reload the stream continues if
-        the register still exists.
+        again. For a slow client, the newest value replaces those that wait. A slow client's stream
+        of ``/in`` ends, because every write must be delivered. After a reload, the stream continues
+        if the register still exists.
 
         Statuses:
             NOT_FOUND: There is no such topic, or a reload has removed it.

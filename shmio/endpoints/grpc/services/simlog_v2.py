@@ -1,6 +1,7 @@
-"""Serves SimlogAPI version 2, package ``simlog.server``, with ``google.protobuf.Value`` as values.
+"""Serves SimlogAPI version 2, package ``simlog.server``, with values as ``google.protobuf.Value``.
 
-Serialised fields may be concatenated, so the fields that all listeners share are encoded once.
+A message is built by concatenating serialised fields, so the fields that all listeners share are
+encoded once.
 """
 
 from __future__ import annotations
@@ -48,15 +49,15 @@ MAX_ALL_TOPICS: Final = 100_000
 MAX_NAME: Final = 256
 """Maximum length of a subscriber's name and uuid, in characters."""
 PATIENCE_S: Final = 1.0
-"""Time in s that Subscribe waits for CreateSubscriber, because the calls may come in any order."""
+"""Time in s for which Subscribe waits for CreateSubscriber, because the two calls may come in any order."""
 MAX_ELEMENTS: Final = 1 << 16
-"""Maximum number of numbers, bits and texts in one value."""
+"""Maximum number of numbers, bits and texts together in one value."""
 MAX_MEMBERS: Final = 4096
 """Maximum number of registers in one structure."""
 MAX_LEVELS: Final = 24
-"""Maximum nesting of structures.
+"""Maximum nesting depth of structures.
 
-Each level of structures needs three levels of messages, and protobuf's readers stop at 100 levels.
+Each level of a structure needs three levels of messages, and protobuf's readers stop at 100 levels.
 """
 
 _DOUBLE: Final = struct.Struct("<Bd")
@@ -79,7 +80,7 @@ class EncodedMessage:
         return len(self.stamp) + len(self.rest)
 
     def under(self, path: bytes) -> bytes:
-        """Return the message with a path; :func:`path_field` encodes the path."""
+        """Return the message for a path, which :func:`path_field` has encoded."""
         last, whole = self._last
         if last != path:  # most listeners use the same path
             header = self.stamp + path
@@ -97,22 +98,22 @@ def value_type(found: Shape) -> wire.ValueType:
 
 
 def subject(found: Shape, layout: Layout) -> Subject:
-    """Return the subject of a topic, for a feed.
+    """Return the subject with which a feed delivers a topic.
 
     Raises:
-        ValueRangeError: The topic is too large or nested too deeply for a message.
+        ValueRangeError: The topic is too large, or nested too deeply, for a message.
 
     """
     return Subject("v2", found.path, found.registers, encoder(found, layout))
 
 
 def encoder(found: Shape, layout: Layout) -> Callable[[BlockImage], EncodedMessage | None]:
-    """Return a function that encodes an image as a message.
+    """Return a function that encodes a topic as a message, from an image.
 
-    The function returns None for invalid bytes, and if the source reports a register as bad.
+    The function returns None if the bytes are invalid, or if the source reports a register as bad.
 
     Raises:
-        ValueRangeError: The topic is too large or nested too deeply for a message.
+        ValueRangeError: The topic is too large, or nested too deeply, for a message.
 
     """
     members, elements = len(found.registers), found.elements
@@ -132,44 +133,44 @@ def encoder(found: Shape, layout: Layout) -> Callable[[BlockImage], EncodedMessa
 
 
 def path_field(path: str) -> bytes:
-    """Encode the path of a header."""
+    """Encode the path as a field of a header."""
     return b"\x12" + delimited(path.encode())
 
 
 @lru_cache(maxsize=64)  # a frame or two for each feed
 def time_stamp(clock_ns: int) -> bytes:
-    """Encode the time of a header, given in ns of the instance's clock."""
+    """Encode a time as a field of a header. ``clock_ns`` is in ns of the instance's clock."""
     seconds, nanos = divmod(clock_ns, 1_000_000_000)
     whole = b"\x08" + varint(seconds) if seconds else b""
     return b"\x0a" + delimited(whole + b"\x10" + varint(nanos) if nanos else whole)
 
 
 def nothing(stamp: bytes) -> EncodedMessage:
-    """Return the message for a missing value."""
+    """Return the message for a missing value. ``stamp`` is its encoded time stamp."""
     return EncodedMessage(stamp, wire.SimlogMessage(type=wire.NULL, value=to_wire(None)).SerializeToString())
 
 
 def time_message(topic: TimeTopic, moment: Moment) -> EncodedMessage:
-    """Return the message of a time topic: a step's number, or the time in s."""
+    """Return the message of a time topic: the step's number, or the time in s."""
     value = moment.number if topic is TimeTopic.STEP else moment.clock_ns / 1e9
     message = wire.SimlogMessage(type=wire.NUMBER, value=to_wire(value))
     return EncodedMessage(time_stamp(moment.clock_ns), message.SerializeToString())
 
 
 def repeated(messages: Iterable[bytes]) -> bytes:
-    """Encode a protobuf message whose field 1 repeats these messages."""
+    """Encode a protobuf message whose field 1 repeats these serialised messages."""
     return b"".join(b"\x0a" + delimited(message) for message in messages)
 
 
 def to_wire(value: Value) -> WireValue:
-    """Convert a decoded value. Numbers become doubles, and a missing value becomes null."""
+    """Convert a decoded value. Numbers become doubles, and a missing value becomes NULL."""
     found = WireValue()
     _put(value, found)
     return found
 
 
 def from_wire(value: WireValue, found: Shape) -> dict[str, object]:
-    """Convert a client's value to values by register path. A structure may lack members.
+    """Convert a client's value to values by register path. A structure need not have all its members.
 
     If a client sends a text for a register of another type, the text is parsed as in version 1. So
     a 64-bit number keeps all its digits.
@@ -337,7 +338,7 @@ class _Subscription:
 
 
 class Subscriber:
-    """A CreateSubscriber call with its topics."""
+    """A CreateSubscriber call, with the topics that it streams."""
 
     def __init__(
         self, topics: Topics, shadows: Shadows, time_topics: TimeTopics, name: str, outbox: Outbox, holder: object
@@ -391,7 +392,7 @@ class Subscriber:
     def on_sources_replaced(self, sources: Collection[str]) -> None:
         """Switch to the new feeds of these sources.
 
-        A topic that no longer exists waits until it exists again.
+        If a topic no longer exists, its subscription waits until the topic exists again.
         """
         for path, subscription in self._subscriptions.items():
             if isinstance(subscription.topic, Topic) and subscription.topic.source in sources:
@@ -462,8 +463,14 @@ class Subscribers:
     def enter(self, uuid: str, name: str, outbox: Outbox, holder: object) -> Subscriber:
         """Add a subscriber for a new stream.
 
-        If the same client already has a stream with this uuid, the old stream ends, because a broken
-        connection may have left it open.
+        If the same client already has a stream with this uuid, the old stream ends, because it may
+        be left from a broken connection.
+
+        Args:
+            uuid: The subscriber's uuid.
+            name: The subscriber's name.
+            outbox: The new stream.
+            holder: The client's identity.
 
         Raises:
             ValueRangeError: The uuid is missing or too long.
@@ -504,6 +511,11 @@ class Subscribers:
     async def subscribe(self, uuid: str, path: str, holder: object) -> None:
         """Add a topic to a subscriber's stream. Wait up to ``PATIENCE_S`` for the stream to open.
 
+        Args:
+            uuid: The subscriber's uuid.
+            path: The topic.
+            holder: The client's identity.
+
         Raises:
             PathError: There is no such topic, or the client has no such subscriber.
             ValueRangeError: The topic is too large for a message.
@@ -533,7 +545,7 @@ class Subscribers:
 
 
 class SimlogV2:
-    """Serves the registers and structures of all sources as ``google.protobuf.Value``."""
+    """Serves registers and structures of all sources as ``google.protobuf.Value``."""
 
     name = SERVICE
 
@@ -589,7 +601,7 @@ class SimlogV2:
         return wire.TopicInfo(path=request.path, type=value_type(found), direction=direction, exists=True)
 
     async def create_subscriber(self, request: wire.Subscriber, context: Context) -> AsyncIterator[bytes]:
-        """Stream the values of all topics that are subscribed for this uuid, in frame order.
+        """Stream the values of all topics that were subscribed to with this uuid, in frame order.
 
         Statuses:
             INVALID_ARGUMENT: The uuid is missing or too long.
@@ -615,10 +627,10 @@ class SimlogV2:
             await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, outbox.failure)
 
     async def subscribe(self, request: wire.SubscriptionRequest, context: Context) -> Empty:
-        """Add a topic to a subscriber's stream: its current value, if it is good, and its changes.
+        """Add a topic to a subscriber's stream: its present value, if it is good, and its changes.
 
-        For ``/in`` the stream has the writes. For ``SIMLOG://step`` it has the number of each step,
-        after the values of that step.
+        For ``/in``, the stream gets the writes. For ``SIMLOG://step``, it gets the number of each
+        step, after the values of that step.
 
         Statuses:
             NOT_FOUND: There is no such topic or subscriber.
@@ -632,10 +644,10 @@ class SimlogV2:
         return Empty()
 
     async def inject(self, request: wire.InjectRequest, context: Context) -> wire.InjectResponse:
-        """Create an injection over a topic. Return the paths for its given values and its originals.
+        """Create an injection over a topic. Return the paths of its given values and its originals.
 
-        The injection lasts while a subscriber has ``shadowPathOut``. Before the first subscriber,
-        it lasts as long as the connection of this call.
+        The injection lasts while a subscriber is subscribed to ``shadowPathOut``. Before the first
+        subscription, it lasts as long as the connection of this call.
 
         Statuses:
             NOT_FOUND: There is no such topic.
@@ -679,7 +691,7 @@ class SimlogV2:
     async def read(self, request: wire.ReadRequest, context: Context) -> bytes:
         """Return the values of topics, in order. The values of one source come from one frame.
 
-        While the quality of a value is bad, NULL is returned for it.
+        A value with bad quality is returned as NULL.
 
         Statuses:
             NOT_FOUND: There is no such topic.

@@ -46,7 +46,7 @@ class SimServer:
         return calls
 
     async def step(self, request: wire.StepRequest, context: Context) -> wire.SimStatus:
-        """Make a step. Answer when all streams have taken its values.
+        """Make a step. Answer when all streams have its values.
 
         Statuses:
             INVALID_ARGUMENT: The step is out of range.
@@ -76,7 +76,7 @@ class SimServer:
         return await self._answer(self._stepper.pause(), context)
 
     async def subscribe(self, _: Empty, context: Context) -> AsyncIterator[bytes]:
-        """Stream the state of time: a message for each step and each change.
+        """Stream the state of time: one message for each step and each other change.
 
         Statuses:
             RESOURCE_EXHAUSTED: The client is too slow for the steps.

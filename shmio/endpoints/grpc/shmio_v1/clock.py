@@ -19,13 +19,13 @@ from shmio.segment import Segment
 from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_ANSWERS: Final = 1024
-"""Maximum number of answers that wait for the client. While that many wait, no further step is made."""
+"""Maximum number of answers that wait for the client. With that many waiting, no further step is made."""
 
 STEPS: Final = wire.StepsResponse.DESCRIPTOR.fields_by_name["steps"].number
 
 
 class StepsCall:
-    """A Steps call: makes steps and collects their answers."""
+    """A Steps call: makes steps, and collects the answers to them."""
 
     def __init__(self, stepper: Stepper, peer: str) -> None:
         """Prepare the call; :meth:`messages` makes the steps.
@@ -48,7 +48,7 @@ class StepsCall:
         response.
 
         Raises:
-            TimeError: A step failed. The answers to the earlier steps come first.
+            TimeError: A step failed. The answers to the earlier steps are yielded first.
             ValueRangeError: A step is out of range.
 
         """
@@ -106,7 +106,7 @@ class TimeCalls:
         }
 
     async def step(self, request: wire.StepRequest, context: Context) -> wire.Clock:
-        """Make one step. Answer when every stream has its changes.
+        """Make one step. Answer when all streams have its changes.
 
         Statuses:
             INVALID_ARGUMENT: The step is out of range.
@@ -134,7 +134,7 @@ class TimeCalls:
             await refuse(context, error)
 
     async def set_step_size(self, request: wire.SetStepSizeRequest, context: Context) -> wire.Clock:
-        """Set the step size: the length of steps whose request names no length.
+        """Set the step size: the length of each step whose request gives no length.
 
         Statuses:
             INVALID_ARGUMENT: The step size is out of range.
@@ -171,7 +171,7 @@ class TimeCalls:
         return await self._do(self._stepper.release(), context)
 
     async def watch(self, _: wire.WatchClockRequest, context: Context) -> AsyncIterator[wire.Clock]:
-        """Stream the state of time: now, and after each step or change.
+        """Stream the state of time: the present state, and the state after each step or other change.
 
         A slow client gets only the newest state.
 
@@ -206,7 +206,7 @@ class TimeCalls:
 
 
 def clock(state: Clock) -> wire.Clock:
-    """Convert the state of the clock page to a message."""
+    """Convert the state of the clock to a message."""
     return wire.Clock(
         virtual=state.virtual,
         step=state.done,

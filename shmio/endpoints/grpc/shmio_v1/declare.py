@@ -27,12 +27,12 @@ from shmio.segment import Block, Event, EventKind
 from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_MATCHES: Final = 10_000_000
-"""Maximum number of comparisons of a target with a register in one call.
+"""Maximum number of comparisons between a target and a register in one call.
 
 This many comparisons take a few seconds.
 """
 SEED_BITS: Final = 53
-"""Number of bits of a random seed. Every JSON reader reads integers of this size exactly."""
+"""Number of bits of a random seed. Any JSON reader reads integers of this size exactly."""
 
 _DECLARED, _HAPPENINGS = (
     wire.DeclareResponse.DESCRIPTOR.fields_by_name[name].number for name in ("declared", "happenings")
@@ -46,7 +46,7 @@ _KINDS: Final = {
 
 
 class DeclareCall:
-    """A Declare call with its injections."""
+    """A Declare call, with its injections."""
 
     def __init__(self, feeds: Mapping[str, Feed], request: wire.DeclareRequest, lock: asyncio.Lock) -> None:
         """Check the declarations.
@@ -90,7 +90,7 @@ class DeclareCall:
         Raises:
             ConfigError: A declaration does not fit the sources.
             ValueRangeError: There are too many targets to compare.
-            CommandError: A source refuses an injection, or does not answer.
+            CommandError: A source refused an injection, or does not answer.
 
         """
         feeds = dict(self._feeds)
@@ -125,12 +125,12 @@ class DeclareCall:
     def abandon(self) -> None:
         """Stop creating injections, because the client has disconnected.
 
-        If :meth:`open` has not created all injections yet, it lifts those that it has created.
+        If :meth:`open` is still creating injections, it lifts those that it has created.
         """
         self._abandoned = True
 
     async def close(self) -> None:
-        """Lift the injections, unless the client asked to keep them. Retry until that succeeds."""
+        """Lift the injections, unless the client has asked to keep them. Retry until that succeeds."""
         if self._lifting is not None:
             await self._lifting
         elif not self._keep:
@@ -169,8 +169,8 @@ class DeclareCall:
     def end(self, reason: str) -> None:
         """End the call, because its record has a gap.
 
-        Unless the client asked to keep the injections, lift them at once: a client that does not read
-        could delay the end of the stream.
+        This lifts the injections at once, unless the client has asked to keep them: a client that
+        does not read could delay the end of the stream.
         """
         self.over = self.over or reason
         if self._complete and not self._keep and self._lifting is None:
@@ -235,7 +235,7 @@ class DeclaredInjection(InjectionFollower):
         )
 
     def lifted(self, reason: str) -> None:
-        """Record the end of the injection, unless an event has already reported it."""
+        """Record the end of the injection, unless an event has recorded it already."""
         if not self.gone:
             self.gone = True
             now_ns = self.commands.block.clock.read().present_ns
