@@ -27,7 +27,7 @@ _TIME_TOPICS: Final = {time_topic.value: time_topic for time_topic in TimeTopic}
 
 
 class Topics:
-    """Resolves paths to the present sources."""
+    """Resolves paths to the sources that exist at present."""
 
     def __init__(self, feeds: Mapping[str, Feed], default_source: str | None) -> None:
         """Create the resolver.
@@ -42,7 +42,7 @@ class Topics:
         self._default = default_source
 
     def topic(self, path: str) -> Topic:
-        """Parse a path.
+        """Parse the path of a topic of a source.
 
         Raises:
             PathError: There is no such source, or the path names a time topic.
@@ -59,7 +59,7 @@ class Topics:
         return topic
 
     def time_topic(self, path: str) -> TimeTopic | None:
-        """Return the time topic that a path names, or None.
+        """Return the time topic that a path names; None if it names none.
 
         Raises:
             PathError: There is no such source.
@@ -71,7 +71,7 @@ class Topics:
         return _TIME_TOPICS.get(f"{topic.source}/{topic.path}") if topic.direction != "in" else None
 
     def name(self, path: str) -> str:
-        """Return the canonical form of a path. The path need not name an existing topic."""
+        """Return the canonical form of a path, even if no such topic exists."""
         try:
             return str(self._parse(path))
         except PathError:
@@ -129,7 +129,7 @@ class Shape(NamedTuple):
     Attributes:
         path: Canonical path in the block.
         registers: One register or array element, or all registers of a structure.
-        whole: Whether the path names a register or an element, not a structure.
+        whole: True if the path names a register or an element, False if it names a structure.
 
     """
 
@@ -139,15 +139,15 @@ class Shape(NamedTuple):
 
     @property
     def elements(self) -> int:
-        """Number of values in all registers: numbers, bits and texts."""
+        """Number of values in all registers together: numbers, bits and texts."""
         return sum(register.count for register in self.registers)
 
 
 def shape(layout: Layout, topic: Topic) -> Shape:
     """Return the registers that a topic names in a layout.
 
-    For a structure of the data block, return only the block's own members, not those that a tag
-    table adds, because old clients expect the same message as before.
+    A structure of the data block has only the block's own members, without those that a tag table
+    adds, because old clients expect the same message as before.
 
     Raises:
         PathError: There is no such register or structure.

@@ -15,7 +15,7 @@ log = logging.getLogger("shmio.grpc")
 Callback = Callable[[], object]
 
 PAUSE_S: Final = 0.005
-"""Pause between wake-ups while all listeners are patient, in s."""
+"""Length of a pause between wake-ups in which all listeners are patient, in s."""
 
 
 class WakeUp:
@@ -44,11 +44,11 @@ class WakeUp:
 
     @property
     def alive(self) -> bool:
-        """True while the thread that waits for the word is running."""
+        """True while the thread that waits for changes is running."""
         return self._relay.alive
 
     def mute(self) -> None:
-        """Stop calling the listeners. After :meth:`unmute`, one call makes up for those missed."""
+        """Stop calling the listeners. After :meth:`unmute`, one call makes up for the calls that they missed."""
         self._loop.remove_reader(self._relay.descriptor)
 
     def unmute(self) -> None:
@@ -56,7 +56,7 @@ class WakeUp:
         self._loop.add_reader(self._relay.descriptor, self._ring)
 
     def pause(self) -> None:
-        """Stop calling the listeners for ``PAUSE_S``, if all of them are patient."""
+        """If all listeners are patient, stop calling them for ``PAUSE_S``."""
         if self._pausing is None and self.patient >= self.listeners.keys():
             self.mute()
             self._pausing = self._loop.call_later(PAUSE_S, self._pause_over)
@@ -81,7 +81,7 @@ class WakeUp:
         self._relay.stop()
 
     def join(self) -> None:
-        """Wait for the end of the thread, after :meth:`stop`."""
+        """Wait until the thread has ended. Call :meth:`stop` first."""
         self._relay.join()
 
     def _ring(self) -> None:
@@ -91,14 +91,14 @@ class WakeUp:
 
 
 class WakeUps:
-    """The wake-ups of all blocks that are followed. Use it only in the event loop's thread."""
+    """The wake-ups of all blocks that are being followed. Use it only in the event loop's thread."""
 
     def __init__(self) -> None:
         self._wake_ups: dict[int, WakeUp] = {}
         self._stopped: list[WakeUp] = []
 
     def join(self, block: Block, ring: Callback, *, patient: bool = False) -> None:
-        """Call ``ring`` when the block has a new frame or event, and periodically.
+        """Call ``ring`` when the block has a new frame or event, and also periodically.
 
         Args:
             block: The block.
@@ -132,7 +132,7 @@ class WakeUps:
             wake_up.resume()
 
     def leave(self, block: Block, ring: Callback) -> None:
-        """Remove ``ring``. The wake-up of a block ends with its last listener."""
+        """Remove ``ring``. When a block's last listener is removed, its wake-up ends."""
         wake_up = self._wake_ups.get(block.section)
         if wake_up is None:
             return  # close() was called before
@@ -155,7 +155,7 @@ class WakeUps:
 class BatchReader:
     """Reads a block's frames or events in batches, at each wake-up.
 
-    Between two batches the event loop serves the streams. Use it only in the event loop's thread.
+    Between two batches, the event loop serves the streams. Use it only in the event loop's thread.
     """
 
     def __init__(
@@ -209,7 +209,7 @@ class BatchReader:
             self.read()
 
     def read(self) -> None:
-        """Read a batch now. If more is waiting, read on when the streams have been served."""
+        """Read a batch now. If more is waiting, read on once the streams have been served."""
         try:
             more = self._read()
         except Exception:

@@ -1,4 +1,4 @@
-"""The call Events: streams the events of sources, and converts each event once for all clients."""
+"""The call Events: streams the events of sources. Each event is converted once for all clients."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ MAX_SOURCES: Final = 256
 BATCH_EVENTS: Final = 32
 """Maximum number of events that are converted before the event loop serves the streams again."""
 BATCH_S: Final = 0.005
-"""Time after which a batch ends early, in s, because one event may be about thousands of registers."""
+"""Time in s after which a batch ends early, because a single event may be about thousands of registers."""
 LOG_BYTES: Final = 8 << 20
-"""Maximum size of the events in a block's log, in bytes.
+"""Maximum total size of the events in a block's log, in bytes.
 
 The log also has at most as many events as the event ring has slots.
 """
@@ -45,8 +45,8 @@ _MISSED: Final = wire.Event.DESCRIPTOR.fields_by_name["missed"].number
 class EventLog:
     """The latest events of one block as messages, for all calls that follow the block.
 
-    When the log is full, it drops the oldest events. A call that has not read them misses
-    them. Use it only in the event loop's thread.
+    When the log is full, it drops the oldest events. A call that has not read them yet misses them.
+    Use it only in the event loop's thread.
     """
 
     def __init__(self, block: Block, wake_ups: WakeUps, after: int) -> None:
@@ -65,7 +65,7 @@ class EventLog:
 
     @property
     def end(self) -> int:
-        """Index after the newest entry."""
+        """Index of the next entry to come."""
         return self.first + len(self._entries)
 
     @property
@@ -75,7 +75,7 @@ class EventLog:
 
     @property
     def failed(self) -> bool:
-        """True if the log cannot follow the block any more, although the block is in use."""
+        """True if the log can no longer follow the block, although the block is still in use."""
         return self.ended and not self.reader.ended
 
     def start(self) -> None:
@@ -91,7 +91,8 @@ class EventLog:
         """Return the entry at an index.
 
         Returns:
-            The number of the event, how many events were missed until then, and the message.
+            The number of the event, the number of events that were missed until then, and the
+            message.
 
         """
         return self._entries[place - self.first]
@@ -133,19 +134,19 @@ class EventLog:
 
 
 class EventLogs:
-    """The logs of all blocks that calls follow."""
+    """The event logs of all blocks that calls follow."""
 
     def __init__(self, wake_ups: WakeUps) -> None:
         self._wake_ups = wake_ups
         self._logs: dict[int, EventLog] = {}  # by the block's section
 
     def join(self, block: Block, wake: Callback, *, after: int) -> EventLog:
-        """Join the log of a block, and return it. The first call that joins starts the log.
+        """Join the log of a block, and return the log. The first call that joins starts the log.
 
         Args:
             block: The block to follow.
             wake: Called when there are new events, and when the log ends.
-            after: Number of the event after which a new log begins.
+            after: If this starts the log: number of the event after which the log begins.
 
         """
         log = self._logs.get(block.section)
@@ -157,7 +158,7 @@ class EventLogs:
         return log
 
     def leave(self, log: EventLog, wake: Callback) -> None:
-        """Leave a log. The log ends when its last call leaves it."""
+        """Leave a log. The log ends when the last call has left it."""
         log.listeners.pop(wake, None)
         if not log.listeners:
             log.stop()
@@ -258,7 +259,7 @@ class EventsCall:
         self._wake.set()
 
     async def messages(self) -> AsyncIterator[bytes]:
-        """Yield serialised EventsResponses without end.
+        """Yield serialised EventsResponses, without end.
 
         Raises:
             EndpointError: The events of a source can no longer be read.

@@ -36,7 +36,7 @@ from shmio.wire import shmio_v1_pb2 as wire
 MAX_INJECTIONS: Final = 256
 """Maximum number of open Inject and Declare calls."""
 MAX_OPEN: Final = 32
-"""Maximum number of one stream's values in flight; further values wait."""
+"""Maximum number of a stream's values that are in flight; further values wait."""
 MAX_LIFETIME_MS: Final = 86_400_000
 
 _ORIGINALS, _ANSWERS = (wire.InjectResponse.DESCRIPTOR.fields_by_name[name].number for name in ("originals", "answers"))
@@ -45,7 +45,7 @@ _PIECES: Final = wire.Update.DESCRIPTOR.fields_by_name["pieces"].number
 
 
 class InjectTarget(NamedTuple):
-    """The target of an injection: a source and a direction, topics, and byte ranges."""
+    """What an injection covers: a source and a direction, and in it topics and byte ranges."""
 
     place: SourceDirection
     topics: tuple[Topic, ...]
@@ -53,7 +53,7 @@ class InjectTarget(NamedTuple):
 
 
 def target_of(topics: Topics, options: wire.Lay) -> InjectTarget:
-    """Read the target of an injection.
+    """Return the target that the options of an Inject call describe.
 
     Raises:
         PathError: There is no such source, or the patterns differ in source or direction.
@@ -89,7 +89,7 @@ def target_of(topics: Topics, options: wire.Lay) -> InjectTarget:
 
 
 class ByteRanges:
-    """The bytes and bits that an injection covers by ranges, in addition to registers."""
+    """The byte ranges that an injection covers, in addition to registers. A range may have a mask of bits."""
 
     def __init__(self, ranges: Iterable[wire.Range], size: int) -> None:
         """Check the ranges.
@@ -118,7 +118,7 @@ class ByteRanges:
 
     @property
     def bits(self) -> bytes:
-        """Mask of the block in which the bits of the ranges are set."""
+        """An image-sized mask in which the bits of the ranges are set."""
         return self._bits.tobytes()
 
     @property
@@ -130,7 +130,7 @@ class ByteRanges:
         )
 
     def differing(self, image: bytes, before: bytes | None) -> bytes:
-        """Return, as fields of an ``Update``, each range from its first to its last changed byte.
+        """Return the changed part of each range, as fields of an ``Update``: from its first to its last changed byte.
 
         If ``before`` is None, all bytes count as changed.
         """
@@ -139,7 +139,7 @@ class ByteRanges:
         return b"".join(self._pieces(new, changed))
 
     def pieces(self, image: bytes, mask: bytes) -> bytes:
-        """Return, as fields of an ``Update``, each range from its first to its last masked byte."""
+        """Return the masked part of each range, as fields of an ``Update``: from its first to its last masked byte."""
         return b"".join(self._pieces(np.frombuffer(image, np.uint8), np.frombuffer(mask, np.uint8)))
 
     def _pieces(self, image: Array, changed: Array) -> Iterator[bytes]:
@@ -156,7 +156,7 @@ def raw_writes(pieces: Collection[wire.Piece], bits: bytes) -> list[Write]:
 
     Args:
         pieces: The raw bytes.
-        bits: Mask of the block in which the bits that the injection covers are set.
+        bits: An image-sized mask in which the bits that the injection covers are set.
 
     Raises:
         ValueRangeError: The injection does not cover all of the bytes, or there are too many
@@ -185,7 +185,7 @@ def raw_writes(pieces: Collection[wire.Piece], bits: bytes) -> list[Write]:
 
 
 class InjectCall(InjectionFollower):
-    """An Inject call with its injection."""
+    """An Inject call, with its injection."""
 
     def __init__(self, topics: Topics, selections: Selections, wake_ups: WakeUps, options: wire.Lay) -> None:
         """Check the request.
@@ -235,7 +235,7 @@ class InjectCall(InjectionFollower):
         Raises:
             PathError: There is no such register.
             ValueRangeError: There are too many registers, or a range is not valid.
-            CommandError: The source refuses the injection, or does not answer.
+            CommandError: The source refused the injection, or does not answer.
             EndpointError: All clients together use too many registers.
 
         """
@@ -272,7 +272,7 @@ class InjectCall(InjectionFollower):
         return not (self._inward or self._options.quiet)
 
     async def close(self) -> None:
-        """Lift the injection, unless the client asked to keep it. Retry until that succeeds."""
+        """Lift the injection, unless the client has asked to keep it. Retry until that succeeds."""
         for task in self._giving:
             task.cancel()
         if self._timer is not None:
@@ -297,7 +297,7 @@ class InjectCall(InjectionFollower):
         self._wake.set()
 
     async def messages(self) -> AsyncIterator[bytes]:
-        """Yield serialised InjectResponses until the injection or its lifetime ends."""
+        """Yield serialised InjectResponses, until the injection or its lifetime has ended."""
         while True:
             self._wake.clear()  # before the checks, so that no wake-up is lost
             if self._waiting:
@@ -312,13 +312,13 @@ class InjectCall(InjectionFollower):
     # ---- given values --------------------------------------------------------------------------
 
     async def take(self, requests: AsyncIterator[wire.InjectRequest]) -> None:
-        """Send the client's values in order.
+        """Send the values of the client's messages to the source, in order.
 
         If a message with a sequence number has an error, an answer reports the error. In a message
         without a sequence number, an error ends the stream.
 
         Raises:
-            ValueRangeError: A message is not one that gives values.
+            ValueRangeError: A message does not give values.
 
         """
         async for request in requests:
@@ -337,7 +337,7 @@ class InjectCall(InjectionFollower):
         self.taken(task)
 
     def taken(self, task: asyncio.Task[None]) -> None:
-        """End the stream if a task that handles the client's values has failed."""
+        """End the stream if a task that handles the client's messages has failed."""
         if not task.cancelled() and isinstance(error := task.exception(), ShmioError):
             self.failure = error
             self._end()
@@ -405,7 +405,7 @@ class InjectCall(InjectionFollower):
         return head(self._view.number, frame, whole=before is None) + body + statuses.field
 
     def divert(self, diverted: CommandWrites) -> None:
-        """Handle diverted values: over ``/in`` from writers, over ``/out`` from inner injections."""
+        """Handle diverted values: over ``/in`` those of writers, over ``/out`` those of inner injections."""
         self._base.divert(diverted.writes)
         if not self._inward:
             self.restack()
@@ -437,15 +437,15 @@ class InjectCall(InjectionFollower):
             self._wake.set()
 
     def lifted(self, reason: str) -> None:
-        """Handle an end of the injection that this call did not request."""
+        """Handle the end of the injection, if this call did not request it."""
         self._lifted = True
         self.over = f"it was lifted: {reason}" if reason != "lifted" else "another program has lifted it"
         self._wake.set()
 
     def fail(self, reason: str) -> None:
-        """Handle missed events: over ``/in``, end the call, because writes are missing.
+        """Handle the loss of events. Over ``/in``, end the call, because writes are missing.
 
-        Over ``/out`` the originals come from frames, so nothing is missing.
+        Over ``/out``, nothing is missing, because the originals come from frames.
         """
         if self._inward and not self._options.quiet:
             self._give_up(reason)
@@ -489,16 +489,16 @@ class InjectionCalls:
         }
 
     async def inject(self, requests: AsyncIterator[wire.InjectRequest], context: Context) -> AsyncIterator[bytes]:
-        """Create an injection that ends with the stream, unless the client asks to keep it.
+        """Create an injection that ends with the stream, unless the client has asked to keep it.
 
-        The call streams the originals to the client. The client streams values to give instead.
+        The call streams the originals to the client. The client streams values to replace them.
 
         Statuses:
             NOT_FOUND: There is no such register.
             INVALID_ARGUMENT: The injection is not valid, or does not cover a given value.
             FAILED_PRECONDITION: The source refuses the injection; the message says why.
             RESOURCE_EXHAUSTED: There are too many streams.
-            ABORTED: Another client lifted the injection, or this client does not read the
+            ABORTED: Another client has lifted the injection, or this client does not read the
                 originals.
         """
         opening: asyncio.Task[bytes] | None = None
@@ -560,10 +560,10 @@ class InjectionCalls:
             self._open.discard(one)
 
     async def declare(self, request: wire.DeclareRequest, context: Context) -> AsyncIterator[bytes]:
-        """Create declared injections, all or none.
+        """Create declared injections: all or none.
 
-        The injections end with the stream, unless the client asks to keep them. The call streams a
-        record of their events.
+        The injections end with the stream, unless the client has asked to keep them. The call
+        streams a record of their events.
 
         Statuses:
             INVALID_ARGUMENT: A declaration is not valid; the message names the key.

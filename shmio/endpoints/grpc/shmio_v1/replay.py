@@ -37,13 +37,14 @@ class ReplayCalls:
     async def replay(self, request: wire.ReplayRequest, context: Context) -> wire.ReplayResponse:
         """Control the replays, or return their status.
 
-        The endpoint carries out one call at a time. If a call ends early, its search ends too.
+        The endpoint carries out one call at a time. If the client ends a call early, the search
+        that it started ends, too.
 
         Statuses:
             INVALID_ARGUMENT: The speed or a time is not valid.
             NOT_FOUND: There is no such source or register.
-            FAILED_PRECONDITION: No source replays a recording, the search finds nothing, or a source
-                does not answer.
+            FAILED_PRECONDITION: No source replays a recording, the search finds nothing, or a
+                source does not answer.
         """
         try:
             wanted = _wanted(request)

@@ -1,4 +1,4 @@
-"""Resolves the patterns of a call to views of blocks, which clients with equal patterns share."""
+"""Resolves the patterns of a call to views of blocks. Clients with equal patterns share their views."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ MAX_REGISTERS: Final = 16_384
 MAX_ELEMENTS: Final = 262_144
 """Maximum number of elements that one call may use."""
 MAX_MATCHES: Final = 1_000_000
-"""Maximum number of comparisons of a star pattern with a register in one call.
+"""Maximum number of comparisons between a pattern with stars and a register in one call.
 
 This many comparisons take a few seconds.
 """
 MAX_ALL_ELEMENTS: Final = 1 << 22
-"""Maximum number of elements that all clients together may use. Equal patterns count once."""
+"""Maximum number of elements that all clients together may use. Elements of equal patterns count once."""
 KEPT: Final = 16
-"""Number of unused views that are cached, for clients that read repeatedly."""
+"""Number of unused views that stay cached, for clients that read repeatedly."""
 
 
 class SourceDirection(NamedTuple):
-    """A source's values; if ``inward`` is True, the writes to the source."""
+    """The values of a source or, if ``inward`` is True, the writes to it."""
 
     source: str
     inward: bool = False
@@ -46,7 +46,7 @@ _Key = tuple[int, bool, tuple[str, ...]]
 
 
 class Selections:
-    """Makes and caches the views of all clients."""
+    """Creates and caches the views of all clients."""
 
     def __init__(self, topics: Topics) -> None:
         self._topics = topics
@@ -93,11 +93,11 @@ class Selections:
         return self._topics.feed(source).commands
 
     async def select(self, wanted: TopicsBySource, *, frames: bool = False) -> list[View]:
-        """Return one view for each source and direction, in order.
+        """Return a view for each source and direction, in order.
 
         Args:
             wanted: The topics, by source and direction.
-            frames: Whether to return views of raw frames.
+            frames: Whether the views deliver raw frames instead of registers.
 
         Raises:
             PathError: There is no such register.
@@ -113,7 +113,7 @@ class Selections:
         return views
 
     async def registers(self, wanted: TopicsBySource) -> Selection:
-        """Return the table of the only source in ``wanted``. Without topics, the table has no registers."""
+        """Return the table for ``wanted``, which must have one source. Without topics, the table has no registers."""
         ((place, topics),) = wanted.items()
         if not topics:
             block = self._topics.feed(place.source).block

@@ -36,7 +36,7 @@ _REMEDY: Final = "shmio-supervisor up takes them over, shmio-supervisor down sto
 
 
 class ShmioV1:
-    """Serves the registers of all sources, typed and packed."""
+    """Serves the registers of all sources: typed, and packed by type."""
 
     name = SERVICE
 

@@ -35,7 +35,7 @@ from shmio.wording import unknown
 
 
 class OutputEncoder:
-    """Encodes the outputs of a model into an image of the block. It caches the lookups."""
+    """Encodes the outputs of a model into an image of the block. It caches what it has looked up."""
 
     def __init__(self, selection: Selection) -> None:
         self._selection = selection
@@ -44,7 +44,7 @@ class OutputEncoder:
         self._paths: dict[str, Register] = {}
 
     async def packed(self, values: wire.Values, image: bytearray) -> None:
-        """Encode values by slot. Other tasks run in between.
+        """Encode values that are given by slot. Other tasks may run in between.
 
         Raises:
             ValueRangeError: A slot or value does not fit the table.
@@ -72,11 +72,11 @@ class OutputEncoder:
                 self._put(*self._at(column, int(slots[at])), part.values[at], image)
 
     async def decode_assignments(self, assignments: Any, image: bytearray) -> None:
-        """Encode values by path. Other tasks run in between.
+        """Encode values that are given by path. Other tasks may run in between.
 
         Raises:
             PathError: The table has no such register.
-            ValueRangeError: A value does not fit, or there are too many.
+            ValueRangeError: A value does not fit, or there are too many values.
 
         """
         if len(assignments) > (most := self._selection.elements):
@@ -158,7 +158,8 @@ class SimulateCalls:
             NOT_FOUND: There is no such source.
             FAILED_PRECONDITION: The source does not accept models.
             ALREADY_EXISTS: Another model has joined the source.
-            INVALID_ARGUMENT: The first message does not join, or a message answers no pending step.
+            INVALID_ARGUMENT: The first message does not join a source, or a later message is not
+                the answer to the pending step.
             UNAVAILABLE: A reload has changed the source.
         """
         taking: asyncio.Task[None] | None = None
@@ -243,7 +244,7 @@ class SimulateCalls:
 
 
 class SimulateCall:
-    """A Simulate call, whose client is the model of a source."""
+    """A Simulate call. Its client is the model of a source."""
 
     def __init__(self, block: Block, segment: Segment, name: str, peer: str) -> None:
         self.block = block
@@ -308,7 +309,7 @@ class SimulateCall:
             self._bell.stop()
 
     def end(self, failure: ShmioError | None = None) -> None:
-        """End the stream, with an error if one is given."""
+        """End the stream. ``failure`` is the error that ends it; None if there is none."""
         self.failure = self.failure or failure
         self._over = True
         self._wake.set()
@@ -357,7 +358,7 @@ class SimulateCall:
     # ---- answers of the model ------------------------------------------------------------------
 
     async def take(self, requests: AsyncIterator[wire.SimulateRequest]) -> None:
-        """Process the model's answers until the model half-closes the stream.
+        """Process the model's answers until the client ends its side of the stream.
 
         Raises:
             ValueRangeError: A message is not the answer to the pending step.
@@ -370,7 +371,7 @@ class SimulateCall:
         self.end()
 
     def taken(self, task: asyncio.Task[None]) -> None:
-        """End the call, because the :meth:`take` task has ended."""
+        """End the call. This is the done-callback of the task that runs :meth:`take`."""
         if not task.cancelled():
             error = task.exception()
             self.end(error if isinstance(error, ShmioError) else None)

@@ -44,8 +44,8 @@ class SnapshotCalls:
         """Save the state of the instance.
 
         Statuses:
-            FAILED_PRECONDITION: Time is real, another program controls it, the state of a process
-                cannot be saved, or the file cannot be written.
+            FAILED_PRECONDITION: The clock is in real time, another program controls time, the state
+                of a process cannot be saved, or the file cannot be written.
         """
         return await self._do(
             "save snapshot",
@@ -58,15 +58,15 @@ class SnapshotCalls:
         """Restore a snapshot.
 
         Statuses:
-            FAILED_PRECONDITION: Time is real, another program controls it, there is no such
-                snapshot, or it does not fit the instance.
+            FAILED_PRECONDITION: The clock is in real time, another program controls time, there is
+                no such snapshot, or it does not fit the instance.
         """
         return await self._do(
             "restore snapshot", request.name, lambda snapshots: snapshots.restore(request.name), context
         )
 
     async def list(self, _: wire.ListSnapshotsRequest, context: Context) -> wire.ListSnapshotsResponse:
-        """Return all snapshots.
+        """List all snapshots.
 
         Statuses:
             FAILED_PRECONDITION: The folder of the snapshots cannot be read.

@@ -37,11 +37,11 @@ from shmio.wire import shmio_v1_pb2 as wire
 MAX_STREAMS: Final = 256
 """Maximum number of open Subscribe calls."""
 BATCH_BYTES: Final = 1 << 18
-"""Size at which a message with the updates of all blocks is complete."""
+"""Size in bytes at which a message with updates is complete and is sent."""
 BATCH_UPDATES: Final = 256
 """Maximum number of updates in one message.
 
-Making that many takes some milliseconds. Then other tasks can run.
+Making this many updates takes some milliseconds. Then other tasks must run.
 """
 MAX_RATE_HZ: Final = 1e6
 
@@ -51,7 +51,11 @@ TABLES, UPDATES, ENDED, STEP = (
 
 
 def check(request: wire.SubscribeRequest) -> None:
-    """Raise ValueRangeError if options are not valid or exclude each other."""
+    """Check the options of a request.
+
+    Raises:
+        ValueRangeError: An option is not valid, or options exclude each other.
+    """
     if request.mode not in wire.Mode.values() or request.format not in wire.Format.values():
         raise ValueRangeError(
             f"mode {request.mode}, format {request.format}: this version supports only 0 and 1 for each"
@@ -71,19 +75,19 @@ def check(request: wire.SubscribeRequest) -> None:
 
 
 class BlockUpdates(Protocol):
-    """Makes the updates of one block for one subscriber. The ring in shared memory is the queue."""
+    """Makes the updates of one block for one subscriber. The ring in shared memory is the subscriber's queue."""
 
     view: View
     follower: FrameFollower
     due_s: float
-    """Event loop's time of the next possible update, in s; infinite: after the next new frame."""
+    """Event loop time of the next possible update, in s; infinite if only a new frame makes an update possible."""
 
     def next(self, now_s: float) -> bytes | None:
-        """Return the next serialised ``Update``, or None if there is none yet."""
+        """Return the next serialised ``Update``; None if there is none yet."""
 
 
 class EveryFrame:
-    """Makes an update of every frame from the present one on, and counts overwritten frames."""
+    """Makes an update of every frame, beginning with the present frame, and counts overwritten frames."""
 
     due_s = math.inf
 
@@ -92,7 +96,10 @@ class EveryFrame:
         self.follower = FrameFollower(view.block)
 
     def next(self, now_s: float) -> bytes | None:  # noqa: ARG002  there is no rate limit
-        """Return the update of the next frame, or an update that reports the last frame as stale."""
+        """Return the update of the next frame, or an update which reports that the last frame is now stale.
+
+        Return None if there is neither.
+        """
         follower = self.follower
         frame = follower.poll()
         if frame is None:
@@ -105,7 +112,7 @@ class EveryFrame:
 
 
 class LatestFrame:
-    """Makes updates of the newest frame if it has changes, at most one update per interval."""
+    """Makes an update of the newest frame if it has changes; at most one update per interval."""
 
     def __init__(self, view: View, interval_s: float, deadband: float) -> None:
         self.view = view
@@ -118,7 +125,10 @@ class LatestFrame:
         self._sent: Frame | None = None  # frame of the last update; kept only if registers have statuses
 
     def next(self, now_s: float) -> bytes | None:
-        """Return the changes of the newest frame, or an update that reports the last frame as stale."""
+        """Return the changes in the newest frame, or an update which reports that the last frame is now stale.
+
+        Return None if there is neither, or if the interval has not ended.
+        """
         follower = self.follower
         shown = follower.frame
         if shown is not None and not follower.behind:
@@ -197,7 +207,7 @@ class WriteFollower:
         return bool(self._waiting)
 
     def next(self) -> bytes | None:
-        """Return the next serialised ``Update``, or None if there is none yet."""
+        """Return the next serialised ``Update``; None if there is none yet."""
         return self._waiting.pop() if self._waiting else None
 
     def accept(self, event: Event) -> None:
@@ -251,16 +261,16 @@ class SubscribeCall:
 
     @property
     def readers(self) -> Iterator[tuple[Block, int]]:
-        """The blocks whose frames are all sent, each with the number of the last frame sent.
+        """The blocks that the client reads frame by frame, each with the number of the last frame sent.
 
-        Without those whose frames wait for a step.
+        A block whose frames wait for a step is left out.
         """
         for updates in self._blocks.values():
             if isinstance(updates, EveryFrame) and self._may_send(updates):
                 yield updates.view.block, updates.follower.last
 
     async def open(self) -> bytes:
-        """Start following all blocks, and return the tables.
+        """Start following all blocks, and return the serialised tables.
 
         Raises:
             PathError: There is no such register.
@@ -280,16 +290,16 @@ class SubscribeCall:
             self._leave(place)
 
     def give_up(self) -> None:
-        """End a call that is too slow for the steps.
+        """End the call, because its client is too slow for the steps.
 
-        The call stops following its blocks now. The stream ends when the client reads again.
+        The call stops following its blocks at once. The stream ends when the client reads again.
         """
         self.late = True
         self.close()
         self._wake.set()
 
     def wake(self) -> None:
-        """Wake the stream, so that it checks for updates."""
+        """Wake the stream, so that it looks for updates."""
         self._wake.set()
 
     def on_sources_replaced(self, sources: Collection[str]) -> None:
@@ -298,11 +308,11 @@ class SubscribeCall:
         self._wake.set()
 
     def mark(self, step: Step) -> asyncio.Future[None]:
-        """Queue the marker of a step, which is sent after the changes of the step.
+        """Queue the marker of a step. The marker is sent after the changes of the step.
 
         Returns:
             A future that is done when the marker has been sent or the call has ended. If the call
-            is not open yet, the future is done at once: :meth:`open` can take seconds.
+            is not open yet, the future is done at once, because :meth:`open` can take seconds.
 
         """
         sent = asyncio.get_running_loop().create_future()
@@ -314,7 +324,7 @@ class SubscribeCall:
         return sent
 
     async def messages(self) -> AsyncIterator[bytes]:
-        """Yield serialised SubscribeResponses without end.
+        """Yield serialised SubscribeResponses, without end.
 
         Raises:
             EndpointError: The client is too slow for the steps or the writes.
@@ -466,7 +476,7 @@ class SubscribeCalls:
 
     @property
     def updates(self) -> int:
-        """Number of updates sent by Subscribe calls since the start."""
+        """Number of updates that Subscribe calls have sent since the start."""
         return self._ended_updates + sum(subscription.updates for subscription in self._open)
 
     @property
@@ -521,7 +531,7 @@ class SubscribeCalls:
                     subscription.give_up()
 
     def release(self) -> None:
-        """Wake all streams. Time is real again, so values need no longer wait for steps."""
+        """Wake all streams: time is real again, so values no longer wait for steps."""
         for subscription in self._open:
             subscription.wake()
 

@@ -1,6 +1,6 @@
-"""Tables of registers, which make updates from a block's frames and writes, packed by type.
+"""Tables of registers. They make updates, packed by type, from a block's frames and writes.
 
-A table of registers is a view of a block; raw frames are the other kind of view. Numpy packs an
+A table of registers is one kind of view of a block; raw frames are the other kind. Numpy packs an
 image into one array for each type, and compares two images. All subscribers to a table share its
 updates.
 """
@@ -61,19 +61,22 @@ KINDS: Final[Mapping[Column, np.dtype[Any]]] = {
     Column.FLOAT: np.dtype("<f4"),
     Column.DOUBLE: np.dtype("<f8"),
 }
-"""Element type of each column's packed field."""
+"""Type of the elements in the packed field of each column."""
 _BITS: Final = {column: np.dtype(f"<u{kind.itemsize}") for column, kind in KINDS.items()}
 
 
 def column_of(element: ElementType) -> Column:
-    """Return the column for values of a type."""
+    """Return the column that holds values of a type."""
     return _BY_BASE.get(element.base) or _COLUMNS.get(scalar_codec(element).plain, Column.TEXT)
 
 
 class DecodedImage(NamedTuple):
-    """All elements of an image.
+    """The values of all elements of an image.
 
-    ``invalid`` has the indices of the registers whose bytes are not a valid value.
+    Attributes:
+        arrays: Numbers and bits, by column.
+        texts: Texts.
+        invalid: Indices of the registers whose bytes are not a valid value.
     """
 
     arrays: Mapping[Column, Array]
@@ -120,9 +123,9 @@ class _SingleValues(NamedTuple):
 
 
 class Columns:
-    """Maps registers to columns, and decodes images into columns.
+    """Assigns registers to columns, and decodes images into columns.
 
-    Use it only in one thread, because decoding caches unchanged values.
+    Use it only in one thread, because it caches decoded values.
     """
 
     def __init__(self, registers: Sequence[Register], order: ByteOrder) -> None:
@@ -168,7 +171,7 @@ class Columns:
                 yield _SingleElement(column, first + flat, place, decode, at, register.element.size)
 
     def place(self, column: Column, slot: int) -> int | None:
-        """Return the index of the register at a slot, or None if there is no such slot."""
+        """Return the index of the register at a slot of a column; None if there is no such slot."""
         if not 0 <= slot < self.sizes[column]:
             return None
         firsts, places = self._starts[column]
@@ -184,7 +187,7 @@ class Columns:
         return found
 
     def of_bits(self, mask: bytes) -> dict[Column, Array]:
-        """Return the slots of the elements that have at least one bit set in a mask of the block."""
+        """Return the slots of the elements of which at least one bit is set in an image-sized mask, by column."""
         arrays = self.decode_numbers(mask)
         found = {column: array.view(_BITS[column]) != 0 for column, array in arrays.items()}
         if self.sizes[Column.TEXT]:
@@ -194,7 +197,7 @@ class Columns:
         return {column: np.flatnonzero(hit) for column, hit in found.items() if hit.any()}
 
     def decode_numbers(self, image: bytes) -> dict[Column, Array]:
-        """Decode the columns of numbers and bits. Elements that need their own decoder are 0."""
+        """Decode the columns of numbers and bits. An element that needs its own decoder becomes 0."""
         data = np.frombuffer(image, np.uint8)
         arrays = {column: np.zeros(self.sizes[column], kind) for column, kind in KINDS.items() if self.sizes[column]}
         if Column.BOOL in arrays:
@@ -205,11 +208,17 @@ class Columns:
         return arrays
 
     def encode(self, column: Column, slots: Array, values: Array, image: bytearray) -> Array:
-        """Encode values at valid slots into an image.
+        """Encode values into an image.
+
+        Args:
+            column: The column of the values.
+            slots: The slot of each value; all must exist.
+            values: The values.
+            image: The image to change.
 
         Returns:
-            Indices into ``slots`` of the values that were not encoded, because they do not fit or
-            need their own encoder.
+            Indices of the values that were not encoded, because they do not fit or need their own
+            encoder.
 
         """
         data, left = np.frombuffer(image, np.uint8), np.full(len(slots), column is not Column.BOOL)
@@ -267,7 +276,7 @@ class Columns:
 
 
 def pack(new: DecodedImage, old: DecodedImage | None = None, deadband: float = 0.0) -> bytes:
-    """Serialise as ``Values`` the elements whose bits differ from ``old``.
+    """Serialise as ``Values`` the elements whose bits differ from those in ``old``.
 
     Without ``old``, serialise all elements. Numbers that differ by no more than ``deadband`` are
     left out. The result is empty if nothing differs.
@@ -294,7 +303,7 @@ def pack(new: DecodedImage, old: DecodedImage | None = None, deadband: float = 0
 
 
 def pack_slots(values: DecodedImage, chosen: Mapping[Column, Array]) -> bytes:
-    """Serialise the elements at these slots as ``Values``."""
+    """Serialise as ``Values`` the elements at the ``chosen`` slots."""
     parts = []
     for column, slots in chosen.items():
         where = field(1, slots.astype("<u4").tobytes())
@@ -306,7 +315,7 @@ def pack_slots(values: DecodedImage, chosen: Mapping[Column, Array]) -> bytes:
 
 
 def merge(new: DecodedImage, old: DecodedImage, deadband: float) -> DecodedImage:
-    """Return the values that a receiver has after :func:`pack`.
+    """Return the values that a receiver of ``old`` has after :func:`pack`.
 
     Numbers that were left out keep their old value.
     """
@@ -348,7 +357,7 @@ def _bits(registers: Sequence[Register]) -> tuple[Array, Array]:
 
 
 class UpdateMessage(NamedTuple):
-    """A serialised ``Update`` in two parts."""
+    """A serialised ``Update``, in two parts: the head, and the changes."""
 
     head: bytes
     body: bytes
@@ -356,8 +365,8 @@ class UpdateMessage(NamedTuple):
     changed: bool
     """True if the update has changes other than source times.
 
-    A receiver of the newest values gets new source times only with the next other change. Otherwise
-    it would get an update for each frame.
+    A receiver of the newest values gets new source times only together with another change.
+    Otherwise it would get an update for each frame.
     """
 
     @property
@@ -367,12 +376,12 @@ class UpdateMessage(NamedTuple):
 
 
 class StatusChanges(NamedTuple):
-    """Changed statuses of registers."""
+    """The changed statuses of registers."""
 
     field: bytes
-    """The field of an ``Update``; empty if there are none."""
+    """The statuses as a field of an ``Update``; empty if none has changed."""
     codes: bool
-    """True if a status code has changed, not only source times."""
+    """True if a status code has changed; False if only source times have."""
 
 
 class WriteUpdates:
@@ -401,11 +410,11 @@ class WriteUpdates:
         self._update = b""
 
     def of(self, event: Event) -> bytes:
-        """Return the serialised ``Update`` of an accepted write.
+        """Return the serialised ``Update`` of an accepted write; empty if it covers no register of the table.
 
-        The result is empty if the write covers no register of the table. If a command writes only a part
-        of an element, the rest of its value comes from the frame before the command. If the
-        command's next event completes the element, only the update of that event has the element.
+        If a command writes only a part of an element, the rest of the value comes from the frame
+        before the command. If the command's next event completes the element, only the update of
+        that event has the element.
         """
         if event.number != self._event:
             self._event, self._update = event.number, self._make(event)
@@ -432,9 +441,9 @@ class WriteUpdates:
 
 
 class Selection:
-    """A table of registers of one block. It makes updates of frames, once for all subscribers.
+    """A table of registers of one block. It makes the updates of frames, once for all subscribers.
 
-    After its creation, use it only in the event loop's thread.
+    Once it is created, use it only in the event loop's thread.
     """
 
     def __init__(self, number: int, block: Block, registers: Sequence[Register], *, inward: bool = False) -> None:
@@ -460,7 +469,7 @@ class Selection:
 
     @cached_property
     def writes(self) -> WriteUpdates:
-        """The encoder of the writes to the registers."""
+        """The encoder of the writes to the table's registers."""
         return WriteUpdates(self.number, self.block, self.registers, self.columns)
 
     @cached_property
@@ -488,15 +497,15 @@ class Selection:
         return found
 
     def update(self, frame: Frame, before: Frame | None = None, sent: Frame | None = None) -> UpdateMessage:
-        """Return an ``Update`` with the changes since ``before``, or with all values.
+        """Return an ``Update`` with the changes since ``before``. The update is cached.
 
-        The update is cached. It has the quality with which the frame was published.
+        It has the quality with which the frame was published.
 
         Args:
             frame: The new frame.
-            before: The last frame that was compared; None: the update has all values.
-            sent: The frame of the last update that was sent; default: ``before``. The receiver has
-                the source times of this frame.
+            before: The frame to compare with; if None, the update has all values.
+            sent: The frame of the last update that was sent, whose source times the receiver has;
+                None for ``before``.
 
         """
         if before is not None and not before.source_ns:
@@ -521,7 +530,7 @@ class Selection:
             before: The last frame that was compared.
             sent: The frame of the last update that was sent.
             values: The values that the receiver has now.
-            deadband: The largest difference that is left out.
+            deadband: The largest difference to leave out.
 
         Returns:
             The update, and the values that the receiver has after it.
@@ -554,10 +563,7 @@ class Selection:
         return UpdateMessage(head(self.number, frame, whole=before is None), b"".join(parts), changed)
 
     def statuses(self, frame: Frame, sent: Frame | None) -> StatusChanges:
-        """Return the statuses of a frame that differ from those of the frame ``sent``.
-
-        If ``sent`` is None, return all statuses.
-        """
+        """Return the statuses of a frame that differ from those of the frame ``sent``; all if ``sent`` is None."""
         area = self.block.statuses
         if area is None:
             return StatusChanges(b"", codes=False)
@@ -586,13 +592,13 @@ class Selection:
         )
 
     def originals(self, frame: Frame) -> bytes:
-        """Return the serialised ``Values`` as the source delivered them."""
+        """Return the values of a frame as the source delivered them, as serialised ``Values``."""
         return pack(self.columns.decode(frame.raw))
 
     def injected(self, frame: Frame) -> Array:
-        """Return the indices of the registers that an injection over ``/out`` covers.
+        """Return the indices of the registers that injections over ``/out`` cover.
 
-        The result is cached, because it changes only with an event.
+        The result is cached, because only an event can change it.
         """
         if frame.effective is None:
             return _NO_PLACES
@@ -632,7 +638,7 @@ class Selection:
 
 
 class RawFrames:
-    """A view of a block's raw frames, with the methods of a :class:`Selection`."""
+    """A view of a block's raw frames. It has the methods of a :class:`Selection`."""
 
     def __init__(self, number: int, block: Block) -> None:
         self.number = number
@@ -658,7 +664,7 @@ class RawFrames:
         before: Frame | None = None,  # noqa: ARG002  a frame is always whole
         sent: Frame | None = None,  # noqa: ARG002
     ) -> UpdateMessage:
-        """Return an ``Update`` with the image, and with the original image if injections change it."""
+        """Return an ``Update`` with the image, and also with the original image if injections change it."""
         found = self._updates.get(frame.number)
         if found is None:
             body = field(IMAGE, frame.image) if frame.source_ns else b""
@@ -673,7 +679,7 @@ View = Selection | RawFrames
 
 
 def head(table: int, frame: Frame, *, whole: bool = False) -> bytes:
-    """Return the serialised ``Update`` of a frame, without values."""
+    """Return the serialised ``Update`` of a frame, without its values."""
     return wire.Update(
         table=table,
         frame=frame.number,
@@ -689,7 +695,7 @@ def head(table: int, frame: Frame, *, whole: bool = False) -> bytes:
 
 
 def head_of(table: int, event: Event) -> bytes:
-    """Return the serialised ``Update`` of an event, without values."""
+    """Return the serialised ``Update`` of an event, without its values."""
     return wire.Update(
         table=table,
         frame=event.frame,
@@ -702,12 +708,19 @@ def head_of(table: int, event: Event) -> bytes:
 
 
 def stale_fields(reason: str) -> bytes:
-    """Return the fields to append to a frame's update to report the frame as stale."""
+    """Return the fields which, appended to a frame's update, report the frame as stale."""
     return _QUALITY_BAD + field(REASON, reason.encode())
 
 
 def describe(register: Register, found: wire.Register, column: Column | None = None, slot: int = 0) -> None:
-    """Fill in a message that describes a register."""
+    """Fill in the message that describes a register.
+
+    Args:
+        register: The register.
+        found: The message.
+        column: The column of the register's values; None if they are not in a table.
+        slot: The first slot of the register in the column.
+    """
     found.path, found.type = register.path, register.type
     found.offset, found.size, found.count = register.offset, register.size, register.count
     found.column = int(column or column_of(register.element))  # type: ignore[assignment]

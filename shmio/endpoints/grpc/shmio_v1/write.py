@@ -1,4 +1,4 @@
-"""The call Write, and helpers for all calls that receive values, by path or by a table's slots."""
+"""The call Write, and helpers for all calls that receive values: by path, or by the slots of a table."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class WriteCalls:
         return {"Write": grpc.unary_unary_rpc_method_handler(self.write, request, response)}
 
     async def write(self, request: wire.WriteRequest, context: Context) -> wire.WriteResponse:
-        """Write registers of one source, all or none, and return the outcome of each.
+        """Write registers of one source, all or none. Return the outcome of each.
 
         If the call ends with an error status, nothing was sent.
 
@@ -76,7 +76,7 @@ def outcome(kind: EventKind, reason: str) -> wire.Outcome:
 
 
 async def decode_assignments(assignments: Any, topics: Topics) -> tuple[str, dict[str, object]]:
-    """Decode the values of a write request. Large requests yield to other tasks.
+    """Decode the values of a write request. While a large request is decoded, other tasks run.
 
     Returns:
         The source of the values, and the values by register path.
@@ -112,7 +112,7 @@ async def decode_assignments(assignments: Any, topics: Topics) -> tuple[str, dic
 
 
 def plain(value: wire.Value, register: Register) -> object:
-    """Convert a value to Python.
+    """Convert a value from a message to Python.
 
     Raises:
         ValueRangeError: The value is missing, or a text does not fit the register.

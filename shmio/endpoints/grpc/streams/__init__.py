@@ -1,1 +1,1 @@
-"""Delivers blocks' frames to clients' streams: feeds, conflation, and back-pressure."""
+"""Delivers the frames of blocks to clients' streams, with conflation and back-pressure."""

@@ -1,4 +1,4 @@
-"""Back-pressure: limits the messages that wait for clients, and skips frames if all clients are busy."""
+"""Back-pressure: limits the messages that wait for clients, and skips frames while all clients are busy."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from typing import Final, Protocol
 from shmio.segment import Block, FrameFollower
 
 WINDOW_S: Final = 0.25
-"""Period for which a client's lost values are compared with those offered to it, in s."""
+"""Length in s of the periods in which the values that a client loses are compared with those offered to it."""
 BEHIND_S: Final = 5.0
-"""Interval at which clients that are far behind get another chance, in s.
+"""Interval in s at which clients that are far behind get another chance.
 
 The values that a client loses while it is behind do not show how fast it could be. All clients get
 their chance at the same time, because a frame that is read for one client is available to all.
 """
 PART: Final = 3
-"""A client that loses more than one in ``PART`` values is far behind."""
+"""A client that loses more than one of ``PART`` values is far behind."""
 LATE_S: Final = 0.002
-"""Time in s after which a newer value replaces a waiting value, if the client is far behind."""
+"""Age in s from which a waiting value is replaced by a newer one, if the client is far behind."""
 
 
 class LossMonitor:
-    """Decides whether a client is far behind, by the number of values that it loses.
+    """Decides from the number of values that a client loses whether the client is far behind.
 
-    Times are in s, by any clock.
+    Times are in s, by any one clock.
     """
 
     def __init__(self) -> None:
@@ -37,7 +37,7 @@ class LossMonitor:
         self._until_s = 0.0
 
     def offer(self, now_s: float) -> None:
-        """Count one value offered to the client. At the end of a period, update ``behind``."""
+        """Count one value that was offered to the client. At the end of a period, update :attr:`behind`."""
         if now_s >= self._until_s:
             self.behind = not self.behind and PART * self._lost > self._offered
             self._offered = self._lost = 0
@@ -45,30 +45,30 @@ class LossMonitor:
         self._offered += 1
 
     def lose(self, count: int) -> None:
-        """Count values that were dropped because newer values replaced them."""
+        """Count values that were dropped because a newer value replaced them."""
         self._lost += count
 
     def skip(self, count: int) -> None:
-        """Count values that were never queued. They count as offered and as lost."""
+        """Count values that were never queued. They count as both offered and lost."""
         self._offered += count
         self._lost += count
 
 
 BOUND_BYTES: Final = 8 << 20
-"""Maximum size of one stream's waiting values, and of its waiting events, in bytes."""
+"""Maximum size of a stream's waiting values, and also of its waiting events, in bytes."""
 TOTAL_BYTES: Final = 256 << 20
-"""Maximum size of all waiting messages, in bytes. Above it, no stream may exceed an equal share."""
+"""Size of all waiting messages, in bytes, above which no stream may exceed an equal share of it."""
 
 
 class TotalBacklog:
-    """Size of the messages that wait in all streams, and the number of these streams."""
+    """Total size of the messages that wait in all streams, and number of these streams."""
 
     def __init__(self) -> None:
         self.size = 0
         self.streams = 0
 
     def over(self, size: int) -> bool:
-        """Return whether the total is too large, and ``size`` bytes exceed a stream's equal share."""
+        """Return whether the total exceeds its limit, and ``size`` bytes exceed a stream's equal share of it."""
         return self.size > TOTAL_BYTES and size > TOTAL_BYTES // max(1, self.streams)
 
 
@@ -81,7 +81,13 @@ class Backlog:
         self._total = total
 
     def full(self, message: Sized, bound: int, bound_bytes: int | None = None) -> bool:
-        """Return whether one more message would exceed a limit. A single message always fits."""
+        """Return whether one more message would exceed a limit. A single message always fits.
+
+        Args:
+            message: The message.
+            bound: Maximum number of messages.
+            bound_bytes: Maximum size of all messages, in bytes; None for ``BOUND_BYTES``.
+        """
         most = BOUND_BYTES if bound_bytes is None else bound_bytes
         size = self.size + len(message)
         return self.count > 0 and (self.count >= bound or size > most or self._total.over(size))
@@ -102,34 +108,34 @@ class Backlog:
 
 
 CATCH_UP_FRAMES: Final = 48
-"""A feed that is further behind than this, or has no listeners, skips to the newest frame.
+"""A feed that is more frames behind than this, or has no listeners, skips to the newest frame.
 
-The limit is a number of frames, because an outbox has room for that many. Frames that are too fast
-for the clients wait in the ring. The MQTT bridge has a time limit instead, because it falls behind
-only if it is delayed itself.
+The limit is a number of frames, because an outbox has room for that many. Frames that come too fast
+for the clients wait in the ring. The MQTT bridge has a limit in time instead, because it falls
+behind only if it is delayed itself.
 """
 FEW_FRAMES: Final = 8
 """Maximum number of frames that a client that is far behind gets at once."""
 LOOK_S: Final = 0.02
-"""Longest time between two reads while all clients are busy, in s. These reads notice bad quality."""
+"""Maximum time in s between two reads while all clients are busy. These reads notice bad quality."""
 
 
 class Stream(Protocol):
     """A client's stream, as back-pressure sees it."""
 
     refills: dict[Callable[[], object], None]
-    """Functions to call once, as soon as the stream has nothing to send."""
+    """Functions to call once, as soon as the stream has nothing left to send."""
 
     @property
     def busy(self) -> bool:
-        """True if messages wait, or if the client has not taken the last message yet."""
+        """True if messages are waiting, or if the client has not taken the last message yet."""
 
     @property
     def behind(self) -> bool:
         """True if the client loses so many values that it is far behind."""
 
     def skip(self, frames: int, topics: int) -> None:
-        """Count frames of ``topics`` topics that were not delivered to a slow client."""
+        """Count frames that were not delivered to a slow client, on ``topics`` of its topics."""
 
 
 class BackPressure:
@@ -154,13 +160,13 @@ class BackPressure:
         self._until_s = 0.0
 
     def join(self, stream: Stream) -> None:
-        """Add one topic of a stream."""
+        """Add a stream. Call this once for each topic that the stream follows."""
         self._streams[stream] += 1
         if self._passing:
             stream.refills[self._refill] = None
 
     def leave(self, stream: Stream) -> None:
-        """Remove one topic of a stream."""
+        """Remove one topic of a stream, and the stream with its last topic."""
         self._streams[stream] -= 1
         if not self._streams[stream]:
             del self._streams[stream]
@@ -169,8 +175,8 @@ class BackPressure:
     def passes(self) -> bool:
         """Return whether the feed should read nothing now, because all streams are busy.
 
-        Return False if the last read was more than ``LOOK_S`` ago. A busy stream calls ``refill``
-        when it can take more.
+        If the feed has not read for ``LOOK_S``, the result is False. A busy stream calls ``refill``
+        once it can take more.
         """
         if not self._streams:
             return False

@@ -1,4 +1,4 @@
-"""Follows one block: scans each frame once for changes, and encodes each change once."""
+"""Follows one block: finds the changes in each frame once, and encodes each change once."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Moment(NamedTuple):
 
 
 class DeliveredImage(NamedTuple):
-    """The image of a block after a step; ``raw`` is the image without injections."""
+    """The image of a block after a step. ``raw`` is the image without injections."""
 
     number: int
     clock_ns: int
@@ -32,9 +32,9 @@ class DeliveredImage(NamedTuple):
 
 
 class VirtualTime:
-    """The state of virtual time, for the feeds.
+    """The state of virtual time, as the feeds need it.
 
-    ``on`` is True while time is virtual. ``moment`` is the step that was delivered last. In virtual
+    ``on`` is True while time is virtual. ``moment`` is the last step that was delivered. In virtual
     time, the values of blocks on the instance's clock are delivered step by step. Use it only in
     the event loop's thread.
     """
@@ -47,29 +47,29 @@ class VirtualTime:
 
 
 class Listener(Protocol):
-    """A stream's subscription to one subject. The event loop's thread calls the methods."""
+    """A stream's subscription to one subject. The methods are called in the event loop's thread."""
 
     @property
     def stream(self) -> Stream:
         """The stream that this listener belongs to."""
 
     since: int
-    """Number of the frame whose value the stream already has."""
+    """Number of the frame whose value the stream already has; 0 if it has none."""
 
     def deliver(self, message: Sized, at_s: float | None = None) -> None:
         """Add one message to the stream.
 
         Args:
             message: The message.
-            at_s: Time of the message, in s of the monotonic clock; None: now.
+            at_s: Time of the message, in s of the monotonic clock; None for now.
 
         """
 
     def keep(self, message: Sized) -> None:
-        """Queue a message of a step, which must not be dropped."""
+        """Queue a message of a step. It must not be dropped."""
 
     def lose(self) -> None:
-        """Drop the messages that have not been sent yet, because the quality has turned bad."""
+        """Drop the messages that have not been sent yet, because the quality has become bad."""
 
 
 class _Channel:
@@ -120,8 +120,8 @@ class Feed:
     """Delivers the changes of one block's registers to listeners, while the quality is good.
 
     After bad quality, the feed delivers every register again. In virtual time, the feed of a block
-    on the instance's clock is *suspended*: only :meth:`step` delivers values. Use it only in the event
-    loop's thread.
+    on the instance's clock is *suspended*: only :meth:`step` delivers its values. Use it only in
+    the event loop's thread.
     """
 
     def __init__(
@@ -165,7 +165,7 @@ class Feed:
 
     @property
     def alive(self) -> bool:
-        """True while the feed follows the block and its events, or if a reload has retired the block."""
+        """True while the feed follows the block and its events, and also once a reload has retired the block."""
         return (self._reader.alive or self.block.retired) and self.commands.alive
 
     @property
@@ -175,7 +175,7 @@ class Feed:
 
     @property
     def over(self) -> bool:
-        """True if the feed has ended, and has no listeners and no commands in flight."""
+        """True if the feed has ended, and nobody needs it: no listener, and no command in flight."""
         return not (self._reader.alive or self._channels) and self.commands.over
 
     def start(self) -> None:
@@ -192,7 +192,7 @@ class Feed:
         self.commands.stop()
 
     def listen(self, subject: Subject, listener: Listener) -> None:
-        """Add a listener. It gets the current value at once, or as soon as the quality is good."""
+        """Add a listener. It gets the present value at once, or as soon as the quality is good."""
         channel = self._channels.get(subject)
         if channel is None:
             slot = self._free.pop() if self._free else len(self._channels)
@@ -205,7 +205,7 @@ class Feed:
         self._settle()
 
     def leave(self, subject: Subject, listener: Listener) -> None:
-        """Remove a listener. The last listener's removal ends the channel."""
+        """Remove a listener. If it was the last listener to the subject, the channel ends."""
         self._awaiting_value.pop(listener, None)
         channel = self._channels[subject]
         del channel.listeners[listener]
@@ -224,7 +224,7 @@ class Feed:
             self._settle()
 
     def suspend(self) -> None:
-        """If the block is on the instance's clock, deliver only by :meth:`step` from now on."""
+        """From now on, deliver values only by :meth:`step`, if the block is on the instance's clock."""
         self._suspended = self.block.attributes.stepped
 
     def resume(self) -> None:
@@ -240,9 +240,9 @@ class Feed:
         self._settle()
 
     def step(self) -> None:
-        """Deliver the changes of a step, which are the differences since the last delivery.
+        """Deliver the changes of a step: the differences from the last delivery.
 
-        They come in the order of the block's registers.
+        The changes come in the order of the block's registers.
 
         Raises:
             SegmentError: No frame can be read.
@@ -391,7 +391,7 @@ class Feed:
         return changes + [channel for channel in apart if channel.changed and channel.changed(shown, frame)]
 
     def present(self) -> Frame | DeliveredImage | None:
-        """Return the image that a new listener would get, or None if the quality is not good."""
+        """Return the image that a new listener would get; None if the quality is not good."""
         if self._suspended:
             self._virtual_time.update()
             return self._shown
@@ -472,7 +472,7 @@ class Feeds(Mapping[str, Feed]):
                 feed.start()
 
     async def follow(self) -> list[str]:
-        """Adopt what a reload has changed.
+        """Adopt the changes of a reload.
 
         Returns:
             The sources that were added or removed, or that have a new feed.

@@ -20,23 +20,23 @@ from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.segment.events import EVENT_SLOTS
 
 TOPIC_BOUND: Final = 64
-"""Maximum number of one topic's waiting values. A feed that catches up delivers fewer."""
+"""Maximum number of waiting values of one topic. A feed that catches up delivers fewer."""
 STATE_BOUND: Final = 4096
-"""Number of waiting values above which a new value replaces all waiting values of its topic."""
+"""Number of a stream's waiting values above which a new value replaces all waiting values of its topic."""
 EVENT_BOUND: Final = 2 * EVENT_SLOTS
-"""Maximum number of a stream's waiting events, twice as many as one catch-up can deliver."""
+"""Maximum number of a stream's waiting events. It is twice as many as one catch-up can deliver."""
 STEP_BOUND: Final = 16_384
-"""Maximum number of values of one step that wait in a stream. No value of a step is dropped."""
+"""Maximum number of a step's values that wait in a stream. No value of a step is dropped."""
 STEP_BOUND_BYTES: Final = 64 << 20
-"""Maximum size of the values of one step that wait in a stream, in bytes."""
+"""Maximum size of a step's values that wait in a stream, in bytes."""
 
 Finish = Callable[[Any], bytes]
 
 
 class Outbox:
-    """The waiting messages of a stream, in order of arrival, with one lane for each topic.
+    """The waiting messages of a stream, in the order in which they came. Each topic has a lane of its own.
 
-    It has one reader. Use it only in the event loop's thread.
+    Only one reader may use :meth:`pop`. Use the outbox only in the event loop's thread.
     """
 
     def __init__(self, total: TotalBacklog | None = None) -> None:
@@ -61,7 +61,7 @@ class Outbox:
 
     @property
     def busy(self) -> bool:
-        """True if messages wait, or if the client has not taken the last message yet."""
+        """True if messages are waiting, or if the client has not taken the last message yet."""
         return bool(self._waiting) or not self._asked
 
     @property
@@ -70,7 +70,7 @@ class Outbox:
         return self.losses.behind
 
     def skip(self, frames: int, topics: int) -> None:
-        """Count frames of ``topics`` topics that were not delivered to this slow client."""
+        """Count frames that were not delivered to this slow client, on ``topics`` of its topics."""
         self.dropped += frames
         self.losses.skip(frames * topics)
 
@@ -80,7 +80,7 @@ class Outbox:
         Args:
             lane: The lane of the message.
             message: The message.
-            at_s: Time of the message, for :meth:`since`, in s.
+            at_s: Time of the message, in s, which :meth:`since` returns.
 
         """
         number = self._next
@@ -92,11 +92,11 @@ class Outbox:
         return number
 
     def since(self, number: int) -> float:
-        """Return the time of a waiting message, in s."""
+        """Return the time of the waiting message with this number, in s."""
         return self._waiting[number][2]
 
     def drop(self, number: int) -> None:
-        """Drop a waiting message."""
+        """Drop the waiting message with this number."""
         lane, message, _ = self._waiting.pop(number)
         lane.load.remove(message)
         self.dropped += 1
@@ -115,12 +115,12 @@ class Outbox:
         self._report_delivery()
 
     def end(self) -> None:
-        """Make :meth:`pop` return None after the messages that wait now."""
+        """Make :meth:`pop` return None once it has returned the messages that are waiting now."""
         self._ended = True
         self._wake()
 
     def fail(self, reason: str) -> None:
-        """End the stream at once. Drop all waiting messages, and those that are added later."""
+        """End the stream at once. Drop all waiting messages, and all that are added later."""
         failed, self.failure = self.failure, self.failure or reason
         self.clear()
         self.end()
@@ -138,7 +138,7 @@ class Outbox:
         return self._taken < self._required and not self.failure
 
     async def delivered(self) -> None:
-        """Wait until the client has taken all messages up to :meth:`require_delivery`, or until the stream ends."""
+        """Wait until the client has taken all messages marked by :meth:`require_delivery`, or until the stream ends."""
         while self.delivery_pending:
             self._delivery = asyncio.get_running_loop().create_future()
             try:
@@ -154,8 +154,8 @@ class Outbox:
     async def pop(self) -> bytes | None:
         """Wait for the oldest message, and return it. After :meth:`end`, return None.
 
-        You may call it again after None. Each call means that the client has taken the previous
-        message, as far as flow control shows.
+        You may call this again after None. As far as flow control shows, each call means that the
+        client has taken the previous message.
         """
         waiting = self._waiting
         self._taken = next(iter(waiting)) if waiting else self._next
@@ -225,7 +225,7 @@ class _Lane:
 
 
 class StateLane(_Lane):
-    """A lane for states. A slow client gets only the newest value, any other client every change.
+    """A lane for states. A slow client gets only the newest value; any other client gets every change.
 
     The outbox counts the values that are left out. The lane is a listener of a feed.
     """
@@ -243,7 +243,7 @@ class StateLane(_Lane):
         self.since = 0
 
     def deliver(self, message: Sized, at_s: float | None = None) -> None:
-        """Add a message. Drop waiting messages if they are too many or too old."""
+        """Add a message. Drop the lane's waiting messages if they are too many or too old."""
         waits = len(self._numbers)  # 0 if the client keeps up
         outbox, numbers, now_s = self._outbox, self._numbers, time.monotonic()
         at_s = now_s if at_s is None else at_s
@@ -257,11 +257,11 @@ class StateLane(_Lane):
         self._add(message, at_s)
 
     def lose(self) -> None:
-        """Drop the waiting messages, because the quality has turned bad."""
+        """Drop the lane's waiting messages, because the quality has become bad."""
         self.drop()
 
     def join(self, feed: Feed, subject: Subject) -> Callable[[], None]:
-        """Listen to a feed's values. Return the function that ends the subscription."""
+        """Listen to the values of a feed. Return the function that ends the subscription."""
         feed.listen(subject, self)
         return partial(feed.leave, subject, self)
 
@@ -291,7 +291,7 @@ class EventLane(_Lane):
         self._add(message)
 
     def fail(self, reason: str) -> None:
-        """Fail the whole outbox, because events are missing."""
+        """Make the whole outbox fail, because events are missing."""
         self._outbox.fail(f"{self._path}: {reason}")
 
     def join(self, feed: Feed, subject: Subject) -> Callable[[], None]:
@@ -317,7 +317,7 @@ class OpenStreams:
 
     @contextmanager
     def joined(self) -> Iterator[None]:
-        """Count a stream while it is open."""
+        """Count a stream within a ``with`` block."""
         self._count += 1
         if self._count == 1:
             self.changed()
@@ -359,7 +359,7 @@ class Outboxes:
 
     @contextmanager
     def opened(self) -> Iterator[Outbox]:
-        """Provide an outbox for a stream while the stream is open."""
+        """Provide an outbox for a stream within a ``with`` block."""
         outbox = Outbox(self._total)
         self._open.add(outbox)
         self._total.streams += 1
@@ -375,7 +375,7 @@ class Outboxes:
     async def delivered(self, patience_s: float) -> None:
         """Wait until all clients have taken the messages marked by :meth:`Outbox.require_delivery`.
 
-        Streams whose clients have not done so within ``patience_s`` fail.
+        If a client has not done so within ``patience_s``, its stream fails.
         """
         late = [outbox for outbox in self._open if outbox.delivery_pending]
         if not late:
@@ -404,7 +404,7 @@ class SendQueue:
         return bool(self._messages)
 
     def add(self, message: bytes) -> str:
-        """Add a message. If there is no room, return the reason; otherwise return an empty text."""
+        """Add a message. Return an empty text or, if there is no room for the message, the reason."""
         if self._load.full(message, MAX_WAITING):
             return f"{self._load.count} messages are waiting: the client reads too slowly"
         self._load.add(message)

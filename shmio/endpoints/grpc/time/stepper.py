@@ -1,4 +1,4 @@
-"""Moves the instance's time for clients of all services: makes steps, and plays in real time."""
+"""Moves the instance's time for the clients of all services: makes steps, and plays in real time."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from shmio.segment import ProcessSlot, Segment
 from shmio.segment.clock import ClockPage
 
 BRIEF_NS: Final = 500_000
-"""Time for which a step blocks the event loop while it waits for the sources' answers, in ns.
+"""Time in ns for which a step blocks the event loop while it waits for the sources' answers.
 
 A wake-up by another thread would take about as long.
 """
 
 
 class StepDriver:
-    """Makes steps as :meth:`Coordinator.step` does, but in an event loop; one step at a time."""
+    """Makes steps as :meth:`Coordinator.step` does, but in an event loop. It makes one step at a time."""
 
     def __init__(self, coordinator: Coordinator, clock: ClockPage, wake_ups: WakeUps) -> None:
         self._coordinator = coordinator
@@ -40,7 +40,8 @@ class StepDriver:
     async def step(self, dt_ns: int | None) -> Step:
         """Make one step. If the task is cancelled, the step is aborted.
 
-        This method raises the errors of :meth:`Coordinator.step`.
+        ``dt_ns`` is the length of the step, in ns; None for the step size. This raises the errors
+        of :meth:`Coordinator.step`.
         """
         until_ns = time.monotonic_ns() + BRIEF_NS
         with closing(self._coordinator.stepping(dt_ns)) as stepping:
@@ -54,7 +55,7 @@ class StepDriver:
                     await self._wait(wait)
 
     def stop(self) -> None:
-        """Stop waiting for the deliveries of other processes."""
+        """Stop waiting for other processes to deliver steps."""
         if self._delivered is not None:
             self._delivered.stop()
             self._delivered.join()
@@ -97,13 +98,13 @@ def _brief(wait: StepWait, rest_ns: int) -> bool:
 
 
 LATE_S: Final = 0.5
-"""Maximum delay that playing makes up for, in s. The rest of a longer delay is lost."""
+"""Maximum delay in s that playing makes up for. The rest of a longer delay is lost."""
 
 log = logging.getLogger("shmio.grpc")
 
 
 class Player:
-    """Makes steps at a multiple of real time. Use it only in the event loop's thread."""
+    """Plays: makes steps at a multiple of real time. Use it only in the event loop's thread."""
 
     def __init__(self, make: Callable[[int | None], Awaitable[object]], step_size_ns: Callable[[], int]) -> None:
         """Prepare to play. :meth:`begin` starts playing.
@@ -126,12 +127,12 @@ class Player:
 
     @property
     def on(self) -> bool:
-        """True while the player plays."""
+        """True from :meth:`begin` until :meth:`end`."""
         return self._task is not None
 
     @property
     def alive(self) -> bool:
-        """False if the player should play but its task has ended; otherwise True."""
+        """False if the task that plays has ended although the player should play; otherwise True."""
         return self._task is None or not self._task.done()
 
     def begin(self) -> None:
@@ -140,14 +141,14 @@ class Player:
             self._task = self._loop.create_task(self._play())
 
     async def end(self) -> None:
-        """Stop playing, and wait for the end of the last step."""
+        """Stop playing, and wait until the last step has ended."""
         task, self._task = self._task, None
         self._woken.set()
         if task is not None:
             await task
 
     async def break_off(self) -> None:
-        """Abort the present step, and stop; :attr:`on` stays True."""
+        """Abort the present step, and stop playing. :attr:`on` stays True."""
         if self._task is not None:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
@@ -171,7 +172,7 @@ class Player:
 
 
 REST_S: Final = 1.0
-"""Time in s without a step after which the endpoint gives up control of time for other programs."""
+"""Time in s without a step after which the endpoint gives up control of time, for other programs."""
 
 _Result = TypeVar("_Result")
 
@@ -222,10 +223,10 @@ class Stepper:
     async def start(self, predecessor: int = 0) -> None:
         """Start following time.
 
-        Resume playing if the previous process of this endpoint was playing.
+        If the previous process of this endpoint was playing, resume playing.
 
         Args:
-            predecessor: Process id of the previous process; 0: there was none.
+            predecessor: Process id of the previous process; 0 if there was none.
 
         """
         self.timeline.start()
@@ -238,11 +239,11 @@ class Stepper:
 
     @property
     def alive(self) -> bool:
-        """True if this process follows time and :attr:`Player.alive` is True."""
+        """True if this process follows time, and playing has not failed; see :attr:`Player.alive`."""
         return self.timeline.alive and self._player.alive
 
     async def set_step_size(self, dt_ns: int) -> None:
-        """Take control of time, and set the length of steps whose request names no length.
+        """Take control of time, and set the step size: the length of each step whose request gives no length.
 
         Raises:
             ValueRangeError: The step size is out of range.
@@ -257,13 +258,14 @@ class Stepper:
     async def step(self, dt_ns: int | None = None, peer: str = "") -> Step:
         """Make a step. Return when all streams have taken the marker of the step.
 
-        Values that came earlier on the peer's Publish streams reach their sources before the step.
+        Values that came earlier on Publish streams of ``peer`` reach their sources before the step.
         If the client disconnects, a step that has started is completed, and a step that still waits
         is cancelled.
 
         Args:
-            dt_ns: Size in ns; None: the step size.
-            peer: The client, as gRPC names it; empty: do not wait for published values.
+            dt_ns: Length of the step, in ns; None for the step size.
+            peer: The client, as gRPC names it; if empty, the step does not wait for published
+                values.
 
         Raises:
             TimeError: The step failed, another program controls time, or this process is playing.
@@ -283,7 +285,11 @@ class Stepper:
         return step
 
     async def play(self, dt_ns: int | None = None, rate: float = 1.0) -> TimeStatus:
-        """Play at ``rate`` times real time in steps of ``dt_ns``. Return the state of time.
+        """Start playing. Return the state of time.
+
+        Args:
+            dt_ns: Length of each step, in ns; None for the step size.
+            rate: Speed, as a multiple of real time.
 
         Raises:
             TimeError: Another program controls time.
@@ -296,10 +302,10 @@ class Stepper:
         return status
 
     async def pause(self, *, end: bool = False) -> TimeStatus:
-        """Stop playing, and return the state of time.
+        """Stop playing. Return the state of time.
 
         Args:
-            end: Whether to report ``alive = False`` until the next step.
+            end: Whether the status reports ``alive = False`` until the next step.
 
         Raises:
             TimeError: Another program controls time.
@@ -311,7 +317,7 @@ class Stepper:
         return status
 
     async def release(self) -> TimeStatus:
-        """Let time run as real time again.
+        """Return to real time. Return the state of time.
 
         Raises:
             TimeError: Another program controls time, or the instance has no real time.
@@ -323,7 +329,7 @@ class Stepper:
         return status
 
     async def while_still(self, work: Callable[[Coordinator], _Result]) -> _Result:
-        """Call ``work`` in a thread, while this process controls time and makes no step.
+        """Call ``work`` in a thread, while this process controls time and makes no step. Return its result.
 
         Raises:
             TimeError: Time is real or is playing, or another program controls it.
@@ -332,7 +338,7 @@ class Stepper:
         return await self._do(self._while_still(work))
 
     async def stop(self) -> None:
-        """Stop moving time. If this process was playing, the next one resumes playing."""
+        """Stop moving time. If this process was playing, the next process of this endpoint resumes playing."""
         if self._rest is not None:
             self._rest.cancel()
         tasks = list(self._tasks)

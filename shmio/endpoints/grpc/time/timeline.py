@@ -1,4 +1,4 @@
-"""Follows the instance's time, and delivers each step, whichever program makes it."""
+"""Follows the instance's time, and delivers each step, whichever program makes the step."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from shmio.model.clock import Clock
 from shmio.segment import ProcessSlot, Segment
 
 PATIENCE_S: Final = 3.0
-"""Time limit in s for clients to take the values of a step, and again to take its marker.
+"""Maximum time in s for clients to take the values of a step, and again to take the step's marker.
 
 Clients of shmio.v1 get a step after the other clients. The total is less than the time-out of a
 step. If only one stream is open, it has this time once, for values and marker together.
@@ -30,10 +30,9 @@ log = logging.getLogger("shmio.grpc")
 class TimeStatus(NamedTuple):
     """The state of the instance's time.
 
-    ``dt_ns`` is the length of the step that the status reports. If it reports no step, ``dt_ns`` is
-    the length of the steps that are played, or the step size.
-
-    ``alive`` is False after a client has called ``stop`` of SimServerAPI, until the next step.
+    ``dt_ns`` is the length of the step that the status reports. If the status reports no step, it
+    is the length of the steps that are played, or the step size. ``alive`` is False after a client
+    has called ``stop`` of SimServerAPI, until the next step.
     """
 
     clock_ns: int
@@ -43,23 +42,23 @@ class TimeStatus(NamedTuple):
 
 
 class Listener(Protocol):
-    """A stream's subscription to a time topic. The event loop's thread calls the methods."""
+    """A stream's subscription to a time topic. The methods are called in the event loop's thread."""
 
     def deliver(self, message: Sized) -> None:
         """Add one message to the stream."""
 
     def keep(self, message: Sized) -> None:
-        """Add one message of a step, which must not be dropped."""
+        """Add one message of a step to the stream. It must not be dropped."""
 
 
 Encode = Callable[[TimeTopic, Moment], Sized]
-"""Encodes a moment as a message of one service."""
+"""Function that encodes a moment as a message of one service."""
 
 
 class TimeTopics:
-    """Sends step numbers and simulation time to listeners.
+    """Sends step numbers and the simulation time to listeners.
 
-    While time is real, the simulation time is sent once per step size.
+    While time is real, the simulation time is sent periodically. The period is the step size.
     """
 
     def __init__(self, virtual_time: VirtualTime, now: Callable[[], Moment], tick_s: Callable[[], float]) -> None:
@@ -78,9 +77,14 @@ class TimeTopics:
         self._timer: asyncio.TimerHandle | None = None
 
     def listen(self, topic: TimeTopic, encode: Encode, listener: Listener) -> Callable[[], None]:
-        """Add a listener, and return the function that removes it.
+        """Add a listener. Return the function that removes it.
 
-        The simulation time is sent at once. The number of a step is sent after that step.
+        The present simulation time is sent at once. A step's number is sent after the step.
+
+        Args:
+            topic: The topic to listen to.
+            encode: Encodes a moment as a message.
+            listener: Gets the messages.
         """
         listeners = self._listeners.setdefault((topic, encode), {})
         listeners[listener] = None
@@ -100,7 +104,7 @@ class TimeTopics:
             del self._listeners[topic, encode]
 
     def publish_step(self) -> None:
-        """Send the number and time of the step that was delivered."""
+        """Send the number and the time of the step that was delivered last."""
         for (topic, encode), listeners in self._listeners.items():
             message = encode(topic, self._virtual_time.moment)
             for listener in listeners:
@@ -123,7 +127,7 @@ class TimeTopics:
                 self._set_timer()
 
     def resume(self) -> None:
-        """Send the simulation time periodically again, because time is real."""
+        """Start to send the simulation time periodically again, because time is real."""
         if any(topic is TimeTopic.CLOCK for topic, _ in self._listeners):
             self._set_timer()
 
@@ -142,7 +146,7 @@ class StepReceiver(Protocol):
         """Number of the service's open streams."""
 
     async def deliver(self, step: Step) -> None:
-        """Send the changes of a step, then its marker. Wait until all streams have both."""
+        """Send the changes of a step, and then its marker. Wait until all streams have taken both."""
 
     def release(self) -> None:
         """Send values without waiting for steps, because time is real again."""
@@ -231,7 +235,7 @@ class _Delivery:
 
 
 class Timeline:
-    """The instance's time as all services of the endpoint see it.
+    """The instance's time, as all services of the endpoint see it.
 
     Use it only in the event loop's thread.
     """
@@ -312,17 +316,17 @@ class Timeline:
     def own(self, owns: bool) -> None:
         """Set whether this process controls time.
 
-        If it does, its own writes to the clock page need no wake-up.
+        If it does, its own changes of the clock page need no wake-up.
         """
         if self._page is not None:
             (self._page.mute if owns else self._page.unmute)()
 
     def add_receiver(self, receiver: StepReceiver) -> None:
-        """Deliver each step also to ``receiver``."""
+        """Add a service that also receives each step."""
         self._delivery.receivers.append(receiver)
 
     def watch(self, watcher: Callable[[TimeStatus], None]) -> None:
-        """Call ``watcher`` with the status after each step and after each change."""
+        """Call ``watcher`` with the status of time, after each step and each other change."""
         self._watchers.append(watcher)
 
     @property
@@ -331,16 +335,16 @@ class Timeline:
         return self._status(self.update())
 
     async def deliver(self, step: Step) -> None:
-        """Deliver a step's values and marker to all streams, unless that has been done already."""
+        """Deliver the values and the marker of a step to all streams, unless that has been done already."""
         if await self._delivery.deliver(step, partial(self._mark, step)):
             self._delivered = step.number
             if self._awaited:
                 self._clock.deliver(self._slot.index, step.number)
 
     def update(self) -> Clock:
-        """Read the clock page, and act on changes.
+        """Read the clock page, and react to its changes.
 
-        This is also called periodically: if a program dies while it plays time, no wake-up comes.
+        This is also called periodically: if a program dies while it is playing, no wake-up comes.
         """
         state = self._clock.read()
         if state.virtual and not self.virtual_time.on:
