@@ -52,7 +52,7 @@ class TableMemory:
 
     @property
     def needs(self) -> dict[Place, int]:
-        """The areas that the registers need, each with its size in bytes, rounded up to an even number."""
+        """The areas that the registers need, each with its size in bytes, which is an even number."""
         sizes: dict[Place, int] = {}
         for one in self._conversions:
             place = _place(one)
@@ -61,7 +61,7 @@ class TableMemory:
 
     @property
     def keys(self) -> frozenset[tuple[object, ...]]:
-        """The keys by which registers are recognised in another table."""
+        """A key for each register, which is equal for the same register in another table."""
         return frozenset(map(_key, self._conversions))
 
     def fill(
@@ -73,9 +73,9 @@ class TableMemory:
         """Store the initial values. Those of the tag table override the defaults of the types.
 
         Args:
-            memory: The areas.
+            memory: The memory areas to write to.
             present: Areas that already have values. Defaults do not overwrite these.
-            known: The ``keys`` of registers that already have values.
+            known: The ``keys`` of registers that already have values, which stay unchanged.
 
         """
         frame, _ = initial_frame(self.layout)
@@ -88,7 +88,7 @@ class TableMemory:
                         _store(one, frame, memory)
 
     def load(self, frame: bytearray, memory: Mapping[Place, bytearray]) -> None:
-        """Copy the registers' values to an image. Invalid values leave the image unchanged."""
+        """Copy the registers' values from the memory to an image, except for invalid values."""
         for one in self._conversions:
             found = one.image_bytes(bytes(memory[_place(one)][one.start : one.stop]))
             if found is not None:
@@ -96,7 +96,7 @@ class TableMemory:
                 frame[offset : offset + len(found)] = found
 
     def store(self, before: bytes, frame: bytearray, memory: Mapping[Place, bytearray]) -> None:
-        """Copy the changed registers of an image to the memory, if it can hold their values."""
+        """Copy the registers that differ between ``before`` and ``frame`` to the memory if it can hold their values."""
         for one in self._changed(before, frame):
             with suppress(ValueError, ValueRangeError):
                 _store(one, frame, memory)

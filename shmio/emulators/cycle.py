@@ -90,13 +90,13 @@ class Cycle:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Run no cycle while the ``with`` block runs."""
+        """Prevent cycles from running during a ``with`` block."""
         with self._turn:
             yield
 
     @property
     def position(self) -> tuple[int, int]:
-        """Number of the last cycle, and the time since then in ns. Set it while the program is frozen."""
+        """Number of the last cycle, and the time since then in ns. Set it only while the program is frozen."""
         return self._number, self._owed_ns
 
     @position.setter

@@ -32,7 +32,7 @@ AREAS: Final[Mapping[Area, SrvArea]] = {
     Area.COUNTER: SrvArea.CT,
     Area.BLOCK: SrvArea.DB,
 }
-"""The areas, with python-snap7's names."""
+"""python-snap7's name of each memory area."""
 
 
 class Emulator:
@@ -107,7 +107,7 @@ class Emulator:
         self.cycle.stop()
 
     def change(self, served: Sequence[Served]) -> None:
-        """Serve other blocks and tables from now on. Memory that old and new ones share keeps its values.
+        """Serve other blocks and tables from now on. Memory that is served before and after keeps its values.
 
         Raises:
             ConfigError: As for a new emulator; nothing was changed.

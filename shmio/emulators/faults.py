@@ -20,7 +20,7 @@ _LENGTHS: Final[Mapping[str, tuple[int, Callable[[bytes | bytearray], int]]]] = 
     "s7": (4, tpkt),
     "modbus": (6, lambda data: 6 + int.from_bytes(data[4:6], "big") if len(data) >= 6 else 0),
 }
-"""For each kind: number of bytes up to the end of an answer's length field, and a function for the whole length."""
+"""For each kind: offset after the length field of an answer, and a function that returns the answer's whole length."""
 
 
 class FaultControl:
@@ -67,7 +67,7 @@ class FaultControl:
         return self._disturbs
 
     def expire(self) -> None:
-        """Disconnect clients that have not sent a command in time."""
+        """Disconnect clients of the control socket that have not sent a command in time."""
         self._control.expire()
 
     def close(self) -> None:

@@ -13,9 +13,9 @@ from shmio.errors import ConfigError
 
 S7: Final = "s7"
 KINDS: Final = (S7, "modbus", "opcua")
-"""The kinds. Each has the name of the connector that can read it."""
+"""The kinds of emulators. Each kind has the name of the connector that can read it."""
 FAULTY: Final = (S7, "modbus")
-"""The kinds that can misbehave on command."""
+"""The kinds of emulators that can misbehave on command."""
 _LIBRARIES: Final = {"modbus": "pymodbus", "opcua": "asyncua"}
 _EXTRA: Final = "kind: the emulator {kind} needs another library; run pip install 'shmio[{kind}]'"
 
@@ -36,8 +36,8 @@ def create(
         served: The layouts to serve, at least one; the program runs on the first.
         program: The program to run.
         listen: The address to listen on.
-        db_number: Number of the first block, for S7; default: the layout's own.
-        code: What the program needs if it is a class of the user.
+        db_number: For S7, the number of the first layout's block; None: the number in the layout.
+        code: Folder and parameters of the program if it is a class of the user.
 
     Raises:
         ConfigError: The library is missing, there is no such program, or a layout does not suit it.

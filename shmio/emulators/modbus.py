@@ -38,12 +38,12 @@ LEAST: Final = 100
 _ILLEGAL_FUNCTION, _ILLEGAL_ADDRESS = 1, 2
 _READS: Final = {1: Table.COIL, 2: Table.DISCRETE, 3: Table.HOLDING, 4: Table.INPUT}
 _TABLES: Final = _READS | {5: Table.COIL, 15: Table.COIL} | dict.fromkeys((6, 16, 22, 23), Table.HOLDING)
-"""The table that each function reads or writes."""
+"""The table that each function code reads or writes."""
 
 Where = tuple[int, Table]
 Key = tuple[str, str, Any, str, Where]
 Words = dict[Where, list[int]]
-"""The entries of each unit's tables: bits as 0 and 1, and words."""
+"""The entries of each table of each unit: a bit as 0 or 1, or a word of 16 bits."""
 
 
 class _State(msgspec.Struct, array_like=True, forbid_unknown_fields=True):
@@ -209,7 +209,7 @@ class ModbusEmulator:
         self._store.replace(words)
 
     def change(self, served: Sequence[Served]) -> None:
-        """Serve other tables from now on. Entries that both have keep their values."""
+        """Serve other tables from now on. Entries that are served before and after keep their values."""
         with self._lock:
             self._serve_tables(served, {place.key for image in self._images for place in image.places})
 

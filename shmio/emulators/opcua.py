@@ -154,7 +154,7 @@ class OpcUaEmulator:
         self._loop.stop()
 
     def change(self, served: Sequence[Served]) -> None:
-        """Serve other layouts from now on. Nodes that both have keep their values."""
+        """Serve other layouts from now on. Nodes that are served before and after keep their values."""
         contents = self._made(served)
         self._loop.run(self._replace, contents)
         self._contents = contents

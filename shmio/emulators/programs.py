@@ -24,14 +24,14 @@ class Stateless:
     """Base class of programs whose registers depend only on the time and the memory."""
 
     def save(self) -> bytes:
-        """Return no state."""
+        """Return an empty state."""
         return b""
 
     def prepare_restore(self, data: bytes) -> Callable[[], None]:
-        """Check that there is no state; there is nothing to restore.
+        """Check that a state is empty; there is nothing to restore.
 
         Raises:
-            SnapshotError: There is a state.
+            SnapshotError: The state is not empty, so it is that of another program.
 
         """
         if data:
@@ -59,7 +59,7 @@ class A50:
             raise ConfigError(f"program a50: {str(error).removeprefix('layout: ')}") from None
 
     def step(self, time_s: float, frame: bytearray) -> None:
-        """Write the axes, inputs and outputs at this time into the frame."""
+        """Write the axes, inputs and outputs at ``time_s`` into the frame."""
         self._runner.resume(bytes(frame))  # clients may have written any register, also outputs
         frame[:] = self._runner.step(round(time_s * 1e9), self.period_ms * 1_000_000)
 
@@ -90,7 +90,7 @@ class Counter(Stateless):
         self._places = _places(layout.size)
 
     def step(self, time_s: float, frame: bytearray) -> None:
-        """Write the words of the cycle at this time."""
+        """Fill the frame with the words of the cycle at ``time_s``."""
         import numpy as np  # noqa: PLC0415
 
         generation = np.uint64(round(time_s * 1000 / self.period_ms))
@@ -145,7 +145,7 @@ class Wave(Stateless):
         self._moved = [(codec(one, layout.byte_order), one.shape, one.type) for one in moved]
 
     def step(self, time_s: float, frame: bytearray) -> None:
-        """Write the values at this time into the frame."""
+        """Write the values at ``time_s`` into the frame."""
         for place, (own, shape, kind) in enumerate(self._moved):
             level = 50 - 50 * math.cos(2 * math.pi * (time_s / self.swing_s + place / 16))
             value: Value = level > 50 if kind == "BOOL" else level if kind in ("REAL", "LREAL") else round(level)
@@ -169,10 +169,10 @@ class Idle(Stateless):
 
 @dataclass(frozen=True)
 class UserCode:
-    """Where to find a program that is a class of the user, and its parameters."""
+    """The folder and the parameters of a program that is a class of the user."""
 
     folder: str | None = None
-    """Folder of modules that are not installed; None if there is none."""
+    """Folder of modules that are not installed; None: all modules are installed."""
     parameters: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -238,7 +238,7 @@ class Program(Protocol):
         """
 
     def save(self) -> bytes:
-        """Return the state beside the memory, for a snapshot.
+        """Return the program's state for a snapshot. The memory is saved separately.
 
         Raises:
             SnapshotError: The program cannot save its state.

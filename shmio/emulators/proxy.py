@@ -50,13 +50,13 @@ class Link:
 
     @property
     def open(self) -> bool:
-        """True if bytes may still pass in either direction."""
+        """True while bytes can pass in at least one direction."""
         if self._sockets[0].fileno() >= 0 and all(pipe.finished for pipe in self.pipes):
             self.close()
         return self._sockets[0].fileno() >= 0
 
     def close(self, *, reset: bool = False) -> None:
-        """Close both connections. With ``reset``, do so by a TCP reset, as when a peer crashes."""
+        """Close both connections; if ``reset`` is true, by a TCP reset, as when a peer crashes."""
         for end in self._sockets:
             if end.fileno() >= 0 and reset:
                 end.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
@@ -96,19 +96,19 @@ class Pipe:
         self._queued += len(data)
 
     def collect_due(self, now_s: float) -> None:
-        """Move bytes that have waited long enough to ``due``."""
+        """Move the bytes whose delay has passed to ``due``."""
         while self._later and self._later[0][0] <= now_s:
             self.due += self._later.popleft()[1]
 
     def end_when_drained(self) -> None:
-        """If the sender has ended its stream and all of its bytes are sent, end the stream to the receiver."""
+        """End the stream to the receiver, if the sender has ended its stream and all its bytes are sent."""
         if self.ended and not self.due and not self._later and not self.finished:
             self.finished = True
             with contextlib.suppress(OSError):
                 self.sink.shutdown(socket.SHUT_WR)
 
     def send(self, limit: int | None) -> None:
-        """Send the bytes that are due, at most ``limit``."""
+        """Send bytes that are due, at most ``limit`` (None: without limit)."""
         self.last_sent = 0
         with contextlib.suppress(BlockingIOError):
             self.last_sent = self.sink.send(self.due if limit is None else self.due[:limit])
@@ -127,7 +127,10 @@ def tpkt(data: bytes | bytearray) -> int:
 
 
 def reference_edit(change: Callable[[int], int]) -> Edit:
-    """Return an edit that changes the PDU reference of S7 answers."""
+    """Return an edit that changes the PDU reference of S7 answers.
+
+    ``change`` returns the new reference, given the present one.
+    """
 
     def edit(frame: bytes) -> bytes:
         reference = change(int.from_bytes(frame[11:13], "big")) & 0xFFFF
@@ -137,7 +140,7 @@ def reference_edit(change: Callable[[int], int]) -> Edit:
 
 
 class Tampering:
-    """The present edit, and the frames that are on hold.
+    """The function that edits frames at present, and the frames that are on hold.
 
     Only the proxy's thread may use it, except ``frame_held``, which any thread may use.
     """
@@ -151,7 +154,7 @@ class Tampering:
         """Set while a frame is on hold."""
 
     def begin(self, edit: Edit, frames: int | None) -> None:
-        """Pass the next ``frames`` frames through a function; if None, all frames until :meth:`end`."""
+        """Pass the next ``frames`` frames through ``edit``; if ``frames`` is None, all frames until :meth:`end`."""
         left = frames
 
         def counted(frame: bytes) -> bytes | None:
@@ -177,9 +180,9 @@ class Tampering:
         return held
 
     def passing(self, waiting: bytearray, data: bytes) -> Iterator[bytes]:
-        """Add new data, and yield the bytes to pass on.
+        """Append ``data`` to ``waiting``, and yield the bytes to pass on, edited if there is an edit.
 
-        An incomplete frame stays in ``waiting``.
+        With an edit, an incomplete frame stays in ``waiting`` until its other bytes arrive.
         """
         waiting += data
         while waiting:
@@ -265,7 +268,10 @@ class FaultProxy:
     # -- faults --------------------------------------------------------------------------------------------------------
 
     def delay(self, up_s: float, down_s: float) -> None:
-        """Change the delay of bytes that arrive from now on."""
+        """Change the delay of bytes that arrive from now on.
+
+        ``up_s`` is the delay of bytes to the server, ``down_s`` of bytes from the server, in s.
+        """
 
         def change() -> None:
             self._up_s, self._down_s = up_s, down_s
@@ -286,7 +292,7 @@ class FaultProxy:
     def cut(self, *, reset: bool = False) -> None:
         """Close all connections now.
 
-        With ``reset``, do so by a TCP reset, as when a peer crashes.
+        If ``reset`` is true, close them by a TCP reset, as when a peer crashes.
         """
 
         def change() -> None:
@@ -332,9 +338,10 @@ class FaultProxy:
         self._do(self._listen)
 
     def edit(self, change_frame: Edit, *, frames: int | None = None) -> None:
-        """Pass frames through a function, which returns None to drop a frame.
+        """Pass frames through ``change_frame``, which returns the frame to send, or None to drop it.
 
-        The edit ends after ``frames`` frames; if None, it lasts until another method ends it.
+        The edit ends after ``frames`` frames; if ``frames`` is None, it lasts until another method
+        ends it.
         """
         self._do(lambda: self._tampering.begin(change_frame, frames))
 
@@ -343,11 +350,18 @@ class FaultProxy:
         self.edit(lambda _: data, frames=1)
 
     def rewrite_reference(self, change: Callable[[int], int], *, frames: int | None = None) -> None:
-        """Change the PDU reference of S7 answers."""
+        """Change the PDU reference of S7 answers.
+
+        ``change`` returns the new reference, given the present one. ``frames`` is as for
+        :meth:`edit`.
+        """
         self.edit(reference_edit(change), frames=frames)
 
     def hold(self, *, frames: int | None = None) -> None:
-        """Put frames on hold until ``release``, so that answers come late."""
+        """Put frames on hold until :meth:`release`, so that answers come late.
+
+        ``frames`` is as for :meth:`edit`.
+        """
         self.edit(self._tampering.keep, frames=frames)
 
     def wait_held(self, timeout_s: float = _TIMEOUT_S) -> bool:

@@ -116,7 +116,7 @@ logger = logging.getLogger(__name__)
 
 
 class Fault(Enum):
-    """A setting of the controller that prevents access to the data."""
+    """A setting of the controller by which it refuses access to the data."""
 
     PUT_GET_OFF = "PUT/GET is not permitted"
     PROTECTED = "the protection level allows no access"
@@ -134,7 +134,7 @@ class ServerOptions:
     """Maximum number of jobs in flight that the server grants."""
     fault: Fault | None = None
     block_size: int | None = None
-    """Maximum size in bytes of data blocks as clients see them, as if the blocks were older; None for no limit."""
+    """Number of bytes of a data block that clients see at most, as if it were an older, shorter one; None: all."""
 
     def __post_init__(self) -> None:
         if not (100 <= self.max_pdu_size <= MAX_PDU_SIZE and 1 <= self.max_jobs <= MAX_JOBS):
@@ -432,7 +432,7 @@ class S7Server(Server):
         return Address(host, port)
 
     def start(self, tcp_port: int | None = None) -> int:
-        """Listen, and serve in threads.
+        """Listen on ``tcp_port`` (None: the configured port), and serve clients in threads.
 
         No other socket can share the port: SO_REUSEADDR, unlike SO_REUSEPORT, only ignores closed
         connections.

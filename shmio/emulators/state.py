@@ -13,7 +13,10 @@ from shmio.model.snapshot import decode_part
 
 
 class DeviceState(msgspec.Struct, array_like=True, forbid_unknown_fields=True):
-    """The state of a device that follows the instance's clock. ``position`` is that of its cycle."""
+    """The state of a device that follows the instance's clock.
+
+    ``place`` is :attr:`InstanceTime.place`, and ``position`` is :attr:`Cycle.position`.
+    """
 
     kind: str
     program: str
@@ -41,7 +44,7 @@ class DeviceKeeper:
         self._device, self._time, self._kind, self._program, self._disturbed = device, time, kind, program, disturbed
 
     def save(self, name: str) -> bytes:  # noqa: ARG002
-        """Return the state.
+        """Return the state of the device.
 
         Raises:
             SnapshotError: The state cannot be saved.
@@ -56,7 +59,7 @@ class DeviceKeeper:
         return msgspec.msgpack.encode(state)
 
     def check(self, data: bytes) -> None:
-        """Check whether a state can be restored.
+        """Check whether a state can be restored, without changing the device.
 
         Raises:
             SnapshotError: The state is damaged, or does not fit the device.

@@ -16,9 +16,9 @@ _PART_NS: Final = 1_000_000_000
 class InstanceTime:
     """Lets the program of an emulated device follow the instance's clock. Use it from one thread.
 
-    In wall time the program keeps its own schedule. In virtual time it stands still, and each step
-    runs the scans that are due. The scans run once all sources have done the step, and the step ends
-    only after the scans.
+    In wall time the program keeps its own schedule. In virtual time the program stands still
+    between steps, and each step runs the scans that are due. The scans run once all sources have
+    completed the step, and the step ends only after the scans.
     """
 
     def __init__(self, page: ClockPage, slot: int, cycle: Cycle, beat: Callable[[], object]) -> None:
@@ -65,7 +65,7 @@ class InstanceTime:
         """The step and the instance time in ns up to which scans have run.
 
         Raises:
-            SnapshotError: Time is real.
+            SnapshotError: The program has not yet stopped for virtual time.
 
         """
         if self._time_ns is None:

@@ -10,8 +10,8 @@ Declare a block in the class body of a program. Each program object then has its
         def scan(self, time_s, dt_s):
             self.locked = self.settled(self.closed)
 
-Call each block once a scan. The time of timers is that of the program, so it stands still when the
-controller does.
+Call each block once a scan. Timers use the program's time, which stands still while the controller is
+stopped.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Protocol, Self, overload
 
 
 class Clock(Protocol):
-    """What a block needs from its program."""
+    """The clock of a program, which its function blocks read."""
 
     _now_ns: int
 
@@ -51,7 +51,11 @@ class FunctionBlock:
         return own
 
     def of(self, program: Clock) -> Self:
-        """Return a new block for a program, for example for a list that ``start`` makes."""
+        """Return a new block like this one, for ``program``.
+
+        A program calls this for blocks that are not declared in its class body, such as a list of
+        blocks that its ``start`` creates.
+        """
         own = copy.copy(self)
         own._clock = program
         return own
@@ -103,7 +107,7 @@ class _Timer(FunctionBlock):
 
 
 class TON(_Timer):
-    """On-delay timer: Q becomes true when IN has been true for PT, and becomes false with IN."""
+    """On-delay timer: Q becomes true once IN has been true for the time PT, and false as soon as IN is false."""
 
     def __call__(self, in_: object) -> bool:
         """Set IN, and return Q."""
@@ -118,7 +122,7 @@ class TON(_Timer):
 
 
 class TOF(_Timer):
-    """Off-delay timer: Q becomes true with IN, and becomes false when IN has been false for PT."""
+    """Off-delay timer: Q becomes true as soon as IN is true, and false once IN has been false for the time PT."""
 
     def __call__(self, in_: object) -> bool:
         """Set IN, and return Q."""
@@ -134,7 +138,7 @@ class TOF(_Timer):
 
 
 class TP(_Timer):
-    """Pulse timer: when IN becomes true, Q is true for PT, whatever IN does meanwhile."""
+    """Pulse timer: when IN becomes true, Q is true for the time PT, whatever IN does in the meantime."""
 
     def __call__(self, in_: object) -> bool:
         """Set IN, and return Q."""
@@ -149,7 +153,7 @@ class TP(_Timer):
 
 
 class R_TRIG(FunctionBlock):  # noqa: N801  the standard's name
-    """Rising edge: Q is true in the call in which CLK has become true.
+    """Rising edge: Q is true in a call in which CLK is true but was false in the previous call.
 
     As in the standard, CLK counts as false before the first call.
     """
@@ -165,9 +169,10 @@ class R_TRIG(FunctionBlock):  # noqa: N801  the standard's name
 
 
 class F_TRIG(FunctionBlock):  # noqa: N801  the standard's name
-    """Falling edge: Q is true in the call in which CLK has become false.
+    """Falling edge: Q is true in a call in which CLK is false but was true in the previous call.
 
-    As in the standard, CLK counts as true before the first call, so Q is true there if CLK is false.
+    As in the standard, CLK counts as true before the first call. So if CLK is false in the first
+    call, Q is true.
     """
 
     def __init__(self) -> None:

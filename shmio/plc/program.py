@@ -17,10 +17,10 @@ class Program(Model):
     """Base class of PLC programs.
 
     A program declares its registers as a model does: :class:`~shmio.simulation.Input` for what it
-    reads, :class:`~shmio.simulation.Output` for what it reads and sets. Function blocks are
+    reads, :class:`~shmio.simulation.Output` for what it sets and can read back. Function blocks are
     declared in the class body, too. ``start`` runs once before the first scan.
 
-    On an emulated controller, all registers are memory of the controller: clients may write each of
+    On an emulated controller, all registers are memory of the controller: clients may write any of
     them between two scans. A program is also a model: a source with ``connector = "simulation"``
     can run it without a controller, one scan a step.
     """
@@ -51,7 +51,7 @@ class Program(Model):
 
     @final
     def step(self, time_s: float, dt_s: float) -> None:
-        """Run one scan."""
+        """Run one scan, after setting the time that the function blocks read."""
         self._now_ns = round(time_s * 1e9)
         self.scan(time_s, dt_s)
 

@@ -64,7 +64,7 @@ def smooth(u: float) -> float:
 class Track:
     """A cyclic motion of several axes through key poses. All axes start and stop together.
 
-    To each position, a slow sine of small amplitude is added, like the play of a servo loop. So the
+    A slow sine of small amplitude is added to each position, like the play of a servo loop. So the
     value of an axis changes even while the axis rests.
     """
 
@@ -85,12 +85,12 @@ class Track:
         self._breath = breath
 
     def rest(self, time_s: float) -> Pose | None:
-        """Return the key pose at which the axes rest; None while they move."""
+        """Return the key pose in which the axes rest at a time in s; None if they are moving then."""
         index, _ = self._place(time_s)
         return self._poses[index] if self._poses[index] == self._poses[index + 1] else None
 
     def pose(self, time_s: float) -> Pose:
-        """Return the position of each axis at a time in s."""
+        """Return the positions of all axes at a time in s."""
         index, u = self._place(time_s)
         share = smooth(u)
         return tuple(
@@ -138,16 +138,16 @@ class Actuator(NamedTuple):
     name: str
     travel_s: float
     spans: tuple[tuple[float, float], ...]
-    """Pairs of times in a cycle, in s: the valve opens to extend the drive, and closes again."""
+    """Pairs (start, stop) of times in a cycle, in s: the valve is open from start to stop and extends the drive."""
 
     def valve(self, phase_s: float) -> bool:
-        """Return whether the valve is open."""
+        """Return whether the valve is open at ``phase_s``, the time in the cycle in s."""
         return any(extend_s <= phase_s < retract_s for extend_s, retract_s in self.spans)
 
     def switches(self, phase_s: float) -> int:
-        """Return the limit switches: bit 0 extended, bit 1 retracted.
+        """Return the limit switches at ``phase_s``, the time in the cycle in s: bit 0 extended, bit 1 retracted.
 
-        Both are 0 while the drive moves.
+        Both bits are 0 while the drive moves.
         """
         travel_s = self.travel_s
         extended = any(extend_s + travel_s <= phase_s < retract_s for extend_s, retract_s in self.spans)
@@ -264,7 +264,7 @@ class _CellState(NamedTuple):
 class A50Cell(Model):
     """A model of the cell and of its controller's program, with the signals of DB201.
 
-    It runs on the layout that it declares, or on the layout of ``db201.db``.
+    The model can use the layout that it declares, or the layout of ``db201.db``.
     """
 
     inputs = InOut("ARRAY[0..999] OF BYTE", path="Inputs", comment="plant to controller")
@@ -281,9 +281,10 @@ class A50Cell(Model):
         self._cell_s: float | None = None  # time of the cell in s, which stops while the cell is paused
 
     def step(self, time_s: float, dt_s: float) -> None:  # noqa: ARG002  everything depends only on the time
-        """Compute axes, inputs and outputs.
+        """Compute the axes, inputs and outputs at ``time_s``.
 
-        The model leaves all bytes after these as clients wrote them.
+        Bytes of ``Inputs`` and ``Outputs`` that the model does not compute keep the values that
+        clients wrote.
         """
         inputs, outputs = self.inputs.commanded, self.outputs.commanded
         hold, opened, closed = _ORDERS.unpack_from(outputs, _OUTPUTS.size)

@@ -52,8 +52,10 @@ class Images:
     def write(self, writes: Sequence[Write]) -> list[str]:
         """Write bytes and bits into the commanded image.
 
-        Return for each write "", or the reason if it is refused: it would change an output, or lies
-        outside the block.
+        Returns:
+            For each write, "" or why it is refused: it would change an output, it lies outside the
+            block, or its value is outside the register's limits.
+
         """
         return [self._write(write) for write in writes]
 
@@ -69,7 +71,7 @@ class Images:
         self.shown[:] = self.commanded[:] = image
 
     def restore(self, commanded: bytes, shown: bytes) -> None:
-        """Set both images.
+        """Set the commanded and the shown image.
 
         Raises:
             LayoutError: An image has the wrong size.
@@ -80,7 +82,7 @@ class Images:
         self.commanded[:], self.shown[:] = commanded, shown
 
     def with_given(self, image: bytes | bytearray) -> bytes:
-        """Return the image, but with the commanded values where the model computes nothing."""
+        """Return a copy of ``image`` with the commanded values of all registers that the model does not compute."""
         if self._all_computed:
             return bytes(image)
         return (_array(self.commanded) & self._given | _array(image) & ~self._given).tobytes()
@@ -158,7 +160,13 @@ def port_of(
 ) -> Port:
     """Return the port of a declaration.
 
-    ``registers`` are the members of a structure by path, or a single register under ``""``.
+    Args:
+        path: The path of a structure, for messages.
+        registers: The members of a structure by path, or a single register under ``""``.
+        byte_order: The byte order of the values.
+        image: The image in which the port reads and writes.
+        limits: The lowest and the highest value that may be written; None: no limits.
+
     """
     ports = {member: RegisterPort(register, byte_order, image, limits) for member, register in registers.items()}
     return ports.get("") or _StructurePort(path, ports, _StructureCodec.of(registers, byte_order), image)
@@ -213,11 +221,11 @@ class RegisterPort:
         return memoryview(self._image)[self._start : self._stop] if self._is_native else None
 
     def overlaps(self, start: int, stop: int) -> bool:
-        """Return whether the register has bytes in a range of the image."""
+        """Return whether the register has bytes in the range of the image from ``start`` to ``stop``, exclusive."""
         return self._start < stop and start < self._stop
 
     def fault(self, value: object) -> str:
-        """Return how a value is outside the limits; "" if it is within them, or is not of a numeric type."""
+        """Return a message if a number in ``value`` is outside the limits; else ""."""
         if self._limits is None:
             return ""
         low, high = self._limits

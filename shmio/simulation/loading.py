@@ -21,7 +21,7 @@ def load(text: str, folder: str | Path | None = None) -> type[Model]:
     Args:
         text: ``package.module:Class``, or the path of an FMU, which ends in ``.fmu``.
         folder: A folder to search for FMUs, and for modules that are not installed, such as the
-            configuration's folder.
+            configuration's folder; None: no folder.
 
     Raises:
         ConfigError: The text is malformed, the module or class does not exist, its import fails, or

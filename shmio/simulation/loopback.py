@@ -22,6 +22,6 @@ class Loopback(Model):
     zone_1 = InOut("SafetyZone", {"zone": "Z1"}, path="safetyzones/Z1")
 
     def step(self, time_s: float, dt_s: float) -> None:  # noqa: ARG002  nothing depends on the time
-        """Copy the values that clients wrote before this step to what readers see."""
+        """Show the values that clients wrote before this step."""
         for ends in (self.r3200_link1, self.kuka_j1, self.kuka_j2, self.r3_l2, self.zone_1):
             ends.shown = ends.commanded

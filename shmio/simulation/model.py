@@ -39,11 +39,11 @@ class _DeclaringModel(Protocol):
 class Declaration:
     """A declaration of a model, such as a register or a parameter.
 
-    On the class, the attribute is this object. On a model object, it is the value. The value of a
-    single register is a bool, int, float or str (see ``shmio.layout.values.codec``). The value of
-    an array is a tuple, nested for several dimensions, or bytes for a one-dimensional array of
-    BYTE. The value of a structure is a dict; if you set it, members that the dict does not name
-    stay unchanged.
+    In the model's class, the attribute is this object. In a model object, the attribute is the
+    value. The value of a single register is a bool, int, float or str (see
+    ``shmio.layout.values.codec``). The value of an array is a tuple, nested for several dimensions,
+    or bytes for a one-dimensional array of BYTE. The value of a structure is a dict; if you set it,
+    members that the dict does not name stay unchanged.
     """
 
     kind: ClassVar[str]
@@ -103,13 +103,16 @@ class Declaration:
 
     @cached_property
     def paths(self) -> Mapping[str, str]:
-        """The path of each register, by its member. A single register has the key ``""``."""
+        """The path of each register, by member of the structure.
+
+        The key of a single register is ``""``.
+        """
         inside = {"": ""} if self.members is None else {member: f"/{member}" for member in self.members}
         return {member: canonical_path(self.path + end) for member, end in inside.items()}
 
     @property
     def tags(self) -> Mapping[str, object]:
-        """The entries of the declaration in a tag table.
+        """The entries of a tag table that declare the same registers.
 
         Raises:
             ValueRangeError: The type is invalid.
@@ -233,9 +236,9 @@ class Model(ABC):
     """The model's name in messages: ``package.module:Class``, or the name of the file of an FMU."""
 
     state_modules: ClassVar[tuple[str, ...]] = ()
-    """Further modules whose classes the model's attributes may have in a snapshot.
+    """Names of further modules whose objects the model's attributes may contain when a snapshot is saved.
 
-    Those of the model's class and its base classes are always allowed.
+    The modules of the model's class and its base classes are always allowed.
     """
 
     random: np.random.Generator
@@ -298,7 +301,10 @@ class Model(ABC):
 
     @classmethod
     def code_files(cls) -> list[Path]:
-        """Return the files of the model's own code. A snapshot is restored only if they are the same."""
+        """Return the files that contain the model's own code.
+
+        A snapshot is restored only if these files are the same as when it was saved.
+        """
         own = (base.__module__ for base in cls.__mro__ if not base.__module__.startswith(("shmio.", "abc", "builtins")))
         files = (getattr(sys.modules.get(name), "__file__", None) for name in dict.fromkeys(own))
         return [Path(file) for file in files if file]
@@ -323,16 +329,17 @@ class Model(ABC):
     def save_state(self) -> object:
         """Return the model's state for a snapshot: by default, a dict of all its attributes.
 
-        The registers and ``random`` are saved anyway. The state consists of numbers, texts, bytes,
-        lists, tuples, dicts, sets, numpy arrays, and objects of classes of the model's modules.
-        Override both this method and :meth:`restore_state` if the model has other attributes.
+        ``ModelRunner`` saves the registers and ``random`` itself. The state may contain numbers,
+        texts, bytes, lists, tuples, dicts, sets, numpy arrays, and objects of classes of the
+        model's modules. Override both this method and :meth:`restore_state` if the model has
+        attributes of other types.
         """
         return {name: value for name, value in vars(self).items() if name not in _NOT_STATE}
 
     def restore_state(self, state: Any) -> None:
         """Continue from a state that :meth:`save_state` has returned, perhaps in another process.
 
-        :meth:`start` has been called before; registers and ``random`` are restored already.
+        ``ModelRunner`` has already called :meth:`start`, and restored the registers and ``random``.
         """
         if not isinstance(state, dict) or not all(isinstance(name, str) for name in state) or _NOT_STATE & state.keys():
             raise SnapshotError("the state is not that of a model with the default save_state()")
@@ -381,7 +388,8 @@ def layout_of(model: type[Model]) -> Layout:
 def explain(error: BaseException, module: str) -> str:
     """Return a text with the error and the place where it occurred.
 
-    The place is the last line in ``module``, if the traceback has one.
+    The place is the last line of the traceback in ``module``, or the last line of all if none is in
+    ``module``.
     """
     if isinstance(error, SyntaxError) and error.filename:
         return _line(f"{error.msg} ({Path(error.filename).name}, line {error.lineno})")

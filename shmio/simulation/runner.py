@@ -43,8 +43,8 @@ class ModelRunner:
 
     There are two images. The commanded image has the values that clients and connections have
     written: to inputs, to the ``/in`` of in-out registers, and to registers that the model does not
-    declare. The shown image has the values that readers see. A value that was written to an input or
-    to an undeclared register appears in it with the next step.
+    declare. The shown image has the values that readers see. A value that was written to an input
+    or to an undeclared register appears in the shown image with the next step.
     """
 
     def __init__(
@@ -179,7 +179,7 @@ class ModelRunner:
         return self.image
 
     def resume(self, image: bytes) -> None:
-        """Set both images to ``image``, to continue from it.
+        """Continue from an image: set both images to it.
 
         Raises:
             LayoutError: The image has the wrong size.
@@ -343,7 +343,7 @@ class Inputs(Protocol):
 
     @property
     def changed(self) -> Collection[str]:
-        """The paths of the inputs whose values have changed."""
+        """The paths of the inputs whose values have changed since the previous step; in the first step, all paths."""
 
     def __contains__(self, path: object, /) -> bool: ...
 
@@ -367,15 +367,15 @@ class Source(Protocol):
 
     @property
     def computed(self) -> bool:
-        """True if this model or an earlier one has already computed these outputs."""
+        """True if a model has computed these outputs; False if they are initial values."""
 
 
 class ServedModel:
     """Runs a model in a client, for a source with ``connector = "remote"``.
 
-    Pass its ``step`` and ``start`` to :meth:`shmio.client.Client.simulate`. The model runs as with
-    ``connector = "simulation"``. When the client connects, the model continues from the source's
-    values.
+    Pass its ``step`` and ``start`` to :meth:`shmio.client.Client.simulate`. The model behaves as
+    with ``connector = "simulation"``. It continues from the values that the source has when the
+    client first connects.
     """
 
     def __init__(self, model: type[Model], parameters: Mapping[str, object] = NOTHING, seed: int = 0) -> None:
@@ -401,7 +401,7 @@ class ServedModel:
         self._sent: bytes | None = None
 
     def start(self, joined: Source) -> None:
-        """Check the source's registers, and continue from its values. Call it after each connect.
+        """Check that the source has the model's registers. Call this after each connect.
 
         Args:
             joined: The source.
@@ -426,7 +426,7 @@ class ServedModel:
             self._runner.resume(bytes(image))
 
     def step(self, time_s: float, dt_s: float, inputs: Inputs) -> dict[str, object]:
-        """Let the model compute a step.
+        """Compute a step with the model.
 
         Args:
             time_s: The simulation time at the end of the step, in s.

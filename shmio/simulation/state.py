@@ -22,7 +22,7 @@ import numpy as np
 from shmio.errors import SnapshotError
 
 MAX_STATE_BYTES: Final = 64 << 20
-"""Largest encoded state of one model."""
+"""Maximum size of the encoded state of one model, in bytes."""
 _MAX_DEPTH: Final = 100
 _GENERATORS: Final = ("PCG64", "PCG64DXSM", "Philox", "MT19937", "SFC64")
 _ARRAY_KINDS: Final = "biufcSUmM"
@@ -52,7 +52,7 @@ def encode_state(value: object, model: object, modules: Collection[str]) -> byte
 
 
 def decode_state(data: bytes, model: object, modules: Collection[str]) -> Any:
-    """Decode a value of :func:`encode_state`. The arguments are those of that function.
+    """Decode a value of :func:`encode_state`. ``model`` and ``modules`` are the same as for that function.
 
     Raises:
         SnapshotError: The data are invalid.
@@ -69,7 +69,11 @@ def decode_state(data: bytes, model: object, modules: Collection[str]) -> Any:
 
 
 def find_class(module: str, name: str, modules: Collection[str]) -> type | None:
-    """Return the class of one of the modules, which must be imported already; None if there is none."""
+    """Return the class ``name`` of the module ``module``.
+
+    Return None if ``modules`` does not contain the module, if the module is not imported yet, or if
+    it defines no such class.
+    """
     if module not in modules:
         return None
     found: object = sys.modules.get(module)

@@ -54,7 +54,7 @@ class Cell:
         self.grpc = grpc
 
     def supervisor(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """Run ``shmio-supervisor`` on this instance."""
+        """Run ``shmio-supervisor`` with these arguments on this instance."""
         return self.run("shmio-supervisor", *arguments)
 
     def run(self, command: str, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -108,7 +108,7 @@ class Cell:
 
 
 def until(condition: Callable[[], bool], what: str, patience_s: float = PATIENCE_S) -> None:
-    """Wait until a condition is true. Raise AssertionError if it does not become true in time."""
+    """Wait until ``condition`` returns true. After ``patience_s``, raise AssertionError, which names ``what``."""
     deadline = time.monotonic() + patience_s
     while not condition():
         if time.monotonic() > deadline:
@@ -119,7 +119,7 @@ def until(condition: Callable[[], bool], what: str, patience_s: float = PATIENCE
 def kill(pid: int, sign: signal.Signals = signal.SIGKILL) -> None:
     """Send a signal to a process that need not be a child.
 
-    It uses a pidfd, so that no other process can get the signal.
+    A pidfd ensures that no other process can get the signal.
     """
     handle = os.pidfd_open(pid)
     try:

@@ -105,7 +105,7 @@ class CellUnderTest:
         return self.attachment.write(values)
 
     def inject(self, target: str | Sequence[str], operation: str = "set", **keys: Any) -> Campaign:
-        """Inject values until the end of the test, or as long as the keys say.
+        """Inject values until the end of the test, unless the keys end the injection earlier.
 
         Args:
             target: The register, or several.
@@ -114,11 +114,11 @@ class CellUnderTest:
                 Times count from now.
 
         Returns:
-            The injection; leave its ``with`` block to lift it.
+            The injection, which a ``with`` statement lifts at the end of its block.
 
         Raises:
             ConfigError: A key is wrong.
-            CommandError: The source refuses.
+            CommandError: The source refuses the injection.
 
         """
         name = keys.pop("name", f"injection-{len(self._injections.spans) + 1}")
@@ -130,6 +130,11 @@ class CellUnderTest:
     def disturb(self, emulator: str, answers: control.Answers, delay_ms: float = 0.0) -> None:
         """Change how an emulator with ``faults = true`` answers: ok, delay, corrupt, hang or refuse.
 
+        Args:
+            emulator: Name of the emulator.
+            answers: How it answers from now on; ``ok`` ends all faults.
+            delay_ms: For ``delay``, the delay of each answer, in ms.
+
         Raises:
             ControlError: There is no such emulator, or it cannot have faults.
 
@@ -140,7 +145,7 @@ class CellUnderTest:
     # -- time and expectations -------------------------------------------------------------------------------------
 
     def run_for(self, duration_s: float, step_s: float | None = None) -> None:
-        """Let the cell run. :meth:`expect` then judges this time.
+        """Let the cell run for a time, which the next calls of :meth:`expect` judge.
 
         Args:
             duration_s: Duration on the instance's clock, in s.
@@ -175,12 +180,13 @@ class CellUnderTest:
             self._take()
 
     def expect(self, formula: str | None = None, *, since_start: bool = False, **keys: Any) -> None:
-        """Fail the test unless the last run met an expectation.
+        """Fail the test unless the cell met an expectation during the last :meth:`run_for`.
 
         Args:
             formula: A formula of signal temporal logic. Its times count from the start of the last
                 :meth:`run_for`.
-            since_start: True to judge all frames since the start of the test.
+            since_start: True to judge all frames since the start of the test, and not only the last
+                run.
             keys: In place of a formula, the keys of another form of ``[[expect]]``, such as
                 ``never``, or ``when``, ``within_s`` and ``then``.
 
@@ -203,7 +209,7 @@ class CellUnderTest:
     # -- evidence --------------------------------------------------------------------------------------------------
 
     def keep(self) -> str:
-        """End the recording, write a report with plots, and return a text that names both."""
+        """End the recording, write a report with plots, and return a text with the paths of both."""
         found = []
         try:
             self._take()

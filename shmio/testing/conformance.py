@@ -57,7 +57,7 @@ class Rig(Protocol):
 
 
 class Run:
-    """A source's running loop, observed through its block."""
+    """A source's loop that runs during a test. The test reads the frames in the source's block."""
 
     def __init__(self, segment: Segment, rig: Rig, writable: tuple[str, ...] = ()) -> None:
         self._segment = segment
@@ -78,7 +78,7 @@ class Run:
             thread.start()
 
     def until(self, condition: Callable[[Frame], bool]) -> Frame:
-        """Follow the block until a frame satisfies the condition, and return that frame."""
+        """Follow the block until a frame satisfies ``condition``, and return that frame."""
         deadline = time.monotonic() + PATIENCE_S
         while (rest_s := deadline - time.monotonic()) > 0:
             frame = self._cursor.next(rest_s)
@@ -116,7 +116,7 @@ class Run:
         self._start(rig, predecessor=before)
 
     def stop(self) -> None:
-        """Stop the loop. Check the rules that all its frames must obey."""
+        """Stop the loop, and check the rules that all its frames must obey."""
         self._clock.stop()
         self.loop.commands.stop()
         for thread in self._threads:
@@ -139,7 +139,7 @@ class Run:
 
 
 def connect(connector: Connector) -> None:
-    """Connect. Try again if the host is so busy that this takes longer than the connector's time-out."""
+    """Connect a connector. Try again if connecting takes longer than the time-out because the host is busy."""
     deadline = time.monotonic() + PATIENCE_S
     while True:
         try:
@@ -288,7 +288,7 @@ class ConnectorConformance:
     def test_a_reload_that_adds_and_removes_registers_without_reconnecting(
         self, others: Iterator[Rig], run: Run, rig: Rig
     ) -> None:
-        """Such reloads keep the connection, even while answers take several periods."""
+        """A reload that only adds and removes registers keeps the connection, even if answers take several periods."""
         last = rig.generation(run.good().raw)
         connections = rig.proxy.accepted
         rig.proxy.delay(SLOW_S, SLOW_S)
@@ -302,7 +302,7 @@ class ConnectorConformance:
 
     @pytest.mark.parametrize("lost", ["before", "after", "frozen"])
     def test_a_device_lost_during_a_reload(self, others: Iterator[Rig], run: Run, rig: Rig, lost: str) -> None:
-        """The new registers become good over a new connection."""
+        """If the connection is lost during a reload, the new registers become good over a new connection."""
         run.good()
         if lost == "frozen":
             rig.proxy.freeze()

@@ -52,7 +52,7 @@ class Flood:
     def upon(
         self, target: tuple[str, int] | str, tls: ssl.SSLContext | None = None, threads: int = 2
     ) -> Iterator[None]:
-        """Send calls to an address, or to a UNIX socket, during a ``with`` block."""
+        """Send calls to an address or a UNIX socket during a ``with`` block, with TLS if a context is given."""
         workers = [threading.Thread(target=self._run, args=(target, tls)) for _ in range(threads)]
         for worker in workers:
             worker.start()
@@ -97,7 +97,10 @@ class Flood:
 
 
 def request(name: bytes, stream: int) -> bytes:
-    """Return the HTTP/2 headers of a call without messages, uncompressed (RFC 7541, 6.2.2)."""
+    """Return the HTTP/2 headers of a call without messages, uncompressed (RFC 7541, 6.2.2).
+
+    ``name`` is the path of the method, and ``stream`` is the number of the stream.
+    """
     block = b"".join(
         b"\0" + bytes((len(field),)) + field + bytes((len(value),)) + value
         for field, value in (_FIELDS | {b":path": name}).items()

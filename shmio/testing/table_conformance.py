@@ -30,7 +30,7 @@ VALUES: Final[Mapping[str, tuple[Value, Value]]] = {
     "LWORD": ((1 << 63) + 1, (1 << 64) - 1), "REAL": (-3.4028234663852886e38, 1.401298464324817e-45),
     "LREAL": (-1.7976931348623157e308, 5e-324), "STRING": ("x", "Grüße 1"), "TIME": (-(1 << 31), (1 << 31) - 1),
 }  # fmt: skip
-"""Two values of each type, which are at the ends of its range."""
+"""The two ends of each type's range."""
 
 Tags = Mapping[str, Mapping[str, object]]
 
@@ -102,7 +102,10 @@ def connected(rig: TableRig, tags: Tags) -> Iterator[Source]:
 
 
 def value_of(tag: Mapping[str, object], which: int) -> Value:
-    """Return the first or the second value for a tag; arrays alternate between both."""
+    """Return one of the two ``VALUES`` of a tag's type: the first (``which`` is 0) or the second (1).
+
+    In an array, the elements alternate between both values, beginning with this one.
+    """
     kind = str(tag["type"])
     base = kind.rpartition(" OF ")[2].partition("[")[0]
     if not kind.startswith("ARRAY[1.."):

@@ -30,7 +30,7 @@ class WriteRig(Rig, Protocol):
     spare: int
     """Offset of ``SPARE`` bytes that are zero at first. The device itself never changes them."""
     flags: int
-    """Offset of a byte in whose upper bits the device counts. The lowest bit is left to writers.
+    """Offset of a byte in whose upper bits the device counts. The tests write the lowest bit.
 
     ``generation`` checks that no count is lost.
     """
@@ -102,7 +102,7 @@ class Writer:
         return self._run.until(lambda frame: frame.quality is Quality.GOOD and frame.source_ns > end.utc_ns)
 
     def once_open(self, *writes: Write) -> Event:
-        """Send a command, and repeat it until the source is connected."""
+        """Send a command again and again until the source is connected, and return the outcome."""
         deadline_s = time.monotonic() + PATIENCE_S
         while True:
             try:

@@ -67,7 +67,7 @@ class Variable(NamedTuple):
 
 
 class Description(NamedTuple):
-    """What shmio needs to know of an FMU. ``parsed`` is FMPy's ``ModelDescription``."""
+    """What shmio needs to know about an FMU. ``parsed`` is FMPy's ``ModelDescription``."""
 
     parsed: Any
     version: int

@@ -42,7 +42,7 @@ log.addFilter(LogRateLimit(one_kind=True))
 
 
 class FmuError(ModelError):
-    """A call to the FMU failed, so that the FMU cannot be used any more."""
+    """A call to the FMU failed, so the FMU cannot be used any more."""
 
 
 class Instance:
@@ -80,14 +80,17 @@ class Instance:
             raise FmuError(self._with_words(f"it cannot be loaded: {shorten(printable(str(error)), 300)}")) from None
 
     def group(self, variables: Iterable[Variable], ports: Mapping[str, Port]) -> list[Group]:
-        """Return groups of variables, each of which the FMU reads or writes in one call."""
+        """Divide variables into groups. One call to the FMU reads or writes all variables of a group."""
         by_type: dict[str, list[Variable]] = {}
         for variable in variables:
             by_type.setdefault(variable.fmi_type, []).append(variable)
         return [Group(self.version, self._fmu, type_, alike, ports) for type_, alike in by_type.items()]
 
     def initialise(self, parameters: list[Group], inputs: list[Group]) -> None:
-        """Initialise the FMU with the values of inputs, and with those parameters that differ from its own."""
+        """Set the parameters and inputs of the FMU, and initialise it.
+
+        A group of parameters is left out if all its values equal the FMU's own.
+        """
         with self._calling():
             for group in parameters:
                 group.set_other(self._fmu.component)
@@ -101,13 +104,13 @@ class Instance:
             self._fmu.exitInitializationMode()
 
     def set(self, groups: list[Group]) -> None:
-        """Give the FMU the values of those groups in which a value has changed."""
+        """Give the FMU the values of each group in which a value has changed since the last call."""
         with self._calling():
             for group in groups:
                 group.set_changed(self._fmu.component)
 
     def get(self, groups: list[Group]) -> None:
-        """Read the values of the FMU, and write them to their ports.
+        """Read the values of all variables in ``groups`` from the FMU, and write them to the variables' ports.
 
         Raises:
             ValueRangeError: A value does not fit its register.
@@ -130,7 +133,7 @@ class Instance:
                 free(state)
 
     def restore(self, data: bytes) -> None:
-        """Give the FMU a state that :meth:`save` has returned."""
+        """Restore a state that :meth:`save` has returned."""
         with self._calling():
             _, free, _, from_bytes, put = self._state_calls()
             state = from_bytes(data)
@@ -146,7 +149,7 @@ class Instance:
         return (fmu.getFMUState, fmu.freeFMUState, fmu.serializeFMUState, fmu.deserializeFMUState, fmu.setFMUState)
 
     def do_step(self, now_s: float, size_s: float) -> float | None:
-        """Let the FMU make one step.
+        """Let the FMU step from ``now_s`` by ``size_s``, both in s of the FMU's own time.
 
         Returns:
             The time that the FMU has reached, if that is less than the end of the step; infinity if
@@ -203,7 +206,7 @@ class Instance:
         return _Call(self)
 
     def failed(self, error: Exception) -> FmuError:
-        """Return an FmuError for FMPy's error about a call, and remember the call's status."""
+        """Convert FMPy's exception about a failed call to an FmuError, and remember the call's status."""
         self._status = max(self._status, _status(error))
         function = getattr(error, "function", "a call")
         status = _status(error)
@@ -212,7 +215,7 @@ class Instance:
 
     @property
     def error(self) -> type[Exception]:
-        """FMPy's class of errors about calls."""
+        """The class of the exceptions that FMPy raises for failed calls."""
         return self._error
 
     def _with_words(self, text: str) -> str:
@@ -251,7 +254,7 @@ class _Call:
 
 
 class Group:
-    """Variables of one type, whose values are in one array that the FMU reads or writes in one call."""
+    """Variables of one type. One call to the FMU reads or writes all their values, in one array."""
 
     def __init__(
         self, version: int, fmu: Any, type_: str, variables: list[Variable], ports: Mapping[str, Port]
@@ -286,15 +289,15 @@ class Group:
             place += size
 
     def get(self, component: object) -> None:
-        """Read the values of the FMU."""
+        """Read the values from the FMU into the array; :meth:`show` writes them to the ports."""
         self._get(component, *self._arguments)
 
     def forget(self) -> None:
-        """Give the FMU all values at the next call of :meth:`set_changed`."""
+        """Make the next :meth:`set_changed` give the FMU all values, even if none has changed."""
         self._given, self._given_bytes = [], []
 
     def show(self) -> None:
-        """Write the values that were read to the ports.
+        """Write the values that :meth:`get` has read to the ports.
 
         Raises:
             ValueRangeError: A value does not fit its register.
@@ -320,12 +323,12 @@ class Group:
             place += count
 
     def set_other(self, component: object) -> None:
-        """Give the FMU the values of the ports, unless it begins with all of them anyway."""
+        """Give the FMU the values of the ports, unless they all equal the FMU's own initial values."""
         self._given = self._starts
         self.set_changed(component)
 
     def set_changed(self, component: object) -> None:
-        """Give the FMU the values of the ports, if any of them has changed since the last call."""
+        """Give the FMU the values of all ports if any of them has changed since the last call."""
         if self._is_native:
             given_bytes = [bytes(view) for view in self._views]
             if given_bytes == self._given_bytes:

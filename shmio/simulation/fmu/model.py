@@ -19,19 +19,19 @@ REMEDY: Final = "; the FMU starts again when its source is restarted"
 MAX_CALLS: Final = 10_000
 """Maximum number of calls of ``doStep`` in one step."""
 MAX_TRIES: Final = 4
-"""How often to try a step of one size before a smaller step is tried."""
+"""Number of times to try a step of one size before trying a smaller one."""
 MAX_HALVINGS: Final = 30
 MAX_REPEATS: Final = 1000
-"""How often to try a discarded step if the FMU does not allow a smaller step."""
+"""Number of times to try a discarded step if the FMU does not allow smaller steps."""
 
 
 def is_fmu(text: str) -> bool:
-    """Return whether a model's name is the path of an FMU, which ends in ``.fmu``."""
+    """Return whether a model's name is the path of an FMU: whether it ends in ``.fmu``, in any case."""
     return text.lower().endswith(SUFFIX)
 
 
 def load_fmu(file: Path) -> type[FmuModel]:
-    """Read an FMU, and return a model's class for it, without running any of the FMU's code.
+    """Return a model class for an FMU, without running any of the FMU's code.
 
     Raises:
         ModelError: The file is not an FMU that shmio can run on this machine.
@@ -51,10 +51,10 @@ class _SavedFmu(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class FmuModel(Model):
-    """Steps an FMU. :func:`load_fmu` makes a subclass for each FMU.
+    """Base class of the models that run FMUs. :func:`load_fmu` makes a subclass for each FMU.
 
-    The FMU's own time begins with the first step. If a call to the FMU fails, all further steps fail
-    for the same reason.
+    The FMU's own time starts at the beginning of the first step. If a call to the FMU fails, all
+    further steps fail for the same reason.
     """
 
     archive: ClassVar[Archive]
@@ -88,7 +88,7 @@ class FmuModel(Model):
             raise self._fail(error) from None
 
     def step(self, time_s: float, dt_s: float) -> None:
-        """Let the FMU compute a step."""
+        """Set the FMU's inputs, let it step to ``time_s``, and read its outputs."""
         if self._failure or self._instance is None:
             raise ModelError(self._failure)
         time_ns, dt_ns = round(time_s * 1e9), round(dt_s * 1e9)
@@ -110,11 +110,11 @@ class FmuModel(Model):
 
     @classmethod
     def code_files(cls) -> list[Path]:
-        """Return the FMU's file."""
+        """Return the path of the FMU, the only file of the model."""
         return [cls.archive.path]
 
     def save_state(self) -> object:
-        """Return the FMU's own state, and the times."""
+        """Return the FMU's own state, and the times that this class keeps."""
         if self._failure or self._instance is None:
             raise SnapshotError(self._failure or "the FMU has not started")
         if self.description.lacks:
@@ -123,7 +123,7 @@ class FmuModel(Model):
         return {"fmu": self._instance.save(), "times": times}
 
     def restore_state(self, state: Any) -> None:
-        """Give the FMU its own state."""
+        """Restore the FMU's own state and the times from what :meth:`save_state` has returned."""
         if self._failure or self._instance is None:
             raise SnapshotError(self._failure or "the FMU has not started")
         if self.description.lacks:
