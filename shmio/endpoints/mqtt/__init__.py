@@ -1,9 +1,9 @@
-"""The MQTT endpoint: a bridge to a broker, and the instance's own broker where there is no other.
+"""The MQTT endpoint: a bridge to a broker, and the instance's own broker if there is no other.
 
 ``bridge`` runs everything in one thread:
 
-- ``feed`` follows one block and marks the topics that changed; ``topics`` has the rules of topics,
-  and makes their payloads.
+- ``feed`` follows one block, and marks the topics that have changed; ``topics`` has the rules of
+  topics, and makes their payloads.
 - ``outbox`` queues topics and results for the broker, and keeps changes during an outage.
 - ``connection`` connects to the broker. ``topic_guard`` corrects what other clients publish on the
   bridge's topics.

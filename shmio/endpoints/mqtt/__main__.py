@@ -16,7 +16,7 @@ from shmio.logs import LogRateLimit
 from shmio.worker import BEAT_S, Worker
 
 BROKER = "broker"
-"""The name of the process of the instance's own broker."""
+"""Name of the process that runs the instance's own broker."""
 
 log = logging.getLogger("shmio.mqtt")
 
@@ -55,7 +55,7 @@ def _run_bridge(worker: Worker) -> None:
 def run_broker(worker: Worker) -> None:
     """Run the instance's own broker until the worker is stopped.
 
-    The broker is mosquitto if that is installed, otherwise aMQTT.
+    The broker is mosquitto if it is installed, otherwise aMQTT.
     """
     settings = msgspec.convert(worker.config, Mqtt)
     program = choose_broker(settings)

@@ -1,4 +1,4 @@
-"""The bridge: one thread that runs the feeds, the outbox, the connections and the commands."""
+"""The bridge: runs the feeds, the outbox, the connections and the commands in one thread."""
 
 from __future__ import annotations
 
@@ -43,16 +43,16 @@ if TYPE_CHECKING:
 OFFLINE: Final = b"offline"
 STOPPED: Final = "the bridge was stopped"
 LEAVE_S: Final = 2.0
-"""Time limit in s for the broker to accept the last messages when the bridge closes."""
+"""Time in s that the broker has to accept the last messages when the bridge closes."""
 TURN_S: Final = 0.2
 MAX_CLEARED: Final = 20_000
-"""Maximum number of topics whose retained messages the bridge deletes at the broker."""
+"""Maximum number of topics whose old retained messages the bridge deletes at the broker."""
 
 log = logging.getLogger("shmio.mqtt")
 
 
 class Bridge:
-    """Connects a segment to a broker.
+    """Connects an instance to a broker.
 
     Use it from one thread: call :meth:`run_once` repeatedly, then :meth:`close`.
     """
@@ -154,7 +154,7 @@ class Bridge:
 
     @property
     def readers(self) -> Iterator[tuple[Block, int]]:
-        """The blocks that the bridge reads now, each with the number of the last frame read."""
+        """The blocks whose frames the bridge reads now, each with the number of the last frame read."""
         for feed in self._feeds.values():
             if not feed.step_driven:
                 yield feed.block, feed.follower.last
@@ -234,7 +234,7 @@ class Bridge:
     # ---- other clients that publish on our topics --------------------------------------------------------------------
 
     def watch(self) -> None:
-        """Subscribe to the bridge's own topics."""
+        """Subscribe to the bridge's own topics, to notice what other clients publish on them."""
         self.connection.watch(self._own)
         self.command_connection.watch()
 
@@ -250,7 +250,7 @@ class Bridge:
         return [*states, *output_filters(self.prefix, self._clients.values())]
 
     def correct(self, topic: str) -> None:
-        """Publish the bridge's value on a topic again, or delete what another client published."""
+        """Publish the bridge's value on a topic again, or delete the message that another client left there."""
         remedy = "let no other account publish there, and no other bridge use this prefix"
         if (channel := self._channels.get(topic)) is not None:
             log.warning(
@@ -262,7 +262,7 @@ class Bridge:
             self.outbox.mark(ClearedTopic(topic))
 
     def correct_all(self) -> None:
-        """Publish the current state of all topics again."""
+        """Publish the present state of all topics again."""
         self.outbox.mark(self._status)
         for feed in self._feeds.values():
             feed.resend()

@@ -26,14 +26,14 @@ from shmio.segment.commands import End, worst
 from shmio.wording import unknown
 
 REPLIES: Final = "shmio/results"
-"""Start of the response topics, after the prefix, that clients may choose for results.
+"""Start, after the prefix, of the response topics that clients may choose for results.
 
 If clients could choose any topic, they could make the bridge write values or publish false values.
 """
 OUTPUTS: Final = ("/out", "/frames")
 RETAINED: Final = "a retained command is not carried out; publish commands without the retain flag"
 MAX_SHOWN: Final = 400
-"""Maximum number of bytes of a payload that the audit log receives. It may shorten them further."""
+"""Maximum number of bytes of a payload that are passed to the audit log, which may shorten them further."""
 MAX_CORRELATION_BYTES: Final = 1024
 MAX_TOPIC_BYTES: Final = 65535 - len("/result")
 """Maximum length of a command's topic, in bytes.
@@ -80,7 +80,7 @@ class CommandClient:
         """Send a value for a register, an array or an element.
 
         Args:
-            register: The register.
+            register: The register, array or element.
             value: The value.
             done: Called once, with the outcome.
             attempt: The command's entry in the audit log.
@@ -120,15 +120,15 @@ def _depths(layout: Layout) -> Sequence[int]:
 
 
 def command_filters(prefix: str, clients: Iterable[CommandClient]) -> list[str]:
-    """Return the topic filters for commands. They match no topic on which the bridge publishes.
+    """Return the topic filters for the commands to these sources. They match no topic that the bridge publishes.
 
-    There is a filter for each path depth of each source.
+    There is a filter for each depth of a path in each source.
     """
     return [f"{prefix}/{one.block.source}/{'+/' * depth}in" for one in clients for depth in one.depths]
 
 
 def output_filters(prefix: str, clients: Iterable[CommandClient]) -> list[str]:
-    """Return topic filters that match the values of these sources, including values of earlier bridges."""
+    """Return topic filters that match the values of these sources, including those that earlier bridges published."""
     found = []
     for one in clients:
         base = f"{prefix}/{one.block.source}"
@@ -137,7 +137,7 @@ def output_filters(prefix: str, clients: Iterable[CommandClient]) -> list[str]:
 
 
 def result_filters(prefix: str, clients: Iterable[CommandClient]) -> list[str]:
-    """Return the topic filters for the results of commands."""
+    """Return the topic filters for the results of commands to these sources."""
     return [f"{one}/result" for one in command_filters(prefix, clients)] + [f"{prefix}/{REPLIES}/#"]
 
 
@@ -169,7 +169,7 @@ class CommandReceiver:
         self._broker = broker
 
     def take(self, message: MQTTMessage) -> None:
-        """Handle a message. If it has the topic of a command, send its value to the source."""
+        """Handle a message. If its topic is that of a command, send its value to the source."""
         try:
             topic = message.topic
         except UnicodeDecodeError:

@@ -1,4 +1,4 @@
-"""Follows one block: scans each frame for changes, and marks the topics to publish."""
+"""Follows one block: finds the changes in each frame, and marks the topics to publish."""
 
 from __future__ import annotations
 
@@ -30,16 +30,13 @@ from shmio.segment.changed_registers import ChangeScan
 log = logging.getLogger("shmio.mqtt")
 
 MAX_FRAMES_PER_TURN: Final = 8
-"""Maximum number of frames that are read before the bridge does other work."""
+"""Maximum number of frames that are read in one go, before the bridge does other work."""
 CATCH_UP_S: Final = 3.0
-"""Maximum time in s by which the bridge may be behind. It may not be behind by more than half the ring, either.
-
-If it is further behind, it skips to the newest frame.
-"""
+"""If the bridge is further behind than this time in s, or half of the ring, it skips to the newest frame."""
 
 
 def follow(block: Block) -> FrameFollower:
-    """Follow a block from its newest frame on. The follower skips frames if it falls far behind."""
+    """Follow a block, beginning with its newest frame. If the follower falls far behind, it skips frames."""
     return FrameFollower(block, catch_up_s=CATCH_UP_S)
 
 
@@ -112,11 +109,11 @@ class Feed:
 
     @property
     def ended(self) -> bool:
-        """True if a reload has ended the block, and all its frames have been read."""
+        """True if a reload has retired the block, and all its frames have been read."""
         return self.follower.ended
 
     def poll(self) -> bool:
-        """Read a few new frames, and return whether more are waiting."""
+        """Read a few new frames. Return whether more are waiting."""
         if self.step_driven:
             return False
         for frame in self.follower.read(MAX_FRAMES_PER_TURN):
@@ -135,12 +132,12 @@ class Feed:
         return False
 
     def step(self) -> None:
-        """Publish the changes of the present step, if this block publishes only by steps."""
+        """Publish the changes of the present step, if the source is :attr:`step_driven`."""
         if self.step_driven and (frame := self.follower.newest()):
             self.take(frame)
 
     def take(self, frame: Frame) -> None:
-        """Make a frame the current frame, and mark the topics that it changes."""
+        """Make a frame the present frame, and mark the topics that it changes."""
         old = self.follower.frame
         change = self.follower.take(frame)
         if old is None or change in (QualityChange.RECOVERED, QualityChange.BAD):
@@ -176,7 +173,7 @@ class Feed:
         self._outbox.mark_all(self.all())
 
     def resend(self) -> None:
-        """Publish the current state of all topics again, after the changes that were kept during an outage."""
+        """Publish the present state of all topics again, after the changes that were kept during an outage."""
         self._limited.clear()
         self._outbox.resend(self.all())
 
@@ -197,8 +194,8 @@ class Feed:
         """Mark the changed channels that a rate limit no longer delays.
 
         Returns:
-            The time at which the next rate limit ends, in ns of the source's clock; None: no change
-            waits for a rate limit.
+            The time at which the next rate limit ends, in ns of the source's clock; None if no
+            change waits for a rate limit.
 
         """
         now_ns, frame = self.block.now_ns(), self.follower.frame

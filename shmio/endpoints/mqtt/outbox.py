@@ -1,4 +1,4 @@
-"""Queues topics for the broker in the order of their first change, each with its newest value.
+"""Queues topics for the broker, in the order of their first change. A topic is sent with its newest value.
 
 While there is no broker, every change goes to a bounded backlog instead. When there is a broker
 again, the backlog is sent first.
@@ -17,11 +17,11 @@ from paho.mqtt.properties import Properties
 from shmio.endpoints.mqtt.topics import Channel, Message
 
 OVERHEAD_BYTES: Final = 200
-"""Approximate memory that one message needs in addition to its payload, in bytes."""
+"""Approximate memory that a message needs in addition to its payload, in bytes."""
 TURN_MESSAGES: Final = 500
-"""Maximum number of messages that are sent before the bridge does other work."""
+"""Maximum number of messages that are sent in one go, before the bridge does other work."""
 MAX_RESULTS: Final = 1024
-"""Maximum number of queued results. If there are more, the oldest results are dropped."""
+"""Maximum number of queued results. If there are more, the oldest are dropped."""
 
 Item = TypeVar("Item")
 
@@ -34,9 +34,9 @@ class _Entry(NamedTuple, Generic[Item]):
 
 
 class Backlog(Generic[Item]):
-    """A store of limited size with several rows of items. Each row is first in, first out.
+    """A store of limited size, with several rows of items. Each row is first in, first out.
 
-    When the backlog is full, the oldest item of all rows is dropped.
+    If there is no room for an item, the oldest items of all rows are dropped.
     """
 
     def __init__(self, most_bytes: int) -> None:
@@ -51,7 +51,7 @@ class Backlog(Generic[Item]):
         """Sequence number of the newest item. Older items have lower numbers."""
 
     def put(self, item: Item, size: int, *, row: str = "", changes: int = 1) -> None:
-        """Append an item, and drop the oldest items until the rest fits.
+        """Append an item. If necessary, drop the oldest items to make room for it.
 
         Args:
             item: The item.
@@ -69,7 +69,7 @@ class Backlog(Generic[Item]):
             self.dropped += oldest.changes
 
     def put_back(self, item: Item, size: int) -> None:
-        """Insert an item before all others, or drop it if there is no room."""
+        """Insert an item of ``size`` bytes before all others of the row ``""``; drop it if there is no room."""
         if self.bytes + size > self._most:
             self.dropped += 1
             return
@@ -78,7 +78,7 @@ class Backlog(Generic[Item]):
         self._add(1, size)
 
     def pop(self, row: str = "") -> Item | None:
-        """Remove and return the oldest item of a row, or return None if the row is empty."""
+        """Remove and return the oldest item of a row; return None if the row is empty."""
         kept = self._rows.get(row)
         if not kept:
             return None
@@ -87,7 +87,7 @@ class Backlog(Generic[Item]):
         return oldest.item
 
     def clear(self) -> None:
-        """Drop all items, and count them as dropped."""
+        """Drop all items. They count as dropped."""
         self.dropped += self.count
         self.count = self.bytes = 0
         self._rows.clear()
@@ -98,7 +98,7 @@ class Backlog(Generic[Item]):
 
 
 class Sender(Protocol):
-    """The part of a connection that the outbox uses."""
+    """What the outbox needs of a connection."""
 
     @property
     def up(self) -> bool:
@@ -106,7 +106,7 @@ class Sender(Protocol):
 
     @property
     def room(self) -> int:
-        """Number of messages that can be sent now without queueing them in memory."""
+        """Number of messages that can be sent now without being queued in memory."""
 
     def send(self, message: Message, properties: Properties | None = None) -> None:
         """Queue a message for :meth:`push`."""
@@ -161,7 +161,7 @@ class Outbox:
 
     @property
     def waiting(self) -> int:
-        """Number of topics that wait to be sent."""
+        """Number of topics that are waiting to be sent."""
         return len(self._waiting)
 
     @property
@@ -175,10 +175,10 @@ class Outbox:
         return self._backlog.dropped + self._dropped_results
 
     def mark(self, channel: Channel) -> None:
-        """Mark a topic as changed.
+        """Mark a topic as changed, so that it is sent.
 
-        While the backlog is being sent, or during an outage (``keeping``), the change goes to the
-        backlog, if it has room. Otherwise the topic waits; a topic that already waits keeps its
+        While the backlog is being sent, or during an outage (:attr:`keeping`), the change goes to
+        the backlog, if it has room. Otherwise the topic waits; a topic that already waits keeps its
         place.
         """
         if self._connection.up and not (self._catching_up and self._backlog.bytes < self._catch_up_bytes):
@@ -199,20 +199,20 @@ class Outbox:
             self.mark(channel)
 
     def resend(self, channels: Iterable[Channel]) -> None:
-        """Queue the current state of these topics. It is sent after the backlog."""
+        """Queue the present state of these topics. It is sent after the backlog."""
         if self._connection.up:
             self._waiting |= dict.fromkeys(channels)
             if not self._catching_up:
                 self._catching_up, self._catch_up_bytes = True, self._most
 
     def queue_result(self, message: Message, properties: Properties | None) -> None:
-        """Queue the result of a command. Results are sent before values."""
+        """Queue the result of a command, with its MQTT 5 properties. Results are sent before values."""
         if self._results.up:
             self._dropped_results += len(self._results_waiting) == MAX_RESULTS
             self._results_waiting.append((message, properties))
 
     def lose(self, unacknowledged: Iterable[Message]) -> None:
-        """Move unacknowledged messages and waiting changes to the backlog, because the connection was lost."""
+        """Handle a lost connection: move waiting changes and these unacknowledged messages to the backlog."""
         for message in reversed(list(unacknowledged)):
             if message.keep:
                 self._backlog.put_back(message._replace(retain=False), _size(message))
@@ -224,12 +224,12 @@ class Outbox:
         self._catching_up = False
 
     def forget(self, channels: Iterable[Channel]) -> None:
-        """Remove channels from the queue."""
+        """Remove channels from the queue, without sending them."""
         for channel in channels:
             self._waiting.pop(channel, None)
 
     def flush(self) -> None:
-        """Send queued messages, up to a limit, in batches while the connections have room."""
+        """Send queued messages in batches, as long as the connections have room, up to ``TURN_MESSAGES``."""
         if not self._results.up:
             self._results_waiting.clear()  # results are lost with their connection
         self._pass(self._results, self._answered)

@@ -1,4 +1,4 @@
-"""Delivers steps of virtual time. Each step waits until the broker acknowledges the step's changes."""
+"""Delivers steps of virtual time. Each step waits until the broker has acknowledged the step's changes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from shmio.model.clock import Clock
 from shmio.segment.clock import ClockPage
 
 PATIENCE_S: Final = 3.0
-"""Time limit in s for a broker to acknowledge a step. It is less than the time-out of a step."""
+"""Time in s that a broker has to acknowledge a step. It is less than the time-out of a step."""
 
 log = logging.getLogger("shmio.mqtt")
 
@@ -45,10 +45,10 @@ class StepDelivery:
         clock.deliver(index, self.done)  # from now on each step waits for this process
 
     def poll(self, feeds: Collection[Feed]) -> Collection[Feed]:
-        """Start to deliver a new step, or finish a delivery. Update which feeds publish only by steps.
+        """Start to deliver a new step, or finish a delivery; update :attr:`Feed.step_driven` of the feeds.
 
         Returns:
-            The feeds that no longer publish only by steps. They may have unread frames.
+            The feeds that were driven by steps until now. They may have unread frames.
 
         """
         now = self._clock.read()
@@ -95,7 +95,7 @@ class StepDelivery:
         return False
 
     def close(self) -> None:
-        """Make steps no longer wait for this process."""
+        """End the deliveries: steps no longer wait for this process."""
         self._clock.abstain(self._index)
 
 
@@ -111,7 +111,7 @@ class StepMarker:
         self._message = Message(topic, msgspec.json.encode(fields), 1, retain=False)
 
     def message(self, *, late: bool = False) -> Message:
-        """Return the message. Unless ``late`` is True, remember it as sent."""
+        """Return the message. Unless ``late`` is True, it counts as sent."""
         if not late:
             self.sent = self._message
         return self._message

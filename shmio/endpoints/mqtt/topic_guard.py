@@ -1,6 +1,6 @@
 """Corrects what other clients publish on the bridge's topics, with growing pauses.
 
-Without the pauses, two bridges with the same prefix would correct each other endlessly. So would
+Without pauses, two bridges with the same prefix would correct each other without end. So would
 brokers that return each other's messages.
 """
 
@@ -17,29 +17,29 @@ from shmio.backoff import Backoff
 AT_ONCE: Final = 200
 """Maximum number of topics that are corrected together."""
 PAUSE: Final = Backoff(0.1, 5.0)
-"""Pauses between corrections. They grow while others publish on the bridge's topics."""
+"""Pauses between corrections. They grow while other clients publish on the bridge's topics."""
 CALM_PAUSES: Final = 4
-"""Number of pauses without a correction after which the pauses are short again."""
+"""Number of pauses without a correction after which pauses are short again."""
 CALM_S: Final = 60.0
-"""Time in s without a break, after which the next break is short again."""
+"""Time in s without a break after which the next break is short again."""
 MOST_WAITING: Final = 1000
 """Maximum number of topics that wait for a correction. If there are more, all topics are published again."""
 MAX_FOREIGN_MESSAGES: Final = 2000
-"""Maximum number of other clients' messages in one second.
+"""Number of messages of other clients within one second above which the guard takes a break.
 
-If there are more, the guard takes a break: for a time, it corrects nothing.
+During the break, it corrects nothing.
 """
 BREAK: Final = Backoff(10.0, 320.0)
-"""Durations of the breaks. They grow while others publish on the bridge's topics."""
+"""Durations of the breaks. They grow while other clients publish on the bridge's topics."""
 
 log = logging.getLogger("shmio.mqtt")
 
 
 class TopicOwner(Protocol):
-    """The methods of the bridge that the guard uses."""
+    """What the guard needs of the bridge."""
 
     def watch(self) -> None:
-        """Subscribe to the bridge's own topics."""
+        """Subscribe to the bridge's own topics, to notice what other clients publish on them."""
 
     def unwatch(self) -> None:
         """Unsubscribe from the bridge's own topics."""
@@ -48,11 +48,11 @@ class TopicOwner(Protocol):
         """Publish the bridge's value on a topic again."""
 
     def correct_all(self) -> None:
-        """Publish the current state of all topics again."""
+        """Publish the present state of all topics again."""
 
 
 class TopicGuard:
-    """Decides when to correct which topics. Use it only in the bridge's thread."""
+    """Decides which topics to correct, and when. Use it only in the bridge's thread."""
 
     def __init__(self, owner: TopicOwner, now_s: Callable[[], float] = time.monotonic) -> None:
         self._owner, self._now_s = owner, now_s
@@ -65,7 +65,7 @@ class TopicGuard:
         self._on_break = False
 
     def begin(self) -> None:
-        """Start to watch after a connect. The bridge then publishes all topics, which makes corrections obsolete."""
+        """Start to watch, after a connect. Waiting corrections are dropped: the bridge publishes all topics then."""
         if not self._on_break:
             self._waiting.clear()
             self._everything = False
@@ -97,7 +97,7 @@ class TopicGuard:
             self._waiting[topic] = None
 
     def run_once(self) -> float:
-        """Correct the topics that are due. Return the time in s after which to call this again."""
+        """Correct the topics that are due. Return the time in s after which to call this method again."""
         now_s = self._now_s()
         if self._on_break:
             if now_s < self._until_s:

@@ -1,4 +1,4 @@
-"""The topics that the bridge publishes: their names, the configuration's rules, and channels.
+"""The topics that the bridge publishes: their names, the configuration's rules for them, and channels.
 
 A channel makes the payload of one topic when the outbox sends the topic.
 """
@@ -21,21 +21,21 @@ from shmio.model.statuses import worse
 from shmio.segment import Frame, FrameFollower, Provenance, Quality
 
 DEFAULT: Final = MqttTopic(match="**")
-"""The rule of registers that no other rule matches."""
+"""The rule for registers that no other rule matches."""
 ONLINE: Final = b"online"
 NUMBERS: Final = (int, float)
 
 _ToJson = Callable[[bytes], Any]
-"""Converts an image to a value for JSON."""
+"""Function that converts an image to a value for JSON."""
 
 
 def output_topic(prefix: str, source: str, path: str = "") -> str:
-    """Return the topic of a source's register or structure, or of the whole source if ``path`` is empty."""
+    """Return the topic of a register or structure; of the whole source if ``path`` is empty."""
     return f"{prefix}/{source}/{path}/out" if path else f"{prefix}/{source}/out"
 
 
 class TopicRules:
-    """The configuration's rules for topics. The first rule that matches a path applies."""
+    """The configuration's rules for topics. For each path, the first rule that matches it applies."""
 
     def __init__(self, topics: Sequence[MqttTopic]) -> None:
         """Compile the rules.
@@ -53,25 +53,25 @@ class TopicRules:
         self._rules = [(Glob(pattern), rule) for pattern, rule in rules if not names_part(pattern)]
 
     def of(self, source: str, path: str) -> MqttTopic:
-        """Return the rule that applies to a register, bit or slice."""
+        """Return the rule for a register, bit or slice."""
         if not self._rules and not self._parts:
             return DEFAULT
         full = f"{source}/{path}"
         return self._parts.get(full) or self._first(full)[1]
 
     def parts(self, source: str) -> Iterator[str]:
-        """Yield the paths of a source's bits, slices and other parts that have rules of their own."""
+        """Yield the paths of those bits, slices and other parts of a source that have rules of their own."""
         for full, rule in self._parts.items():
             first, _, path = full.partition("/")
             if first == source and rule.publish:
                 yield path
 
     def structure(self, source: str, path: str) -> str | None:
-        """Return the structure whose topic has the value of a register.
+        """Return the structure whose topic contains the value of a register.
 
         Returns:
-            The path of the structure; empty: the topic of the whole source has the value; None:
-            the register has its own topic.
+            The path of the structure; empty if the topic of the whole source contains the value;
+            None if the register has a topic of its own.
 
         """
         glob, rule = self._first(f"{source}/{path}")
@@ -85,7 +85,7 @@ class TopicRules:
         return next((found for found in self._rules if found[0].matches(full)), (None, DEFAULT))
 
     def frames(self, source: str) -> MqttTopic | None:
-        """Return the rule for a source's whole frames, or None if they are not published."""
+        """Return the rule for a source's whole frames; None if they are not published."""
         rule = self._frames.get(source)
         return rule if rule and rule.publish else None
 
@@ -94,7 +94,8 @@ class Message(NamedTuple):
     """One message for the broker.
 
     ``keep`` is True for a change of a value, which the backlog keeps while there is no broker.
-    ``source_ns`` is the time of the value at the source, in ns since 1970; 0: unknown, or no value.
+    ``source_ns`` is the time of the value at the source, in ns since 1970; 0 if it is unknown, or
+    there is no value.
     """
 
     topic: str
@@ -111,9 +112,9 @@ class Channel(Protocol):
     topic: str
 
     def message(self, *, late: bool = False) -> Message:
-        """Make the message from the current state.
+        """Make the message from the present state.
 
-        If ``late`` is True, the message is sent later, when there is a broker again.
+        ``late`` is True if the message will be sent later, when there is a broker again.
         """
 
 
@@ -147,7 +148,7 @@ class _RuledChannel:
 
 
 class RegisterChannel(_RuledChannel):
-    """The topic of a register or an array element, as text or JSON."""
+    """The topic of a register or an array element, with text or JSON as payload."""
 
     def __init__(self, follower: FrameFollower, register: Register, topic: str, rule: MqttTopic) -> None:
         super().__init__(follower, topic, rule)
@@ -161,7 +162,7 @@ class RegisterChannel(_RuledChannel):
         """The quality in the last message; None if the source gives registers no status."""
 
     def moved(self, image: bytes) -> bool:
-        """Return whether the value differs by more than the dead-band from the last message.
+        """Return whether the value differs from that of the last message by more than the dead-band.
 
         A change of quality also counts.
         """
@@ -209,7 +210,7 @@ class RegisterChannel(_RuledChannel):
 
 
 class StructureChannel(_RuledChannel):
-    """The topic of a structure: its registers as one JSON object."""
+    """The topic of a structure. Its payload has the registers of the structure as one JSON object."""
 
     json = True
 
@@ -235,9 +236,9 @@ class StructureChannel(_RuledChannel):
         self._indices = [] if area is None else area.indices(registers)
 
     def message(self, *, late: bool = False) -> Message:
-        """Make the message. While the quality is bad, the message has the last known values.
+        """Make the message. While the quality is bad, it has the last known values.
 
-        If the source gives each register a status, the message has the worst of their qualities.
+        If the source gives each register a status, the message has the worst of the qualities.
         """
         follower = self._follower
         block, frame = follower.block, follower.frame
@@ -260,10 +261,10 @@ ValueChannel = RegisterChannel | StructureChannel
 
 
 class FramesChannel(_RuledChannel):
-    """The topic of a block's frames: the bytes of the image that consumers see."""
+    """The topic of a block's frames. Its payload is the image that consumers see."""
 
     def message(self, *, late: bool = False) -> Message:
-        """Make the message, which is empty while there is no good frame."""
+        """Make the message. Its payload is empty while there is no good frame."""
         frame, quality = self._follower.frame, self._follower.quality
         self._pause()
         return self._message(b"" if frame is None or quality is Quality.BAD else frame.image, late=late)
@@ -277,7 +278,7 @@ class StatusChannel:
         self._follower = follower
 
     def message(self, *, late: bool = False) -> Message:  # noqa: ARG002  sent again when the broker is back
-        """Make the message from the current state."""
+        """Make the message from the present state."""
         follower = self._follower
         return status(self.topic, follower.quality, follower.reason, follower.missed, follower.frame)
 
@@ -296,7 +297,7 @@ class BridgeStatusChannel:
 class ClearedTopic:
     """A topic that is no longer published.
 
-    An empty message deletes the retained one at the broker.
+    Its empty message deletes the retained message at the broker.
     """
 
     def __init__(self, topic: str) -> None:
@@ -330,14 +331,14 @@ def _json_payload(
 
 
 def status(topic: str, quality: Quality, reason: str, missed: int, frame: Frame | None = None) -> Message:
-    """Make the message of a source's status topic.
+    """Return the message for a source's status topic.
 
     Args:
         topic: The topic.
         quality: The source's quality.
-        reason: Why the quality is not good.
+        reason: Why the quality is not good; empty if it is good.
         missed: Number of frames that were skipped.
-        frame: The newest frame, or None.
+        frame: The newest frame; None if there is none.
 
     """
     fields = {

@@ -1,1 +1,1 @@
-"""The broker that the instance runs itself: mosquitto, or aMQTT for development."""
+"""The broker that the instance itself runs: mosquitto, or aMQTT for development."""

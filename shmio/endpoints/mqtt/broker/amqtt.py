@@ -1,8 +1,8 @@
-"""aMQTT as the instance's own broker, for development on a host without mosquitto.
+"""Runs aMQTT as the instance's own broker, for development on a host without mosquitto.
 
-It speaks MQTT 3.1.1. Every program that reaches it may publish and subscribe to everything. Roles
-cannot be enforced: aMQTT publishes wills without asking its plugins, and replaces a client's
-session before it authenticates the new client.
+The broker speaks MQTT 3.1.1. Every program that can reach it may publish and subscribe to
+everything. Roles cannot be enforced: aMQTT publishes wills without asking its plugins, and replaces
+a client's session before it authenticates the new client.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _CONFIG: Final = {
     "plugins": {"amqtt.plugins.authentication.AnonymousAuthPlugin": {}},
 }
 _UNSUPPORTED: Final = b"\x20\x03\x00\x84\x00"
-"""A CONNACK packet that refuses the version of the protocol (MQTT 5.0, section 3.2)."""
+"""A CONNACK packet that refuses the client's version of the protocol (MQTT 5.0, section 3.2)."""
 
 log = logging.getLogger("shmio.mqtt")
 

@@ -1,7 +1,7 @@
 """The directory of the instance's own broker, with its socket and the bridge's password.
 
 The directory is next to the supervisor's socket, and only this user can read it. Each start of the
-broker makes a new password. The broker accepts it only on its UNIX socket.
+broker makes a new password. The broker accepts this password only on its UNIX socket.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from shmio.errors import EndpointError
 from shmio.segment import Segment
 
 SOCKET: Final = "s"
-"""Name of the socket. Its path must not be longer than the path of the supervisor's socket."""
+"""Name of the broker's socket. Its path must not be longer than the path of the supervisor's socket."""
 SECRET: Final = "key"  # noqa: S105  a name
 """Name of the file with the bridge's password."""
 BRIDGE: Final = "bridge"
 """Name of the bridge's account."""
 ID: Final = re.compile(r"(?<=-)[0-9a-f]{32}\b")
-"""Matches the secret part of a client id; see :func:`secret_id`."""
+"""Pattern for the secret part of a client id; see :func:`secret_id`."""
 
 
 def folder(segment: Segment) -> Path:
@@ -38,17 +38,17 @@ def own_socket(segment: Segment) -> str:
 
 
 def write_private(file: Path, text: str) -> None:
-    """Create a file with mode 0600. The file must not exist."""
+    """Create a file with mode 0600 and this text. The file must not exist yet."""
     fd = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     with open(fd, "w", encoding="utf-8") as stream:  # noqa: PTH123  a descriptor
         stream.write(text)
 
 
 def prepare(place: Path) -> None:
-    """Create the directory with mode 0700, or empty it.
+    """Create the directory with mode 0700; if it exists, remove its files.
 
     Raises:
-        EndpointError: The path is not a directory, or belongs to another user.
+        EndpointError: The path is not a directory, belongs to another user, or cannot be created.
 
     """
     try:
@@ -66,14 +66,14 @@ def prepare(place: Path) -> None:
 
 
 def clear(place: Path) -> None:
-    """Remove the files in the directory."""
+    """Remove all files in the directory."""
     for entry in place.iterdir():
         if not entry.is_dir():
             entry.unlink(missing_ok=True)
 
 
 def remove(place: Path) -> None:
-    """Remove the directory and its files."""
+    """Remove the directory, with its files."""
     clear(place)
     place.rmdir()
 
@@ -86,7 +86,7 @@ def new_secret(place: Path) -> str:
 
 
 def secret_of(socket: str) -> str:
-    """Read the bridge's password for the broker at a socket.
+    """Read the bridge's password from the directory of the broker with this socket.
 
     Raises:
         FileNotFoundError: The broker is not running.
@@ -96,7 +96,7 @@ def secret_of(socket: str) -> str:
 
 
 def secret_id(client_id: str, secret: str) -> str:
-    """Return a client id that others cannot guess.
+    """Return a client id that others cannot guess: ``client_id`` with a secret part.
 
     Anyone who knows the id of a client can disconnect that client.
     """

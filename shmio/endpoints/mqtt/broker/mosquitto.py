@@ -1,4 +1,4 @@
-"""Eclipse Mosquitto as the instance's own broker: configuration, access rules, and process.
+"""Runs Eclipse Mosquitto as the instance's own broker: its configuration, access rules, and process.
 
 Only the bridge may publish values, status and results.
 """
@@ -27,9 +27,9 @@ STOP_S: Final = 3.0
 MAX_PACKET_BYTES: Final = 1 << 21
 MAX_QUEUED_MESSAGES: Final = 100_000
 MAX_QUEUED_BYTES: Final = 64 << 20
-"""Maximum size of the queue for a slow client, in bytes. Beyond it, the client loses newer messages."""
+"""Maximum size of the queue for a slow client, in bytes. If the queue is full, the client loses new messages."""
 MAX_LEVELS: Final = 64
-"""Maximum number of levels in the path of a register that can be written by MQTT."""
+"""Maximum number of levels in the path of a register that clients can write by MQTT."""
 READERS: Final = MqttAccount(roles=["read"])
 """The account of clients that have no ``[[mqtt.account]]``."""
 _STAMP: Final = re.compile(r"^\d+: ")
@@ -38,7 +38,7 @@ log = logging.getLogger("shmio.mqtt")
 
 
 def configuration(settings: Mqtt, place: Path, *, anonymous: bool) -> str:
-    """Return the text of mosquitto.conf(5).
+    """Return the text of mosquitto.conf(5) for these settings.
 
     Args:
         settings: The configuration's ``[mqtt]`` section.
@@ -77,7 +77,7 @@ class Rights(NamedTuple):
 
     Attributes:
         read: True if the account may subscribe to all topics.
-        filters: The topic filters on which the account may publish.
+        filters: Topic filters; the account may publish on the topics that match one of them.
     """
 
     read: bool
@@ -85,14 +85,12 @@ class Rights(NamedTuple):
 
 
 def rights(settings: Mqtt, instance: str, accounts: Iterable[str] | None) -> dict[str | None, Rights]:
-    """Return the rights of each account, by its name.
-
-    The name None stands for clients without an account.
+    """Return the rights of each account, by its name. The name None stands for clients without an account.
 
     Args:
         settings: The configuration's ``[mqtt]`` section.
         instance: Name of the instance.
-        accounts: Names of the accounts that have a password; None: passwords are not used.
+        accounts: Names of the accounts that have a password; None if passwords are not used.
 
     """
     given = {account.name: account for account in settings.account}
@@ -118,8 +116,8 @@ def access_rules(given: Mapping[str | None, Rights], *, accounts: bool) -> str:
     """Return the text of an ACL file. Mosquitto denies everything that the file does not allow.
 
     Args:
-        given: The rights of each account, by its name.
-        accounts: Whether there are accounts. If not, mosquitto ignores the user names of clients.
+        given: The rights of each account, by its name; None: of clients without an account.
+        accounts: Whether accounts are in use. If not, mosquitto ignores the user names of clients.
 
     """
     lines = []
@@ -173,7 +171,7 @@ class Mosquitto:
         """Wait until mosquitto accepts connections.
 
         Args:
-            beat: Called repeatedly while waiting.
+            beat: Called repeatedly during the wait.
 
         Raises:
             EndpointError: Mosquitto has ended, or takes too long. The message has its last log

@@ -13,7 +13,7 @@ from shmio.parent import end_with_parent
 
 
 def main() -> None:
-    """Replace this process by the program, or exit if the parent has already ended."""
+    """Replace this process by the program; exit instead if the parent has already ended."""
     parent, program = int(sys.argv[1]), sys.argv[2]
     if end_with_parent(parent):
         os.execv(program, sys.argv[2:])  # noqa: S606  to run this program is the purpose

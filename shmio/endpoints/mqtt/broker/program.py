@@ -12,7 +12,7 @@ from shmio.config import Address, Mqtt
 from shmio.errors import ConfigError
 
 PLACES: Final = ("/usr/local/sbin", "/usr/sbin", "/sbin")
-"""Directories to search after the PATH, because Debian installs mosquitto in one of them."""
+"""Directories to search after those in PATH, because Debian installs mosquitto in one of them."""
 INSTALL: Final = "install mosquitto (Debian: apt install mosquitto)"
 EXTRA: Final = "pip install 'shmio[broker]'"
 MISSING: Final = f'mqtt.broker: "mosquitto" is not on this machine; {INSTALL}'
@@ -24,12 +24,12 @@ EVERYBODY: Final = frozenset(("read", "write"))
 
 
 def find_mosquitto() -> str | None:
-    """Find mosquitto.
+    """Find the program mosquitto.
 
     Returns:
-        The program that ``SHMIO_MOSQUITTO`` names, if it is set; otherwise the mosquitto in the
-        PATH or in the usual directories. None: mosquitto was not found, or ``SHMIO_MOSQUITTO`` is
-        empty.
+        The program that the environment variable ``SHMIO_MOSQUITTO`` names; if it is not set, the
+        program ``mosquitto`` in PATH or in the usual directories. None if mosquitto was not found,
+        or if ``SHMIO_MOSQUITTO`` is empty.
 
     """
     named = os.environ.get("SHMIO_MOSQUITTO")
@@ -42,7 +42,7 @@ def choose_broker(settings: Mqtt) -> str | None:
     """Choose the program of the instance's own broker.
 
     Returns:
-        The path of mosquitto; None: aMQTT.
+        The path of mosquitto; None for aMQTT.
 
     Raises:
         ConfigError: Neither program is installed, or the settings demand mosquitto and only aMQTT
@@ -65,7 +65,7 @@ def choose_broker(settings: Mqtt) -> str | None:
 
 
 def check_installed() -> None:
-    """Check that this machine has a broker.
+    """Check that a broker is installed on this machine.
 
     Raises:
         ConfigError: Neither mosquitto nor aMQTT is installed.

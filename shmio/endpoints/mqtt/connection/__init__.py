@@ -1,1 +1,1 @@
-"""Connections to the broker: connecting, retrying, and reading and writing the socket."""
+"""Connections to the broker: making and retrying them, and reading and writing their sockets."""

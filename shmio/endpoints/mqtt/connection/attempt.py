@@ -1,4 +1,4 @@
-"""Attempts to connect, and the reasons why they fail.
+"""Makes one attempt to connect, and finds out why an attempt has failed.
 
 Each attempt runs in its own thread, because files, DNS, TCP and TLS may block.
 """
@@ -27,11 +27,11 @@ from shmio.endpoints.mqtt.topics import Message
 from shmio.errors import ConfigError
 
 CONNECT_S: Final = 4.0
-"""Time limit in s for each of these: TCP connect, TLS handshake, and CONNACK."""
+"""Time limit in s for each step: the TCP connection, the TLS handshake, and CONNACK."""
 SLOW_S: Final = 15.0
 SLOW: Final = "no answer yet: the broker, the name server, or the file system of mqtt.tls or mqtt.password_file is slow"
 MAX_PACKET_BYTES: Final = 1 << 21
-"""Maximum packet size that the bridge accepts, in bytes. Only brokers with MQTT 5 learn this number."""
+"""Maximum packet size that the bridge accepts, in bytes. Only brokers with MQTT 5 are told this number."""
 # Reason codes: MQTT 5.0, section 2.4. Paho uses the same numbers for MQTT 3.1.1.
 _WHO: Final = frozenset({0x86, 0x87})
 _BUSY: Final = frozenset({0x88, 0x89, 0x97, 0x9F})
@@ -39,10 +39,10 @@ _TAKEN_OVER: Final = 0x8E
 
 
 class BrokerClient(Client):
-    """A paho client that remembers the TLS error that ended the connection."""
+    """A paho client that remembers the TLS error that ended its connection."""
 
     tls_error: ssl.SSLError | None = None
-    """The TLS error that ended the established connection, or None."""
+    """The TLS error that ended the established connection; None if there was none."""
 
 
 class _TlsClient(BrokerClient):
@@ -55,7 +55,7 @@ class _TlsClient(BrokerClient):
 
 
 class ConnectAttempt:
-    """An attempt to connect to the next broker. Its thread starts at once."""
+    """An attempt to connect to the next broker, in a thread that starts at once."""
 
     def __init__(
         self,
@@ -97,7 +97,7 @@ class ConnectAttempt:
 
     @property
     def slow(self) -> bool:
-        """True if the attempt takes unusually long."""
+        """True if the attempt is taking unusually long."""
         return time.monotonic() >= self._begun_s + SLOW_S
 
     def abandon(self) -> None:
@@ -183,7 +183,7 @@ def close_socket(client: Client) -> None:
 
 
 def refusal(code: ReasonCode, policy: ReconnectPolicy) -> str:
-    """Describe the reason code with which a broker refuses a connection."""
+    """Return a text that explains the reason code with which a broker refuses a connection."""
     if code.value in _WHO:
         return (
             f"it refuses shmio's login ({code}); check mqtt.username, mqtt.password_file and the broker's own accounts"
@@ -196,10 +196,10 @@ def refusal(code: ReasonCode, policy: ReconnectPolicy) -> str:
 
 
 def ended(error: ssl.SSLError | None, *, up: bool, tls: bool) -> str:
-    """Describe why a connection ended.
+    """Return a text that explains why a connection has ended.
 
     Args:
-        error: The TLS error, if there was one.
+        error: The TLS error; None if there was none.
         up: Whether the broker had accepted the CONNECT.
         tls: Whether TLS is in use.
 

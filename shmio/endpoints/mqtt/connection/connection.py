@@ -1,8 +1,8 @@
-"""Connections to the broker: they reconnect with growing waits, and never block.
+"""Connections to the broker. They reconnect with growing waits, and never block.
 
-Commands and their results have their own connection. On the connection for values, the broker's
-acknowledgements would wait behind all commands. A flood of commands with QoS 0 would then delay
-values, because the protocol does not limit their number (MQTT 5.0, section 4.9).
+Commands and their results have a connection of their own. On the connection for values, the
+broker's acknowledgements would wait behind all commands. A flood of commands with QoS 0 would then
+delay values, because the protocol does not limit their number (MQTT 5.0, section 4.9).
 """
 
 from __future__ import annotations
@@ -35,25 +35,25 @@ from shmio.endpoints.mqtt.topics import Message
 from shmio.layout.topic import shorten
 
 STABLE_S: Final = 5.0
-"""A connection that has lasted this long, in s, resets the back-off."""
+"""Time in s after which a connection counts as stable, and its loss resets the back-off."""
 MAX_REASON_LENGTH: Final = 300
 """Maximum length of the text with the problems of all brokers, in characters."""
 SUBSCRIBE_S: Final = CONNECT_S
-"""Time limit for the broker's SUBACK to the subscription to commands, in s."""
+"""Time limit in s for the broker's SUBACK to the subscription to commands."""
 MOST_IN_FLIGHT: Final = 1000
 """Maximum number of unacknowledged messages."""
 FEW_IN_FLIGHT: Final = 4
 """Maximum number of unacknowledged messages on connections that receive commands.
 
-The broker may send that many commands in one turn, and each takes time.
+The broker may send this many commands in one turn, and each takes time.
 """
 HEAD_BYTES: Final = 128
-"""Maximum size of the parts of a packet other than topic and payload, in bytes."""
+"""Maximum size in bytes of a packet without its topic and its payload."""
 OFTEN: Final = 4
 OFTEN_S: Final = 60.0
-"""If ``OFTEN`` connections are lost within this time, in s, the problem names a likely cause."""
+"""If ``OFTEN`` connections are lost within this time in s, the reported problem names a likely cause."""
 REFUSED_S: Final = 10.0
-"""Time in s for which a refused message stays the current problem, if others are accepted."""
+"""Time in s for which a refused message stays the current problem if the broker accepts later messages."""
 WITH_WILL: Final = "Disconnect with will message"
 _WATCHED: Final = 1
 """Identifier of the subscription to the bridge's own topics."""
@@ -64,8 +64,8 @@ log = logging.getLogger("shmio.mqtt")
 class Limits(NamedTuple):
     """The limits that a broker states in its CONNACK (MQTT 5.0, section 3.2.2.3).
 
-    MQTT 3.1.1 has no such limits. ``in_flight`` is the maximum number of unacknowledged messages.
-    ``packet_bytes`` is None if packets may have any size.
+    With MQTT 3.1.1, there are no such limits. ``in_flight`` is the maximum number of unacknowledged
+    messages. ``packet_bytes`` is None if packets may have any size.
     """
 
     in_flight: int = MOST_IN_FLIGHT
@@ -73,15 +73,15 @@ class Limits(NamedTuple):
     qos: int = 1
     retain: bool = True
     identifiers: bool = True
-    """True if subscriptions may have an identifier, which the broker adds to their messages."""
+    """True if subscriptions may have an identifier. The broker adds it to the messages of the subscription."""
 
     @classmethod
     def from_connack(cls, properties: Properties | None, most: int) -> Limits:
-        """Read the limits of a CONNACK.
+        """Read the limits in a CONNACK.
 
         Args:
             properties: The properties of the CONNACK; None with MQTT 3.1.1.
-            most: The number of unacknowledged messages that the bridge wants.
+            most: Maximum number of unacknowledged messages that the bridge wants.
 
         """
         given = vars(properties) if properties is not None else {}
@@ -94,7 +94,7 @@ class Limits(NamedTuple):
         )
 
     def fit(self, message: Message) -> bool:
-        """Return whether a message is small enough."""
+        """Return whether a message is small enough for the broker."""
         if self.packet_bytes is None:
             return True
         return HEAD_BYTES + len(message.topic.encode()) + len(message.payload) <= self.packet_bytes
@@ -110,7 +110,7 @@ def _subscription(*, retained: bool) -> SubscribeOptions:
 
 
 class ConnectionProblems:
-    """The current problem of a connection. Each problem is logged once."""
+    """The current problem of a connection. A problem is logged when it becomes current."""
 
     def __init__(self) -> None:
         self.problem = ""
@@ -128,7 +128,11 @@ class ConnectionProblems:
         self.problem = problem
 
     def connection_lost(self, problem: str, client_id: str) -> str:
-        """Count a lost connection. Return the problem, with a likely cause if it occurs often."""
+        """Count a lost connection.
+
+        Returns:
+            The problem; if connections are lost often, with a likely cause.
+        """
         self._lost_s.append(time.monotonic())
         if len(self._lost_s) < OFTEN or self._lost_s[-1] - self._lost_s[0] > OFTEN_S:
             return problem
@@ -144,25 +148,25 @@ class ConnectionProblems:
         self.report(problem)
 
     def message_refused(self, problem: str) -> None:
-        """Count a refused message, and report it unless there is another problem."""
+        """Count a refused message, and report it unless there is a problem already."""
         self.refused += 1
         self._refused_s = time.monotonic()
         if not self.problem:  # the first refusal represents those that follow
             self.report(problem)
 
     def message_accepted(self) -> None:
-        """Clear the problem of refused messages if the last refusal was long enough ago."""
+        """Clear the problem of refused messages, if the last refusal was ``REFUSED_S`` ago."""
         if self.problem and time.monotonic() >= self._refused_s + REFUSED_S:
             self.problem = self._subscription_problem
 
 
 def is_watched(message: MQTTMessage) -> bool:
-    """Return whether a message is another client's message on one of the bridge's own topics."""
+    """Return whether a message came from another client on one of the bridge's own topics."""
     return _WATCHED in (vars(message.properties) if message.properties else {}).get("SubscriptionIdentifier", ())
 
 
 class BrokerConnection:
-    """A connection to a broker. After a loss, it reconnects. Use it only in the bridge's thread.
+    """A connection to a broker. If it is lost, it is made again. Use it only in the bridge's thread.
 
     It registers its socket with ``selector``. Call the ``data`` of the selector's key when the
     socket is ready.
@@ -219,12 +223,12 @@ class BrokerConnection:
 
     @property
     def problem(self) -> str:
-        """Reason why there is no connection, or what the broker refuses; empty: no problem."""
+        """Why there is no connection, or what the broker refuses; empty if there is no problem."""
         return self.problems.problem
 
     @property
     def at(self) -> Target | None:
-        """The broker that has accepted the CONNECT, or None."""
+        """The broker that has accepted the CONNECT; None if none has."""
         return None if self._client is None or self._deadline_s is not None else self._target
 
     @property
@@ -234,7 +238,7 @@ class BrokerConnection:
 
     @property
     def room(self) -> int:
-        """Number of messages that can be sent now without queueing them in memory."""
+        """Number of messages that can be sent now without being queued in memory."""
         blocked = not self.up or self._socket_io is None or self._socket_io.writing
         return 0 if blocked else min(BATCH, self._limits.in_flight - len(self._in_flight))
 
@@ -246,7 +250,7 @@ class BrokerConnection:
     # ---- the loop ----------------------------------------------------------------------------------------------------
 
     def run_once(self) -> float:
-        """Do what is due. Return the time in s after which to call this again."""
+        """Do the work that is due. Return the time in s after which to call this method again."""
         now_s = time.monotonic()
         if self._attempt is not None and self._attempt.over:
             self._take(self._attempt)
@@ -346,10 +350,10 @@ class BrokerConnection:
     # ---- dropping the connection -------------------------------------------------------------------------------------
 
     def drop(self, problem: str, *, politely: bool = False) -> None:
-        """Drop the connection, or the attempt that waits for CONNACK.
+        """Drop the connection, or the attempt that is waiting for CONNACK.
 
         Args:
-            problem: Reason for the drop.
+            problem: Why it is dropped.
             politely: Whether to send DISCONNECT, so that the broker does not publish the will. Do
                 not set this in a callback of the client.
 
@@ -422,14 +426,14 @@ class BrokerConnection:
             self._socket_io.push()
 
     def is_unacknowledged(self, message: Message) -> bool:
-        """Return whether this message object was sent and is not acknowledged."""
+        """Return whether this very message object was sent and has not been acknowledged."""
         return any(one is message for one in self._in_flight.values())
 
     def subscribe(self, filters: Sequence[str], *, retained: bool = False) -> None:
-        """Subscribe to filters.
+        """Subscribe to these topic filters.
 
-        Without ``retained``, MQTT 5 brokers leave out retained messages. MQTT 3.1.1 brokers send
-        them with the retain flag. New messages from bridged brokers may have this flag, too.
+        Without ``retained``, MQTT 5 brokers do not send retained messages. MQTT 3.1.1 brokers send
+        them with the retain flag, which new messages from bridged brokers may also have.
         """
         client = self._client
         self.subscribed = not filters
@@ -441,9 +445,9 @@ class BrokerConnection:
         self._subscription = self._subscription if retained or mid is None else mid
 
     def watch(self, filters: Sequence[str]) -> None:
-        """Subscribe to other clients' messages on the bridge's own topics: see :func:`is_watched`.
+        """Subscribe to other clients' messages on the bridge's own topics; :func:`is_watched` recognizes them.
 
-        This needs MQTT 5.
+        Without MQTT 5, this does nothing.
         """
         if self._client is None or not (filters and self.mqtt5 and self._limits.identifiers):
             return  # we would receive our own messages, and could not tell them from retained ones
@@ -453,27 +457,27 @@ class BrokerConnection:
         self._client.subscribe([(one, options) for one in filters], properties=properties)
 
     def unwatch(self, filters: Sequence[str]) -> None:
-        """Unsubscribe from the bridge's own topics."""
+        """End the subscription that :meth:`watch` has made."""
         if self._client is not None and filters and self.mqtt5:
             self._client.unsubscribe(list(filters))
 
     def recall(self, filters: Sequence[str]) -> None:
-        """Ask the broker once for the retained messages that match these filters."""
+        """Ask the broker to send the retained messages that match these filters, once."""
         self.subscribe(filters, retained=True)
         if self._client is not None and filters:
             self._client.unsubscribe(list(filters))
 
     def open(self) -> None:
-        """Allow connecting again after :meth:`close`."""
+        """Allow connections again, after :meth:`close`."""
         self._protocol, self._retry_s = MQTTv5, 0.0
         self.problems.clear()
         self._problem_of.clear()
 
     def close(self, *, will: bool = False) -> None:
-        """Disconnect. Messages that have been written to the socket still arrive.
+        """Disconnect. Messages that have been written to the socket will still arrive.
 
         Args:
-            will: Whether to ask the broker to publish the will. This needs MQTT 5.
+            will: Whether the broker is to publish the will. This needs MQTT 5.
 
         """
         if self._client is not None:
@@ -522,22 +526,22 @@ class CommandConnection:
 
     @property
     def ready(self) -> bool:
-        """True if commands can arrive, or if it is known why they cannot arrive."""
+        """True if commands can arrive, or if it is known why they cannot."""
         return self.connection.subscribed or bool(self.connection.problem)
 
     @property
     def problem(self) -> str:
-        """Reason why no commands arrive or no results are sent; empty if there is no problem."""
+        """Why no commands arrive or no results are sent; empty if there is no problem."""
         return f"commands: {self.connection.problem}" if self.connection.problem else ""
 
     def run_once(self, at: Target | None) -> float:
-        """Connect to the broker that receives the values, and do what is due.
+        """Connect to the broker that receives the values, and do the work that is due.
 
         Args:
-            at: The broker that receives the values; None: there is no connection for values.
+            at: The broker that receives the values; None if there is no connection for values.
 
         Returns:
-            The time in s after which to call this again.
+            The time in s after which to call this method again.
 
         """
         if at is not self._at:
@@ -558,7 +562,7 @@ class CommandConnection:
         return max(0.0, min(rest_s, left_s))
 
     def subscribe(self) -> None:
-        """Subscribe to the commands of all current sources."""
+        """Subscribe to the commands for all present sources."""
         if self.connection.up:
             self.connection.subscribe(self._filters())
             self.watch()
@@ -570,5 +574,5 @@ class CommandConnection:
         self.connection.watch(self._answers())
 
     def unwatch(self) -> None:
-        """Unsubscribe from the topics of results."""
+        """End the subscription that :meth:`watch` has made."""
         self.connection.unwatch(self._answers())

@@ -11,20 +11,20 @@ from shmio.config import Mqtt
 from shmio.config.mqtt import brokers
 
 RECONNECT: Final = Backoff(0.25, 15.0, jitter=0.5)
-"""Waiting times before the next attempt to connect.
+"""Waiting times before attempts to connect.
 
 They vary at random, so that the bridges of a plant do not all reconnect at the same time.
 """
 RECONNECT_OWN: Final = Backoff(0.25, 0.5, jitter=0.5)
-"""Waiting times before the next attempt to connect to the instance's own broker.
+"""Waiting times before attempts to connect to the instance's own broker.
 
-They are short, because this broker is on this host and is restarted at once.
+They are short, because this broker runs on this host and is restarted at once.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """The address of a broker. If ``transport`` is ``unix``, ``host`` is the path of the socket."""
+    """The address of a broker. If ``transport`` is ``unix``, ``host`` is the path of its socket."""
 
     host: str
     port: int = 1883
@@ -36,12 +36,12 @@ class Target:
 
 
 def targets(settings: Mqtt, own_socket: str) -> list[Target]:
-    """Return the brokers in the order in which to try them.
+    """Return the addresses of the brokers, in the order in which to try them.
 
     Args:
         settings: The configuration's ``[mqtt]`` section.
-        own_socket: Path of the socket of the instance's own broker. It is used unless the broker
-            is external.
+        own_socket: Path of the socket of the instance's own broker, which is used unless the
+            configured broker is external.
 
     """
     if settings.broker != "external":
@@ -50,7 +50,7 @@ def targets(settings: Mqtt, own_socket: str) -> list[Target]:
 
 
 class ReconnectPolicy:
-    """Chooses the broker to try next, and the wait before the attempt."""
+    """Chooses the broker to try next, and how long to wait before the attempt."""
 
     def __init__(self, settings: Mqtt, client_id: str, there: Sequence[Target]) -> None:
         self.settings = settings
@@ -70,11 +70,11 @@ class ReconnectPolicy:
         self.reset_failures()
 
     def retry_same(self) -> None:
-        """Make :meth:`next` return the same broker again."""
+        """Make :meth:`next` return the last broker once more."""
         self._next -= 1
 
     def next(self) -> Target:
-        """Return the next broker to try. The next call returns the broker after it."""
+        """Return the next broker to try. The brokers take turns."""
         self._next += 1
         return self._targets[(self._next - 1) % len(self._targets)]
 

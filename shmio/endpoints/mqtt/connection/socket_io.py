@@ -20,13 +20,14 @@ from shmio.endpoints.mqtt.connection.attempt import close_socket
 BATCH: Final = 32
 """Maximum number of messages in a batch.
 
-The messages of a batch share TCP segments. The first message waits until the last has been made.
+The messages of a batch share TCP segments. The first message waits until the last one has been
+made.
 """
 PACKETS: Final = 4
-"""Maximum number of packets that are read before the bridge does other work.
+"""Number of packets after which reading stops, so that the bridge can do other work.
 
-It may be exceeded: one call of paho may read a packet for each unacknowledged message. That takes
-hardly any time.
+More packets may be read: one call of paho may read a packet for each unacknowledged message. That
+takes hardly any time.
 """
 
 
@@ -64,7 +65,7 @@ class SocketIo:
         selector.register(made, selectors.EVENT_READ, self._serve)
 
     def counting(self, callback: Callable[..., None]) -> Callable[..., None]:
-        """Wrap a callback of the client, so that its calls are counted."""
+        """Return a callback that calls ``callback``, and counts its calls."""
 
         def counted(*arguments: object) -> None:
             self._packets += 1
@@ -73,14 +74,14 @@ class SocketIo:
         return counted
 
     def run_once(self) -> float:
-        """Read data that the selector cannot see. Return the time in s after which to call this again."""
+        """Read data that the selector cannot see. Return the time in s after which to call this method again."""
         if self._unseen():
             self._serve(selectors.EVENT_READ)
         self.push()
         return 0.0 if self._unseen() else 1.0
 
     def push(self) -> None:
-        """Write the messages that the client has queued."""
+        """Write the messages that the client has queued to the socket."""
         if self._socket is not None and not self.writing and self._client.want_write():
             self._serve(0)
 

@@ -18,7 +18,7 @@ from shmio.segment.changed_registers import ChangeScan
 
 
 class DeviceEvent(Enum):
-    """Kinds of changes of a device."""
+    """What happens to a device."""
 
     BIRTH = "birth"
     DATA = "data"
@@ -26,16 +26,16 @@ class DeviceEvent(Enum):
 
 
 class DeviceChange(NamedTuple):
-    """A change of a device. ``at`` has the indices of the metrics with new values."""
+    """A change of a device. ``at`` has the indices of the metrics that have new values."""
 
     kind: DeviceEvent
     at: Sequence[int] = ()
 
 
 class Device:
-    """Follows one block for Sparkplug. Use it only in the bridge's thread.
+    """Follows one block, and reports its changes as those of a Sparkplug device.
 
-    For a large layout, it takes seconds to create a device.
+    Use it only in the bridge's thread. Creating a device takes seconds for a large layout.
     """
 
     def __init__(self, block: Block, command_client: CommandClient, globs: Sequence[Glob], *, elements: bool) -> None:
@@ -60,7 +60,7 @@ class Device:
         self._follower = follow(block)
 
     def set_metrics(self, metrics: Sequence[Metric]) -> None:
-        """Set the metric of each of :attr:`parts`, in the same order."""
+        """Set the metrics: one for each of :attr:`parts`, in the same order."""
         self._metrics = metrics
 
     @property
@@ -69,7 +69,7 @@ class Device:
         return self._follower.quality is not Quality.BAD
 
     def poll(self) -> Iterator[DeviceChange]:
-        """Read a few new frames, and yield the changes of the device."""
+        """Read a few new frames, and yield the changes that they make to the device."""
         for frame in self._follower.read(MAX_FRAMES_PER_TURN):
             if (change := self._take(frame)) is not None:
                 yield change
@@ -92,7 +92,7 @@ class Device:
         return self._follower.behind
 
     def samples(self, at: Sequence[int] | None = None) -> list[Sample]:
-        """Return samples of all metrics, or only of the metrics with the indices ``at``."""
+        """Return samples of the metrics with the indices ``at``; of all metrics if ``at`` is None."""
         follower = self._follower
         frame = follower.frame
         if frame is None:

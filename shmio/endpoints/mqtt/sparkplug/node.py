@@ -95,7 +95,7 @@ _BITS: Final = {INT32: 32, INT64: 64}
 
 
 class Metric:
-    """A metric: a register, or an element of an array. ``alias`` is unique in its edge node."""
+    """A metric: a register, or an element of an array. ``alias`` is its number, unique in the edge node."""
 
     def __init__(self, register: Register, alias: int) -> None:
         kind = _DATATYPES.get(register.element.base, _STRING)
@@ -108,7 +108,7 @@ class Metric:
         self._bits = 0 if register.dims else _BITS.get(kind.datatype, 0)
 
     def put(self, metric: wire.Metric, value: Any) -> None:
-        """Write a value to a message. None becomes null, and so does an array with a None in it."""
+        """Write a value to a message. None, or an array that contains None, becomes null."""
         data: Any = self._packed(value) if self.register.dims else value
         if data is None:
             metric.is_null = True
@@ -161,7 +161,7 @@ class Metric:
 
 
 def parts_of(layout: Layout, registers: Iterable[Register], *, single: bool = False) -> Iterator[Register]:
-    """Yield the registers, and the elements of arrays, to publish as metrics.
+    """Yield the registers, and elements of arrays, that become metrics.
 
     An array of numbers or bits is one metric. Other arrays are split into their elements. With
     ``single``, all arrays are split.
@@ -186,8 +186,8 @@ class Sample(NamedTuple):
 class Command(NamedTuple):
     """A command of a host application.
 
-    If ``rebirth`` is True, the node has to publish its births again. Otherwise ``values`` has
-    values for ``device``, by path.
+    If ``rebirth`` is True, the node must publish its births again. Otherwise ``values`` has values
+    for ``device``, by path.
     """
 
     rebirth: bool = False
@@ -196,7 +196,7 @@ class Command(NamedTuple):
 
 
 class EdgeNode:
-    """The edge node. It exists across sessions. Use it from one thread."""
+    """An edge node. It continues to exist between sessions. Use it from one thread."""
 
     def __init__(
         self,
@@ -230,7 +230,7 @@ class EdgeNode:
         self._by_alias: dict[int, Metric] = {}
 
     def define(self, devices: Mapping[str, Iterable[Register]]) -> None:
-        """Define the devices and their registers. The node then has to publish all births again."""
+        """Define the devices and their registers. Afterwards, the node must publish all births again."""
         aliases = count(1)
         self.metrics = {
             device: {register.path: Metric(register, next(aliases)) for register in registers}
@@ -245,22 +245,22 @@ class EdgeNode:
         return [self._topic("NCMD"), self._topic("DCMD", "+")]
 
     def will(self) -> Message:
-        """Begin a new session, and return the will of its connection."""
+        """Start a new session. Return the will for its connection."""
         self._session = (self._session + 1) % _SEQUENCE
         self._born.clear()
         return self.death()
 
     def death(self) -> Message:
-        """Return the message to publish before the node disconnects by itself."""
+        """Return the message to publish before the node disconnects of its own accord."""
         self.alive = False
         payload = wire.Payload(timestamp=self._now_ms())
         self._put_session(payload)
         return Message(self._topic("NDEATH"), payload.SerializeToString(), 1, retain=False)
 
     def birth(self) -> Message:
-        """Return the birth of the node: the first message of a session, or the answer to a request.
+        """Return the birth of the node: the first message of a session, or the reply to a request.
 
-        Publish the births of the devices after this message.
+        Publish the births of the devices after it.
         """
         self.alive = True
         self._born.clear()
@@ -271,7 +271,7 @@ class EdgeNode:
         return self._message(payload, "NBIRTH")
 
     def device_birth(self, device: str, samples: Iterable[Sample]) -> Message:
-        """Return the birth of a device with all its metrics. Metrics without a sample are null."""
+        """Return the birth of a device, with all its metrics. A metric without a sample is null."""
         self._born.add(device)
         payload = wire.Payload(timestamp=self._now_ms(), seq=self._next())
         given = {sample.metric.name: sample for sample in samples}
@@ -282,9 +282,9 @@ class EdgeNode:
         return self._message(payload, "DBIRTH", device)
 
     def data(self, device: str, samples: Iterable[Sample], *, historical: bool = False) -> Message:
-        """Return a message with changed values.
+        """Return a message with changed values of a device.
 
-        If ``historical`` is True, the message marks the values as late and not current.
+        If ``historical`` is True, the message marks the values as late, not current.
         """
         payload = wire.Payload(timestamp=self._now_ms(), seq=self._next())
         for sample in samples:
@@ -303,7 +303,7 @@ class EdgeNode:
         return self._message(payload, "DDEATH", device)
 
     def is_born(self, device: str) -> bool:
-        """Return whether a device has published its birth in this session, and not its death."""
+        """Return whether a device has published its birth in this session, and has not died since."""
         return device in self._born
 
     def command(self, topic: str, data: bytes, check: Callable[[str, Register], object] = lambda *_: None) -> Command:
@@ -312,8 +312,8 @@ class EdgeNode:
         Args:
             topic: The topic.
             data: The payload.
-            check: Called with the device and the register of a wrong value. It may raise an error
-                that is more important.
+            check: Called with the device and the register of an invalid value. It may raise another
+                error, which then takes precedence.
 
         Raises:
             ValueRangeError: The payload is not Sparkplug B, or a value does not fit its metric.

@@ -1,7 +1,7 @@
 """Publishes an instance as an edge node of Sparkplug B.
 
-The edge node has its own connection, because a connection has only one will, and the bridge's connection
-has another will.
+The edge node has its own connection, because a connection has only one will, and the bridge's
+connection has a different will.
 """
 
 from __future__ import annotations
@@ -35,26 +35,26 @@ from shmio.segment import DONE, Block, EventKind, Segment
 SAMPLE_BYTES: Final = 96
 """Approximate memory that a sample needs in addition to its value, in bytes."""
 ELEMENT_BYTES: Final = 32
-"""Approximate memory that a number in a list needs, in bytes."""
+"""Approximate memory that each number in a list needs, in bytes."""
 TURN_SAMPLES: Final = 2000
-"""Maximum number of samples of the backlog that are sent before the bridge does other work."""
+"""Maximum number of samples of the backlog that are sent in one go, before the bridge does other work."""
 AHEAD_MS: Final = 86_400_000
-"""Maximum time by which the clock of a host may be ahead of this host's clock, in ms."""
+"""Maximum time in ms by which the clock of a primary host may be ahead of the clock of this computer."""
 HOST_S: Final = 10.0
-"""Time limit for a primary host to announce itself at one of several brokers, in s."""
+"""Time in s that a primary host has to announce itself at one of several brokers."""
 
 log = logging.getLogger("shmio.mqtt")
 
 
 class DeviceBacklog(Backlog[list[Sample]]):
-    """A backlog with a row for each device: the samples of its frames, in order."""
+    """A backlog with a row for each device. Each item of a row has the samples of one frame."""
 
     def keep(self, device: str, samples: list[Sample]) -> None:
-        """Keep the samples of one frame."""
+        """Add the samples of one frame."""
         self.put(samples, OVERHEAD_BYTES + sum(map(_size, samples)), row=device, changes=len(samples))
 
     def take(self, device: str) -> list[Sample]:
-        """Remove and return the oldest samples of a device; an empty list if there are none."""
+        """Remove and return a device's oldest samples, those of one frame; an empty list if there are none."""
         return self.pop(device) or []
 
 
@@ -64,7 +64,7 @@ class _State(msgspec.Struct):
 
 
 class PrimaryHost:
-    """The state of the primary host, as the host has published it at the current broker."""
+    """The state of the primary host, as the host has published it at the present broker."""
 
     def __init__(self, name: str) -> None:
         self.topic = f"{NAMESPACE}/STATE/{name}"
@@ -73,14 +73,14 @@ class PrimaryHost:
         self._at_ms = float("-inf")
 
     def forget(self) -> None:
-        """Forget the state for a new connection, because the state at another broker may be older."""
+        """Forget the state, because at another broker the published state may be older."""
         self.online, self._at_ms = None, float("-inf")
 
     def update(self, payload: bytes) -> None:
-        """Read a state message.
+        """Adopt the state in a message.
 
-        A message that is older than the last message is ignored. It may be the late will of an
-        earlier session.
+        A message that is older than the last one is ignored: it may be the late will of an earlier
+        session.
         """
         try:
             state = msgspec.json.decode(payload, type=_State)
@@ -100,8 +100,8 @@ class PrimaryHost:
 class Session:
     """The Sparkplug session of an instance. Call :meth:`run_once` in each turn of the bridge's thread.
 
-    While the broker is slow, changes are merged. While there is no broker, changes are kept, and
-    sent later as historical values.
+    While the broker is slow, changes of a metric are merged. While there is no broker, changes are
+    kept, and are sent later as historical values.
     """
 
     def __init__(
@@ -184,7 +184,7 @@ class Session:
         return f"Sparkplug: {problem}" if problem else ""
 
     def new_device(self, feed: Feed) -> Device:
-        """Make the device of a source. You may call this from any thread."""
+        """Create the device of a source. You may call this from any thread."""
         return Device(feed.block, feed.command_client, self._globs, elements=self._elements)
 
     def add_device(self, device: Device) -> None:
@@ -209,7 +209,7 @@ class Session:
             self._birth()
 
     def run_once(self) -> float:
-        """Do what is due. Return the time in s after which to call this again."""
+        """Do the work that is due. Return the time in s after which to call this method again."""
         if not self._defined:
             self._define()
         if self.connection.problem and not self.connection.up:
@@ -249,7 +249,7 @@ class Session:
         self.connection.drop(f"the primary host is offline ({host.topic})", politely=True)
 
     def close(self) -> None:
-        """Publish the node's death, and disconnect.
+        """Publish the death of the node, and disconnect.
 
         With MQTT 5 the broker also publishes the will. The specification demands both (5.5,
         intentional-disconnect-ndeath, and 6.4.25, ndeath-will-message-publisher-disconnect-mqtt50).
