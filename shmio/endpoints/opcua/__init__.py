@@ -1,1 +1,1 @@
-"""The OPC UA endpoint: serves the instance as an address space."""
+"""The OPC UA endpoint: serves the instance as an OPC UA address space."""

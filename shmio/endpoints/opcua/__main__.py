@@ -17,7 +17,7 @@ from shmio.logs import LogRateLimit
 from shmio.worker import BEAT_S, Worker
 
 LOGGERS: Final = ("shmio.opcua", "asyncua", "asyncio")
-"""Loggers that clients can flood. The rate of their lines is limited."""
+"""Loggers whose lines clients can cause in great number. The rate of these lines is limited."""
 
 
 def run(worker: Worker) -> None:

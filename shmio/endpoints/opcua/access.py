@@ -22,9 +22,12 @@ MAX_PASSWORD = 1024
 
 @dataclass(frozen=True)
 class User:
-    """An identified client. ``name`` is its account, a name in its certificate, or ``anonymous``.
+    """An identified client.
 
-    ``kind`` is how the client has identified itself: ``account``, ``certificate`` or ``anonymous``.
+    Attributes:
+        name: Its account, a name in its certificate, or ``anonymous``.
+        roles: The roles that it has.
+        kind: How it has identified itself: ``account``, ``certificate`` or ``anonymous``.
     """
 
     name: str
@@ -51,12 +54,13 @@ class Access:
         self.anonymous = frozenset(config.anonymous if config.anonymous is not None else () if guarded else ROLES)
 
     def identify(self, name: str | None, password: str | None, certificate: bytes | None) -> User | None:
-        """Return the user with these credentials, or None if they are wrong or give no role.
+        """Return the user with these credentials; None if they are wrong or give no role.
 
         Args:
-            name: Name of the account; None: the client has no account.
-            password: Password of the account.
-            certificate: The certificate of the user or of the client, as DER.
+            name: Name of the account; None if the client has no account.
+            password: Password of the account; None if there is none.
+            certificate: The certificate of the user or of the client, as DER; None if there is
+                none.
 
         """
         roles = set(self.anonymous)
@@ -97,7 +101,10 @@ class Access:
         return [name for name in dict.fromkeys(names) if name]
 
     def trusts(self, certificate: bytes) -> bool:
-        """Return whether a certificate is valid now, and is itself trusted or issued by a trusted authority."""
+        """Return whether a certificate is valid now, and is trusted or was issued by a trusted authority.
+
+        ``certificate`` is in DER.
+        """
         try:
             shown = x509.load_der_x509_certificate(certificate)
             now = datetime.now(UTC)

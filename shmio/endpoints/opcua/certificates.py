@@ -18,7 +18,15 @@ MIN_KEY_BITS: Final = 2048
 
 
 def read_certificates(key: str, file: Path) -> list[x509.Certificate]:
-    """Return the certificates in a PEM or DER file. Raise ConfigError if the file is unusable."""
+    """Return the certificates in a PEM or DER file.
+
+    Args:
+        key: The configuration's key that names the file, for errors.
+        file: The file.
+
+    Raises:
+        ConfigError: The file is unusable.
+    """
     data = _read(key, file)
     try:
         if b"-----BEGIN" in data:
@@ -29,7 +37,7 @@ def read_certificates(key: str, file: Path) -> list[x509.Certificate]:
 
 
 def read_identity(opcua: OpcUa) -> tuple[x509.Certificate, rsa.RSAPrivateKey] | None:
-    """Return the server's certificate and key, or None if none are configured.
+    """Return the server's certificate and key; None if none are configured.
 
     Raises:
         ConfigError: A file is unusable, or the key does not belong to the certificate.
@@ -56,7 +64,7 @@ def read_identity(opcua: OpcUa) -> tuple[x509.Certificate, rsa.RSAPrivateKey] | 
 
 
 def application_uri(certificate: x509.Certificate) -> str | None:
-    """Return the application URI in a certificate, or None if it has none."""
+    """Return the application URI in a certificate; None if there is none."""
     try:
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:

@@ -1,4 +1,4 @@
-"""Sends the commands of clients to one source, and waits for their outcomes."""
+"""Sends clients' commands to one source, and waits for their outcomes."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from shmio.segment import Block
 from shmio.segment.commands import End, worst
 
 ROOM_S: Final = 2.0
-"""Maximum time in s that a command waits until fewer commands are in flight."""
+"""Maximum time in s for which a command waits because too many commands are in flight."""
 
 
 class CommandClient:
-    """Sends commands to one source. After its creation, use it only in the event loop's thread."""
+    """Sends commands to one source. Once it is created, use it only in the event loop's thread."""
 
     def __init__(self, block: Block, writer: int) -> None:
         """Prepare to send commands. For a large layout this takes seconds."""
@@ -32,20 +32,20 @@ class CommandClient:
         self._room = asyncio.Event()
 
     def is_writable(self, register: Register) -> bool:
-        """Return whether the configuration allows clients to write the whole register, element or part."""
+        """Return whether the configuration allows clients to write all of a register, element or part."""
         return self._source_writer.is_writable(register)
 
     async def write(self, register: Register, value: object, attempt: Attempt | None = None) -> End:
-        """Write a value, wait for the outcome, and return it.
+        """Write a value, wait for the outcome, and return the outcome.
 
         Args:
             register: The register, element or part.
             value: The value.
-            attempt: The command's entry in the audit log.
+            attempt: The command's entry in the audit log; None if there is none.
 
         Raises:
             CommandError: The command was not sent.
-            ValueRangeError: The value does not fit the register; the command was not sent.
+            ValueRangeError: The value does not fit the register. The command was not sent.
 
         """
         cost = CommandCost.of(sizes(register))
@@ -53,7 +53,11 @@ class CommandClient:
         return await self._sent(self._source_writer.submit({register.path: value}), cost, attempt)
 
     async def lift(self, injection: int) -> End:
-        """Lift an injection, and return the outcome. Raise CommandError if the command was not sent."""
+        """Lift an injection, and return the outcome.
+
+        Raises:
+            CommandError: The command was not sent.
+        """
         cost = CommandCost.of(())
         with Attempt("lift", {"source": self.block.source, "injection": injection}) as attempt:
             await self._await_room(cost)

@@ -1,4 +1,4 @@
-"""Handles a client's connection: splits messages, opens the secure channel, processes requests, within limits."""
+"""Handles a client's connection within limits: splits messages, opens the secure channel, processes requests."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ MAX_SESSIONS: Final = 100
 MAX_CHUNK_BYTES: Final = 65_535
 MAX_MESSAGE_BYTES: Final = 4 << 20
 MAX_WAITING: Final = 32
-"""Maximum number of received messages that wait. Beyond it, the endpoint stops reading from the connection."""
+"""Number of waiting messages above which the endpoint reads no more from the connection."""
 MAX_UNSENT_BYTES: Final = 1 << 20
-"""Maximum number of unsent bytes for a client. Beyond it, the endpoint stops processing its requests."""
+"""Number of unsent bytes for a client above which the endpoint does not process the client's requests."""
 STUCK_S: Final = 30.0
 """Time in s after which the endpoint disconnects a client that does not read."""
 ACTIVATION_S: Final = 10.0
-"""Time limit in s for a new client to activate a session."""
+"""Time in s that a new client has to activate a session."""
 
 _KINDS: Final = (b"HEL", b"OPN", b"MSG", b"CLO")
 _IDS = ua.ObjectIds
@@ -53,7 +53,7 @@ _SERVED: Final = frozenset({
     _IDS.DeleteMonitoredItemsRequest_Encoding_DefaultBinary,
     _IDS.PublishRequest_Encoding_DefaultBinary, _IDS.RepublishRequest_Encoding_DefaultBinary,
 })  # fmt: skip
-"""The services that a session may use. The endpoint refuses the others; some could change the address space."""
+"""The services that a session may use. The endpoint refuses all others: some could change the address space."""
 
 log = logging.getLogger("shmio.opcua")
 
@@ -72,7 +72,7 @@ class Processor(UaProcessor):
         self._pass.set()
 
     def can_send(self) -> bool:
-        """Return whether messages can be sent: the connection is open, and the client reads."""
+        """Return whether messages can be sent: whether the connection is open, and the client reads."""
         return self._pass.is_set() and not self._transport.is_closing()
 
     def pause(self) -> None:
@@ -95,7 +95,10 @@ class Processor(UaProcessor):
         self.send_response(request.requesthdr.RequestHandle, request.seqhdr, response)
 
     def open_secure_channel(self, algohdr: Any, seqhdr: Any, body: Any) -> None:
-        """Open or renew a channel. If the configuration requires trusted certificates, check the client's."""
+        """Open or renew a channel.
+
+        If the configuration requires trusted certificates, the client's certificate is checked.
+        """
         access = self.iserver.access
         certificate = self._connection.security_policy.peer_certificate
         if self.encrypted and access.asks_certificates and not (certificate and access.trusts(certificate)):
@@ -190,7 +193,7 @@ class _CountedTransport:
 
 
 class Protocol(OPCUAProtocol):
-    """Receives messages, limits their size and number, and disconnects clients that break the protocol."""
+    """Receives messages, limits their size and number, and disconnects clients that violate the protocol."""
 
     iserver: Any  # InternalServer of the module server, which imports this one
 
@@ -213,14 +216,14 @@ class Protocol(OPCUAProtocol):
         self.transport.set_write_buffer_limits(high=MAX_UNSENT_BYTES)
 
     def connection_lost(self, ex: BaseException | None) -> None:
-        """Stop the timer, and let the library clean up."""
+        """Stop the timer, and let the library clean up. asyncio calls this when the connection has ended."""
         if self._stuck is not None:
             self._stuck.cancel()
         if self.transport is not None:
             super().connection_lost(ex)
 
     def pause_writing(self) -> None:
-        """Stop processing requests of a client that does not read, and disconnect it after ``STUCK_S``."""
+        """Stop processing a client's requests, because it does not read; disconnect it after ``STUCK_S``."""
         if self.processor is not None:
             self.processor.pause()
         self._stuck = asyncio.get_running_loop().call_later(STUCK_S, self._drop, "it does not read what it is sent")

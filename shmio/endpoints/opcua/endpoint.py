@@ -1,4 +1,4 @@
-"""The endpoint: follows all sources, serves their nodes, and adds and removes sources after reloads."""
+"""The endpoint: follows all sources, serves their nodes, and adds and removes sources after a reload."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ log = logging.getLogger("shmio.opcua")
 
 
 class Endpoint:
-    """Serves a segment. Use it only in the event loop's thread."""
+    """Serves an instance. Use it only in the event loop's thread."""
 
     def __init__(self, segment: Segment, slot: ProcessSlot, config: OpcUa) -> None:
         """Read certificates and accounts. :meth:`start` starts the server.
@@ -37,7 +37,11 @@ class Endpoint:
         self._reading: asyncio.Task[list[SourceNode]] | None = None
 
     async def start(self) -> None:
-        """Create the nodes, and start to listen. Raise EndpointError if the address cannot be used."""
+        """Create the nodes, and start to listen.
+
+        Raises:
+            EndpointError: The address cannot be used.
+        """
         await self.server.init()
         self.server.iserver.catch_up = self.poll
         self._stepping = Stepping(self._segment)
@@ -47,7 +51,7 @@ class Endpoint:
 
     @property
     def sources(self) -> dict[str, SourceNode]:
-        """The objects of the sources, by name."""
+        """The objects of the sources, by source name."""
         return self.server.iserver.space.sources
 
     @property
@@ -62,7 +66,7 @@ class Endpoint:
 
     @property
     def readers(self) -> Iterator[tuple[Block, int]]:
-        """The blocks that the endpoint reads, each with the number of the last frame read."""
+        """The blocks that the endpoint reads, each with the number of the last frame that it has read."""
         return ((source.feed.block, source.feed.follower.last) for source in self.sources.values())
 
     def poll(self) -> None:
@@ -74,7 +78,7 @@ class Endpoint:
     # ---- sources that come and go ------------------------------------------------------------------------------------
 
     def follow_reloads(self) -> None:
-        """Add and remove sources after a reload. A thread reads new layouts, because that may take seconds."""
+        """Add and remove sources after a reload. Large layouts are read in a thread, because that takes seconds."""
         if self._reading is not None and self._reading.done():
             reading, self._reading = self._reading, None
             self._add(reading.result())

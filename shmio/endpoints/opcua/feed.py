@@ -1,4 +1,4 @@
-"""Follows one source's block: keeps its newest frame, and notifies the watches of variables that changed."""
+"""Follows one source's block: keeps the newest frame, and notifies the watches of variables that have changed."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ from shmio.segment.doorbell import TURN_NS
 log = logging.getLogger("shmio.opcua")
 
 MAX_FRAMES_PER_TURN: Final = 8
-"""Maximum number of frames to read before the endpoint does other work."""
+"""Maximum number of frames that are read in one go, before the endpoint does other work."""
 CATCH_UP_S: Final = 3.0
 """If the endpoint is further behind than this time in s, or half of the ring, it skips to the newest frame."""
 
 
 class Listener(Protocol):
-    """What a watch notifies of changes: a monitored item."""
+    """A listener of a watch: a monitored item."""
 
     every: bool
-    """True if the item also reports frames in which only the time has changed."""
+    """True if the listener also reports frames in which only the time has changed."""
     queues: bool
-    """True if the item queues several values, not only the newest."""
+    """True if the listener queues several values, not only the newest."""
 
     def changed(self) -> None:
         """Handle a change of the variable."""
 
 
 class Watch:
-    """Tracks the changes of one variable for all clients that monitor it.
+    """Tracks the changes of one variable, for all clients that monitor it.
 
-    The value is encoded once for all clients, when the first of them needs it.
+    A value is encoded once for all clients, when the first of them needs it.
     """
 
     __slots__ = ("_encoded", "_get", "_value", "feed", "gone", "key", "listeners")
@@ -55,47 +55,50 @@ class Watch:
         self._encoded: bytes | None = None
 
     def add(self, listener: Listener) -> None:
-        """Notify a listener of changes from now on."""
+        """Add a listener. From now on, it is notified of changes."""
         self.listeners[listener] = None
         self.feed.count()
 
     def remove(self, listener: Listener) -> None:
-        """Remove a listener. The watch ends with its last listener."""
+        """Remove a listener. The watch ends when its last listener is removed."""
         self.listeners.pop(listener, None)
         if not self.listeners:
             self.feed.release(self)
         self.feed.count()
 
     def renew(self, get: Callable[[], ua.DataValue] | None) -> None:
-        """Replace the function that returns the value, after a reload; None: the variable no longer exists."""
+        """Replace the function that returns the value, after a reload.
+
+        ``get`` is None if the variable no longer exists.
+        """
         self.gone = get is None
         self._get = _unknown if get is None else get
         self.changed()
 
     def changed(self) -> None:
-        """Record that the value has changed, and notify the listeners."""
+        """Handle a change of the value: notify the listeners."""
         self.forget()
         for listener in self.listeners:
             listener.changed()
 
     def forget(self) -> None:
-        """Discard the value and its encoding. They are computed again when needed."""
+        """Discard the cached value and its encoding."""
         self._value = self._encoded = None
 
     def fetch(self) -> bytes:
-        """Read the present value again, and return it encoded."""
+        """Compute the present value anew, without the cache, and return it encoded."""
         return struct_to_binary(self._get())
 
     @property
     def value(self) -> ua.DataValue:
-        """The present value."""
+        """The present value. It is cached until it changes."""
         if self._value is None:
             self._value = self._get()
         return self._value
 
     @property
     def encoded(self) -> bytes:
-        """The present value, encoded."""
+        """The present value, encoded. It is cached until it changes."""
         if self._encoded is None:
             self._encoded = struct_to_binary(self.value)
         return self._encoded
@@ -106,7 +109,7 @@ def _unknown() -> ua.DataValue:
 
 
 class Feed:
-    """Follows one source. After its creation, use it only in the event loop's thread."""
+    """Follows one source. Once it is created, use it only in the event loop's thread."""
 
     def __init__(self, block: Block, writer: int, namespace: str) -> None:
         """Create the feed. For a large layout this takes seconds.
@@ -144,7 +147,7 @@ class Feed:
     # ---- values ------------------------------------------------------------------------------------------------------
 
     def data_value(self, register: Register) -> ua.DataValue:
-        """Return the present state of a register, an element or a part."""
+        """Return the present state of a register, an element or a part, as a value for OPC UA."""
         state = values.register_state(self.follower, register, self.injected())
         frame = self.follower.frame
         return ua.DataValue(
@@ -155,7 +158,7 @@ class Feed:
         )
 
     def injected(self) -> Sequence[Any]:
-        """Return the present ``/out`` injections; none if the newest frame shows no injection."""
+        """Return the present injections over ``/out``; none if the newest frame contains no injected value."""
         frame = self.follower.frame
         if frame is None or frame.effective is None:
             return ()
@@ -168,7 +171,12 @@ class Feed:
     # ---- watches -----------------------------------------------------------------------------------------------------
 
     def watch(self, path: str, get: Callable[[], ua.DataValue]) -> Watch:
-        """Return the watch of a register, an element or a part."""
+        """Return the watch of a register, an element or a part. Create it if there is none yet.
+
+        Args:
+            path: Path of the register, element or part.
+            get: Returns its value, for a new watch.
+        """
         index = self._register_of(path)
         found = self._by_register.setdefault(index, {})
         if path not in found:
@@ -176,7 +184,14 @@ class Feed:
         return found[path]
 
     def watch_detail(self, key: str, get: Callable[[], ua.DataValue]) -> Watch:
-        """Return the watch of a property. After each frame, the feed checks whether the property has changed."""
+        """Return the watch of a property. Create it if there is none yet.
+
+        After each frame, the feed checks whether the property has changed.
+
+        Args:
+            key: Identifies the property.
+            get: Returns its value, for a new watch.
+        """
         if key not in self._details:
             self._details[key] = Watch(self, key, get)
             self._shown[key] = self._details[key].encoded
@@ -187,8 +202,8 @@ class Feed:
 
         Args:
             watch: The watch.
-            path: Path of the watch's register; None: it watches a property.
-            get: Returns the variable's value; None: the variable no longer exists.
+            path: Path of the register that it watches; None if it watches a property.
+            get: Returns the variable's value; None if the variable no longer exists.
 
         """
         watch.feed = self
@@ -209,7 +224,7 @@ class Feed:
         return self._index[path]
 
     def release(self, watch: Watch) -> None:
-        """Forget a watch that has no listeners."""
+        """Remove a watch that has no listeners."""
         path = watch.key.removeprefix(f"{self.block.source}/")
         if self._details.get(watch.key) is watch:
             del self._details[watch.key], self._shown[watch.key]
@@ -222,7 +237,7 @@ class Feed:
                     del self._by_register[index]
 
     def count(self) -> None:
-        """Record that listeners were added or removed."""
+        """Handle the addition or removal of listeners."""
         self._counted = False
 
     def _count(self) -> None:
@@ -234,7 +249,7 @@ class Feed:
     # ---- frames ------------------------------------------------------------------------------------------------------
 
     def poll(self) -> bool:
-        """Read new frames and events, and return whether more are waiting."""
+        """Read new frames and events. Return whether more are waiting."""
         self.commands.poll()
         if not self._counted:
             self._count()

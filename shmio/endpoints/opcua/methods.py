@@ -1,4 +1,4 @@
-"""Methods that clients can call to step virtual time and to lift injections."""
+"""Methods with which clients step virtual time and lift injections."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from shmio.local.time_control import Coordinator
 from shmio.segment import EventKind, Segment
 
 PATIENCE_S: Final = 2.0
-"""Maximum time in s that a step waits for another program to release control of the clock."""
+"""Maximum time in s for which a step waits until another program releases control of the clock."""
 
 
 class Stepping:
@@ -29,7 +29,13 @@ class Stepping:
         self._coordinator = Coordinator(segment)
 
     async def step(self, length_ms: float) -> list[ua.Variant]:
-        """Step virtual time by ``length_ms`` (0: by the step size). Return the step's number and time in s.
+        """Step virtual time.
+
+        Args:
+            length_ms: Length of the step, in ms; 0 for the step size.
+
+        Returns:
+            The step's number, and the instance time after the step, in s.
 
         Raises:
             ServiceError: The length is not valid.
@@ -53,7 +59,7 @@ class Stepping:
 
 
 def add_step(root: Node, stepping: Stepping) -> None:
-    """Add a method that steps virtual time to the instance's object."""
+    """Add a method that steps virtual time to the instance's object, ``root``."""
     method = Method(root, "Step", "control", "Steps virtual time; it returns when all sources are done", stepping.step)
     method.inputs = [_argument("Length", ua.ObjectIds.Double, "in ms; 0: the step size")]
     method.outputs = [
@@ -64,7 +70,7 @@ def add_step(root: Node, stepping: Stepping) -> None:
 
 
 def add_injections(source: SourceNode) -> None:
-    """Add a list of a source's injections, and methods that lift them, to the source's object."""
+    """Add to a source's object the list of its injections, and methods that lift them."""
     block, commands = source.feed.block, source.feed.commands
 
     def present() -> dict[int, str]:

@@ -1,6 +1,6 @@
 """The instance's nodes: objects by path, a variable for each register, properties and methods.
 
-A node computes its attributes and references when a client requests them. So a large cell starts
+A node computes its attributes and references when a client asks for them. So a large cell starts
 fast, and a value always comes from the newest frame.
 """
 
@@ -29,12 +29,12 @@ Roles = frozenset[str]
 
 
 class Node:
-    """A node of the instance: an object, unless a subclass says otherwise."""
+    """A node of the instance. It is an object, unless a subclass says otherwise."""
 
     node_class = ua.NodeClass.Object
     type_definition = ua.ObjectIds.FolderType
     reference = ua.ObjectIds.Organizes
-    """Type of the reference from the parent to this node."""
+    """Type of the reference from the parent node to this node."""
 
     def __init__(self, node_id: ua.NodeId, name: str, parent: Node | None) -> None:
         self.id, self.name, self.parent = node_id, name, parent
@@ -45,7 +45,12 @@ class Node:
         yield from self.children.values()
 
     def description(self, *, forward: bool = True, reference: int | None = None) -> ua.ReferenceDescription:
-        """Describe this node as the target of a reference."""
+        """Describe this node as the target of a reference.
+
+        Args:
+            forward: Whether the reference leads forward to this node, not back.
+            reference: Type of the reference; None for :attr:`reference`.
+        """
         return ua.ReferenceDescription(
             ua.NodeId(self.reference if reference is None else reference),
             forward,
@@ -57,7 +62,7 @@ class Node:
         )
 
     def references(self) -> Iterator[ua.ReferenceDescription]:
-        """Yield the references of this node."""
+        """Yield the references from this node."""
         for child in self.all_children():
             yield child.description()
         if self.parent is not None:
@@ -76,7 +81,7 @@ class Node:
             )  # fmt: skip
 
     def read(self, attribute: int, roles: Roles) -> ua.DataValue:
-        """Return an attribute as a client with these roles sees it."""
+        """Return an attribute, as a client with these roles sees it."""
         found = self._attribute(attribute, roles)
         if found is None:
             return bad(ua.StatusCodes.BadAttributeIdInvalid)
@@ -109,7 +114,7 @@ class Node:
 
 
 class VariableNode(Node):
-    """A variable: a node with a value."""
+    """A node with a value."""
 
     node_class = ua.NodeClass.Variable
     type_definition = ua.ObjectIds.BaseDataVariableType
@@ -124,7 +129,7 @@ class VariableNode(Node):
         raise NotImplementedError
 
     def watch(self) -> Watch | None:
-        """Return the watch of this variable's changes, or None if its value never changes."""
+        """Return the watch of the variable's changes; None if its value never changes."""
         return None
 
     def _own(self, attribute: int, roles: Roles) -> ua.Variant | ua.DataValue | None:
@@ -150,7 +155,7 @@ class VariableNode(Node):
 
 
 class RegisterNode(VariableNode):
-    """The variable of a register, or of an array's element, a slice or a bit."""
+    """The variable of a register, or of an element, a slice or a bit of one."""
 
     def __init__(self, node_id: ua.NodeId, name: str, parent: Node | None, feed: Feed, register: Register) -> None:
         super().__init__(node_id, name, parent)
@@ -158,7 +163,7 @@ class RegisterNode(VariableNode):
 
     @property
     def data_type(self) -> ua.NodeId:  # a property here, an attribute in other classes
-        """Data type of the register, or of its elements."""
+        """Data type of the register's value, or of its elements."""
         return ua.NodeId(values.data_type(self.register).value)
 
     @property
@@ -168,7 +173,7 @@ class RegisterNode(VariableNode):
 
     @property
     def period_ms(self) -> float:  # type: ignore[override]
-        """The time between two cycles of the source, in ms."""
+        """Length of the source's cycle, in ms."""
         return self.feed.block.period_ns / 1e6
 
     @property
@@ -190,14 +195,14 @@ class RegisterNode(VariableNode):
         return self.feed.watch(self.register.path, self.value)
 
     def all_children(self) -> Iterator[Node]:
-        """Yield the properties."""
+        """Yield the properties of the register."""
         yield from self.children.values()
         for name, make in PROPERTIES.items():
             if name != UNIT or self.register.unit:
                 yield make(self, name)
 
     def property_named(self, name: str) -> Node | None:
-        """Return the property with this name, or None if there is none."""
+        """Return the property with this name; None if there is none."""
         make = PROPERTIES.get(name)
         return None if make is None or (name == UNIT and not self.register.unit) else make(self, name)
 
@@ -225,7 +230,7 @@ class Property(VariableNode):
         return ua.DataValue(self._get())
 
     def watch(self) -> Watch | None:
-        """Return the watch of the property's changes, or None if it never changes."""
+        """Return the watch of the property's changes; None if its value never changes."""
         return None if self._watch is None else self._watch(str(self.id.Identifier), self.value)
 
 
@@ -260,11 +265,11 @@ PROPERTIES: Final[dict[str, Callable[[RegisterNode, str], Property]]] = {
     "Provenance": _provenance,
     "Injected": _injected,
 }
-"""The properties of each register's variable, by name."""
+"""For each property of a register's variable, the function that creates it, by name."""
 
 
 class Method(Node):
-    """A method that clients with ``role`` may call."""
+    """A method that clients may call if they have the role ``role``."""
 
     node_class = ua.NodeClass.Method
     type_definition = 0
@@ -288,7 +293,7 @@ class Method(Node):
                 yield found
 
     def property_named(self, name: str) -> Node | None:
-        """Return the property that describes the input or output arguments, or None if there are none."""
+        """Return the property that describes the input or output arguments; None if there is none with this name."""
         arguments = {"InputArguments": self.inputs, "OutputArguments": self.outputs}.get(name)
         if not arguments:
             return None
@@ -366,11 +371,14 @@ def _id(source: str, path: str) -> ua.NodeId:
 
 
 def child_id(owner: Node, name: str) -> ua.NodeId:
-    """Return the node id of a property or method. Its name follows a ``#``, which no path contains."""
+    """Return the node id of a property or method of ``owner``.
+
+    The name follows a ``#``, which no path contains.
+    """
     head = "" if owner.id == ROOT else owner.id.Identifier
     return ua.NodeId(f"{head}#{name}", NAMESPACE)
 
 
 def bad(code: int) -> ua.DataValue:
-    """Return an empty value with this bad status code."""
+    """Return a value without content, with this bad status code."""
     return ua.DataValue(StatusCode=ua.StatusCode(code))

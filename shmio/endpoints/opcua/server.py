@@ -47,7 +47,7 @@ _OAEP: Final[dict[str, Callable[[Any, bytes], bytes]]] = {
     "http://www.w3.org/2001/04/xmlenc#rsa-oaep": uacrypto.decrypt_rsa_oaep,
     "http://opcfoundation.org/UA/security/rsa-oaep-sha2-256": uacrypto.decrypt_rsa_oaep_sha256,
 }
-"""Accepted encryptions of passwords. PKCS 1.5 is missing, because it is vulnerable to padding attacks."""
+"""The accepted encryptions of passwords. PKCS 1.5 is missing, because padding attacks can break it."""
 _SHA1: Final = "http://www.w3.org/2000/09/xmldsig#rsa-sha1"
 _LIMITS: Final = {
     "MaxNodesPerRead": MAX_NODES, "MaxNodesPerWrite": MAX_WRITES, "MaxNodesPerMethodCall": MAX_CALLS,
@@ -60,17 +60,17 @@ log = logging.getLogger("shmio.opcua")
 
 @dataclass
 class Counters:
-    """Counts the writes of clients, refused requests, and what clients were sent."""
+    """Counts the clients' writes, the refused requests, and what was sent to clients."""
 
     writes: int = 0
     refused: int = 0
     sent_messages: int = 0
     sent_bytes: int = 0
-    """Numbers of messages and bytes that were written to the connections."""
+    """Number of bytes that were written to the connections."""
 
 
 class InternalServer(LibraryInternalServer):
-    """The state that all connections share."""
+    """The state that all connections of the server share."""
 
     time_task: Any
 
@@ -92,12 +92,12 @@ class InternalServer(LibraryInternalServer):
         self.max_session_timeout_ms = 300_000
 
     async def init(self, shelffile: Any = None) -> None:
-        """Create the standard's nodes and the instance's root."""
+        """Create the nodes of the OPC UA standard, and the instance's root node."""
         await super().init(shelffile)
         self.space = Space(self.instance, self.aspace)
 
     async def stop(self) -> None:
-        """Stop at once. The library's own method would first wait for its clock task."""
+        """Stop at once. The method of the library would wait for its clock task first."""
         if self.time_task is not None:
             self.time_task.cancel()
             await asyncio.wait((self.time_task,))
@@ -105,7 +105,11 @@ class InternalServer(LibraryInternalServer):
         await super().stop()
 
     def create_session(self, name: str, user: Any = None, external: bool = False) -> InternalSession:  # noqa: ARG002
-        """Create a session. Raise ServiceError if there are too many."""
+        """Create a session.
+
+        Raises:
+            ServiceError: There are too many sessions.
+        """
         if len(self._external_sessions) >= MAX_SESSIONS:
             raise ServiceError(ua.StatusCodes.BadTooManySessions)
         return Session(self, self.aspace, self.subscription_service, name, external=external)
@@ -116,7 +120,7 @@ class InternalServer(LibraryInternalServer):
         return len(self._external_sessions)
 
     def get_user(self, _server: Any, username: str | None, password: str | None, certificate: bytes | None) -> Any:
-        """Return the user with these credentials, or None."""
+        """Return the user with these credentials; None if they are wrong or give no role."""
         user = self.access.identify(username, password, certificate)
         if user is None:
             nameless = "it has no account and no certificate with a role, and opcua.anonymous is empty"
@@ -144,7 +148,7 @@ class InternalServer(LibraryInternalServer):
         return name, plain[4 : 4 + length - len(isession.nonce)].decode()
 
     def verify_x509_token(self, isession: Any, token: ua.X509IdentityToken, signature: ua.SignatureData) -> bytes:
-        """Check that a client's certificate is trusted, and that the client has its key."""
+        """Return a client's certificate, after checking that it is trusted and that the client has its key."""
         if signature.Algorithm == _SHA1:
             raise ServiceError(ua.StatusCodes.BadIdentityTokenInvalid)
         if not self.access.trusts(token.CertificateData):
@@ -166,7 +170,7 @@ class _Listener(BinaryServer):
 
 
 class Server(Library):
-    """The server of one instance. Use it only in the event loop's thread."""
+    """The OPC UA server of an instance. Use it only in the event loop's thread."""
 
     iserver: InternalServer
 
@@ -208,7 +212,7 @@ class Server(Library):
         )
 
     async def init(self, shelf_file: Any = None) -> None:
-        """Create the nodes of the OPC UA standard; set the namespace, the build info and the limits."""
+        """Create the nodes of the OPC UA standard. Set the namespace, the build info and the limits."""
         await super().init(shelf_file)
         await self.register_namespace(self.namespace)
         await self.set_build_info(
@@ -219,7 +223,11 @@ class Server(Library):
             await self.get_node(node).write_value(most, ua.VariantType.UInt32)
 
     async def start(self) -> None:
-        """Start to listen. Raise EndpointError if the address cannot be used."""
+        """Start to listen.
+
+        Raises:
+            EndpointError: The address cannot be used.
+        """
         await self._setup_server_nodes()
         await self.iserver.start()
         listener = _Listener(self.iserver, self.address.host, self.address.port, self.limits)
@@ -240,7 +248,7 @@ class Server(Library):
 def bound_decoding() -> None:
     """Make the library refuse arrays of nulls.
 
-    The elements of such an array take no bytes in the message, so a short message could fill the
+    The elements of such an array take no bytes in a message, so a short message could fill the
     memory.
     """
     original = ua_binary.unpack_uatype_array

@@ -25,17 +25,17 @@ from shmio.layout.topic import shorten
 from shmio.segment import DONE, EventKind
 
 MAX_NODES: Final = 10_000
-"""Maximum number of nodes, items or paths in a request. The server publishes it in its OperationLimits."""
+"""Maximum number of nodes, items or paths in a request. The server's OperationLimits contain this number."""
 MAX_WRITES: Final = 1_000
 MAX_CALLS: Final = 10
 MAX_RESPONSE_BYTES: Final = 8 << 20
 """Approximate maximum size of the values in a response to Read."""
 MAX_REFERENCES: Final = 20_000
-"""Maximum number of references in a response to Browse; BrowseNext returns the rest."""
+"""Maximum number of references in a response to Browse. BrowseNext returns further ones."""
 MAX_CONTINUATIONS: Final = 20
 """Maximum number of continuation points of a session."""
 TURN: Final = 500
-"""Number of nodes after which a request yields to other tasks."""
+"""Number of nodes after which a request lets other tasks run."""
 
 _OUTCOMES: Final = {
     EventKind.REJECTED: ua.StatusCodes.BadRequestNotAllowed,
@@ -43,10 +43,10 @@ _OUTCOMES: Final = {
     EventKind.EXPIRED: ua.StatusCodes.BadNoCommunication,
     EventKind.UNKNOWN: ua.StatusCodes.BadTimeout,
 }
-"""The status code of a failed write, by its outcome."""
+"""The status code of a failed write, by the command's outcome."""
 
 _ACTIONS: Final = {"LiftAll": "lift"}
-"""The audit log's names of methods' actions, where they are not the methods' names in lower case."""
+"""The action of a method in the audit log, where it is not the method's name in lower case."""
 
 log = logging.getLogger("shmio.opcua")
 
@@ -54,7 +54,7 @@ Fault = ua.StatusCodes
 
 
 class Session(InternalSession):
-    """A client's session, with the services that it may use. Use it only in the event loop's thread."""
+    """A client's session, with the services that the client may use. Use it only in the event loop's thread."""
 
     iserver: Any  # InternalServer of the module server, which imports this one
     user: Any
@@ -84,7 +84,16 @@ class Session(InternalSession):
         return Actor(self.user.kind, self.user.name, origin)
 
     def need(self, role: str, action: str = "read", what: trail.What | None = None) -> None:
-        """Raise ServiceError if the client lacks a role; ``action`` and ``what`` are for the audit log."""
+        """Check that the client has a role. Refusals are recorded in the audit log.
+
+        Args:
+            role: The role.
+            action: The action that needs the role, for the audit log.
+            what: What the action is about, for the audit log; None for nothing.
+
+        Raises:
+            ServiceError: The client lacks the role.
+        """
         if role not in self.roles:
             self.iserver.counters.refused += 1
             reason = f"it needs the role {role}"
@@ -94,7 +103,7 @@ class Session(InternalSession):
     def activate_session(
         self, params: ua.ActivateSessionParameters, peer_certificate: bytes | None
     ) -> ua.ActivateSessionResult:
-        """Identify the client. A client that takes over a session must be the same user."""
+        """Identify the client. To take over an existing session, a client must be the same user."""
         before = self.user if self.is_activated() else None
         shown = getattr(params.UserIdentityToken, "UserName", None) or ""
         try:
@@ -112,7 +121,7 @@ class Session(InternalSession):
         return result
 
     async def close_session(self, delete_subs: bool = True) -> None:  # noqa: ARG002  the subscriptions always end
-        """End the session and its subscriptions. No other session can take these over."""
+        """End the session and its subscriptions. No other session can take over the subscriptions."""
         self._continuations.clear()
         if self.external:
             self.iserver.subscriptions.delete(self.iserver.subscriptions.of(self))
@@ -121,7 +130,7 @@ class Session(InternalSession):
     # ---- reading -----------------------------------------------------------------------------------------------------
 
     async def read(self, params: ua.ReadParameters) -> list[ua.DataValue]:
-        """Read attributes."""
+        """Return attributes of nodes."""
         if not self.external:
             return await super().read(params)
         self.need("read")
@@ -147,7 +156,7 @@ class Session(InternalSession):
         return _part(value, asked.IndexRange) if asked.IndexRange else value
 
     async def browse(self, params: ua.BrowseParameters) -> list[ua.BrowseResult]:
-        """Return the references of nodes."""
+        """Return the references from nodes."""
         if not self.external:
             return await super().browse(params)
         self.need("read")
@@ -167,7 +176,7 @@ class Session(InternalSession):
         return results
 
     def browse_more(self, params: ua.BrowseNextParameters) -> list[ua.BrowseResult]:
-        """Return further references, or discard them if the client releases the continuation points."""
+        """Return further references. If the client releases the continuation points, discard them instead."""
         self.need("read")
         _bound(params.ContinuationPoints, MAX_NODES)
         room, results = MAX_REFERENCES, []
@@ -196,7 +205,7 @@ class Session(InternalSession):
         return result
 
     async def translate_browsepaths_to_nodeids(self, params: list[ua.BrowsePath]) -> list[ua.BrowsePathResult]:
-        """Return the nodes at the end of each path."""
+        """Return the nodes at the end of each path of browse names."""
         if not self.external:
             return await super().translate_browsepaths_to_nodeids(params)
         self.need("read")
@@ -219,7 +228,7 @@ class Session(InternalSession):
     # ---- writing and calling -----------------------------------------------------------------------------------------
 
     async def write(self, params: ua.WriteParameters) -> list[ua.StatusCode]:
-        """Write registers. Each write is a command to its source; its status is the outcome of the command."""
+        """Write registers. Each write is a command to its source, and its status is the command's outcome."""
         if not self.external:
             return await super().write(params)
         self.need("write", "write", _first_values(params.NodesToWrite))
@@ -324,22 +333,28 @@ class Session(InternalSession):
         return ua.CreateSubscriptionResult(found.id, found.interval_ms, found.lifetime, found.keep_alive)
 
     def attach(self, found: Subscription, callback: Any, request_callback: Any) -> None:
-        """Make a subscription publish through a connection."""
+        """Make a subscription publish through this session's connection.
+
+        Args:
+            found: The subscription.
+            callback: Sends a publication.
+            request_callback: Returns a waiting Publish request.
+        """
         found.pub_result_callback, found.pub_request_callback = callback, request_callback
         found.can_send = callback.__self__.can_send
 
     def sent(self, result: ua.PublishResult, request: Any, subscription: Subscription) -> None:
-        """Send a subscription's publication, as the answer to a Publish request."""
+        """Send a publication of a subscription, as the answer to a Publish request."""
         subscription.pub_result_callback.__self__.publish(result, request)
 
     def modify_subscription(self, params: ua.ModifySubscriptionParameters) -> ua.ModifySubscriptionResult:
-        """Change a subscription's interval and limits."""
+        """Change the interval and the limits of a subscription."""
         found = self.iserver.subscriptions.find(params.SubscriptionId, self)
         found.revise(params)
         return ua.ModifySubscriptionResult(found.interval_ms, found.lifetime, found.keep_alive)
 
     async def set_publishing_mode(self, params: ua.SetPublishingModeParameters) -> list[ua.StatusCode]:
-        """Switch publishing of subscriptions on or off."""
+        """Switch the publishing of subscriptions on or off."""
         _bound(params.SubscriptionIds, MAX_NODES)
 
         def switch(number: int) -> None:
@@ -360,12 +375,19 @@ class Session(InternalSession):
         params: ua.TransferSubscriptionsParameters,
         callback: Callable[..., Any],  # noqa: ARG002
     ) -> list[ua.TransferResult]:
-        """Refuse, because no session may take over the subscriptions of another."""
+        """Refuse the transfer, because no session may take over the subscriptions of another session."""
         _bound(params.SubscriptionIds, MAX_NODES)
         return [ua.TransferResult(ua.StatusCode(Fault.BadSubscriptionIdInvalid)) for _ in params.SubscriptionIds]
 
     def publish(self, acks: Iterable[ua.SubscriptionAcknowledgement] | None = None) -> tuple[int, list[ua.StatusCode]]:
-        """Process acknowledgements. Return the session's number of subscriptions, and each acknowledgement's status."""
+        """Process a Publish request's acknowledgements.
+
+        Returns:
+            The number of subscriptions of the session, and the status of each acknowledgement.
+
+        Raises:
+            ServiceError: The session has no subscription.
+        """
         own = self.iserver.subscriptions
         mine = own.of(self)
         if not mine:
@@ -381,11 +403,11 @@ class Session(InternalSession):
         return len(mine), results
 
     def republish(self, params: ua.RepublishParameters) -> ua.NotificationMessage:
-        """Return an unacknowledged message, to send it again."""
+        """Return an unacknowledged message, so that it is sent again."""
         return self.iserver.subscriptions.find(params.SubscriptionId, self).republish(params.RetransmitSequenceNumber)
 
     async def create_monitored_items(self, params: ua.CreateMonitoredItemsParameters) -> list[Any]:
-        """Monitor variables."""
+        """Start to monitor variables."""
         self.need("read")
         _bound(params.ItemsToCreate, MAX_NODES)
         self.iserver.catch_up()
@@ -422,7 +444,7 @@ class Session(InternalSession):
         return results
 
     async def set_monitoring_mode(self, params: ua.SetMonitoringModeParameters) -> list[ua.StatusCode]:
-        """Change the mode of monitored items."""
+        """Change the monitoring mode of items."""
         _bound(params.MonitoredItemIds, MAX_NODES)
         found = self.iserver.subscriptions.find(params.SubscriptionId, self)
         mode = ua.MonitoringMode(params.MonitoringMode)
@@ -436,7 +458,7 @@ class Session(InternalSession):
 
 
 MAX_ITEMS_PER_REQUEST: Final = 50_000
-"""Maximum number of items that one request may delete: as many as a session can have."""
+"""Maximum number of items that one request may delete. It is the number that a session can have."""
 
 
 def _value(asked: ua.WriteValue) -> Any:

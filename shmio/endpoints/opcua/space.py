@@ -1,4 +1,4 @@
-"""The address space: the nodes of the standard, which asyncua provides, and those of the instance."""
+"""The address space: the nodes of the standard, which come from asyncua, and those of the instance."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Space:
         standard[OBJECTS].references.append(self.root.description())
 
     def add(self, source: SourceNode) -> None:
-        """Add a source. It takes over the watches of the previous source with the same name."""
+        """Add a source. It takes over the watches of an earlier source with the same name."""
         before = self.sources.get(source.name)
         self.sources[source.name] = self.root.children[source.name] = source
         if before is not None:
@@ -67,7 +67,10 @@ class Space:
     # ---- look up -----------------------------------------------------------------------------------------------------
 
     def find(self, node_id: ua.NodeId) -> Node | None:
-        """Return the instance's node with this id, or None. Elements, slices and bits of registers have ids, too."""
+        """Return the instance's node with this id; None if there is none.
+
+        Elements, slices and bits of registers have ids, too.
+        """
         if node_id.NamespaceIndex != NAMESPACE:
             return None
         if node_id == ROOT:
@@ -109,11 +112,11 @@ class Space:
         return RegisterNode(ua.NodeId(f"{source.name}/{path}", NAMESPACE), name, holder, source.feed, register)
 
     def knows(self, node_id: ua.NodeId) -> bool:
-        """Return whether a node has this id."""
+        """Return whether there is a node with this id."""
         return self.find(node_id) is not None or node_id in self._standard
 
     def read(self, node_id: ua.NodeId, attribute: int, roles: Roles) -> ua.DataValue:
-        """Return an attribute of a node as a client with these roles sees it."""
+        """Return an attribute of a node, as a client with these roles sees it."""
         node = self.find(node_id)
         if node is not None:
             return node.read(attribute, roles)
@@ -122,7 +125,7 @@ class Space:
     # ---- references --------------------------------------------------------------------------------------------------
 
     def references(self, node_id: ua.NodeId) -> Iterator[Reference] | None:
-        """Return the references of a node, or None if there is no such node."""
+        """Return the references from a node; None if there is no such node."""
         node = self.find(node_id)
         if node is not None:
             return node.references()
@@ -130,7 +133,7 @@ class Space:
         return None if found is None else iter(found.references)
 
     def browse(self, asked: ua.BrowseDescription) -> Iterator[Reference] | None:
-        """Return the references that a browse description selects; None: there is no such node."""
+        """Return the references that a browse description selects; None if there is no such node."""
         found = self.references(asked.NodeId)
         return None if found is None else (one for one in found if self._suits(asked, one))
 
@@ -167,8 +170,12 @@ class Space:
     def follow(self, start: ua.NodeId, elements: list[ua.RelativePathElement]) -> list[ua.NodeId]:
         """Return the nodes at the end of a path of browse names.
 
+        Args:
+            start: The node at which the path starts.
+            elements: The path.
+
         Raises:
-            ServiceError: The start does not exist, or a name is empty.
+            ServiceError: The start node does not exist, or a name is empty.
 
         """
         if not elements or any(not element.TargetName or not element.TargetName.Name for element in elements):
@@ -192,7 +199,7 @@ class Space:
     # ---- changes -----------------------------------------------------------------------------------------------------
 
     def watch(self, node_id: ua.NodeId, attribute: int, roles: Roles) -> tuple[Watch, float]:
-        """Return the watch of an attribute, and the shortest time between two changes in ms.
+        """Return the watch of an attribute, and the shortest time between two changes, in ms.
 
         Raises:
             ServiceError: There is no such node or attribute.
@@ -217,12 +224,12 @@ class Space:
         return self._static[key], 0.0
 
     def forget(self, key: tuple[ua.NodeId, int]) -> None:
-        """Forget a watch that has no listeners."""
+        """Remove a watch that has no listeners. ``key`` is its node and attribute."""
         self._static.pop(key, None)
 
 
 class StaticWatch(Watch):
-    """Watch of an attribute of a standard node, or of an attribute that never changes."""
+    """The watch of an attribute of a standard node, or of an attribute that never changes."""
 
     __slots__ = ("_handle", "_node", "_space", "_standard")
 
@@ -243,7 +250,7 @@ class StaticWatch(Watch):
         self.changed()
 
     def remove(self, listener: Any) -> None:
-        """Remove a listener. The watch ends with its last listener."""
+        """Remove a listener. The watch ends when its last listener is removed."""
         self.listeners.pop(listener, None)
         if not self.listeners:
             if self._standard is not None:

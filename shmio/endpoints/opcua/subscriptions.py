@@ -1,8 +1,8 @@
 """Subscriptions and their monitored items, with limits.
 
-They replace the subscriptions of asyncua, where items keep a copy of each value, and clients can use
-each other's subscriptions. Here, a value is encoded once for all clients. An item with a queue of one
-stores no value: it sends the newest value when its subscription publishes.
+They replace the subscriptions of asyncua, where each item keeps a copy of each value, and clients
+can use each other's subscriptions. Here, a value is encoded once for all clients. An item with a
+queue of length one stores no value: it sends the newest value when its subscription publishes.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ MAX_ITEMS_PER_SESSION: Final = 50_000
 MAX_QUEUE: Final = 100
 """Maximum length of an item's queue."""
 MAX_QUEUED_BYTES: Final = 4 << 20
-"""Maximum size of a subscription's queues, in bytes. Beyond it, an item keeps only its newest value."""
+"""Size of a subscription's queues, in bytes, above which each item keeps only its newest value."""
 MAX_MESSAGE_BYTES: Final = 1 << 20
-"""Size in bytes at which a message ends; further values go into the next message."""
+"""Size in bytes at which a message is complete. Further values go into the next message."""
 MAX_UNACKNOWLEDGED: Final = 8
 """Maximum number of unacknowledged messages that a subscription keeps."""
 MAX_UNACKNOWLEDGED_BYTES: Final = 4 << 20
@@ -43,7 +43,7 @@ MAX_NOTIFICATIONS: Final = 10_000
 """Maximum number of values in a message."""
 
 _OVERFLOW: Final = 0x00000480
-"""Info bits: the type of the bits is DataValue, and there was an overflow (OPC 10000-4, section 7.39)."""
+"""Info bits that mean an overflow of a DataValue (OPC 10000-4, section 7.39)."""
 _HANDLE: Final = struct.Struct("<I")
 _DATA_CHANGE: Final = ua.NodeId(ua.ObjectIds.DataChangeNotification_Encoding_DefaultBinary)
 _NO_DIAGNOSTICS: Final = struct.pack("<i", -1)
@@ -54,7 +54,7 @@ Fault = ua.StatusCodes
 
 
 class Item:
-    """A monitored item: a variable that a client monitors."""
+    """A monitored item: a variable that a client monitors, with the values to send."""
 
     __slots__ = (
         "_at_s", "_deadband", "_sampling_s", "_sent", "_status_only", "_subscription", "every", "handle", "id",
@@ -72,12 +72,13 @@ class Item:
         self._sent: ua.DataValue | None = None
 
     def revise(self, asked: ua.MonitoringParameters, slowest_ms: float, fastest_ms: float) -> tuple[float, int]:
-        """Apply the parameters that the client requested, within the limits.
+        """Apply the parameters that the client requests, within the limits.
 
         Args:
             asked: The requested parameters.
-            slowest_ms: The publishing interval; it replaces a requested sampling interval of -1.
-            fastest_ms: The source's period, the shortest sampling interval.
+            slowest_ms: The publishing interval, in ms. It replaces a requested sampling interval of
+                -1.
+            fastest_ms: The shortest sampling interval, in ms: the source's period.
 
         Returns:
             The revised sampling interval in ms, and the revised length of the queue.
@@ -119,7 +120,7 @@ class Item:
         self._status_only = asked.Trigger == ua.DataChangeTrigger.Status
 
     def changed(self) -> None:
-        """Handle a change of the variable: prepare to send the value, if it passes the filter."""
+        """Handle a change of the variable: queue the value to be sent, if it passes the filter."""
         if self.mode == ua.MonitoringMode.Disabled:
             return
         if (self._deadband or self._status_only) and not self._matters():
@@ -163,7 +164,7 @@ class Item:
             self._subscription.queued_bytes += len(self.queue[0]) - len(old)
 
     def take(self) -> Iterator[bytes]:
-        """Yield the encoded values to send, and remove them from the queue."""
+        """Remove the values to send from the queue, and yield them encoded."""
         if self.size == 1:
             yield self.watch.encoded
             return
@@ -183,7 +184,7 @@ _TEXTS: Final = (ua.VariantType.String, ua.VariantType.LocalizedText, ua.Variant
 
 
 def overflowed(encoded: bytes) -> bytes:
-    """Return an encoded value with the overflow bit in its status."""
+    """Return an encoded value with the overflow bits set in its status."""
     from asyncua.common.utils import Buffer  # noqa: PLC0415
     from asyncua.ua.ua_binary import struct_from_binary  # noqa: PLC0415
 
@@ -210,7 +211,7 @@ def _flat(value: Any) -> Iterator[Any]:
 
 
 class Subscription:
-    """A client's subscription: publishes the changes of its items at its interval."""
+    """A client's subscription. It publishes the changes of its items at a fixed interval."""
 
     def __init__(
         self, number: int, owner: Any, asked: ua.CreateSubscriptionParameters, on_end: Callable[[], Any]
@@ -239,7 +240,7 @@ class Subscription:
         self.revise(asked)
 
     def revise(self, asked: Any) -> None:
-        """Apply the parameters that the client requested, within the limits."""
+        """Apply the parameters that the client requests, within the limits."""
         interval = asked.RequestedPublishingInterval
         interval = interval if math.isfinite(interval) else MAX_PUBLISHING_MS
         self.interval_ms = min(max(interval, MIN_PUBLISHING_MS), MAX_PUBLISHING_MS)
@@ -277,11 +278,11 @@ class Subscription:
         self._idle = not self.dirty
 
     def mark(self, item: Item) -> None:
-        """Record that an item has values to send. Publish them at once if the last interval had no changes.
+        """Record that an item has values to send. If the last interval had no changes, publish them at once.
 
-        If a source changes its values as often as the subscription publishes, some changes come just
-        after the end of an interval. If they waited for the next end, newer values would replace
-        them.
+        If a source changes its values as often as the subscription publishes, some changes come
+        just after the end of an interval. If these waited for the next end, newer values would
+        replace them.
         """
         self.dirty[item] = None
         if self._idle:
@@ -304,7 +305,11 @@ class Subscription:
         return self._first or (self.enabled and bool(self.dirty)) or self._silent >= self.keep_alive
 
     async def publish_results(self, request: Any) -> bool:
-        """Answer a Publish request at once if a publication waits for one. Return whether one waited."""
+        """Answer a Publish request at once, if a publication is waiting for one.
+
+        Returns:
+            True if a publication was waiting.
+        """
         self._idle_intervals = 0
         if not self._wants():
             return False
@@ -312,7 +317,7 @@ class Subscription:
         return True
 
     def reset_lifetime(self) -> None:
-        """Record that the client has sent a Publish request."""
+        """Count the intervals without a Publish request from 0 again, because the client has sent one."""
         self._idle_intervals = 0
 
     def _send(self, request: Any) -> None:
@@ -353,17 +358,21 @@ class Subscription:
             del self._kept[next(iter(self._kept))]
 
     def acknowledge(self, number: int) -> int:
-        """Discard a message that the client has acknowledged. Return a status code."""
+        """Discard a message that the client has acknowledged. Return the status of the acknowledgement."""
         return Fault.Good if self._kept.pop(number, None) else Fault.BadSequenceNumberUnknown
 
     def republish(self, number: int) -> ua.NotificationMessage:
-        """Return an unacknowledged message. Raise ServiceError if the subscription no longer keeps it."""
+        """Return an unacknowledged message.
+
+        Raises:
+            ServiceError: The subscription does not have this message any more.
+        """
         if number not in self._kept:
             raise ServiceError(Fault.BadMessageNotAvailable)
         return self._kept[number][0]
 
     def stop(self) -> None:
-        """End the subscription."""
+        """End the subscription, and stop monitoring its items."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -375,7 +384,16 @@ class Subscription:
     def add(
         self, watch: Watch, asked: ua.MonitoredItemCreateRequest, fastest_ms: float
     ) -> ua.MonitoredItemCreateResult:
-        """Monitor a variable. Raise ServiceError if the filter is not supported."""
+        """Start to monitor a variable.
+
+        Args:
+            watch: The watch of the variable.
+            asked: The request.
+            fastest_ms: The shortest sampling interval, in ms.
+
+        Raises:
+            ServiceError: The filter is not supported.
+        """
         mode = ua.MonitoringMode(asked.MonitoringMode)
         item = Item(self, self._next_item, watch, asked.RequestedParameters.ClientHandle, mode)
         interval_ms, size = item.revise(asked.RequestedParameters, self.interval_ms, fastest_ms)
@@ -386,14 +404,26 @@ class Subscription:
         return ua.MonitoredItemCreateResult(ua.StatusCode(), item.id, interval_ms, size)
 
     def modify(self, asked: ua.MonitoredItemModifyRequest, fastest_ms: float) -> ua.MonitoredItemModifyResult:
-        """Change an item's parameters. Raise ServiceError if the item does not exist, or its filter is unsupported."""
+        """Change the parameters of an item.
+
+        Args:
+            asked: The request.
+            fastest_ms: The shortest sampling interval, in ms.
+
+        Raises:
+            ServiceError: The item does not exist, or its filter is not supported.
+        """
         item = self._item(asked.MonitoredItemId)
         interval_ms, size = item.revise(asked.RequestedParameters, self.interval_ms, fastest_ms)
         item.watch.feed.count()
         return ua.MonitoredItemModifyResult(ua.StatusCode(), interval_ms, size)
 
     def set_mode(self, number: int, mode: ua.MonitoringMode) -> None:
-        """Change an item's mode. Raise ServiceError if the item does not exist."""
+        """Change the monitoring mode of an item.
+
+        Raises:
+            ServiceError: The item does not exist.
+        """
         item = self._item(number)
         before, item.mode = item.mode, mode
         if mode == ua.MonitoringMode.Disabled:
@@ -406,7 +436,11 @@ class Subscription:
             self.dirty.pop(item, None)
 
     def remove(self, number: int) -> None:
-        """Stop monitoring a variable. Raise ServiceError if the item does not exist."""
+        """Remove an item.
+
+        Raises:
+            ServiceError: The item does not exist.
+        """
         item = self._item(number)
         item.clear()
         item.watch.remove(item)
@@ -428,7 +462,7 @@ class Subscriptions:
 
     @property
     def items(self) -> int:
-        """Number of all monitored items."""
+        """Number of monitored items of all subscriptions."""
         return sum(len(one.items) for one in self.subscriptions.values())
 
     def of(self, owner: Any) -> list[Subscription]:
@@ -436,14 +470,22 @@ class Subscriptions:
         return [one for one in self.subscriptions.values() if one.owner is owner]
 
     def find(self, number: int, owner: Any) -> Subscription:
-        """Return a subscription of a session. Raise ServiceError if the session has no such subscription."""
+        """Return the subscription of a session with this number.
+
+        Raises:
+            ServiceError: The session has no such subscription.
+        """
         found = self.subscriptions.get(number)
         if found is None or found.owner is not owner:
             raise ServiceError(Fault.BadSubscriptionIdInvalid)
         return found
 
     def create(self, owner: Any, asked: ua.CreateSubscriptionParameters) -> Subscription:
-        """Create a subscription, without starting it. Raise ServiceError if there are too many."""
+        """Create a subscription for a session, without starting it.
+
+        Raises:
+            ServiceError: There are too many subscriptions.
+        """
         if len(self.subscriptions) >= MAX_SUBSCRIPTIONS or len(self.of(owner)) >= MAX_SUBSCRIPTIONS_PER_SESSION:
             raise ServiceError(Fault.BadTooManySubscriptions)
         number, self._next = self._next, self._next + 1
@@ -452,12 +494,12 @@ class Subscriptions:
         return found
 
     def delete(self, found: Iterable[Subscription]) -> None:
-        """End subscriptions."""
+        """End these subscriptions."""
         for one in list(found):
             one.stop()
             self.subscriptions.pop(one.id, None)
 
     def room(self, owner: Any) -> int:
-        """Return how many more items a session may have."""
+        """Return how many more items a session may monitor."""
         own = sum(len(one.items) for one in self.of(owner))
         return max(0, min(MAX_ITEMS_PER_SESSION - own, MAX_ITEMS - self.items))

@@ -24,7 +24,7 @@ BAD_NO_COMMUNICATION: Final = 0x80310000
 BAD_OUT_OF_SERVICE: Final = 0x808D0000
 UNCERTAIN: Final = 0x40000000
 GOOD_LOCAL_OVERRIDE: Final = 0x00960000
-"""The status of an injected value (OPC 10000-8, section 6.3): it does not come from the device."""
+"""The status of an injected value (OPC 10000-8, section 6.3), which does not come from the device."""
 
 _TYPES: Final = {
     ua.VariantType.Boolean: ("BOOL",),
@@ -40,7 +40,7 @@ _TYPES: Final = {
     ua.VariantType.Double: ("LREAL",),
 }
 _TYPE_OF: Final = {name: found for found, names in _TYPES.items() for name in names}
-"""The OPC UA data type of each elementary type. The values of all other types are texts."""
+"""The OPC UA data type of each elementary type. Values of all other types are sent as texts."""
 
 _UNITS: Final = {
     "%": "P1", "1/min": "RPM", "1/s": "C97", "A": "AMP", "Hz": "HTZ", "K": "KEL", "N": "NEW", "Nm": "NU", "Pa": "PAL",
@@ -50,18 +50,18 @@ _UNITS: Final = {
     "min": "MIN", "mm": "MMT", "mm/s": "C16", "ms": "C26", "rad": "C81", "rad/s": "2A", "rpm": "RPM", "s": "SEC",
     "°": "DD", "°C": "CEL", "°F": "FAH", "µm": "4H", "Ω": "OHM",
 }  # fmt: skip
-"""UNECE common codes of units (OPC 10000-8, section 5.6.3)."""
+"""The UNECE common codes of units (OPC 10000-8, section 5.6.3)."""
 _UNECE: Final = "http://www.opcfoundation.org/UA/units/un/cefact"
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def data_type(register: Register) -> ua.VariantType:
-    """Return the OPC UA data type of a register or of its elements."""
+    """Return the OPC UA data type of a register's value, or of its elements."""
     return _TYPE_OF.get(register.element.base, ua.VariantType.String)
 
 
 def is_number(register: Register) -> bool:
-    """Return whether a register holds numbers."""
+    """Return whether a register's values are numbers."""
     return register.element.base in NUMBERS
 
 
@@ -77,7 +77,7 @@ def variant(register: Register, value: Value) -> ua.Variant:
 
 
 def unit(text: str, namespace: str) -> ua.EUInformation:
-    """Return a unit as OPC UA sends it. A unit without a UNECE code is in the instance's namespace."""
+    """Return a unit as OPC UA sends it. A unit without a UNECE code gets ``namespace``."""
     code = _UNITS.get(text)
     name = ua.LocalizedText(text)
     if code is None:
@@ -91,12 +91,12 @@ def moment(ns: int) -> datetime:
 
 
 class RegisterState(NamedTuple):
-    """State of a register in a frame.
+    """The state of a register in a frame.
 
     Attributes:
         value: The value; None while the status is bad.
         code: The OPC UA status code.
-        source_ns: UTC time of the value at its origin, in ns since 1970; 0: unknown.
+        source_ns: UTC time of the value at its origin, in ns since 1970; 0 if unknown.
     """
 
     value: Value
@@ -108,9 +108,9 @@ def register_state(follower: FrameFollower, register: Register, injected: Sequen
     """Return the present state of a register, an element or a part.
 
     Args:
-        follower: Follows the source's block, and has its newest frame.
+        follower: The follower of the source's block, which has the newest frame.
         register: The register, element or part.
-        injected: The ``/out`` injections that the frame shows.
+        injected: The injections over ``/out`` that the frame contains.
     """
     block, frame = follower.block, follower.frame
     code = block_status(block, frame)
@@ -132,7 +132,7 @@ def register_state(follower: FrameFollower, register: Register, injected: Sequen
 
 
 def block_status(block: Block, frame: Frame | None) -> int:
-    """Return the status code that a block's present quality gives all its registers."""
+    """Return the status code that all registers of a block get from its present quality."""
     if frame is None:
         return BAD_WAITING_FOR_INITIAL_DATA
     quality, _ = block.assess(frame)
