@@ -1,1 +1,1 @@
-"""Layouts: compile data-block sources, find registers by path, and convert values. No I/O."""
+"""Compiles layouts, finds their registers by path, and converts the registers' values. No I/O."""

@@ -34,7 +34,7 @@ from shmio.wording import larger_than
 
 MAX_ALL_REGISTERS = 500_000
 MAX_ALL_STRUCTURES = 500_000
-"""Limit for all blocks that are compiled together, because a small source can declare many large blocks."""
+"""Maximum number of structures in all blocks compiled together: a small source can declare many large blocks."""
 
 _Declaration = TypeVar("_Declaration", TypeDeclaration, BlockDeclaration, ConstantDeclaration)
 
@@ -84,9 +84,10 @@ def compile_sources(
 
     Args:
         sources: The files.
-        blocks: Names of the data blocks to compile, in any case. Errors in other blocks are
-            ignored. None compiles all blocks.
-        type_bytes: Sizes in bytes of types whose members are unknown, by type name in any case.
+        blocks: Names of the data blocks to compile, in upper or lower case. Errors in other blocks
+            are ignored. None compiles all blocks.
+        type_bytes: Sizes in bytes of types whose members are unknown, by type name in upper or
+            lower case.
 
     Returns:
         The layouts in source order, with the warnings.
@@ -175,7 +176,7 @@ class Program:
         yield from self._doubles
 
     def compile(self, blocks: Collection[str] | None = None, type_bytes: Mapping[str, int] | None = None) -> Compiled:
-        """Compile the data blocks with the names ``blocks``, or all: see :func:`compile_sources`.
+        """Compile the data blocks named in ``blocks`` (None: all). :func:`compile_sources` explains the arguments.
 
         Raises:
             LayoutError: A source is wrong; ``diagnostics`` has all errors, then all warnings.

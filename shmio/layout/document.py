@@ -49,7 +49,7 @@ _DECODER = msgspec.json.Decoder(_Layout)  # msgspec crashes if two threads are t
 
 
 def load_layout(data: bytes) -> Layout:
-    """Read and validate the JSON that ``Layout.to_json`` writes; the data may be hostile.
+    """Read and validate JSON that ``Layout.to_json`` should have written; the data may be hostile.
 
     Raises:
         LayoutError: The JSON is malformed, or the layout is impossible. For example, registers

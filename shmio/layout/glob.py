@@ -1,9 +1,9 @@
 """Glob patterns over register paths.
 
-``*`` matches within one segment. ``**`` crosses segments; a whole segment ``**`` also matches no
-segment. The name of an array or a structure matches everything below it. Segments may be
-percent-encoded like those of a path, so ``%2A`` is a literal star. Because patterns come from
-clients, the time to match is linear in the path's length, whatever the pattern.
+``*`` matches within one segment. ``**`` also matches across segments; if ``**`` is a whole segment, it
+may match no segment at all. A pattern that matches an array or a structure also matches everything
+inside. Segments may be percent-encoded like those of a path, so ``%2A`` is a literal star. Because
+patterns come from clients, the time to match is linear in the path's length, whatever the pattern.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Glob:
         return bool(states & final)
 
     def reaches(self, path: str) -> bool:
-        """Return whether the pattern may match something below the path: an array element."""
+        """Return whether the pattern may match something inside ``path``, such as an element of an array."""
         states = self._start
         for char in f"{path}/":
             states = self._step(states, char)
@@ -149,7 +149,7 @@ def named(layout: Layout, topic: Topic) -> list[Register]:
 
 
 def choose(patterns: Iterable[str], layouts: Mapping[str, Layout]) -> list[tuple[str, Register]]:
-    """Return the registers that patterns name, in their order and each once, as (source, register).
+    """Return the registers that patterns name, as (source, register), in the patterns' order without duplicates.
 
     Args:
         patterns: Paths, array elements, slices, structures, globs, or names of sources.

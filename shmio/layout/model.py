@@ -1,8 +1,8 @@
 """The compiled layout of a block: its registers with their offsets, and the elementary types of S7.
 
-Everything here is immutable and free of I/O. Segments, recordings and ``shmio-layout --json``
-hold a ``Layout`` as JSON, which ``document.py`` reads. Sizes and alignments of the types are those
-of a block with standard access, as given in Siemens' STEP 7 help under "Data types";
+Everything here is immutable and free of I/O. Segments and recordings store a ``Layout`` as JSON, which
+``document.py`` reads and ``shmio-layout --json`` prints. Sizes and alignments of the types are those of
+a block with standard access, as given in Siemens' STEP 7 help under "Data types";
 ``docs/reference/layout-rules.md`` has the whole table.
 """
 
@@ -113,13 +113,13 @@ _STRING = re.compile(r"(W?STRING)(?:\[([0-9]{1,5})\])?")
 
 
 def string_limit(base: str) -> int:
-    """Return the maximum declared length of ``STRING`` or ``WSTRING``, in characters."""
+    """Return the largest length, in characters, that a ``STRING`` or ``WSTRING`` (``base``) may declare."""
     return _MAX_STRING if base == "STRING" else _MAX_WSTRING
 
 
 @lru_cache(maxsize=1024)
 def element_type(name: str) -> ElementType | None:
-    """Return the elementary type with this name or alias, in any case; None if there is none."""
+    """Return the elementary type with this name or alias, in upper or lower case; None if there is none."""
     upper = name.upper()
     fixed = _FIXED.get(ALIASES.get(upper, upper))
     if fixed is not None:
@@ -266,7 +266,7 @@ class Layout:
         return self._sorted.below(prefix)
 
     def in_any_case(self, path: str) -> str | None:
-        """Return the path of the register or structure that equals ``path`` except for case, or None."""
+        """Return the path of a register or structure that equals ``path`` except for case; None if there is none."""
         wanted = path.lower()
         at = self._sorted_in_lower_case.first(wanted)
         if at is None:
@@ -310,7 +310,7 @@ class Layout:
         )
 
     def with_statuses(self) -> Layout:
-        """Return the layout with a status area after its registers; itself if it has one already."""
+        """Return the layout with a status area after its registers; this layout if it has one already."""
         if self.status_offset is not None:
             return self
         start = -(-self.size // 8) * 8
@@ -388,7 +388,11 @@ class _Sorted:
 
 
 def status_bytes(registers: int) -> int:
-    """Return the size of a status area in bytes: 4 for each register's code, padded to 8, then 8 for each time."""
+    """Return the size in bytes of a status area for a number of registers.
+
+    The area has a code of 4 bytes for each register, padding to a multiple of 8 bytes, and a time
+    of 8 bytes for each register.
+    """
     return -(-4 * registers // 8) * 8 + 8 * registers
 
 
@@ -398,7 +402,10 @@ def shape_of(dims: Dims) -> tuple[int, ...]:
 
 
 def flat_index(dims: Dims, index: tuple[int, ...]) -> int:
-    """Return the position in an array, from 0, of the element with these declared indices; the last runs fastest."""
+    """Return the position, from 0, of the element of an array with these declared indices.
+
+    The last index runs fastest.
+    """
     flat = 0
     for i, (low, high) in zip(index, dims, strict=True):
         flat = flat * (high - low + 1) + i - low
@@ -406,7 +413,7 @@ def flat_index(dims: Dims, index: tuple[int, ...]) -> int:
 
 
 def index_at(dims: Dims, flat: int) -> tuple[int, ...]:
-    """Return the declared indices of the element at a position in an array: undo :func:`flat_index`."""
+    """Return the declared indices of the array element at position ``flat``: the reverse of :func:`flat_index`."""
     index: tuple[int, ...] = ()
     for low, high in reversed(dims):
         flat, place = divmod(flat, high - low + 1)

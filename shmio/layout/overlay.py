@@ -26,8 +26,8 @@ def overlay_register(base: Layout, path: str, over: str, kind: tuple[ElementType
         path: Path of the new register.
         over: Canonical path of the part that it names: a register of the block, an element, a
             slice, or a bit or another part of an integer.
-        kind: The type of the new register, and its bounds; None: those of the named part. With
-            another type, the register is a view of the bytes from the start of the part on.
+        kind: The type and the array bounds of the new register; None: those of the named part. A
+            register of another type interprets the bytes from the start of the part.
 
     Raises:
         PathError: The block has no such part.
@@ -64,10 +64,11 @@ def overlay_register(base: Layout, path: str, over: str, kind: tuple[ElementType
 
 
 def needed(layout: Layout, register: Register) -> set[str]:
-    """Return the paths of the layout's registers that are necessary to read a register, element or part.
+    """Return the paths of the layout's registers that must be read to know a register, element or part.
 
-    These are the register itself or the register that contains it. If that lies over the block, it
-    is also the block's own register below it.
+    The result contains the layout's register that is or contains ``register``. If that register
+    lies over the block, the result also contains the block's own register that is or contains the
+    named part, if there is one.
     """
     over = _over(layout, register)
     paths = [path for path in holders(over) if path in layout.by_path] if over else []

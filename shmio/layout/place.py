@@ -94,7 +94,7 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """What the expansion of a type yields: numbers of registers, elements, characters and structures."""
+    """The size of what the expansion of a type yields: numbers of registers, elements, characters and structures."""
 
     registers: int = 0
     elements: int = 0
@@ -144,7 +144,10 @@ def _extent_of(placed: Leaf | Group | Repeat) -> _Extent:
 
 
 class Placer:
-    """Places structures; looks up user types by name and places each at its first use."""
+    """Places structures.
+
+    User types are looked up by name, and each is placed when it is first used.
+    """
 
     def __init__(
         self,
@@ -209,7 +212,7 @@ class Placer:
         return Group(fields, _round_up(_round_up(bits, 8) // 8, 2), cost, height) if good else None
 
     def named(self, name: Named) -> ElementType | Group | None:
-        """Look up a type, elementary or defined by the user; after an error report it and return None."""
+        """Return the elementary or user type with a name; report an error and return None if there is none."""
         try:
             return self._named(name, 0)
         except BoundFault as fault:

@@ -72,7 +72,7 @@ CONTENTS: Final[Mapping[str, str]] = {
     "SafetyZone": "safety_zone",
     "SafetyZoneCmd": "safety_zone_cmd",
 }
-"""The structures that a message can hold, with the message's field for each."""
+"""The structures that a message can contain, each with the name of the message's field for it."""
 
 _S7: Final[Mapping[str, str]] = {"float": "REAL", "uint32": "UDINT", "uint64": "ULINT", "string": "STRING[80]"}
 _FITS: Final[Mapping[str, frozenset[str]]] = {
@@ -87,7 +87,7 @@ _INDEX = re.compile(r"-?[0-9]{1,10}")
 
 
 def members(text: str) -> dict[str, str] | None:
-    """Return the types of a structure's members, by path; None if ``text`` is no type of structure.
+    """Return the types of a structure's members, by path; None if ``text`` is not the type of a structure.
 
     Some names are followed by numbers: ``JointTrajectoryPoint[6]`` has 6 joints, and
     ``JointTrajectory[6, 20]`` has 6 joints and 20 points.
@@ -129,9 +129,10 @@ Found = Mapping[str, "Register | Found | Sequence[Found]"]
 
 
 def recognise(path: str, registers: Sequence[Register]) -> tuple[str, Found] | None:
-    """Return the structure in ``CONTENTS`` that these registers form, with its members, or None.
+    """Return the name of the structure in ``CONTENTS`` that registers form, and its members; None if there is none.
 
     The registers must be all needed members of the structure, with matching types, and no others.
+    ``path`` is the path of the structure.
     """
     if not 0 < len(registers) <= MAX_REGISTERS:
         return None

@@ -41,7 +41,7 @@ def block_path(text: str, layout: Layout) -> str:
 
 
 def topic_path(text: str, layouts: Mapping[str, Layout], default: str | None) -> str:
-    """Return a topic in shmio's spelling: a path that may name its source and a direction.
+    """Return a topic in shmio's spelling: a path, which may also name its source and a direction.
 
     Paths of TIA Portal begin with the name of the data block, which stands for its source. Text
     that names nothing is returned unchanged.

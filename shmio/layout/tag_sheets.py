@@ -28,14 +28,14 @@ _NUMBER: Final = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[
 
 
 class Sheet(NamedTuple):
-    """The registers of a table, and the number of each one's row; both by path."""
+    """The registers of a table by path, and the number of each register's row by path."""
 
     registers: Mapping[str, object]
     rows: Mapping[str, int]
 
 
 def read_sheet(file: str, data: bytes, report: Report, needed: Sequence[str] = ("path", "type")) -> Sheet:
-    """Read a table, and add its errors to the report; each row must fill the ``needed`` columns."""
+    """Return the registers of a table, and add its errors to the report; each row must fill the ``needed`` columns."""
     try:
         rows, comma = _rows_of(file, data)
         return _sheet(file, rows, report, needed, decimal_comma=comma)

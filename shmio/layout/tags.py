@@ -75,7 +75,7 @@ _BOUNDS = re.compile(r"\s*(-?[0-9]{1,9})\s*\.\.\s*(-?[0-9]{1,9})\s*")
 _PATH = re.compile(r"[/.%]")
 _TEXTS: Final = frozenset({"STRING", "WSTRING", "CHAR", "WCHAR"})
 _COMMON: Final = (*NUMBERS, *_TEXTS, "BOOL", "TIME", "LTIME", "DATE", *CONTENTS)
-"""The types that a misspelled one may stand for."""
+"""The types to suggest in place of a misspelled type."""
 _Scalar = bool | int | float | str
 _Read = TypeVar("_Read")
 
@@ -129,11 +129,12 @@ def read_sheet(file: str, data: bytes, report: Report, needed: Sequence[str] = (
 
 
 def place_tags(name: str, registers: Mapping[str, object], byte_order: ByteOrder = "little") -> Layout:
-    """Place registers that a program declares.
+    """Return a layout of registers that a program declares.
 
     Args:
         name: Name of the block.
-        registers: Entries by path, as in a tag table: the type, or a dict with the keys of an entry.
+        registers: Entries by path, as in a tag table: the type, or a dict with the keys of an
+            entry.
         byte_order: Byte order of the values.
 
     Returns:
@@ -141,13 +142,14 @@ def place_tags(name: str, registers: Mapping[str, object], byte_order: ByteOrder
 
     Raises:
         LayoutError: A register is wrong; the message of each diagnostic begins with the path.
+
     """
     places = {path: place for place, path in enumerate(registers, 1)}
     return _place_table(name, _Table(dict(registers), name, byte_order), Report([name]), places.__getitem__)
 
 
 def read_toml(file: str, data: bytes, report: Report, kind: type[_Read]) -> _Read:
-    """Return the content of a TOML file as ``kind``; raise LayoutError if it cannot be read."""
+    """Return the content of a TOML file as an object of type ``kind``; raise LayoutError if it cannot be read."""
     found = _read(file, data, report, kind)
     report.raise_errors()
     if found is None:
@@ -198,7 +200,7 @@ def _syntax_error(file: str, text: str, error: Exception) -> Diagnostic:
 
 
 class Lines:
-    """Finds the line of a table's key, searching the text only when first asked."""
+    """Finds the line of a key in a table. The text is not searched before the first question."""
 
     def __init__(self, text: str) -> None:
         self._text = text

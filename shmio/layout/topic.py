@@ -1,17 +1,17 @@
 """Topics: the paths by which clients name registers.
 
-A topic is ``<source>/<member>/…[/<index>…]``, optionally followed by ``/in`` or ``/out``. Before
-the direction, the path may end in a part of a register:
+A topic is ``<source>/<member>/…[/<index>…]``, optionally followed by ``/in`` or ``/out``. Before the
+direction, the path may end in a part of a register:
 
 - ``Inputs/2..5``: a range in place of an array's last index; the slice has one dimension.
 - ``Outputs/13.%X0``: a bit of an integer, as in STEP 7's slice access; bit 0 is the lowest.
   ``.%B1`` is a byte, ``.%W0`` a word, ``.%D0`` a double word; number 0 is the least significant.
 
-These parts cannot be confused with the name of a member, where ``%`` would be encoded.
+No member's name looks like such a part of an integer, because ``%`` is encoded in names.
 
-A topic may begin with a slash, or with ``<SCHEME>://``, whose scheme is a source's name in any case.
-In a member's name ``/ % + #`` are percent-encoded, and so is the first letter of a member named
-exactly ``in`` or ``out``.
+A topic may begin with a slash, or with ``<SCHEME>://``, in which the scheme is the name of a source in
+upper or lower case. In a member's name ``/ % + #`` are percent-encoded, and so is the first letter of a
+member named exactly ``in`` or ``out``.
 """
 
 from __future__ import annotations
@@ -208,12 +208,12 @@ def _which(first: str, sources: Collection[str]) -> str:
 
 
 def look_up(layout: Layout, topic: Topic) -> Register:
-    """Return the register of a topic, as :func:`find` does; a PathError also names the source."""
+    """Return the register that a topic names. Like :func:`find`, but a PathError also names the source."""
     return _with_source_in_errors(layout, topic, find)
 
 
 def look_up_each(layout: Layout, topic: Topic) -> list[Register]:
-    """Return the registers of a topic, as :func:`find_each` does; a PathError also names the source."""
+    """Return the registers that a topic names. Like :func:`find_each`, but a PathError also names the source."""
     return _with_source_in_errors(layout, topic, lambda layout, path: list(find_each(layout, path)))
 
 
@@ -254,7 +254,7 @@ def find(layout: Layout, path: str) -> Register:
 
 
 def part_of(layout: Layout, register: Register, kind: str, number: int) -> Register:
-    """Return a bit (kind ``X``), byte (``B``), word (``W``) or double word (``D``) of an integer.
+    """Return part ``number`` of an integer: a bit (kind ``X``), byte (``B``), word (``W``) or double word (``D``).
 
     Raises:
         PathError: The register is not an integer, or has no such part.
@@ -286,7 +286,8 @@ def slice_of(layout: Layout, array: Register, leading: tuple[int, ...], low: int
     ``leading`` are the indices in the other dimensions.
 
     Raises:
-        PathError: The array has no such row, or the row lacks some of these elements.
+        PathError: The array has no elements with the indices ``leading``, or lacks some from
+            ``low`` to ``high``.
 
     """
     path = "/".join((array.path, *map(str, leading), f"{low}..{high}"))
@@ -315,7 +316,7 @@ def names_part(path: str) -> bool:
 
 
 def holders(path: str) -> Iterator[str]:
-    """Yield a canonical path, then the paths of what contains it: element, array, structures."""
+    """Yield a canonical path, and then the path of each element, array and structure that contains it."""
     yield path
     if part := _PART.fullmatch(path):
         path = part["head"]
@@ -325,7 +326,7 @@ def holders(path: str) -> Iterator[str]:
 
 
 def holder(layout: Layout, register: Register) -> str:
-    """Return the path of the layout's register that is or contains ``register``, a result of :func:`find`."""
+    """Return the path of the layout's register that is or contains ``register``, which :func:`find` returned."""
     return next(path for path in holders(register.path) if path in layout.by_path)
 
 

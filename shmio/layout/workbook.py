@@ -31,7 +31,10 @@ Row = tuple[int, list[str]]
 
 
 class WorkbookError(ShmioError):
-    """A workbook cannot be read; the message says why. ``row`` is 1 if the error concerns no row."""
+    """A workbook cannot be read; the message says why.
+
+    ``row`` is the number of the wrong row; 1 if the error does not concern a row.
+    """
 
     def __init__(self, message: str, row: int = 1) -> None:
         super().__init__(message)

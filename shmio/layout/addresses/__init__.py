@@ -1,1 +1,4 @@
-"""Addresses in tag tables, which tell where a device has a register; one module for each protocol but S7."""
+"""Addresses in tag tables, which say where a device has a register.
+
+Each protocol has a module here, except S7: see ``shmio.layout.s7``.
+"""

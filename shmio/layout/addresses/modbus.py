@@ -61,7 +61,8 @@ class Address:
     """The place of a register's first element in a device.
 
     Attributes:
-        unit: Unit id of the device behind a gateway; None: the source's default.
+        unit: Unit id of the device behind a gateway; None: the unit id that the source has by
+            default.
         table: The table.
         number: Number in the table, from 0.
         bit: Bit of the word, 0 to 15; None: the whole word.
@@ -138,7 +139,7 @@ def _check(address: Address, register: Register, text: str) -> None:
 
 
 class WordCodec:
-    """Converts elements of one register: words of the device to values, and values to words."""
+    """Converts the elements of one register between the device's words and values."""
 
     def __init__(self, address: Address, register: Register, word_order: Order, byte_order: Order) -> None:
         self._text = address.kind.base == "STRING"
@@ -152,7 +153,7 @@ class WordCodec:
         self._name = address.kind.name
 
     def decode(self, data: bytes) -> Scalar:
-        """Return an element's value; ``data`` are its words as the device sent them."""
+        """Return an element's value. ``data`` are the element's words as the device sent them."""
         data = self.ordered(data)
         if self._text:
             return data[: self._length].partition(b"\0")[0].decode("latin-1")

@@ -3,14 +3,12 @@
 A node id is ``ns=3;s=Speed`` or ``nsu=http://maker/device;i=1001``, as in OPC 10000-6, section
 5.3.1.10; in a URI, ``%3B`` stands for a semicolon, and ``%25`` for ``%``. The identifier types are
 ``i`` (number), ``s`` (text), ``g`` (GUID) and ``b`` (base64). A browse path begins at the root:
-``/Objects/2:Device/2:Speed``. Each step is a browse name, with the number of its namespace unless
-that is 0; ``&`` precedes one of the characters ``/ . < > : # ! &`` in a name (OPC 10000-4, annex
-A.2).
+``/Objects/2:Device/2:Speed``. Each step is a browse name, with the number of its namespace unless that
+is 0; in a name, ``&`` escapes each of the characters ``/ . < > : # ! &`` (OPC 10000-4, annex A.2).
 
-The address of a structure's member is the address of the structure's node, a ``#``, and the steps
-to the member: ``ns=3;s=Pump#Motor.Speed``, ``/Objects/2:Line#[0].Forces``. After the ``#``, ``&``
-precedes one of the characters ``. [ ] # &`` in a name. In a text identifier, ``##`` stands for
-``#``.
+The address of a structure's member is the address of the structure's node, a ``#``, and the steps to
+the member: ``ns=3;s=Pump#Motor.Speed``, ``/Objects/2:Line#[0].Forces``. After the ``#``, ``&`` escapes
+each of the characters ``. [ ] # &`` in a name. In a text identifier, ``##`` stands for ``#``.
 """
 
 from __future__ import annotations
@@ -47,7 +45,7 @@ class NodeAddress:
 
 @dataclass(frozen=True, slots=True)
 class BrowsePath:
-    """The browse names, each as (namespace, name), from the root to a node."""
+    """The browse names from the root to a node, each as a pair (namespace, name)."""
 
     steps: tuple[tuple[int, str], ...]
 
@@ -74,7 +72,8 @@ def parse_member(text: str) -> tuple[Address, Member]:
     """Parse the address of a node, or of a member of its structure.
 
     Returns:
-        The address of the node, and the steps to the member; no steps for the node's whole value.
+        The address of the node, and the steps to the member, which are empty for the node's whole
+        value.
 
     Raises:
         ValueError: The text is neither a node id nor a browse path, or the steps are malformed.
@@ -102,12 +101,12 @@ def parse_member(text: str) -> tuple[Address, Member]:
 
 
 def node_text(text: str) -> str:
-    """Return a node id as it is written in an address: with ``##`` for ``#``."""
+    """Return a node id in the spelling of an address, which has ``##`` for ``#``."""
     return text.replace("#", "##")
 
 
 def member_text(member: Member) -> str:
-    """Return the part of an address from the ``#`` on; empty if ``member`` has no steps."""
+    """Return the part of an address that begins with ``#`` and names a member; empty if ``member`` is empty."""
     steps = [
         "." + re.sub(r"([.\[\]#&])", r"&\1", one) if isinstance(one, str) else f"[{','.join(map(str, one))}]"
         for one in member
@@ -134,12 +133,12 @@ def _member(text: str, way: str | None) -> Member:
 
 
 def escaped_uri(uri: str) -> str:
-    """Return the URI of a namespace as it is written in an address: with ``%25`` and ``%3B``."""
+    """Return a namespace's URI in the spelling of an address, which has ``%25`` for ``%`` and ``%3B`` for ``;``."""
     return uri.replace("%", "%25").replace(";", "%3B")
 
 
 def unescaped_uri(text: str) -> str:
-    """Return the URI of a namespace, from its spelling in an address: undo :func:`escaped_uri`."""
+    """Return the URI of a namespace from its spelling in an address, as :func:`escaped_uri` returns it."""
     return text.replace("%3B", ";").replace("%3b", ";").replace("%25", "%")
 
 

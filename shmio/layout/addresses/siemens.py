@@ -23,8 +23,8 @@ _INDEX: Final = re.compile(r"-?[0-9]+")
 def node_address(layout: Layout, register: Register) -> NodeAddress:
     """Return the node id of a register of a data block.
 
-    Each number in the path counts as the index of an array. If a member's name is a number, the
-    result is wrong; a tag table must then give the register's address.
+    Each number in the path counts as the index of an array. So the result is wrong if a member's
+    name is a number; the user must then give the register's address in a tag table.
     """
     parts: list[str] = [f'"{layout.name}"']
     indices: list[str] = []

@@ -1,4 +1,4 @@
-"""Import XML of TIA Portal Openness (SimaticML): PLC tag tables and global data blocks."""
+"""Import XML that TIA Portal Openness exports (SimaticML): PLC tag tables and global data blocks."""
 
 from __future__ import annotations
 

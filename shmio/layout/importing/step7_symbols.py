@@ -1,4 +1,8 @@
-"""Import symbol tables of STEP 7 classic: ``.sdf`` (quoted, with commas), ``.asc`` (columns), ``.seq`` (tabs)."""
+"""Import symbol tables of STEP 7 classic.
+
+The formats are ``.sdf`` (quoted texts with commas), ``.asc`` (columns of fixed width) and ``.seq``
+(texts with tabs).
+"""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ _TIMER: Final = scalar_codec(ElementType("S5TIME", "S5TIME", 2, 2), "big")
 
 
 class Conversion:
-    """A register, its address, and the conversion of its values."""
+    """A register with its address, which converts its values between the controller and the image."""
 
     def __init__(self, register: Register, address: Address, byte_order: ByteOrder) -> None:
         """Prepare the conversion.
@@ -124,7 +124,7 @@ class Conversion:
             raise ValueError(f"the controller cannot hold {value!r} as {self.address.kind.name}") from None
 
     def device_bit(self, byte: int) -> int:
-        """Return the offset in the controller's value for the offset ``byte`` in the register.
+        """Return the offset in the controller's value that corresponds to the offset ``byte`` in the register.
 
         Raises:
             ValueError: The value must be decoded and encoded, so its bits cannot be written.

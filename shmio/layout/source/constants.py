@@ -21,7 +21,7 @@ _BASES = {"2": "01", "8": "01234567", "16": "0123456789ABCDEF"}
 
 
 def bounds(at: Cursor) -> Bounds:
-    """Read ``[low..high, …]``; ``[*]`` has no bounds."""
+    """Read the bounds of an array, ``[low..high, …]``; for ``[*]``, return none."""
     at.expect("[", "'[' and the bounds of the array")
     dims: list[tuple[Bound, Bound]] = []
     flexible = False
@@ -145,7 +145,7 @@ class Constants:
         self._numbers: dict[str, int] = {}  # cache: many constants may refer to one
 
     def find(self, name: str) -> ConstantDeclaration | None:
-        """Return the constant with this name, in any case, or None."""
+        """Return the constant with this name, in upper or lower case; None if there is none."""
         scope = self._scope(name.lower())
         return scope._declared[name.lower()] if scope else None
 

@@ -56,7 +56,7 @@ class Token:
         return repr(self.text if len(self.text) <= 40 else f"{self.text[:39]}…")
 
     def is_word(self, *words: str) -> bool:
-        """Return whether this is one of the keywords (given in upper case), in any case."""
+        """Return whether the token is one of the keywords ``words`` (in upper case), whatever its own case."""
         return self.kind is Kind.WORD and self.text.upper() in words
 
     def is_punct(self, text: str) -> bool:
@@ -225,7 +225,7 @@ class Cursor:
         self.token = self._tokens[index]
 
     def skip_to(self, word: str) -> bool:
-        """Go to the next keyword ``word``, without reporting faults before it, and return True.
+        """Go to the next keyword ``word`` without reporting faults before it; return whether there is one.
 
         If the keyword does not occur again, stay and return False.
         """
@@ -274,7 +274,7 @@ class Cursor:
             raise self.expected(word)
 
     def names_member(self) -> bool:
-        """Return whether the current word is a name and not a keyword, as the next token shows."""
+        """Return whether the current word is a member's name and not a keyword; the next token shows this."""
         following = self._tokens[min(self.index + 1, len(self._tokens) - 1)]
         return self.token.kind is Kind.WORD and following.kind is Kind.PUNCT and following.text in (":", "{", ",")
 

@@ -71,7 +71,10 @@ class Struct:
 
 @dataclass(frozen=True, slots=True)
 class Array:
-    """An array; ``element`` is never an array. ``ARRAY[*]``, sized by the caller, has no bounds."""
+    """An array; ``element`` is never an array.
+
+    ``ARRAY[*]``, whose size the caller determines, has no bounds.
+    """
 
     bounds: Bounds
     element: Named | Struct
@@ -82,7 +85,7 @@ Type = Named | Struct | Array
 
 
 class Section(Enum):
-    """The section that declares a member; the instance of a function block has this order of sections."""
+    """The section in which a member is declared. An instance of a function block has the sections in this order."""
 
     INPUT = "VAR_INPUT"
     OUTPUT = "VAR_OUTPUT"

@@ -1,17 +1,17 @@
 """System data types whose layout has a public source.
 
-This module declares them as a user would, and the placement rules give their addresses. For each
-type, these agree with the length or the addresses that the public source states.
-``docs/reference/layout-rules.md`` lists the types.
+This module declares the types as a user would, and the placement rules compute the addresses of their
+members. For each type, the result agrees with the length or the addresses that the public source
+states. ``docs/reference/layout-rules.md`` lists the types.
 
 - ErrorStruct, CREF, NREF: members in Siemens' help on GET_ERROR, lengths in the help on system data types.
 - TCON_Param, TADDR_Param: Siemens' help on open user communication has every byte.
 - SSL_HEADER: members in Siemens' help on RDSYSST, length in the help on system data types.
 - SFB 0 to 5: the simulator awlsim has the interfaces; its tests state the addresses of SFB 0.
 
-For IEC_TIMER and similar types, only the length is public, and not the places of the members. Such
-a type becomes an array of bytes. Any other system type is an error unless the configuration gives
-its size.
+For IEC_TIMER and similar types, only the length is public, and not the offsets of the members. Such a
+type becomes an array of bytes. Any other system type is an error unless the configuration gives its
+size.
 """
 
 from __future__ import annotations

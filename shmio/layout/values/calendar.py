@@ -36,7 +36,7 @@ def days(year: int, month: int, day: int) -> int | None:
 
 
 def parse_moment(text: str) -> int | None:
-    """Convert a date, with or without a time, to nanoseconds since 1970; None for any other text.
+    """Convert a date, with or without a time, to ns since 1970; return None if the text is neither.
 
     Accept ``2024-02-29``, ``2024-02-29T12:00:00.5`` and S7's ``2024-2-29-12:00:00.5``.
     """

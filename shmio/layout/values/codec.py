@@ -53,7 +53,8 @@ _S5_BASES_MS = (10, 100, 1000, 10_000)
 class ScalarCodec(Protocol):
     """Decodes and encodes one element.
 
-    ``plain`` is the format of ``struct`` if unpacking is all that decoding takes; else empty.
+    ``plain`` is a format of ``struct`` if unpacking with it is all that decoding takes; else it is
+    empty.
     """
 
     plain: str
@@ -69,7 +70,7 @@ class RegisterCodec(Protocol):
     """Decodes and encodes one register of a frame; ``codec`` returns it."""
 
     def decode(self, data: Buffer) -> Value:
-        """Return the register's value in a frame; invalid bytes of a scalar or an element are None."""
+        """Return the register's value in a frame. Elements, or a scalar, whose bytes are invalid become None."""
 
     def encode_into(self, value: object, frame: bytearray | memoryview) -> None:
         """Write the value into a frame; after an error the frame is unchanged.
@@ -197,7 +198,7 @@ class _BoolArray:
 
 
 def nest(flat: list[Value], shape: tuple[int, ...]) -> list[Value]:
-    """Return a flat list as nested lists of this shape; the last index runs fastest."""
+    """Return a flat list as nested lists with the lengths ``shape``; the last index runs fastest."""
     for length in reversed(shape[1:]):
         flat = [flat[start : start + length] for start in range(0, len(flat), length)]
     return flat
@@ -289,7 +290,7 @@ class _Number:
 
 
 def bounds(code: str, limit: int | None = None) -> tuple[float, float]:
-    """Return the least and greatest number that a ``struct`` code can hold; ``limit`` lowers the greatest."""
+    """Return the least and the greatest number that a ``struct`` code can hold; the greatest is at most ``limit``."""
     if code in "fd":
         most = REAL_MAX if code == "f" else sys.float_info.max
         return -most, most

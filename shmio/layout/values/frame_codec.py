@@ -4,7 +4,7 @@
 BOOL                          ``?``
 integers, BYTE … LWORD        ``i1`` … ``u8``
 REAL, LREAL                   ``f4``, ``f8``
-CHAR, STRING and their wide   ``U``, of the declared length; numpy drops trailing NULs
+CHAR, STRING, WCHAR, WSTRING  ``U``, of the declared length; numpy drops trailing NULs
 TIME, S5TIME, TIME_OF_DAY     ``m8[ms]``
 LTIME, LTOD                   ``m8[ns]`` (the least LTIME is numpy's NaT)
 DATE                          ``M8[D]``

@@ -246,7 +246,7 @@ def _text(text: str, element: ElementType) -> str | None:
 
 
 def literal_text(value: Value, register: Register) -> str:
-    """Return a value as text for people, which ``parse_literal`` reads back.
+    """Return a value as text for people, which :func:`parse_literal` converts back.
 
     Times and dates become S7 literals (``T#1s500ms``, ``TOD#12:00:00``, ``D#2026-11-22``); all
     other values are as ``to_text`` writes them.
@@ -292,7 +292,7 @@ def split_array(text: str, shape: tuple[int, ...]) -> list[tuple[int, int, str]]
     """Split an array literal into values; return (first element, number of elements, text) of each.
 
     The literal has the form ``[1, 2, 3(0)]``, with or without the brackets, or has each row in
-    brackets. Values beyond the end of the array are left out.
+    brackets. Values beyond the end of the array are ignored.
     """
     runs: list[tuple[int, int, str]] = []
     _fill(text, shape, 0, runs)

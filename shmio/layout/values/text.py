@@ -31,11 +31,11 @@ _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,4})?
 _NON_FINITE = {"nan": math.nan} | {
     f"{sign}{word}": -math.inf if sign == "-" else math.inf for sign in ("", "+", "-") for word in ("inf", "infinity")
 }
-"""NaN and infinities by their texts in lower case; the case of a text does not matter."""
+"""NaN and infinities, by their texts in lower case."""
 
 
 def wire_type(register: Register) -> WireType:
-    """Return the name that version 1 has for the type of a register or of its elements."""
+    """Return the type of a register, or of its elements, as version 1 names it."""
     base = register.element.base
     if base == "BOOL":
         return "bool"
@@ -70,7 +70,7 @@ def _real_text(value: Any) -> str:
 
 
 def shortest(value: float, element: ElementType) -> float:
-    """Return the float that has the fewest digits and is the same REAL; an LREAL is unchanged."""
+    """Return the float with the fewest digits that becomes the same REAL; an LREAL is returned unchanged."""
     return _shortest_real(value) if element.base == "REAL" and math.isfinite(value) else value
 
 
@@ -81,10 +81,11 @@ def _shortest_real(value: float) -> float:
 
 
 def from_text(text: str, register: Register) -> Value:
-    """Convert a text to a value: undo ``to_text``. Numbers may also be as Java prints them.
+    """Convert a text to a value, the reverse of :func:`to_text`. Numbers may also be as Java prints them.
 
     Raises:
         ValueRangeError: The text is not a value of the register's type, or is out of range.
+
     """
     if len(text) > MAX_TEXT:
         raise ValueRangeError(f"{register.path}: the text is longer than {MAX_TEXT} characters")

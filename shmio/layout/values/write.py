@@ -52,12 +52,12 @@ def encode(register: Register, value: object, byte_order: ByteOrder = "big") -> 
 
 
 def sizes(register: Register) -> list[int]:
-    """Return the maximum size in bytes of each write that :func:`encode` returns for a register."""
+    """Return the maximum size, in bytes, of each write that :func:`encode` would return for a register."""
     return [register.size] + [1] * 14 if register.partial else [register.size]
 
 
 def apply(write: Write, image: bytearray | memoryview) -> None:
-    """Apply a write to an image of the block."""
+    """Carry out a write in an image of the block."""
     offset, mask, data = write
     if mask:
         image[offset] = image[offset] & (mask ^ 0xFF) | data[0] & mask
@@ -124,9 +124,10 @@ def chosen(layout: Layout, pattern: str) -> Iterator[Register]:
 
 
 def merge(image: bytes | bytearray, mask: bytes | bytearray, ranges: Iterable[tuple[int, int]]) -> list[Write]:
-    """Return writes, as few as possible, that copy the masked bits of an image to a block.
+    """Return writes that copy to a block those bits of an image that are set in ``mask``.
 
-    They copy only bytes in the ``ranges`` (start, stop).
+    There are as few writes as possible. They copy only bytes in the ``ranges``, which are pairs
+    (start, stop).
     """
     writes: list[Write] = []
     for start, stop in _joined(ranges):
@@ -183,7 +184,7 @@ def _fill_rows(mask: bytearray, register: Register) -> None:
 
 
 def paths_of(layout: Layout, writes: Iterable[Write], most: int | None = None) -> list[str]:
-    """Return the paths of what writes set, in address order; at most ``most`` paths.
+    """Return the paths of what writes set, in address order; at most ``most`` paths (None: all).
 
     For a register that is written in part, return paths of slices, elements, bytes or bits; if its
     type has no parts, as REAL, return its own path. Skip bytes that belong to no register.
@@ -200,7 +201,7 @@ def paths_of(layout: Layout, writes: Iterable[Write], most: int | None = None) -
 
 
 def path_at(layout: Layout, offset: int) -> str:
-    """Return the path of the register or array element that has a byte; "" if there is none."""
+    """Return the path of the register or array element to which a byte belongs; "" if there is none."""
     for index in _overlapping(layout, offset, offset + 1):
         register = layout.own[index]
         if not register.dims or register.bit is not None:
