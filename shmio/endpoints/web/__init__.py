@@ -1,1 +1,1 @@
-"""The HTTP endpoint: the web page, and metrics of the instance for Prometheus."""
+"""The HTTP endpoint: the web page, and the instance's metrics for Prometheus."""

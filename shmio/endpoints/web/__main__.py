@@ -18,7 +18,7 @@ from shmio.logs import LogRateLimit
 from shmio.worker import BEAT_S, Worker
 
 LOGGERS: Final = ("shmio.web", "uvicorn", "asyncio", "websockets")
-"""Loggers that clients can flood. The rate of their lines is limited."""
+"""Loggers whose lines clients can cause in great number. The rate of these lines is limited."""
 FOLDERS: Final = "folders"
 
 

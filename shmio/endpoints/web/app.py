@@ -30,7 +30,7 @@ STATIC: Final = Path(__file__).parent / "static"
 MAX_PAGES: Final = 64
 """Maximum number of open pages that have made a call."""
 MAX_SILENT: Final = 256
-"""Maximum number of WebSockets without a call. If there are more, the oldest is closed."""
+"""Maximum number of WebSockets on which no call has been made. If there are more, the oldest is closed."""
 MAX_LOGIN_BYTES: Final = 4096
 _TYPES: Final = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
 _POLICY: Final = {
@@ -46,7 +46,7 @@ _HINT: Final = "shmio: /metrics has the figures of the instance, for Prometheus\
 def metrics_app(
     segment: Segment, measurements: Measurements, folders: Mapping[str, str], registers: Sequence[str]
 ) -> Starlette:
-    """Return the application of ``[metrics]``, which answers ``/metrics``, and ``/`` with a hint.
+    """Return the application of ``[metrics]``. It serves ``/metrics``, and a hint at ``/``.
 
     Args:
         segment: The instance's segment.
@@ -112,15 +112,15 @@ class PageApp:
 
     @property
     def counters(self) -> tuple[int, int, int]:
-        """Numbers of open pages, and of messages and bytes that were sent to pages."""
+        """Number of open pages, and numbers of messages and bytes that were sent to pages."""
         return len(self._pages), self._served.messages, self._served.bytes
 
     def app(self, measurements: Measurements, registers: Sequence[str]) -> Starlette:
-        """Return the application with its routes.
+        """Return the application, with its routes.
 
         Args:
             measurements: The histograms for ``/metrics``.
-            registers: Patterns of the registers that ``/metrics`` reports.
+            registers: Patterns of the registers whose values ``/metrics`` reports.
 
         """
         routes: list[BaseRoute] = [

@@ -1,4 +1,4 @@
-"""Finds out who is connected to the endpoints, from the connections of their sockets in proc_net(5).
+"""Finds out who is connected to the endpoints, from the sockets that proc_net(5) lists.
 
 So the endpoints need not count their clients, and the clients of mosquitto are found, too.
 """
@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple
 ENDPOINTS: Final = ("grpc", "mqtt", "opcua", "web")
 """Kinds of processes that have clients."""
 MAX_CLIENTS: Final = 50
-"""Maximum number of clients that are listed for an endpoint. Those with the most connections come first."""
+"""Maximum number of clients that are listed for an endpoint, those with the most connections first."""
 _ESTABLISHED: Final = "01"
 _LISTEN: Final = "0A"
 _ACCEPTS: Final = 0x10000  # __SO_ACCEPTCON of a UNIX socket
@@ -44,9 +44,9 @@ def clients(pids: Mapping[str, tuple[str, int]]) -> list[dict[str, Any]]:
         pids: Kind and pid of each process of the instance, by name.
 
     Returns:
-        For each endpoint that listens: its name, its number of connections, and its clients, each with
-        a number of connections. A client is an address, ``UNIX socket``, or the name of a process of
-        the instance.
+        For each endpoint that is listening: its name, its number of connections, and its clients
+        with their numbers of connections. A client is an address, ``UNIX socket``, or the name of a
+        process of the instance.
 
     """
     owners = {inode: name for name, (_, pid) in pids.items() for inode in _sockets(pid)}

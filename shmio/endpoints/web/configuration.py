@@ -1,4 +1,4 @@
-"""The configuration file as all pages show it: its text, its faults, and what a reload would do.
+"""The configuration file, as all pages show it: its text, its faults, and what a reload would do.
 
 The supervisor checks the file, as for ``shmio-supervisor reload --dry-run``. All pages share the
 result, so that many pages cause no more work than one page.
@@ -23,7 +23,7 @@ from shmio.endpoints.web.supervisor import Supervisor
 from shmio.errors import ConfigError, ControlError
 
 CHECK_S: Final = 90.0
-"""Time limit in s for the supervisor's answer to a dry run."""
+"""Maximum time in s that the supervisor may take to answer a dry run."""
 WHERE_S: Final = 5.0
 FRESH_S: Final = 1.0
 """Time in s for which a result is reused."""
@@ -45,7 +45,12 @@ class ConfigurationFile:
         self._state_s = -FRESH_S
 
     async def state(self) -> tuple[str, int | None]:
-        """Return the file's version, and when the instance read the file, in ns since 1970; None: unknown."""
+        """Return the version of the file, and when the instance read the file.
+
+        Returns:
+            The version (see :func:`version`), and the time in ns since 1970; None if the time is
+            unknown.
+        """
         asked_s = time.monotonic()
         async with self._asking:
             if self._state_s < asked_s - FRESH_S:
@@ -58,7 +63,10 @@ class ConfigurationFile:
             return self._state
 
     async def checked(self) -> dict[str, Any]:
-        """Return the file with the result of a check that started at most a second ago, and after the last reload."""
+        """Return the file and the result of checking it.
+
+        The check has started at most a second ago, and after the last reload.
+        """
         asked_s = time.monotonic()
         async with self._checking:
             if self._checked_s < max(asked_s - FRESH_S, self._outdated_s) or self._checked["problem"]:
@@ -68,7 +76,7 @@ class ConfigurationFile:
             return self._checked
 
     def outdate(self) -> None:
-        """Reuse no result of a check that started before now, because a reload has changed the instance."""
+        """Do not reuse the results of earlier checks, because a reload has changed the instance."""
         self._outdated_s = time.monotonic()
 
     async def _check(self) -> dict[str, Any]:
@@ -89,7 +97,10 @@ class ConfigurationFile:
 
 
 def version(file: str) -> str:
-    """Return a text that changes when the file changes, and reveals no content; empty: there is no file."""
+    """Return a text that changes whenever the file changes; empty if there is no file.
+
+    It reveals nothing of the content.
+    """
     try:
         found = Path(file).stat()
     except OSError:

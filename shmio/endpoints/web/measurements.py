@@ -1,6 +1,7 @@
-"""Histograms of each source's timing, measured from the frames and events that it publishes.
+"""Histograms of each source's timing, measured from the frames and events that the source publishes.
 
-The sources do not measure anything. A thread of this process reads their rings, which costs the sources no time.
+The sources do not measure anything. A thread of this process reads their rings, which costs the
+sources no time.
 """
 
 from __future__ import annotations
@@ -18,16 +19,16 @@ from shmio.segment import Block, Segment
 from shmio.segment.events import ENDS, Event, EventKind
 
 INTERVAL_S: Final = 0.5
-"""Interval at which the rings are read, in s. A ring has room for at least some seconds."""
+"""Interval in s at which the rings are read. A ring has room for several seconds at least."""
 BOUNDS_S: Final = (
     0.0001, 0.0002, 0.0005, 0.001, 0.002, 0.003, 0.005, 0.0075, 0.01, 0.015, 0.02, 0.025, 0.03, 0.05, 0.075,
     0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0,
 )  # fmt: skip
 """Upper bounds of the buckets of all histograms, in s."""
 MAX_CHANGES: Final = 4096
-"""Maximum number of a source's changes of quality that are kept."""
+"""Maximum number of changes of quality that are stored for each source."""
 MAX_COMMANDS: Final = 4096
-"""Maximum number of a source's commands without outcome. If there are more, the oldest are forgotten."""
+"""Maximum number of a source's commands that wait for their outcome. If there are more, the oldest are forgotten."""
 
 
 class Histogram:
@@ -46,13 +47,13 @@ class Histogram:
 
     @property
     def buckets(self) -> list[tuple[str, float]]:
-        """The upper bound of each bucket as text, and the number of durations up to it."""
+        """For each bucket, its upper bound as text, and the number of durations up to this bound."""
         names = [*(f"{bound:g}" for bound in BOUNDS_S), "+Inf"]
         return list(zip(names, map(float, accumulate(self._counts)), strict=True))
 
 
 class SourceTiming:
-    """The histograms of one source. Use it in one thread; others may read the histograms."""
+    """The histograms of one source. Only one thread may use it; others may read the histograms."""
 
     def __init__(self, block: Block, started_ns: int) -> None:
         """Start with the next frame and event.
@@ -83,7 +84,7 @@ class SourceTiming:
         self._accepted: OrderedDict[tuple[int, int], int] = OrderedDict()
 
     def follow(self) -> None:
-        """Read all new frames and events."""
+        """Evaluate all new frames and events."""
         while (frame := self._frames.poll()) is not None:
             place = (frame.incarnation, frame.cycle, frame.publish_ns)
             before, self._before = self._before, place
@@ -115,7 +116,7 @@ class SourceTiming:
             self.connections.append((event.publish_ns / 1e9, bad))
 
     def wait(self) -> None:
-        """Wait for the next frame, and count how long it took to wake up."""
+        """Wait for the next frame, and count the time from its publication until this process has woken up."""
         frame = self.block.cursor().next(INTERVAL_S)
         if frame is not None and not self.block.attributes.stepped:
             self.wake_up.add(time.monotonic_ns() - frame.publish_ns)

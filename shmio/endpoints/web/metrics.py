@@ -1,8 +1,8 @@
-"""The metrics of an instance in the text format of Prometheus.
+"""The metrics of an instance, in the text format of Prometheus.
 
 Names, units and types follow https://prometheus.io/docs/practices/naming. All values come from the
-segment, from ``/proc``, and from :mod:`shmio.endpoints.web.measurements`. No other process does any
-work for them.
+segment, from ``/proc``, and from :mod:`shmio.endpoints.web.measurements`. They cause no work in
+other processes.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from shmio.segment.processes import Phase
 from shmio.version import __version__
 
 MAX_REGISTERS: Final = 10_000
-"""Maximum number of register values in an answer."""
+"""Maximum number of registers whose values an answer contains."""
 FRESH_S: Final = 0.25
-"""Time in s for which an answer is reused, so that many scrapers cost no more than a single scraper."""
+"""Time in s for which an answer is reused, so that many scrapers cost no more than one."""
 
 
 class _Named(NamedTuple):
@@ -111,16 +111,16 @@ _COUNTERS: Final[Mapping[str, Mapping[str, _Named]]] = {
     },
 }
 _LABELS: Final[Mapping[str, str]] = {"source": "source", "emulator": "emulator", "web": "process"}
-"""The label that holds a process's name, for each kind of which an instance can have several processes."""
+"""For each kind of which an instance can have several processes, the label that holds the process's name."""
 BROKER: Final = "broker"
-"""Name of the process of shmio's own MQTT broker. It has the same kind as the bridge, but no counters."""
+"""Process name of the instance's own MQTT broker. Its kind is that of the bridge, but it has no counters."""
 _TICKS: Final = os.sysconf("SC_CLK_TCK")
 _PAGE_BYTES: Final = os.sysconf("SC_PAGE_SIZE")
 
 
 @dataclass(frozen=True)
 class Usage:
-    """Resources that a process uses, from ``/proc``."""
+    """The resources that a process uses, from ``/proc``."""
 
     cpu_s: float
     memory_bytes: int
@@ -328,7 +328,7 @@ class InstanceCollector(Collector):
 
 
 class Exposition:
-    """Answers requests for the metrics. Several threads may use it."""
+    """Answers requests for the metrics. Several threads may use it at the same time."""
 
     def __init__(self, collector: Collector) -> None:
         self._registry = CollectorRegistry(auto_describe=False)
@@ -338,7 +338,7 @@ class Exposition:
         self._fresh_until_s = 0.0
 
     def answer(self) -> bytes:
-        """Return all metrics in the text format. They are at most ``FRESH_S`` old."""
+        """Return all metrics in the text format. They are at most ``FRESH_S`` s old."""
         with self._lock:
             if time.monotonic() >= self._fresh_until_s:
                 self._answer = generate_latest(self._registry)

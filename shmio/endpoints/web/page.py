@@ -1,11 +1,12 @@
 """One open page: its WebSocket, the calls that it makes, and the data that it follows.
 
 A page sends calls as JSON text, ``{"id": 7, "call": "registers.rows", "with": {…}}``. The answer is
-``{"id": 7, "result": …}`` or ``{"id": 7, "error": "…"}``. The server sends data that a page follows as
-``{"topic": "overview", "data": …}``, or as binary messages for plots (``signals.py``). The classes in
-``tabs/`` implement the calls.
+``{"id": 7, "result": …}`` or ``{"id": 7, "error": "…"}``. The server sends data that a page follows
+as ``{"topic": "overview", "data": …}``, or as binary messages for plots (``signals.py``). The
+classes in ``tabs/`` implement the calls.
 
-Nothing waits for a slow page: newer data replaces data of the same topic that is not sent yet.
+Nothing waits for a slow page: newer data replaces data of the same topic that has not been sent
+yet.
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ from shmio.errors import ShmioError
 from shmio.model.cell import Closable
 
 MAX_CALLS: Final = 16
-"""Maximum number of a page's calls that may be in progress. The page's next call waits."""
+"""Maximum number of a page's calls that may be in progress. Further calls wait."""
 MAX_BATCHES: Final = 32
-"""Maximum number of binary messages that may wait for a page. If there are more, the oldest are dropped."""
+"""Maximum number of binary messages that wait for a page. If there are more, the oldest are dropped."""
 FIRST_CALL_S: Final = 10.0
-"""Time limit in s for a page's first call. If too many pages make none, the oldest is closed earlier."""
+"""Time in s that a page has to make its first call. If too many pages have made none, the oldest is closed."""
 
 _log = logging.getLogger("shmio.web")
 
@@ -64,7 +65,7 @@ _Tab = TypeVar("_Tab", bound="Tab")
 def call(
     role: str, arguments: type[_Arguments]
 ) -> Callable[[Callable[[_Tab, _Arguments], Awaitable[Any]]], Callable[[_Tab, _Arguments], Awaitable[Any]]]:
-    """Decorate a method of a tab, so that pages can call it as ``<tab>.<method>``.
+    """Return a decorator for a method of a tab, which pages can then call as ``<tab>.<method>``.
 
     Args:
         role: The role that a user needs.
@@ -82,7 +83,12 @@ def call(
 
 
 def release(resources: Mapping[str, Closable], user: User) -> None:
-    """Close the resources of a closed page, given by name. Another program or a source may have ended some."""
+    """Close the resources of a closed page. Those that another program or a source has ended are skipped.
+
+    Args:
+        resources: The resources, by name.
+        user: The user of the page, for the audit log.
+    """
     for name, one in resources.items():
         with acting(user.actor, "web"), suppress(ShmioError), Attempt("lift", {name: None}) as attempt:
             one.close()
@@ -90,7 +96,7 @@ def release(resources: Mapping[str, Closable], user: User) -> None:
 
 
 class Tab:
-    """One tab of a page: the state that it has on the server, and its calls."""
+    """A tab of a page: the state that it has on the server, and its calls."""
 
     name: ClassVar[str]
     calls: ClassVar[Mapping[str, Call]]
@@ -111,7 +117,7 @@ class Tab:
         return True
 
     def close(self) -> None:
-        """Release the tab's resources, because the page has been closed."""
+        """Release the tab's resources. This is called when the page is closed."""
 
 
 class FollowedTab(Tab):
@@ -125,13 +131,13 @@ class FollowedTab(Tab):
 
     @call("read", Nothing)
     async def follow(self, _: Nothing) -> None:
-        """Send the tab's data now, and then whenever it changes, until ``leave``."""
+        """Send the tab's data now, and again whenever it changes, until :meth:`leave`."""
         await self.leave(_)
         self._following = self.page.start(self._follow())
 
     @call("read", Nothing)
     async def leave(self, _: Nothing) -> None:
-        """Stop sending what ``follow`` started to send."""
+        """End :meth:`follow`: send no more data."""
         if self._following is not None:
             self._following.cancel()
             self._following = None
@@ -147,7 +153,7 @@ _ACTIONS: Final = {
     "injections.start": "declare",
     "injections.lift_all": "lift",
 }
-"""The audit log's names of calls, where they differ from the methods' names."""
+"""The action of a call in the audit log, where it differs from the name of the method."""
 
 
 def _outcome(result: Any) -> tuple[str, str]:
@@ -181,9 +187,9 @@ class Page:
         """Serve the page until it is closed.
 
         Args:
-            admit: Called at the page's first call. It returns the reason to close the page; empty: the page
-                stays open.
-            lasts_s: Time in s after which the user's session ends; None: it does not end.
+            admit: Called at the page's first call. It returns why to close the page; empty if the
+                page may stay open.
+            lasts_s: Time in s after which the user's session ends; None if it does not end.
 
         """
         sender = self.start(self._send())
@@ -213,7 +219,7 @@ class Page:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     def end(self, why: str) -> None:
-        """Close the page, with ``why`` as the reason."""
+        """Close the page. ``why`` is the reason that the page is told."""
         self.silent, self._why = False, why
         with suppress(RuntimeError):  # run() has ended, or has not started
             self._limit.reschedule(asyncio.get_running_loop().time())
@@ -232,12 +238,12 @@ class Page:
         return task
 
     def push(self, topic: str, data: object) -> None:
-        """Send data of a topic soon. It replaces data of the topic that is not sent yet."""
+        """Send data of a topic soon. It replaces data of the same topic that has not been sent yet."""
         self._newest[topic] = msgspec.json.encode({"topic": topic, "data": data})
         self._waiting.set()
 
     def push_batch(self, batch: bytes) -> None:
-        """Send a binary message soon. If too many wait, drop the oldest."""
+        """Send a binary message soon. If too many are waiting, drop the oldest."""
         self._batches.append(batch)
         self._waiting.set()
 

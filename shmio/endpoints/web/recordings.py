@@ -1,6 +1,6 @@
-"""The recordings in the recorder's directory, which all pages share.
+"""The recordings in the recorder's directory. All pages share this object's files and threads.
 
-A page names a file, never a path. Files are read in a few threads, a part at a time and only when
+A page names a file, never a path. Files are read in a few threads, a part at a time, and only when
 a page asks for the next part, so that a large or hostile file delays no other page.
 """
 
@@ -27,26 +27,26 @@ from shmio.recording.reading.part import Part
 from shmio.recording.times import lost
 
 THREADS: Final = 2
-"""Maximum number of threads that read recordings at a time."""
+"""Maximum number of threads that read recordings at the same time."""
 MAX_LISTED: Final = 500
-"""Maximum number of files that are listed. The newest are chosen."""
+"""Maximum number of files that are listed: the newest ones."""
 MAX_NAME: Final = 255
 LOOKS: Final = 16
-"""Maximum number of files whose details one request for the list reads."""
+"""Maximum number of files whose details are read for one request for the list."""
 MAX_OF_RUN: Final = 256
-"""Maximum number of files to search for those of the present run."""
+"""Maximum number of files that are searched for those of the present run."""
 MAX_OPEN: Final = 64
-"""Maximum number of files that are open at a time."""
+"""Maximum number of files that are open at the same time."""
 MAX_DAMAGE: Final = 20
-"""Maximum number of damaged places of an open recording that are listed."""
+"""Maximum number of damaged places that are listed for an open recording."""
 OPENING_S: Final = 60.0
-"""Time limit in s for opening a file."""
+"""Maximum time in s that opening a file may take."""
 PART_S: Final = 30.0
-"""Time limit in s for one part of the work on a file."""
+"""Maximum time in s that one part of the work on a file may take."""
 IDLE_S: Final = 15.0
-"""Time in s for which a file stays open after its last use. If it is deleted, it takes disk space meanwhile."""
+"""Time in s for which a file stays open after its last use. A deleted file takes up disk space until it is closed."""
 FRESH_S: Final = 2.0
-"""Minimum time in s before a growing file is opened again. It is longer if opening takes long."""
+"""Minimum time in s before a growing file is opened again. If opening takes long, it is longer."""
 SUFFIX: Final = ".mem"
 
 _NAME: Final = re.compile(rf"[^/\0.][^/\0]*{re.escape(SUFFIX)}")
@@ -93,18 +93,18 @@ class Opened:
     watch: _Watch
     took_s: float
     damage: list[str]
-    """Messages about places that could not be read."""
+    """Messages about the places that could not be read."""
     opened_s: float = field(default_factory=time.monotonic)
     users: int = 0
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     @property
     def fresh(self) -> bool:
-        """True if the file was opened so recently that it is not worth opening it again."""
+        """True if the file was opened so recently that opening it again is not worthwhile."""
         return time.monotonic() - self.opened_s < max(FRESH_S, 20 * self.took_s)
 
     def close(self) -> None:
-        """Wait until nobody uses the file, and close it."""
+        """Close the file, as soon as nobody uses it."""
         with self.lock:
             self.dump.close()
 
@@ -132,7 +132,7 @@ class Work(Generic[T]):
         self.stopped = False
 
     async def next(self) -> T | None:
-        """Do the next part of the work, and return its result; None: there are no more parts.
+        """Do the next part of the work, and return its result; None if there are no more parts.
 
         Raises:
             RecordingError: The file cannot be read.
@@ -145,7 +145,7 @@ class Work(Generic[T]):
                 return None
 
     def stop(self) -> None:
-        """Stop the work. A part that is being read ends soon."""
+        """Stop the work. A part that is being done ends soon."""
         if not self.stopped:
             self.stopped = True
             if self._opened is not None:
@@ -186,10 +186,10 @@ class Recordings:
         return await to_thread.run_sync(function, limiter=self._limiter)
 
     def path(self, name: str) -> Path:
-        """Return the path of a file.
+        """Return the path of the file with this name.
 
         Raises:
-            RecordingError: This is not the name of a recording in the recorder's directory.
+            RecordingError: The name is not that of a recording, or the instance has no recorder.
 
         """
         if self.folder is None:
@@ -199,12 +199,13 @@ class Recordings:
         return self.folder / name
 
     async def open(self, name: str, since_s: float | None = None) -> Opened:
-        """Open a recording, or return it if it is open already. :meth:`release` it after use.
+        """Open a recording; if it is open already, return it. Call :meth:`release` after use.
 
         Args:
             name: Name of the file.
-            since_s: If the file has grown, an already open recording is only returned if it was opened
-                after this monotonic time in s; None: if it was opened a short time ago.
+            since_s: Monotonic time in s. A file that has grown since it was opened is returned as
+                it is only if it was opened after this time; None: only if it was opened a short
+                time ago.
 
         Raises:
             RecordingError: The recording cannot be opened.
@@ -232,7 +233,9 @@ class Recordings:
                 self._opening.pop(name, None)
 
     async def of_run(self, instance: str, epoch: str, since_s: float) -> AsyncIterator[Opened]:
-        """Open and yield the recordings of an instance's present run, the newest first. Release each after use.
+        """Open and yield the recordings of an instance's present run, the newest first.
+
+        Call :meth:`release` for each after use.
 
         Args:
             instance: Name of the instance.
@@ -260,7 +263,10 @@ class Recordings:
             self.release(opened)
 
     def release(self, opened: Opened, *, at_once: bool = False) -> None:
-        """Release a recording after use. If nobody uses it any more, it is closed after ``IDLE_S``, or at once."""
+        """Release a recording after use. When nobody uses it any more, it is closed after ``IDLE_S``.
+
+        With ``at_once``, it is closed without delay.
+        """
         opened.users -= 1
         loop = asyncio.get_running_loop()
         if at_once:
@@ -278,7 +284,7 @@ class Recordings:
     # ---- list --------------------------------------------------------------------------------------------------------
 
     async def listed(self) -> list[dict[str, Any]]:
-        """Return the recordings, the newest first. Details that are not known yet follow in a later list."""
+        """Return the recordings, the newest first. Details that are not known yet follow with a later call."""
         if self.folder is None:
             return []
         folder = self.folder

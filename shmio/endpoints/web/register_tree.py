@@ -1,4 +1,4 @@
-"""The tree of all registers, of which a page shows a few rows."""
+"""The tree of all registers. A page shows only a few of its rows at a time."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from shmio.segment import Block
 
 
 class Row(NamedTuple):
-    """One visible row: a source, a structure, a register, or an array's element."""
+    """A visible row: a source, a structure, a register, or an element of an array."""
 
     path: str
     name: str
     depth: int
     register: Register | None
-    """None for a source or a structure."""
+    """The register; None for a source or a structure."""
     expandable: bool
 
 
@@ -48,7 +48,7 @@ def tree(source: str, layout: Layout) -> Node:
 
 
 def rows(root: Node, layout: Layout, expanded: Collection[str]) -> Iterator[Row]:
-    """Yield the visible rows of a source: its root, and the rows below each node whose path is in ``expanded``."""
+    """Yield the visible rows of a source: its root, and all rows below nodes whose path is in ``expanded``."""
     pending = [(root, 0)]
     while pending:
         node, depth = pending.pop()
@@ -62,7 +62,7 @@ def rows(root: Node, layout: Layout, expanded: Collection[str]) -> Iterator[Row]
 
 
 class Trees:
-    """The trees of all sources, which all pages share: a tree of 100,000 registers takes tens of MB."""
+    """The trees of all sources, shared by all pages, because a tree of 100,000 registers takes tens of MB."""
 
     def __init__(self) -> None:
         self._trees: dict[int, Node] = {}
@@ -71,7 +71,7 @@ class Trees:
         """Held during a search for rows. Simultaneous searches would delay the data of all pages."""
 
     def of(self, block: Block, blocks: Iterable[Block]) -> Node:
-        """Return the tree of a block. If the tree is new, drop the trees of blocks that are not in ``blocks``."""
+        """Return the tree of a block. If a new tree is made, drop the trees of blocks that are not in ``blocks``."""
         with self._making:
             node = self._trees.get(block.section)
             if node is None:
@@ -82,7 +82,10 @@ class Trees:
 
 
 def matching(root: Node, layout: Layout, text: str) -> Iterator[Row]:
-    """Yield a row for each register with ``text`` in its path, comment or source's name. Case is ignored."""
+    """Yield a row for each register that has ``text`` in its path, its comment or its source's name.
+
+    Case is ignored.
+    """
     wanted = text.lower()
     for register in layout.registers:
         if wanted in register.path.lower() or wanted in register.comment.lower() or wanted in root.name.lower():
@@ -98,7 +101,7 @@ def _elements(node: Node, depth: int, layout: Layout, array: Register) -> Iterat
 
 
 def root_of(path: str) -> str:
-    """Return the name of the source in a path."""
+    """Return the name of the source, with which a path begins."""
     return path.partition("/")[0]
 
 
@@ -112,7 +115,10 @@ def _indices(dims: tuple[tuple[int, int], ...]) -> Iterator[tuple[int, ...]]:
 
 
 def window(visible: Iterator[Row], first: int, count: int, most: int) -> tuple[list[Row], int]:
-    """Return ``count`` rows from ``first`` on, and the number of all rows, counted up to ``most``."""
+    """Return ``count`` rows, beginning with number ``first``, and the number of all rows.
+
+    Rows are counted only up to ``most``.
+    """
     skipped = sum(1 for _ in islice(visible, first))
     chosen = list(islice(visible, count))
     return chosen, skipped + len(chosen) + sum(1 for _ in islice(visible, max(0, most - skipped - len(chosen))))

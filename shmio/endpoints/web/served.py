@@ -1,4 +1,4 @@
-"""State that all pages share: the instance, and its overview, which is computed once for all pages."""
+"""The state that all pages share: the instance, and its overview, which is computed once for all pages."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from shmio.segment import Segment
 OVERVIEW_S: Final = 0.9
 """Time in s for which an overview is reused."""
 MINUTES: Final = (1, 10, 30)
-"""Periods, in minutes, for which losses and recoveries of a source's data are counted."""
+"""Lengths of the periods, in minutes, in which losses and recoveries of a source's data are counted."""
 _TICKS: Final = os.sysconf("SC_CLK_TCK")
 _PAGE_BYTES: Final = os.sysconf("SC_PAGE_SIZE")
 

@@ -1,4 +1,4 @@
-"""The HTTP server: limits connections and requests, and adds security headers to all answers."""
+"""The HTTP server. It limits connections and requests, and adds security headers to all answers."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from shmio.errors import EndpointError
 from shmio.wording import cannot_listen
 
 MAX_CONNECTIONS: Final = 512
-"""Maximum number of connections. If there are more, the server closes the one longest without a request."""
+"""Maximum number of connections. If there are more, the one that has been without a request longest is closed."""
 MAX_MESSAGE_BYTES: Final = 64 << 10
 """Maximum size of a message that a page sends over its WebSocket."""
 SEND_BUFFER_BYTES: Final = 64 << 10
-"""Size of the kernel's buffer for each client. A larger one would hold old data for a client that does not read."""
+"""Size of the kernel's send buffer for each client. In a larger one, old data would wait for slow clients."""
 PING_S: Final = 20.0
-"""Interval of pings to a page, and the time in which it must answer each."""
+"""Interval in s at which a page is pinged, and the time in s in which it must answer a ping."""
 REQUEST_S: Final = 10.0
-"""Time limit in s for a client's first request, and for each later request from its first byte on."""
+"""Time in s in which a client must send its first request, and each later request from its first byte on."""
 IDLE_S: Final = 75
-"""Time in s after which an idle connection is closed. Prometheus keeps its connection between scrapes."""
+"""Time in s after which an idle connection is closed. Between scrapes, Prometheus keeps its connection."""
 MAX_HEADER_BYTES: Final = 16 << 10
 BACKLOG: Final = 64
 STOP_S: Final = 1
-"""Time in s that answers may take to end when the server stops."""
+"""Time in s that answers have to end when the server stops."""
 _HEADERS: Final = (
     (b"x-content-type-options", b"nosniff"),
     (b"x-frame-options", b"DENY"),
@@ -44,18 +44,18 @@ _HEADERS: Final = (
     (b"content-security-policy", b"default-src 'none'; frame-ancestors 'none'"),
     (b"cache-control", b"no-store"),
 )
-"""Headers of every answer."""
+"""The headers of each answer."""
 
 
 @dataclass
 class Counters:
-    """Counts the requests, refusals and bytes of answers so far, and the open connections."""
+    """Counts requests, refusals and bytes of answers since the start, and open connections."""
 
     requests: int = 0
     refused: int = 0
     connections: int = 0
     answer_bytes: int = 0
-    """Number of bytes of the bodies of answers to HTTP requests."""
+    """Number of bytes in the bodies of answers to HTTP requests."""
 
 
 class _Protocol(H11Protocol):
@@ -269,7 +269,11 @@ class HttpServer:
         self._serving: asyncio.Task[None] | None = None
 
     async def start(self) -> None:
-        """Start to listen. Raise EndpointError if the address cannot be used."""
+        """Start to listen.
+
+        Raises:
+            EndpointError: The address cannot be used.
+        """
         family = socket.AF_INET6 if ":" in self.address.host else socket.AF_INET
         listening = socket.socket(family, socket.SOCK_STREAM)
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -1,8 +1,8 @@
 """Sessions: who uses the page, and what each user may do.
 
 A user who shows a token gets a session. Its cookie is HttpOnly, so that scripts cannot read it, and
-SameSite, so that browsers do not send it with requests of other sites' pages. A session belongs to
-the host that opened it: a stolen cookie is worth nothing elsewhere.
+SameSite, so that browsers do not send it with requests of other sites' pages. A session is valid
+only on the host that opened it, so a stolen cookie is useless elsewhere.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ COOKIE: Final = "shmio_session_{}"
 """Name of the cookie. It includes the instance's name, because browsers share cookies among a host's ports."""
 MAX_SESSIONS: Final = 256
 MAX_AGE_S: Final = 12 * 3600
-"""Time in s after which a user must show the token again."""
+"""Time in s after which a session ends, so that the user must show the token again."""
 ATTEMPTS: Final = 10
 ATTEMPTS_S: Final = 60.0
-"""Each host may show at most ``ATTEMPTS`` wrong tokens in this time in s."""
+"""Length in s of the period in which a host may show at most ``ATTEMPTS`` wrong tokens."""
 _MAX_HOSTS: Final = 1024
 
 
 @dataclass(frozen=True, slots=True)
 class User:
-    """A user of the page. ``name`` is the token's name; empty: the user has shown no token."""
+    """A user of the page. ``name`` is the name of the user's token; empty if the user has shown none."""
 
     name: str
     roles: frozenset[str]
@@ -45,7 +45,7 @@ class User:
 
     @property
     def listed_roles(self) -> list[str]:
-        """The roles in their usual order."""
+        """The user's roles, in the order in which roles are always listed."""
         return [role for role in ROLES if role in self.roles]
 
 
@@ -79,11 +79,11 @@ class Sessions:
 
     @property
     def takes_tokens(self) -> bool:
-        """True if there are tokens that a user can show."""
+        """True if there are tokens that users can show."""
         return bool(self._tokens)
 
     def user(self, cookie: str | None, host: str) -> User:
-        """Return the user of the session with this cookie and host; an anonymous user if there is none."""
+        """Return the user of the session with this cookie on this host; an anonymous user if there is none."""
         found = self._found(cookie, host)
         return User("", self._anonymous, host) if found is None else found.user
 
@@ -93,7 +93,7 @@ class Sessions:
         return None if found is None else found.opened_s + MAX_AGE_S - self._now()
 
     def on_end(self, cookie: str | None, host: str, end: Callable[[], None]) -> Callable[[], None]:
-        """Call ``end`` when a session is closed. Return a function that cancels this."""
+        """Register a function to call when a session is closed. Return a function that cancels this."""
         found = self._found(cookie, host)
         if found is None:
             return lambda: None
@@ -110,7 +110,7 @@ class Sessions:
         """Open a session for the owner of a token.
 
         Returns:
-            The cookie and the user; None if there is no such token.
+            The session's cookie, and the user; None if there is no such token.
 
         """
         user = self.owner(token, host)
@@ -123,7 +123,10 @@ class Sessions:
         return cookie, user
 
     def owner(self, token: str, host: str) -> User | None:
-        """Return the owner of a token; None if there is no such token."""
+        """Return the owner of a token; None if there is no such token.
+
+        A wrong token counts as a failed attempt of the host.
+        """
         shown, owner = digest(token.strip().encode()), None
         for secret in self._tokens:
             if hmac.compare_digest(secret.digest, shown):
@@ -134,7 +137,7 @@ class Sessions:
         return User(owner.name, owner.roles | self._anonymous, host)
 
     def close(self, cookie: str) -> None:
-        """Close the session of a cookie, and its pages."""
+        """Close the session with this cookie, and its pages."""
         session = self._users.pop(digest(cookie.encode()), None)
         if session is not None:
             self._ended(session)

@@ -1,7 +1,7 @@
 """The history of registers in a recording, reduced for a plot, part by part.
 
-A part has batches as in ``signals.py``, each with one register. A batch's number is the register's
-index in the request. A NaN between two samples means that frames are missing there.
+A part has batches as in ``signals.py``, each with one register. The number of a batch is the
+register's index in the request. A NaN between two samples means that frames are missing there.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from shmio.segment.explain import Explainer, kind_of
 PART_S: Final = 0.1
 """Time in s after which a part ends."""
 PART_BYTES: Final = 16 << 20
-"""Size of the frames after which a part ends."""
+"""Size of the frames, in bytes, after which a part ends."""
 PART_FRAMES: Final = 20_000
 """Number of frames after which a part ends."""
 MAX_PATHS: Final = 3
-"""Maximum number of paths that an event lists."""
+"""Maximum number of paths that are listed for an event."""
 MAX_EXPLAINED: Final = 64
-"""Maximum number of registers to search for those that an event concerns."""
+"""Maximum number of registers that are searched for those that an event is about."""
 NEAR_NS: Final = 50_000_000
 """Precision, in ns, with which the log time of a frame is found."""
 GAP_NS: Final = 1_000
-"""Time from the last frame before a gap to the gap's mark, in ns."""
+"""Time in ns between the last frame before a gap and the mark of the gap."""
 
 
 class Signal(NamedTuple):
@@ -53,12 +53,12 @@ class Signal(NamedTuple):
 
     @property
     def newest(self) -> Register:
-        """The register in the last block that has it."""
+        """The register, in the last block that has it."""
         return next(reversed(self.registers.values()))
 
 
 class Window(NamedTuple):
-    """A range of time, UTC in ns, and the number of columns into which a plot divides it."""
+    """A range of time, in ns of UTC, and the number of columns into which a plot divides it."""
 
     from_ns: int
     to_ns: int
@@ -66,7 +66,7 @@ class Window(NamedTuple):
 
 
 class MarkedEvent(msgspec.Struct, omit_defaults=True):
-    """An event for a plot, and the number of events in its column."""
+    """The first event in a column of a plot, and the number of events in the column."""
 
     time_s: float
     source: str
@@ -75,20 +75,20 @@ class MarkedEvent(msgspec.Struct, omit_defaults=True):
     text: str
     paths: list[str]
     more: int = 0
-    """Number of paths that are not listed."""
+    """Number of the event's paths that are not listed."""
     count: int = 1
 
 
 class Part(msgspec.Struct):
-    """A part of the history: its batches and events, and the share of the work that is done."""
+    """A part of the history: batches, events, and the share of the work that is done by now."""
 
     batches: list[bytes]
     events: list[MarkedEvent]
     share: float
     reduced: bool = False
-    """True if frames were left out so far, because the plot does not need them."""
+    """True if frames have been left out so far, because the plot does not need them."""
     damage: list[str] = []
-    """Only in the last part: messages about places that could not be read."""
+    """Messages about places that could not be read. Only the last part has them."""
 
 
 def signals_of(dump: Dump, paths: Sequence[str]) -> list[Signal]:
@@ -114,9 +114,10 @@ def signal_history(dump: Dump, signals: Sequence[Signal], window: Window, damage
 
     Args:
         dump: The recording.
-        signals: The registers.
+        signals: The registers; if empty, only the events of all sources are yielded.
         window: The window.
-        damage: Messages about places of the recording that could not be read. The work may add some.
+        damage: Messages about places of the recording that could not be read. More may be added
+            during the work.
 
     """
     sources = list(dict.fromkeys(signal.source for signal in signals))
@@ -138,8 +139,8 @@ def past(dump: Dump, signals: Sequence[Signal], window: Window, utc_ns: int) -> 
     Args:
         dump: A recording of this run.
         signals: The registers, all of one source.
-        window: The window, on this time scale.
-        utc_ns: UTC minus the time of CLOCK_MONOTONIC in ns, as for a feed in ``signals.py``.
+        window: The window, on the time scale of live plots.
+        utc_ns: Difference between UTC and CLOCK_MONOTONIC, in ns, as for a feed in ``signals.py``.
 
     """
     source = signals[0].source
@@ -154,7 +155,10 @@ def past(dump: Dump, signals: Sequence[Signal], window: Window, utc_ns: int) -> 
 
 
 def first_time(dump: Dump, source: str) -> int | None:
-    """Return the monotonic time in ns at which the first recorded frame of a source was published; None: no frame."""
+    """Return when the first recorded frame of a source was published; None if there is no frame.
+
+    The time is in ns of CLOCK_MONOTONIC.
+    """
     for _, batch in dump.batches(source):
         return int(batch.head["publish_ns"][0])
     return None
@@ -307,7 +311,13 @@ class _History:
 
 
 def events(dump: Dump, sources: Collection[str], window: Window) -> Iterator[Part]:
-    """Yield the progress, and finally the first event of each column."""
+    """Yield the progress, and finally the first event in each column.
+
+    Args:
+        dump: The recording.
+        sources: The sources whose events count.
+        window: The window, and its number of columns.
+    """
     width_ns = max(1, (window.to_ns - window.from_ns) // max(1, window.columns))
     explainers: dict[DumpBlock, Explainer] = {}
     found: dict[int, MarkedEvent] = {}

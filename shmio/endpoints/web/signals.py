@@ -30,38 +30,41 @@ from shmio.segment import Block
 from shmio.segment.block import Frame
 
 INTERVAL_S: Final = 0.04
-"""Interval at which new frames are packed and sent, in s. A page redraws at the same interval."""
+"""Interval in s at which new frames are packed and sent. A page redraws at the same interval."""
 HISTORY_S: Final = 8.0
-"""A new follower first gets the frames of this time in s, as far as the ring still has them."""
+"""Length in s of the past that a new follower gets first, as far as its frames are still in the ring."""
 MAX_HISTORY: Final = 2_000
-"""Maximum number of frames that a new follower first gets. If there are more, every n-th is chosen."""
+"""Maximum number of past frames that a new follower gets first. If there are more, every n-th is chosen."""
 MAX_BEHIND: Final = 500
-"""Maximum number of unread frames. If there are more, this process was too slow: the older ones become a gap."""
+"""Maximum number of unread frames. If there are more, this process was too slow, and the older ones become a gap."""
 MAX_BATCH_BYTES: Final = 256 << 10
-"""Maximum size of the values and marks of a batch."""
+"""Maximum size in bytes of the values and provenance marks of a batch."""
 MAX_IMAGE_BYTES: Final = 32 << 20
-"""Maximum size of the images from which a batch is made."""
+"""Maximum size in bytes of the images from which a batch is made."""
 LEAST_GAP_NS: Final = 100_000_000
-"""Minimum time without frames that counts as a gap, in ns. It is longer for sources with a long period."""
+"""Minimum time in ns without frames that counts as a gap. For sources with a long period, it is longer."""
 HEAD: Final = struct.Struct("<IId")
-"""The head of a batch."""
+"""The format of a batch's head."""
 _MILLISECOND: Final = np.timedelta64(1, "ms")
 
 _log = logging.getLogger("shmio.web")
 
 
 class Follower(Protocol):
-    """Receives the batches of a feed."""
+    """Receives the batches of feeds."""
 
     def take(self, batch: bytes) -> None:
         """Receive a batch. The follower may drop it."""
 
     def end(self, number: int) -> None:
-        """Handle the end of a feed: a reload has replaced its source, or the feed has failed."""
+        """Handle the end of the feed with this number: a reload has replaced its source, or the feed has failed."""
 
 
 class Feed:
-    """Sends the values of some registers of one source to followers. Use it in the event loop's thread only."""
+    """Sends the values of some registers of one source to its followers.
+
+    Use it in the event loop's thread only.
+    """
 
     def __init__(self, number: int, block: Block, registers: Sequence[Register], utc_ns: int) -> None:
         """Start with the next frame.
@@ -82,12 +85,15 @@ class Feed:
         self._utc_ns = utc_ns
 
     def history(self, last: int) -> tuple[list[bytes], Frame | None]:
-        """Return batches of older frames for a new follower, and the last of these frames.
+        """Return batches of past frames for a new follower, and the last of these frames.
 
         You may call this from another thread.
 
         Args:
             last: Number of the last frame to return.
+
+        Returns:
+            The batches, and the last frame in them; None if there is no frame.
 
         """
         block = self.block
@@ -98,12 +104,15 @@ class Feed:
         return list(packer.batches(filter(None, map(block.read, numbers)))), packer.before
 
     def between(self, before: Frame | None, first: int, last: int) -> list[bytes]:
-        """Return the batches of the frames with the numbers from ``first`` to ``last``."""
+        """Return the batches of the frames with numbers from ``first`` to ``last``.
+
+        ``before`` is the frame before them; None after a gap.
+        """
         return list(_Packer(self, before).batches(filter(None, map(self.block.read, range(first, last + 1)))))
 
     @property
     def last(self) -> int:
-        """Number of the last frame that was sent to all followers."""
+        """Number of the last frame that was sent to the followers."""
         return self._cursor.last
 
     def send(self) -> None:
@@ -114,17 +123,17 @@ class Feed:
                 follower.take(batch)
 
     def read(self) -> list[bytes]:
-        """Return batches of the frames that are new since the last call."""
+        """Return the batches of the frames that are new since the last call."""
         cursor = self._cursor
         if cursor.behind > MAX_BEHIND:
             cursor.resume(after=cursor.last + cursor.behind - MAX_BEHIND)
         return list(self._live.batches(islice(iter(cursor.poll, None), MAX_BEHIND)))
 
     def pack(self, before: Frame | None, frames: Sequence[Frame]) -> bytes:
-        """Return a batch of frames.
+        """Return one batch with these frames.
 
         Args:
-            before: The frame before these; None after a gap.
+            before: The frame before them; None after a gap.
             frames: The frames.
 
         """
@@ -205,7 +214,7 @@ class _Packer:
 
 
 class Feeds:
-    """All feeds that pages follow. Use it in the event loop's thread only."""
+    """The feeds that pages follow. Use it in the event loop's thread only."""
 
     def __init__(self) -> None:
         self._feeds: dict[tuple[int, tuple[str, ...]], Feed] = {}
@@ -215,7 +224,7 @@ class Feeds:
         self._task: asyncio.Task[None] | None = None
 
     async def follow(self, block: Block, registers: Sequence[Register], follower: Follower) -> Feed:
-        """Send a follower the frames of the last seconds, and from then on all new frames.
+        """Send a follower the frames of the last seconds, and from then on each new frame. Return the feed.
 
         Args:
             block: The source's block.
@@ -278,7 +287,11 @@ def _sent(feed: Feed) -> bool:
 
 
 def check_plottable(register: Register) -> None:
-    """Raise PathError unless a register is a single number, BOOL or duration."""
+    """Check that a register can be plotted: that it is a single number, BOOL or duration.
+
+    Raises:
+        PathError: It cannot be plotted.
+    """
     kind = np.dtype(_kind(register)).kind
     if register.dims:
         raise PathError(f"{register.path}: this is an array; plot one element, such as {_first(register)}")
@@ -296,6 +309,6 @@ def _first(register: Register) -> str:
 
 
 def numbers(values: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-    """Return values of a plottable register as numbers; durations in ms."""
+    """Return the values of a plottable register as numbers. Durations are in ms."""
     found: npt.NDArray[np.float64] = values / _MILLISECOND if values.dtype.kind == "m" else values.astype(np.float64)
     return found

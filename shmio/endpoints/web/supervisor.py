@@ -1,4 +1,4 @@
-"""Sends requests of pages to the supervisor."""
+"""Sends the pages' requests to the supervisor."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from shmio.local.supervisor import ask_supervisor
 from shmio.segment import Segment
 
 MAX_REQUESTS: Final = 4
-"""Maximum number of requests at a time. The supervisor has room for more, so that commands can still reach it."""
+"""Maximum number of requests at a time. The supervisor can take more, so that commands can still reach it."""
 
 
 class Supervisor:
@@ -23,10 +23,14 @@ class Supervisor:
         self._room = asyncio.Semaphore(MAX_REQUESTS)
 
     async def ask(self, request: Request, timeout_s: float) -> dict[str, Any]:
-        """Send a request, and return the answer.
+        """Send a request, and return the supervisor's answer.
 
-        A daemon thread waits for the answer. It does not keep this process alive, which the request may
-        be about to restart.
+        A daemon thread waits for the answer. It does not keep this process alive, which the request
+        may be about to restart.
+
+        Args:
+            request: The request.
+            timeout_s: Maximum time to wait for the answer, in s.
 
         Raises:
             ControlError: The supervisor refuses, does not answer, or seems to be dead.

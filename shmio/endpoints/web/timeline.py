@@ -1,4 +1,4 @@
-"""The newest events of all sources, which are read once for all pages."""
+"""The newest events of all sources. They are read once for all pages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from shmio.segment import Segment
 MAX_EVENTS: Final = 200
 """Maximum number of events that are kept."""
 MAX_READ: Final = 500
-"""Maximum number of a source's events that are read at a time. The ring keeps more for the next time."""
+"""Maximum number of a source's events that are read at a time. Further events stay in the ring until the next time."""
 MAX_PATHS: Final = 8
 """Maximum number of paths that are kept for an event."""
 INTERVAL_S: Final = 0.4

@@ -1,7 +1,7 @@
-"""Compiles files that a user drops on a page: sources of data blocks, tag tables, other tools' tag lists.
+"""Compiles files that a user drops on a page: sources of data blocks, tag tables, and other tools' tag lists.
 
-These files may be hostile. A separate process reads them from its standard input, with limits of time
-and memory. No file is written.
+These files may be hostile. A separate process reads them from its standard input, with limits of
+time and memory. No file is written.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from shmio.logs import printable
 MAX_BYTES: Final = 8 << 20
 """Maximum size of all files together, in bytes."""
 MAX_HEAD_BYTES: Final = 64 << 10
-"""Maximum size of the line with the names, in bytes."""
+"""Maximum size in bytes of an upload's first line, which has the names of the files."""
 MAX_RECEIVING: Final = 8
-"""Maximum number of uploads that are received at the same time. A newer one ends the oldest."""
+"""Maximum number of uploads that are received at the same time. If one more comes, the oldest is ended."""
 MAX_COMPILING: Final = 2
 """Maximum number of uploads that are compiled at the same time. Others wait."""
 WAIT_S: Final = 10
@@ -43,9 +43,9 @@ MAX_ANSWER_BYTES: Final = 16 << 20
 """Maximum size of the shown registers as JSON, in bytes."""
 MAX_MESSAGES: Final = 200
 MAX_TEXT: Final = 500
-"""Maximum number of characters of a text that are shown."""
+"""Maximum number of characters that are shown of a text."""
 LIMIT_S: Final = 30
-"""Time limit in s to compile files."""
+"""Maximum time in s that compiling files may take."""
 MEMORY_BYTES: Final = 1 << 30
 """Maximum address space of the process that compiles, in bytes."""
 _SOURCES: Final = (".db", ".udt", ".awl", ".scl")
@@ -62,7 +62,10 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Uploads:
-    """Receives and compiles uploads. Slow clients do not block others. Use it in the event loop's thread only."""
+    """Receives and compiles uploads. A slow client does not block others.
+
+    Use it in the event loop's thread only.
+    """
 
     def __init__(self) -> None:
         self._receiving: dict[int, bytearray] = {}
@@ -71,7 +74,7 @@ class Uploads:
         self._compiling = asyncio.Semaphore(MAX_COMPILING)
 
     async def receive(self, parts: AsyncIterable[bytes]) -> bytes | None:
-        """Return a whole upload; None if it is too large.
+        """Receive an upload, and return it whole; None if it is too large.
 
         Raises:
             EndpointError: Too many newer uploads came meanwhile.
@@ -94,7 +97,7 @@ class Uploads:
             self._receiving.pop(number, None)
 
     async def compile(self, body: bytes) -> bytes:
-        """Compile an upload: :func:`compile_uploads`. Wait until few enough others are being compiled.
+        """Compile an upload as :func:`compile_uploads` does. Wait first while too many others are being compiled.
 
         Raises:
             CommandError: Compiling took too much time or memory.
@@ -113,10 +116,11 @@ class Uploads:
 
 
 async def compile_uploads(body: bytes) -> bytes:
-    """Compile files in a separate process, and return its answer, which is JSON.
+    """Compile the files of an upload in a separate process. Return its answer, which is JSON.
 
     Args:
-        body: A line with a JSON list of names and sizes, and then the contents of the files.
+        body: The upload: a line with a JSON list of the files' names and sizes, and then their
+            contents.
 
     Raises:
         CommandError: The process took too much time or memory.
@@ -146,7 +150,7 @@ async def compile_uploads(body: bytes) -> bytes:
 
 
 def describe(body: bytes) -> dict[str, Any]:
-    """Return the layouts in the files of a request, and the messages about them.
+    """Return the layouts that the files of an upload define, and the messages about the files.
 
     Args:
         body: As for :func:`compile_uploads`.
@@ -242,7 +246,7 @@ def _short(text: str) -> str:
 
 
 def main() -> None:
-    """Read a request from standard input, and write the answer to standard output."""
+    """Read an upload from standard input, and write the answer to standard output."""
     signal.alarm(2 * LIMIT_S)  # ends this process even if its parent has died
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     resource.setrlimit(resource.RLIMIT_CPU, (LIMIT_S, LIMIT_S))

@@ -1,4 +1,4 @@
-"""The tabs of a page. Each module has one tab's calls, and sends the data that the tab follows."""
+"""The tabs of a page. Each module has the calls of one tab, and sends the data that the tab follows."""
 
 from typing import Final
 

@@ -15,9 +15,9 @@ from shmio.endpoints.web.page import FollowedTab, Nothing, Page, call
 from shmio.errors import CommandError
 
 INTERVAL_S: Final = 1.0
-"""Interval in s at which to check that the file is still the same."""
+"""Interval in s at which to check whether the file has changed."""
 RELOAD_S: Final = 90.0
-"""Time limit in s for a reload."""
+"""Maximum time in s that a reload may take."""
 
 _log = logging.getLogger("shmio.web")
 
@@ -39,7 +39,7 @@ class Configuration(FollowedTab):
 
     @call("read", Nothing)
     async def check(self, _: Nothing) -> dict[str, Any]:
-        """Check the file now; return it and its state."""
+        """Check the file now. Return it with its faults and the changes that a reload would make."""
         return await self._described()
 
     @call("control", Seen)

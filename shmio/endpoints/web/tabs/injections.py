@@ -29,15 +29,15 @@ from shmio.segment import Block, Quality
 from shmio.segment.block import Layouts
 
 INTERVAL_S: Final = 0.5
-"""Interval at which injections and events are sent if they have changed, in s."""
+"""Interval in s at which injections and events are sent, if they have changed."""
 MAX_INJECTIONS: Final = 500
 """Maximum number of injections that are shown."""
 MAX_PATHS: Final = 20
 """Maximum number of paths that are shown for an injection or an event."""
 MAX_COUNTED: Final = 4_096
-"""Maximum number of an injection's registers that are counted."""
+"""Maximum number of registers that are counted for an injection."""
 MAX_CAMPAIGNS: Final = 16
-"""Maximum number of campaigns that one page may run at a time."""
+"""Maximum number of campaigns that one page may run at the same time."""
 MAX_CONDITION: Final = 1_000
 """Maximum number of characters of a condition."""
 MAX_CAMPAIGN: Final = 60_000
@@ -45,15 +45,15 @@ MAX_CAMPAIGN: Final = 60_000
 
 
 class Given(msgspec.Struct, forbid_unknown_fields=True):
-    """The arguments of a call about a campaign: its TOML text."""
+    """The arguments of a call about a campaign: its text, in TOML."""
 
     text: Annotated[str, Meta(max_length=MAX_CAMPAIGN)]
     keep: bool = False
-    """True if the injections continue after the page is closed."""
+    """True if the injections continue after the page has been closed."""
 
 
 class Typed(msgspec.Struct, forbid_unknown_fields=True):
-    """The arguments of ``condition``: a condition that the user types."""
+    """The arguments of ``condition``: a condition, as the user is typing it."""
 
     when: Annotated[str, Meta(max_length=MAX_CONDITION)]
 
@@ -63,7 +63,7 @@ class Chosen(msgspec.Struct, forbid_unknown_fields=True):
 
     source: Annotated[str, Meta(max_length=200)]
     number: Annotated[str, Meta(pattern="^[0-9]{1,20}$")]
-    """The number as text, because JavaScript has no exact numbers above 2**53."""
+    """The number as text, because JavaScript has no exact integers above 2**53."""
 
 
 class Injections(FollowedTab):
@@ -76,7 +76,7 @@ class Injections(FollowedTab):
         self._campaigns: list[Campaign] = []
 
     def close(self) -> None:
-        """Lift the campaigns of this page, except those with ``keep``."""
+        """Lift the injections of this page's campaigns, except those with ``keep``."""
         campaigns, self._campaigns = self._campaigns, []
         if campaigns:
             named = {", ".join(f"{one.source}: {one.name}" for one in held.declared): held for held in campaigns}
@@ -84,22 +84,22 @@ class Injections(FollowedTab):
 
     @call("inject", Chosen)
     async def lift(self, given: Chosen) -> None:
-        """Lift an injection of any program."""
+        """Lift an injection, whichever program has created it."""
         await run_in_threadpool(self.page.served.cell.lift, given.source, int(given.number))
 
     @call("inject", Nothing)
     async def lift_all(self, _: Nothing) -> int:
-        """Lift all injections of all sources; return their number."""
+        """Lift all injections on all sources. Return their number."""
         return len(await run_in_threadpool(self.page.served.cell.lift_all))
 
     @call("read", Given)
     async def check(self, given: Given) -> list[dict[str, Any]]:
-        """Check a campaign, and return what it would inject. Nothing is started."""
+        """Check a campaign, and return the injections that it would make. Nothing is started."""
         return await run_in_threadpool(self._preview, given.text)
 
     @call("read", Typed)
     async def condition(self, given: Typed) -> dict[str, Any]:
-        """Return whether a condition holds at present (None: unknown), and the values that it reads."""
+        """Return whether a condition is true at present (None if unknown), and the values that it reads."""
         blocks = self.page.served.segment.blocks
         condition = compile_condition(given.when, Layouts(blocks))
         values = [_present(blocks[source], codec) for source, codec in condition.reads]

@@ -13,20 +13,20 @@ from shmio.endpoints.web.page import Tab, call
 from shmio.local.log_files import last_lines, parse_line
 
 MAX_LINES: Final = 500
-"""Maximum number of lines that are sent."""
+"""Maximum number of lines that are sent to the page."""
 SEARCHED_LINES: Final = 5_000
-"""Number of the newest lines in which a filter searches."""
+"""Number of newest lines in which a filter searches."""
 MAX_TEXT: Final = 2_000
-"""Maximum number of characters of a line that are sent."""
+"""Maximum number of characters that are sent of a line."""
 
 
 class Wanted(msgspec.Struct, forbid_unknown_fields=True):
-    """The arguments of ``lines``: which lines the page shows."""
+    """The arguments of ``lines``: which lines the page wants."""
 
     filter: Annotated[str, Meta(max_length=200)] = ""
-    """Text that each line must contain; case is ignored."""
+    """Text that each line must contain; empty: any line. Case is ignored."""
     process: Annotated[str, Meta(max_length=200)] = ""
-    """Name of the process; empty: all processes."""
+    """Name of the process whose lines to return; empty: of all processes."""
     count: Annotated[int, Meta(ge=1, le=MAX_LINES)] = 200
 
 
@@ -37,7 +37,7 @@ class Log(Tab):
 
     @call("read", Wanted)
     async def lines(self, given: Wanted) -> list[dict[str, Any]]:
-        """Return the newest lines that match, the oldest first."""
+        """Return the newest matching lines, the oldest first."""
         served = self.page.served
         names = ["supervisor", *(slot.name for slot in served.segment.processes)]
         chosen = [name for name in names if given.process in ("", name)]

@@ -13,11 +13,11 @@ from shmio.control import Restart
 from shmio.endpoints.web.page import Nothing, Page, Tab, call
 
 INTERVAL_S: Final = 1.0
-"""Interval at which the overview is sent, in s."""
+"""Interval in s at which the overview is sent."""
 
 
 RESTART_S: Final = 40.0
-"""Time limit in s for the restart of a process."""
+"""Maximum time in s that the restart of a process may take."""
 
 _log = logging.getLogger("shmio.web")
 
@@ -29,7 +29,7 @@ class Named(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Overview(Tab):
-    """Sends the overview of the instance. Every page follows it, because all tabs show its head line."""
+    """Sends the overview of the instance. Each page follows it, because all tabs show the overview's head line."""
 
     name: ClassVar[str] = "overview"
 
@@ -39,13 +39,13 @@ class Overview(Tab):
 
     @call("read", Nothing)
     async def follow(self, _: Nothing) -> None:
-        """Send the overview now, and then each second."""
+        """Send the overview now, and then once a second."""
         if self._following is None:
             self._following = self.page.start(self._follow())
 
     @call("control", Named)
     async def restart(self, given: Named) -> None:
-        """Stop and start a process; return when it runs again."""
+        """Stop and start a process. Return once it runs again."""
         _log.info(
             "%s asks the supervisor to restart %s",
             f"user {self.page.user.name!r}" if self.page.user.name else "a page",

@@ -1,4 +1,4 @@
-"""The plots tab: live values of registers, and their past from the recordings of this run."""
+"""The plots tab: live values of registers, and past values from the recordings of this run."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MAX_SIGNALS: Final = 200
 """Maximum number of registers that one page plots."""
 MAX_COLUMNS: Final = 4000
 RECORDED_S: Final = 2.0
-"""Time in s after which a published frame is in the recorder's file."""
+"""Time in s after which a published frame must be in the recorder's file."""
 
 
 class Plotted(msgspec.Struct, forbid_unknown_fields=True):
@@ -34,9 +34,9 @@ class Plotted(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Wanted(msgspec.Struct, forbid_unknown_fields=True):
-    """The arguments of ``past``: registers of one source, a window of time, and the plot's width in pixels.
+    """The arguments of ``past``: registers of one source, a window of time, and the width of the plot in pixels.
 
-    Times are in s, UTC, as in batches.
+    Times are in s of UTC, as in batches.
     """
 
     source: Annotated[str, Meta(min_length=1, max_length=MAX_PATH)]
@@ -73,11 +73,11 @@ class Plots(Tab):
 
     @call("read", Wanted)
     async def past(self, given: Wanted) -> list[int]:
-        """Start to read the past of registers. This replaces an earlier request for the same source.
+        """Start to read past values of registers. This replaces an earlier request for the same source.
 
         Returns:
-            A number for each recording that has some of this past, in the order of time; ``more``
-            returns its parts. Empty: no recording has any.
+            A number for each recording that has some of these values, in the order of time. Pass it
+            to ``more`` to get the parts. The list is empty if no recording has any.
 
         """
         async with self._changing:
@@ -109,7 +109,10 @@ class Plots(Tab):
 
     @call("read", Numbered)
     async def more(self, given: Numbered) -> Part | None:
-        """Return the next part of the past; None: there are no more, or a newer request has replaced it."""
+        """Return the next part of the past values.
+
+        Return None if there are no more, or if a newer request has replaced this one.
+        """
         work = next((works[given.number] for works in self._past.values() if given.number in works), None)
         return None if work is None else await work.next()
 
@@ -119,10 +122,10 @@ class Plots(Tab):
 
     @call("read", Plotted)
     async def follow(self, given: Plotted) -> dict[str, Any] | None:
-        """Send the values of these registers of a source from now on, in place of those sent so far.
+        """Send the values of these registers from now on, instead of those of this source that were sent so far.
 
         The answer comes before the first batch. It has the feed's number, and the registers in the
-        order of the batches.
+        order of the batches; it is None if there are no registers.
         """
         async with self._changing:
             paths = list(dict.fromkeys(given.paths))
@@ -154,7 +157,7 @@ class Plots(Tab):
         self.page.push_batch(batch)
 
     def end(self, number: int) -> None:
-        """Tell the page which feeds are left, so that it follows the registers of the ended feed again."""
+        """Tell the page which feeds remain, so that it follows the registers of the ended feed again."""
         self._feeds = {source: feed for source, feed in self._feeds.items() if feed.number != number}
         self.page.push("plots", [feed.number for feed in self._feeds.values()])
 

@@ -26,20 +26,20 @@ from shmio.recording.description import describe
 from shmio.recording.reading.reader import Reader
 
 MAX_SIGNALS: Final = 32
-"""Maximum number of registers that one plot of a recording has."""
+"""Maximum number of registers in one plot of a recording."""
 MAX_COLUMNS: Final = 4000
 MAX_WORKS: Final = 4
 """Maximum number of plots and checks that one page may have in progress."""
 MAX_FOUND: Final = 50
 """Maximum number of registers that a search returns."""
 MAX_SHOWN: Final = 100
-"""Maximum number of blocks and gaps that the description of a recording lists."""
+"""Maximum number of blocks, and of gaps, that the description of a recording lists."""
 MAX_INSTANCE: Final = 40
 """Maximum length of an instance's name."""
 BESIDE: Final = "-replay"
-"""Suffix of the name of an instance that replays a recording beside this instance."""
+"""Suffix of the name of a second instance, which replays a recording while this instance runs."""
 CHECKED_BYTES: Final = 1 << 20
-"""Number of bytes after which a check reports its progress."""
+"""Number of checked bytes after which a check reports its progress."""
 
 _Path = Annotated[str, Meta(min_length=1, max_length=MAX_PATH)]
 _Name = Annotated[str, Meta(min_length=1, max_length=MAX_NAME)]
@@ -54,16 +54,16 @@ class Named(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Search(msgspec.Struct, forbid_unknown_fields=True):
-    """The arguments of ``registers``: a recording, and a text that the paths of registers must contain."""
+    """The arguments of ``registers``: a recording, and a text that the paths of the registers must contain."""
 
     name: _Name
     filter: Annotated[str, Meta(max_length=200)] = ""
 
 
 class Plotted(msgspec.Struct, forbid_unknown_fields=True):
-    """The arguments of ``plot``: registers of a recording, a window of time, and the plot's width in pixels.
+    """The arguments of ``plot``: registers of a recording, a window of time, and the width of the plot in pixels.
 
-    Times are in s, UTC; None: the start or the end of the recording.
+    Times are in s of UTC; None stands for the start or the end of the recording.
     """
 
     name: _Name
@@ -74,13 +74,13 @@ class Plotted(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Numbered(msgspec.Struct, forbid_unknown_fields=True):
-    """The arguments of a call about work that the page has started: its number."""
+    """The arguments of a call about work that the page has started: the number of the work."""
 
     number: int
 
 
 class Request(msgspec.Struct, forbid_unknown_fields=True):
-    """The arguments of ``replay``: a change as in :class:`shmio.local.replays.ReplayRequest`."""
+    """The arguments of ``replay``: a change, with the fields of :class:`shmio.local.replays.ReplayRequest`."""
 
     paused: bool | None = None
     speed: float | None = None
@@ -120,7 +120,7 @@ class RecordingsTab(Tab):
 
     @call("read", Named)
     async def describe(self, given: Named) -> dict[str, Any]:
-        """Describe a recording as ``shmio-dump info`` does, with the commands that play it."""
+        """Describe a recording as ``shmio-dump info`` does. Add the commands that replay it."""
         path = self._recordings.path(given.name)
         found = await self._once(lambda beat: describe(path, own=True, beat=beat))
         found["blocks"], found["gaps"] = found["blocks"][:MAX_SHOWN], found["gaps"][:MAX_SHOWN]
@@ -129,7 +129,7 @@ class RecordingsTab(Tab):
 
     @call("read", Search)
     async def registers(self, given: Search) -> list[dict[str, str]]:
-        """Return registers of a recording whose path contains a text."""
+        """Return the registers of a recording whose path contains a text."""
         opened = await self._recordings.open(given.name)
         try:
             return await self._recordings.in_thread(lambda: _found(opened, given.filter.lower()))
@@ -138,7 +138,7 @@ class RecordingsTab(Tab):
 
     @call("read", Plotted)
     async def plot(self, given: Plotted) -> dict[str, Any]:
-        """Start to read the history of registers, reduced to the width of the plot; ``more`` returns its parts."""
+        """Start to read the history of registers, reduced to the width of the plot. ``more`` returns its parts."""
         opened = await self._recordings.open(given.name)
         try:
             dump = opened.dump
@@ -165,7 +165,7 @@ class RecordingsTab(Tab):
 
     @call("read", Named)
     async def verify(self, given: Named) -> int:
-        """Start to read a whole recording, as ``shmio-dump verify`` does; ``more`` returns progress and result."""
+        """Start to check a recording, as ``shmio-dump verify`` does. ``more`` returns the progress and the result."""
         path = self._recordings.path(given.name)
 
         def work(beat: Callable[[], None]) -> Iterator[dict[str, Any]]:
@@ -187,7 +187,7 @@ class RecordingsTab(Tab):
 
     @call("read", Numbered)
     async def more(self, given: Numbered) -> Any:
-        """Return the next part of work that the page has started; None at its end."""
+        """Return the next part of the result of work that the page has started; None at the end of the work."""
         work = self._works.get(given.number)
         if work is None:
             raise CommandError("this work was stopped")
@@ -209,7 +209,7 @@ class RecordingsTab(Tab):
 
     @call("read", Nothing)
     async def replays(self, _: Nothing) -> dict[str, Any]:
-        """Return the status of each replay, and the kinds of events for which a replay can search."""
+        """Return the status of each replay, and the kinds of events that a replay can search for."""
         try:
             found = await run_in_threadpool(self.page.served.cell.replay.status)
         except CommandError:  # the instance plays no recording

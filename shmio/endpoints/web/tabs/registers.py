@@ -1,4 +1,4 @@
-"""The registers tab: a tree of all registers with their values, writes and overrides."""
+"""The registers tab: a tree of all registers with their values, which the user can write and override."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from shmio.model.values import Reading
 from shmio.segment import Block
 
 INTERVAL_S: Final = 0.2
-"""Interval at which changed values of visible rows are sent, in s."""
+"""Interval in s at which changed values of visible rows are sent."""
 MAX_ROWS: Final = 200
 MAX_COUNTED: Final = 2_000_000
 """Maximum number of visible rows that are counted."""
 MAX_EXPANDED: Final = 1000
 MAX_OVERRIDES: Final = 64
-"""Maximum number of registers that one page may override at a time."""
+"""Maximum number of registers that one page may override at the same time."""
 MAX_TEXT: Final = 200
-"""Maximum number of characters of a value that are shown."""
+"""Maximum number of characters that are shown of a value."""
 _TEXTS: Final = frozenset({"CHAR", "WCHAR", "STRING", "WSTRING"})
 
 _Path = Annotated[str, Meta(min_length=1, max_length=MAX_PATH)]
@@ -45,7 +45,7 @@ class Shown(msgspec.Struct, forbid_unknown_fields=True):
     first: Annotated[int, Meta(ge=0, le=MAX_COUNTED)]
     count: Annotated[int, Meta(ge=0, le=MAX_ROWS)]
     expanded: Annotated[list[_Path], Meta(max_length=MAX_EXPANDED)] | None = None
-    """Paths of the expanded nodes; None: all sources are expanded."""
+    """Paths of the expanded nodes; None if all sources, and nothing else, are expanded."""
     filter: Annotated[str, Meta(max_length=200)] = ""
 
 
@@ -69,7 +69,7 @@ class Followed(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Registers(Tab):
-    """Shows registers, and writes and overrides them."""
+    """Shows registers, writes them, and overrides them."""
 
     name: ClassVar[str] = "registers"
 
@@ -91,7 +91,7 @@ class Registers(Tab):
 
     @call("read", Shown)
     async def rows(self, given: Shown) -> dict[str, Any]:
-        """Return rows, and send the values of these rows from now on, whenever they change."""
+        """Return the requested rows. From now on, send the values of these rows whenever they change."""
         async with self._looking, self.page.served.trees.looking:  # one search at a time for a page, and for all pages
             found, total = await run_in_threadpool(self._rows, given)
         self._show([(row.path, row.register) for row in found if row.register is not None])
@@ -99,7 +99,7 @@ class Registers(Tab):
 
     @call("read", Followed)
     async def follow(self, given: Followed) -> None:
-        """Send the values of these registers from now on, in place of those of the rows."""
+        """From now on, send the values of these registers, instead of those of the rows."""
         self._show([(path, self._cell.resolve(path)[1]) for path in given.paths])
 
     @call("write", Given)
@@ -111,7 +111,7 @@ class Registers(Tab):
 
     @call("inject", Given)
     async def override(self, given: Given) -> dict[str, str]:
-        """Show consumers this value in place of the source's, until the page lifts it or is closed."""
+        """Override a register: show consumers this value until the page lifts the override or is closed."""
         path, value = self._typed(given)
         shadow = self._overrides.get(path)
         if shadow is None:
@@ -125,7 +125,7 @@ class Registers(Tab):
 
     @call("inject", Named)
     async def lift(self, given: Named) -> None:
-        """End an override of this page."""
+        """Lift an override of this page."""
         shadow = self._overrides.pop(given.path, None)
         if shadow is None:
             raise PathError(f"{given.path}: this page does not override it; the tab Injections lifts others")

@@ -1,6 +1,6 @@
 """The 3D tab: the bodies of the cell, and the registers that move them.
 
-The page follows these registers as the tabs Plots and Registers do.
+The page follows these registers in the same way as the tabs Plots and Registers.
 """
 
 from __future__ import annotations

@@ -18,14 +18,14 @@ _Seconds = Annotated[float, Meta(ge=1e-6, le=3600)]
 
 
 class Steps(msgspec.Struct, forbid_unknown_fields=True):
-    """The arguments of ``step``: the number of steps, and the length of each in s; None: the step size."""
+    """The arguments of ``step``: the number of steps, and the length of each in s; None for the step size."""
 
     count: Annotated[int, Meta(ge=1, le=MAX_STEPS)] = 1
     dt_s: _Seconds | None = None
 
 
 class Rate(msgspec.Struct, forbid_unknown_fields=True):
-    """The arguments of ``play``: the speed relative to real time, and the length of a step in s.
+    """The arguments of ``play``: the speed as a multiple of real time, and the length of each step in s.
 
     If the length is None, it is the step size.
     """
@@ -37,35 +37,36 @@ class Rate(msgspec.Struct, forbid_unknown_fields=True):
 class Time(Tab):
     """Controls the instance's clock.
 
-    The process ``web`` owns the clock after a page has taken control, so any page can continue.
+    Once a page has taken control of the clock, the process ``web`` owns it, so any page can
+    continue.
     """
 
     name: ClassVar[str] = "time"
 
     @call("read", Nothing)
     async def state(self, _: Nothing) -> dict[str, Any]:
-        """Return the clock, and the sources that steps do not affect."""
+        """Return the state of the clock, and the sources that steps do not affect."""
         cell = self.page.served.cell
         return {"clock": _described(cell.clock), "real_sources": cell.real_sources()}
 
     @call("control", Steps)
     async def step(self, given: Steps) -> dict[str, Any]:
-        """Step virtual time, and return the clock after the last step."""
+        """Step virtual time. Return the state of the clock after the last step."""
         return _described(await run_in_threadpool(self.page.served.cell.step, given.dt_s, given.count))
 
     @call("control", Rate)
     async def play(self, given: Rate) -> dict[str, Any]:
-        """Play virtual time until it is paused."""
+        """Play virtual time until it is paused. Return the state of the clock."""
         return _described(await run_in_threadpool(self.page.served.cell.play, given.rate, given.dt_s))
 
     @call("control", Nothing)
     async def pause(self, _: Nothing) -> dict[str, Any]:
-        """Pause virtual time."""
+        """Pause virtual time. Return the state of the clock."""
         return _described(await run_in_threadpool(self.page.served.cell.pause))
 
     @call("control", Nothing)
     async def release(self, _: Nothing) -> dict[str, Any]:
-        """Release the clock, so that time is real again."""
+        """Release the clock, so that time is real again. Return the state of the clock."""
         return _described(await run_in_threadpool(self.page.served.cell.release))
 
 
