@@ -112,7 +112,7 @@ def acting(actor: Actor, endpoint: str) -> Iterator[Acting]:
 
 
 def uid_actor(uid: int | None, origin: str) -> Actor:
-    """Return the actor for a user of this host, by user id; None: the user is unknown."""
+    """Return the actor for the user with this id on this host. If ``uid`` is None, the user is unknown."""
     return Actor("uid", "" if uid is None else str(uid), origin)
 
 

@@ -14,7 +14,7 @@ from shmio.layout.model import Layout
 from shmio.simulation.fmu import is_fmu
 
 MAX_BYTES: Final = 64 << 20
-"""Maximum size in bytes of a file to compute the digest of."""
+"""Maximum size in bytes of a file that gets a digest."""
 
 
 def of_file(file: Path) -> str:
@@ -35,7 +35,7 @@ def of_campaign(file: Path, expectations: Iterable[Expectation]) -> Iterator[tup
 
 
 def of_layouts(layouts: Mapping[str, Layout]) -> Iterator[tuple[str, str]]:
-    """Yield a label and the digest for each layout. ``layouts`` are by source."""
+    """Yield a label and the digest for the layout of each source."""
     for source, layout in layouts.items():
         yield f"layout of {source}", layout.hash.hex()
 

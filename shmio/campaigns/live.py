@@ -30,11 +30,11 @@ from shmio.segment import Block, Event, Frame, Segment
 from shmio.segment.block import Layouts
 
 MAX_STEPS: Final = 256
-"""Maximum number of steps of virtual time after which the judge evaluates the new frames."""
+"""Maximum number of steps of virtual time between two turns of the judge."""
 STOP_STEPS: Final = 64
-"""Maximum number of steps between two turns of the judge if the run stops at the first failure.
+"""As :data:`MAX_STEPS`, if the run stops at the first failure.
 
-It is therefore also the maximum number of steps after the failure.
+It is then also the maximum number of steps after the failure.
 """
 GOOD_S: Final = 10.0
 """Maximum time in s to wait at the start until all sources that the expectations read have good quality."""
@@ -116,7 +116,7 @@ class LiveRun:
         self._blocks: dict[str, Block] = {source: blocks[source] for source in self.judge.sources}
 
     def run(self, over: threading.Event, begun: Callable[[], None] = lambda: None) -> None:
-        """Run to the end or until ``over`` is set; with :attr:`Plan.stop`, at most to the first failure.
+        """Run to the end, or until ``over`` is set; with :attr:`Plan.stop`, stop also at the first failure.
 
         Args:
             over: Set this event to end the run.

@@ -1,4 +1,4 @@
-"""``shmio inject``: overrides values while the command runs: values from the command line, or a campaign file."""
+"""``shmio inject``: overrides single values, or runs a campaign file, for as long as the command runs."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ def config_file(arguments: argparse.Namespace) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """The instance on which a verb acts, and the configuration that names it; ``file`` is None if there is none."""
+    """The instance on which a verb acts, and the configuration that names it; ``file`` is None if none does."""
 
     name: str
     file: Path | None = None
@@ -83,7 +83,7 @@ def config_option(arguments: argparse.Namespace) -> str | None:
 
     Returns:
         The option; "" for the default file; None if the configuration is unknown, because
-        ``--instance`` named the instance, or the command found the running instance.
+        ``--instance`` named the instance, or the command found the only running instance.
     """
     if getattr(arguments, "instance", None) is not None:
         return None

@@ -26,7 +26,7 @@ SHELL_HELP = "Print the code with which a shell completes command lines: see doc
 
 
 class Verb(NamedTuple):
-    """A verb that acts on an instance: its help, the function that adds its arguments, and the one that runs it."""
+    """A verb that acts on an instance: its help, and the functions that add its arguments and run it."""
 
     help: str
     arguments: Callable[[argparse.ArgumentParser], None]

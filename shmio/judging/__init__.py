@@ -1,1 +1,1 @@
-"""Judges expectations: formulas over signals, their verdicts and their robustness."""
+"""Judges expectations. Each becomes a formula over signals, and gets a verdict with its robustness."""

@@ -215,7 +215,7 @@ class Network:
         return TopLevelExtremum(_extremum(tree.name), self.truth(tree.operands[0]), tree.bounds_ns)
 
     def like(self, signal: Signal, golden: Piece, tolerance: float, tolerance_ns: int) -> tuple[TopLevel, Tube]:
-        """Return the comparison of a signal with a golden signal, and its node.
+        """Return the comparison of a signal with a golden signal, as a top-level part and as a node.
 
         Args:
             signal: The signal to compare.

@@ -21,7 +21,7 @@ from shmio.judging.verdict import All, Outcome, TopLevel, TopLevelExtremum, Verd
 from shmio.layout.model import Layout, Register
 
 AROUND: Final = 3
-"""Number of values before a failure, and after it, that a verdict shows."""
+"""Number of values that a verdict shows before the moment of a failure, and also after it."""
 
 
 Golden = Callable[[str, Sequence[Signal]], Sequence[Piece]]

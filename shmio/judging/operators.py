@@ -145,7 +145,7 @@ class Edge(Node):
 
     Args:
         operand: The truth.
-        first: Whether a truth that is already true in the first frame has become true there.
+        first: Whether a truth that is true in the first frame counts as having become true there.
     """
 
     def __init__(self, operand: Node, *, first: bool) -> None:
@@ -244,8 +244,8 @@ class Window(Node):
     ``verdict.TopLevelExtremum`` takes its place.
 
     A window reaches into the future (``begin`` and ``end`` are at least 0: ``eventually``,
-    ``always``) or into the past (both are at most 0: ``once``, ``historically``). If a window ends
-    before the judged time begins, ``once`` is false there, and ``historically`` is true.
+    ``always``) or into the past (both are at most 0: ``once``, ``historically``). For a window that
+    ends before the judged time begins, ``once`` is false, and ``historically`` is true.
 
     The node keeps only the values that can still decide a future result. Each window that is not
     computed yet reaches at least up to the newest value. For the greatest value, the node therefore
@@ -458,8 +458,8 @@ class Tube(Node):
 
     Args:
         operand: The number.
-        lower: The lower limit; its times count from the start of the judged time.
-        upper: The upper limit, with the same times.
+        lower: The lower limit. Its times count from the start of the judged time.
+        upper: The upper limit. Its times count in the same way.
     """
 
     def __init__(self, operand: Node, lower: Piece, upper: Piece) -> None:

@@ -28,7 +28,7 @@ _HEADINGS = ("NAME", "KIND", "STATE", "PID", "RESTARTS", "UPTIME", "")
 _LIST_HEADINGS = ("NAME", "STATE", "FILE", "LISTENS ON")
 WHERE_S = 2.0
 LATE_S = 1.0
-"""The status shows each reader that is at least this time behind its source, in s."""
+"""Time in s by which a reader must be behind its source for the status to show the reader."""
 
 
 def status(arguments: argparse.Namespace) -> int:

@@ -1,1 +1,1 @@
-"""Alerts: a process that watches conditions, and notifies people and programs."""
+"""The alert process: it watches conditions, and notifies people and programs."""

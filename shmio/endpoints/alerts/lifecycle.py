@@ -40,8 +40,8 @@ class Lifecycle:
     """The state of one alert.
 
     An alert becomes active once its condition has been true for ``for_ns``, and ends when its
-    condition is false. An unknown condition (None) changes nothing, but restarts ``for_ns``. There
-    are at least ``every_ns`` between two notices of activations. An activation that comes sooner is
+    condition is false. An unknown condition (None) changes nothing, but restarts ``for_ns``. Two
+    notices of activations are at least ``every_ns`` apart. An activation that comes sooner is
     announced at the end of this interval, if the alert is still active then. Otherwise it only
     counts as suppressed.
     """

@@ -32,7 +32,7 @@ log = logging.getLogger("shmio.alerts")
 
 
 class WatchedAlert:
-    """An alert: its configuration, what it watches, and its state."""
+    """An alert with its configuration, the thing that it watches, and its state."""
 
     def __init__(self, alert: Alert, progress: Progress, watch: Watch) -> None:
         self.alert = alert

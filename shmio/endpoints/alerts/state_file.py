@@ -29,7 +29,7 @@ log = logging.getLogger("shmio.alerts")
 
 
 class AlertState(msgspec.Struct):
-    """The state of one alert. ``digest`` is the :func:`digest` of the alert's configuration."""
+    """The state of one alert. ``digest`` identifies what the alert watches; see :func:`digest`."""
 
     digest: str
     severity: str
@@ -60,7 +60,7 @@ class State(msgspec.Struct):
     waiting: Waiting = msgspec.field(default_factory=Waiting)
 
     def progress(self, alerts: list[Alert]) -> dict[str, Progress]:
-        """Return the saved progress of each alert, by name; without alerts that now watch something else."""
+        """Return the saved progress of each alert, by name. Leave out alerts that now watch something else."""
         return {
             alert.title: self.alerts[alert.title].progress
             for alert in alerts

@@ -126,7 +126,7 @@ def delimited(data: bytes) -> bytes:
 
 
 def field(field_number: int, data: bytes) -> bytes:
-    """Encode a field of bytes, of text, of packed numbers, or with a message."""
+    """Encode a field that holds bytes, a text, a message, or packed numbers."""
     return varint(field_number << 3 | 2) + varint(len(data)) + data
 
 

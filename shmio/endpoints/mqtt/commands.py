@@ -26,7 +26,7 @@ from shmio.segment.commands import End, worst
 from shmio.wording import unknown
 
 REPLIES: Final = "shmio/results"
-"""Start, after the prefix, of the response topics that clients may choose for results.
+"""Clients may choose a response topic for results only below this topic, which follows the prefix.
 
 If clients could choose any topic, they could make the bridge write values or publish false values.
 """

@@ -26,12 +26,12 @@ CATCH_UP_S: Final = 3.0
 
 
 class Listener(Protocol):
-    """A listener of a watch: a monitored item."""
+    """A monitored item, which a watch notifies of changes."""
 
     every: bool
-    """True if the listener also reports frames in which only the time has changed."""
+    """True if the item also reports frames in which only the time has changed."""
     queues: bool
-    """True if the listener queues several values, not only the newest."""
+    """True if the item queues several values, not only the newest."""
 
     def changed(self) -> None:
         """Handle a change of the variable."""

@@ -265,7 +265,7 @@ PROPERTIES: Final[dict[str, Callable[[RegisterNode, str], Property]]] = {
     "Provenance": _provenance,
     "Injected": _injected,
 }
-"""For each property of a register's variable, the function that creates it, by name."""
+"""The function that creates each property of a register's variable, by the name of the property."""
 
 
 class Method(Node):

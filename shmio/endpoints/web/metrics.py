@@ -338,7 +338,7 @@ class Exposition:
         self._fresh_until_s = 0.0
 
     def answer(self) -> bytes:
-        """Return all metrics in the text format. They are at most ``FRESH_S`` s old."""
+        """Return all metrics in the text format. They are at most ``FRESH_S`` old."""
         with self._lock:
             if time.monotonic() >= self._fresh_until_s:
                 self._answer = generate_latest(self._registry)

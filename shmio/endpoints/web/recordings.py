@@ -1,4 +1,4 @@
-"""The recordings in the recorder's directory. All pages share this object's files and threads.
+"""The recordings in the recorder's directory. All pages share the open files, and the threads that read them.
 
 A page names a file, never a path. Files are read in a few threads, a part at a time, and only when
 a page asks for the next part, so that a large or hostile file delays no other page.
@@ -203,9 +203,8 @@ class Recordings:
 
         Args:
             name: Name of the file.
-            since_s: Monotonic time in s. A file that has grown since it was opened is returned as
-                it is only if it was opened after this time; None: only if it was opened a short
-                time ago.
+            since_s: A file that has grown since it was opened is opened again, unless it was opened
+                after this monotonic time, in s; if None, unless it was opened a short time ago.
 
         Raises:
             RecordingError: The recording cannot be opened.

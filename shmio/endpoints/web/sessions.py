@@ -147,7 +147,7 @@ class Sessions:
             end()
 
     def blocked(self, host: str) -> bool:
-        """Return whether a host has shown too many wrong tokens lately."""
+        """Return whether a host has shown ``ATTEMPTS`` wrong tokens within the last ``ATTEMPTS_S``."""
         failures = self._failures.get(host, [])
         return len(failures) >= ATTEMPTS and self._now() - failures[-ATTEMPTS] < ATTEMPTS_S
 

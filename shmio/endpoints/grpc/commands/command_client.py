@@ -83,7 +83,7 @@ class CommandClient:
 
     @property
     def over(self) -> bool:
-        """True if the client has stopped, and nobody needs it: no command in flight, subscriber or listener."""
+        """True if the client has stopped, and has no commands in flight, no subscribers and no listeners."""
         return not (
             self._reader.alive
             or self._in_flight
@@ -109,7 +109,7 @@ class CommandClient:
             self._reader.read()
 
     def ready(self, values: Mapping[str, object]) -> bool:
-        """Return whether :meth:`send` would send these values without waiting. The same is true of :meth:`give`."""
+        """Return whether :meth:`send` or :meth:`give` would send these values without waiting."""
         return self._prepared and not self._lock.locked() and self._has_room(self._cost(values))
 
     async def writable(self, registers: Iterable[Register]) -> bool:

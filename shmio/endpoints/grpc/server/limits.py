@@ -12,7 +12,7 @@ from typing import Any, Final, TypeVar
 # ---- file descriptors ------------------------------------------------------------------------------------
 
 OWN: Final = 256
-"""Number of file descriptors that are reserved for everything except connections. It is generous."""
+"""Number of file descriptors to reserve for everything except connections; more than are needed."""
 EACH: Final = 1
 """Number of file descriptors that are reserved for each connection."""
 FEW: Final = 64

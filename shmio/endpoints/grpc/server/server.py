@@ -81,7 +81,7 @@ class Server:
         return sum(server.refused for server in self._servers)
 
     async def start(self, listeners: Sequence[Listener], tls: Tls | None = None, gid: int | None = None) -> list[int]:
-        """Listen at all addresses, and return their ports.
+        """Listen on all addresses, and return their ports.
 
         Args:
             listeners: The addresses; port 0 stands for any free port.

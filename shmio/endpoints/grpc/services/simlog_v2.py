@@ -98,7 +98,7 @@ def value_type(found: Shape) -> wire.ValueType:
 
 
 def subject(found: Shape, layout: Layout) -> Subject:
-    """Return the subject with which a feed delivers a topic.
+    """Return the :class:`Subject` that a feed needs to deliver a topic.
 
     Raises:
         ValueRangeError: The topic is too large, or nested too deeply, for a message.

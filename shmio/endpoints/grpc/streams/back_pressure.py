@@ -166,7 +166,7 @@ class BackPressure:
             stream.refills[self._refill] = None
 
     def leave(self, stream: Stream) -> None:
-        """Remove one topic of a stream, and the stream with its last topic."""
+        """Remove one topic of a stream. When a stream's last topic is removed, the stream is removed, too."""
         self._streams[stream] -= 1
         if not self._streams[stream]:
             del self._streams[stream]

@@ -175,7 +175,7 @@ class Feed:
 
     @property
     def over(self) -> bool:
-        """True if the feed has ended, and nobody needs it: no listener, and no command in flight."""
+        """True if the feed has ended, and has no listeners and no commands in flight."""
         return not (self._reader.alive or self._channels) and self.commands.over
 
     def start(self) -> None:

@@ -104,7 +104,7 @@ log = logging.getLogger("shmio.grpc")
 
 
 class Player:
-    """Plays: makes steps at a multiple of real time. Use it only in the event loop's thread."""
+    """Makes steps at a multiple of real time: it *plays*. Use it only in the event loop's thread."""
 
     def __init__(self, make: Callable[[int | None], Awaitable[object]], step_size_ns: Callable[[], int]) -> None:
         """Prepare to play. :meth:`begin` starts playing.

@@ -116,7 +116,8 @@ def access_rules(given: Mapping[str | None, Rights], *, accounts: bool) -> str:
     """Return the text of an ACL file. Mosquitto denies everything that the file does not allow.
 
     Args:
-        given: The rights of each account, by its name; None: of clients without an account.
+        given: The rights of each account, by its name. The name None stands for clients without an
+            account.
         accounts: Whether accounts are in use. If not, mosquitto ignores the user names of clients.
 
     """

@@ -35,7 +35,7 @@ from shmio.endpoints.mqtt.topics import Message
 from shmio.layout.topic import shorten
 
 STABLE_S: Final = 5.0
-"""Time in s after which a connection counts as stable, and its loss resets the back-off."""
+"""Time in s after which a connection counts as stable. The loss of a stable connection resets the back-off."""
 MAX_REASON_LENGTH: Final = 300
 """Maximum length of the text with the problems of all brokers, in characters."""
 SUBSCRIBE_S: Final = CONNECT_S
@@ -155,7 +155,7 @@ class ConnectionProblems:
             self.report(problem)
 
     def message_accepted(self) -> None:
-        """Clear the problem of refused messages, if the last refusal was ``REFUSED_S`` ago."""
+        """Clear the problem of refused messages, if the last refusal was at least ``REFUSED_S`` ago."""
         if self.problem and time.monotonic() >= self._refused_s + REFUSED_S:
             self.problem = self._subscription_problem
 
@@ -166,7 +166,7 @@ def is_watched(message: MQTTMessage) -> bool:
 
 
 class BrokerConnection:
-    """A connection to a broker. If it is lost, it is made again. Use it only in the bridge's thread.
+    """A connection to a broker, which reconnects after a loss. Use it only in the bridge's thread.
 
     It registers its socket with ``selector``. Call the ``data`` of the selector's key when the
     socket is ready.
