@@ -228,9 +228,9 @@ class Attempt:
         self.what = what
         """What the action is about; see :func:`record`."""
         self.command = 0
-        """Number of the command, if one was sent."""
+        """Number of the command; 0 if none was sent."""
         self.event = 0
-        """Number of the source's event that ended the command, if it is known."""
+        """Number of the source's event that ended the command; 0 if it is not known."""
 
     def __enter__(self) -> Attempt:
         return self

@@ -108,9 +108,9 @@ class LiveRun:
         self.virtual = False
         """True if the run is in virtual time."""
         self.step_s = 0.0
-        """Length of a step of virtual time."""
+        """Length of a step of virtual time, in s."""
         self.start: SnapshotInfo | None = None
-        """The snapshot in which the run has begun; None if there is none."""
+        """The snapshot from which the run has started; None if it started in the present state."""
         self.problem: ShmioError | None = None
         """The error that ended the run early; None if there was no such error."""
         self._blocks: dict[str, Block] = {source: blocks[source] for source in self.judge.sources}

@@ -54,7 +54,7 @@ class Pairs(argparse.Action):
     def __call__(
         self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: object, _: str | None = None
     ) -> None:
-        """Store the words as pairs; a path without a value is wrong usage."""
+        """Store the words as pairs. A path without a value is wrong usage."""
         words = [word[_NEGATIVE.match(word[1:]) is not None :] for word in values] if isinstance(values, list) else []
         if len(words) % 2:
             parser.error(f"{words[-1]!r} has no value; give PATH VALUE [PATH VALUE ...]")

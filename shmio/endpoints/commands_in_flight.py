@@ -115,7 +115,7 @@ class InFlightTable:
         self.open_events = 0
         """Maximum number of events that all commands together may still cause."""
         self.untaken_bytes = 0
-        """Size of the commands that may still be in the source's queue, in bytes."""
+        """Total size of the commands that may still be in the source's queue, in bytes."""
         self._writer = writer
         self._by_number: dict[int, InFlightCommand] = {}
 

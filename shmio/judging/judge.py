@@ -54,7 +54,7 @@ class Judge:
             expectations: The expectations.
             layouts: The layout of each source.
             stale_ns: The age from which a frame of a source is stale, in ns.
-            golden: Reads signals of recordings, for ``like``; None if there are no recordings.
+            golden: Reads signals of recordings, for ``like``; None if no recordings can be read.
 
         Raises:
             ConfigError: An expectation is invalid; the message starts as ``expect[0].formula: …``.
@@ -79,7 +79,7 @@ class Judge:
         self._histories = {name: _History(horizon_ns + 2 * horizon_ns // UNTIL_SHARE) for name in self._sources}
         self._origin_ns: int | None = None
         self.end_ns: int | None = None
-        """End of the judged time; None before :meth:`finish`."""
+        """End of the judged time, in ns; None before :meth:`finish`."""
         for name in self._sources:
             self.follow(name, layouts[name], stale_ns[name])
 

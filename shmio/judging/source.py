@@ -163,14 +163,14 @@ class Source:
         self.inputs = tuple(Input() for _ in signals)
         """The node of each signal."""
         self.troubles: list[Trouble] = []
-        """The first spans of time in which values are unknown, and why."""
+        """The first spans of time in which values are unknown, with the reasons."""
         self._noted: dict[str, int] = {}  # the index of the last trouble for each reason
         self.origin_ns: int | None = None
-        """The instance time of the first frame; None before that frame."""
+        """Instance time of the first frame, in ns; None before that frame."""
         self.newest_ns = 0
-        """The instance time of the newest frame."""
+        """Instance time of the newest frame, in ns."""
         self.frames = 0
-        """Number of frames."""
+        """Number of frames that were added."""
         self.rows = _no_rows(len(signals))
         """The values that the last turn made known."""
         self._decoder: _Decoder | None = None

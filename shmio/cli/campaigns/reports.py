@@ -21,7 +21,7 @@ class Reports:
     """The reports that the command line asks for. They collect signals only if a report has plots."""
 
     def __init__(self, arguments: argparse.Namespace) -> None:
-        """Create the reports; ``arguments.report`` and ``arguments.junit`` are files or None."""
+        """Create the reports. ``arguments.report`` and ``arguments.junit`` are the files to write, or None."""
         self._html: Path | None = arguments.report
         self._junit: Path | None = arguments.junit
         self._traces: Traces | None = None

@@ -306,7 +306,7 @@ class Table:
     """Formats each entry as a line with columns. It prints headings whenever the block changes."""
 
     def __init__(self, room: int | None) -> None:
-        """Set the largest number of characters of a value; None for no limit."""
+        """Create the formatter. ``room`` is the maximum number of characters of a value; None for no limit."""
         self._room = room
         self._view: View | None = None
         self._widths: list[int] = []

@@ -64,9 +64,9 @@ class Progress:
     """
 
     def __init__(self, what: str, *, silent: bool = False) -> None:
-        """Create the line. With ``silent``, show nothing: the terminal shows other output."""
+        """Create the line. With ``silent``, nothing is shown, because the terminal shows other output."""
         self.total = 0
-        """Total amount of work, in bytes or in ns of a recording."""
+        """Total amount of work: in bytes of the file, or in ns of the recording."""
         self._what = what
         self._shown = False
         self._next_s = time.monotonic() + FIRST_S if sys.stderr.isatty() and not silent else float("inf")

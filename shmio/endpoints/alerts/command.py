@@ -37,7 +37,7 @@ class Command:
     once = True  # nobody knows what an interrupted program has already done
 
     def __init__(self, arguments: Sequence[str], timeout_s: float) -> None:
-        """Prepare to run a program; the first of the arguments is its name."""
+        """Prepare to run a program: ``arguments`` has its name, and then its arguments."""
         self.text = f"command {arguments[0]}"
         self._arguments, self._timeout_s = list(arguments), timeout_s
         self._stopping = threading.Event()

@@ -38,9 +38,9 @@ class WatchedAlert:
         self.alert = alert
         self.watch = watch
         self.seen: bool | None = None
-        """Result of the condition's last evaluation; None: unknown."""
+        """The last result of evaluating the condition; None if it was unknown."""
         self.holds: bool | None = None
-        """The condition's last known result; None: it was never known."""
+        """The last known result of the condition; None if it has never been known."""
         self.finding = Finding()
         """What the alert saw when :attr:`holds` last changed."""
         self.lifecycle = Lifecycle(round(alert.for_s * 1e9), round(alert.every_s * 1e9), alert.resolved, progress)
@@ -67,8 +67,9 @@ class Monitor:
             segment: The instance's segment.
             alerts: The alerts.
             progress: The state that an earlier process saved for its alerts, by name.
-            selector: The monitor registers a descriptor for each source here, which becomes ready
-                when the source publishes. The caller must then call the ``data`` of its key.
+            selector: The monitor registers a descriptor for each source here. The descriptor
+                becomes ready when the source publishes; the caller must then call the ``data`` of
+                its key.
 
         """
         self._segment, self._selector = segment, selector
@@ -80,7 +81,7 @@ class Monitor:
         self.suppressed = 0
         """Number of suppressed activations that notices have reported since the process started."""
         self.done = 0
-        """Number of the last step of virtual time whose frames have all been evaluated."""
+        """Number of the last step of virtual time of which all frames have been evaluated."""
         self._missed = 0
         self._followers: dict[str, FrameFollower] = {}
         self._relays: dict[int, Relay] = {}

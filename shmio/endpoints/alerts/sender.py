@@ -67,10 +67,10 @@ class Sender:
             action: The action.
             on_change: Called, from any thread, when :attr:`waiting` or :attr:`problem` has changed.
             waiting: Notices that an earlier process could not deliver.
-            turns: Context manager that each attempt enters, to limit simultaneous attempts; None: no
-                limit.
+            turns: Context manager that each attempt enters, to limit simultaneous attempts; None
+                for no limit.
             retry: The waiting times between attempts.
-            give_up_s: How long to retry, in s.
+            give_up_s: Time in s for which to retry.
 
         """
         self.problem = ""

@@ -97,7 +97,7 @@ class StateWriter:
 
     def __init__(self, file: Path) -> None:
         self.problem = ""
-        """Why the state could not be written; empty if it could."""
+        """Why the last state could not be written; empty if it could."""
         self._file = file
         self._condition = threading.Condition()
         self._newest: bytes | None = None

@@ -34,8 +34,8 @@ class Topics:
 
         Args:
             feeds: The feeds of all sources, by name.
-            default_source: The source of paths that name no source; None: the only source, if there
-                is just one.
+            default_source: The source of paths that name no source; if None, the only source, if
+                there is just one.
 
         """
         self._feeds = feeds

@@ -31,7 +31,7 @@ class WakeUp:
         Args:
             word: The word in shared memory.
             name: Name of the thread that waits.
-            turn_ns: Longest time between two calls, in ns.
+            turn_ns: Maximum time between two calls, in ns.
 
         """
         self.listeners: dict[Callback, None] = {}  # in the order in which they came
@@ -173,8 +173,8 @@ class BatchReader:
             block: The block to read.
             wake_ups: Wakes this reader.
             read: Reads a batch, and returns whether more is waiting.
-            passes: Returns whether to read nothing now. If it returns True, the reader is patient
-                until :meth:`resume`. None: the reader reads at each wake-up.
+            passes: Returns whether to read nothing now. If so, the reader is patient until
+                :meth:`resume`. If ``passes`` is None, the reader reads at each wake-up.
             patient: See :meth:`WakeUps.join`.
 
         """

@@ -61,7 +61,7 @@ class CommandClient:
         """
         self.block = block
         self.depths = _depths(block.layout)
-        """The numbers of segments that the paths of this source's registers and elements have, in ascending order."""
+        """The depths (numbers of segments) of the paths of this source's registers and elements, in ascending order."""
         self._source_writer = SourceWriter(block, writer)
         self._source_writer.prepare()
         self._pending = InFlightTable(writer)

@@ -124,7 +124,7 @@ class Outbox:
         Args:
             connection: The connection for values.
             results: The connection for the results of commands.
-            backlog_bytes: Maximum size of the backlog.
+            backlog_bytes: Maximum size of the backlog, in bytes.
 
         """
         self._connection, self._results = connection, results

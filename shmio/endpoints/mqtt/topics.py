@@ -221,7 +221,7 @@ class StructureChannel(_RuledChannel):
 
         Args:
             follower: Follows the block.
-            path: Path of the structure; empty: the whole source.
+            path: Path of the structure; empty for the whole source.
             registers: The registers of the structure.
             topic: The topic.
             rule: The rule of the topic.

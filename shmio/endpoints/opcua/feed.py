@@ -124,7 +124,7 @@ class Feed:
         self.follower = FrameFollower(block, catch_up_s=CATCH_UP_S)
         self.commands = CommandClient(block, writer)
         self.turn_ns = min(TURN_NS, block.stale_ns)
-        """Interval in ns at which to poll without a doorbell: none rings when a frame becomes stale."""
+        """Interval in ns at which to poll even without a doorbell, because none rings when a frame becomes stale."""
         self._scan = _scan(block)
         self._index = {register.path: index for index, register in enumerate(block.layout.registers)}
         self._by_register: dict[int, dict[str, Watch]] = {}

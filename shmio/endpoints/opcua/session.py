@@ -66,7 +66,7 @@ class Session(InternalSession):
             self.auth_token = ua.NodeId(secrets.token_bytes(32), 0, ua.NodeIdType.ByteString)
             self.iserver.register_external_session(self)
         self.trusted_channel = False
-        """True if the client may send its password as plain text: the channel is encrypted, or stays on this host."""
+        """True if the client may send its password in plain text: the channel is encrypted, or stays on this host."""
         self._continuations: dict[bytes, Any] = {}
 
     @property

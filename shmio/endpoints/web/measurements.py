@@ -37,7 +37,7 @@ class Histogram:
     def __init__(self) -> None:
         self._counts = [0] * (len(BOUNDS_S) + 1)
         self.sum_s = 0.0
-        """Sum of all durations."""
+        """Sum of all durations, in s."""
 
     def add(self, duration_ns: int) -> None:
         """Count a duration. A negative duration, which a change of the clock may cause, counts as 0."""
@@ -65,17 +65,17 @@ class SourceTiming:
         """
         self.block = block
         self.period = Histogram()
-        """Times from one cycle's frame to the next cycle's."""
+        """Times from the frame of one cycle to the frame of the next."""
         self.lateness = Histogram()
-        """Times from the due time of a cycle to the publication of its frame."""
+        """Times from the moment at which a cycle was due to the publication of its frame."""
         self.round_trip = Histogram()
         """Times that the device took to answer."""
         self.wake_up = Histogram()
-        """Times from the publication of a frame until this process, which waited for it, woke up."""
+        """Times from the publication of a frame until this process, which was waiting for the frame, woke up."""
         self.command = Histogram()
         """Times from the acceptance of a command by the source until its outcome was known."""
         self.connections: deque[tuple[float, bool]] = deque(maxlen=MAX_CHANGES)
-        """Newest changes between bad and other quality: the time by CLOCK_MONOTONIC in s, and True if it became bad."""
+        """The newest changes from or to bad quality: the time by CLOCK_MONOTONIC in s, and True if it became bad."""
         self._bad = False
         self._started_ns = started_ns
         self._frames = block.cursor()

@@ -119,9 +119,10 @@ class Work(Generic[T]):
 
         Args:
             recordings: The recordings.
-            work: Returns an iterator that does the work and yields its results. It runs in other threads. Its
-                argument is the ``beat`` for readers that it opens.
-            opened: The recording that the work uses; it is released when the work is stopped.
+            work: Returns an iterator that does the work and yields its results. It runs in other
+                threads. Its argument is the ``beat`` for readers that it opens.
+            opened: The recording that the work uses; it is released when the work is stopped. None
+                if the work opens its own files.
 
         """
         self._recordings, self._opened = recordings, opened

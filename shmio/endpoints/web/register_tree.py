@@ -68,7 +68,7 @@ class Trees:
         self._trees: dict[int, Node] = {}
         self._making = threading.Lock()
         self.looking = asyncio.Lock()
-        """Held during a search for rows. Simultaneous searches would delay the data of all pages."""
+        """Held while rows are searched, because simultaneous searches would delay the data of all pages."""
 
     def of(self, block: Block, blocks: Iterable[Block]) -> Node:
         """Return the tree of a block. If a new tree is made, drop the trees of blocks that are not in ``blocks``."""

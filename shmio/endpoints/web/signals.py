@@ -72,7 +72,7 @@ class Feed:
         Args:
             number: The feed's number, which its batches carry.
             block: The source's block.
-            registers: The registers; :func:`check_plottable` accepts each of them.
+            registers: The registers; :func:`check_plottable` must have accepted each of them.
             utc_ns: UTC minus the time of CLOCK_MONOTONIC, in ns.
 
         """

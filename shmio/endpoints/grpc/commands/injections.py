@@ -126,20 +126,20 @@ class InjectionBase:
 
         Args:
             block: The block of the injection.
-            image: Initial values of the inner injections; default: zeros.
+            image: Initial values of the inner injections, as an image; zeros if empty.
 
         """
         self.number = 0
         """The injection's number; 0 until the number is known."""
         self.given = bytearray(image or bytes(block.layout.size))
+        """The values that were diverted to the injection so far, as an image."""
         if (statuses := block.layout.status_offset) is not None:
             self.given[statuses:] = bytes(len(self.given) - statuses)  # a diverted value is good
-        """The values that were diverted to the injection so far, as an image."""
         self._block = block
         self._inner: tuple[bytes, bytes] | None = None  # bits that inner layers set, and their values
 
     def divert(self, writes: Iterable[Write]) -> None:
-        """Apply values that were diverted to the injection by inner injections."""
+        """Apply values that were diverted to the injection: by inner injections, or over ``/in`` from writers."""
         apply(self.given, writes)
 
     def restack(self) -> bool:

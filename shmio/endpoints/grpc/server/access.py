@@ -174,8 +174,8 @@ class ListenerAccess:
         Args:
             keys: The tokens and patterns.
             anonymous: Roles of clients without credentials.
-            takes_tokens: Whether clients may send tokens to this address. In plain text they must
-                not.
+            takes_tokens: Whether clients may send tokens to this address. They must not, if it is
+                plain text.
 
         """
         self.keys = keys

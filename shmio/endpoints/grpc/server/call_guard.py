@@ -52,7 +52,7 @@ class Refusals:
         Args:
             what: The first words of each log line.
             about: The log field that names what was refused.
-            turn_s: Period for which log lines are counted, in s.
+            turn_s: Length of the periods in which log lines are counted, in s.
 
         """
         self.count = 0
@@ -481,7 +481,7 @@ class CoreServer(AioServer):  # type: ignore[misc]
     """An asyncio gRPC server that uses a :class:`Core`."""
 
     def __init__(self, options: Sequence[tuple[str, Any]], interceptor: grpc.aio.ServerInterceptor) -> None:
-        """Create a server with one interceptor, and the defaults of ``grpc.aio.server`` otherwise."""
+        """Create a server with this interceptor, and otherwise with the defaults of ``grpc.aio.server``."""
         check_version()
         self._loop = cygrpc.get_working_loop()
         self._server: Core = Core(self._loop, None, (), (interceptor,), tuple(options), None)

@@ -52,7 +52,7 @@ class Server:
 
         Args:
             services: The handlers of each service, by the service's full name.
-            calls: Counts and limits the open calls; default: a new :class:`OpenCalls`.
+            calls: Counts and limits the open calls; None for a new :class:`OpenCalls`.
 
         """
         self.calls = OpenCalls() if calls is None else calls
@@ -63,7 +63,7 @@ class Server:
         self._files: dict[str, SocketFile] = {}
         self._connections = 1
         self.shortage = ""
-        """Note for ``status`` if the endpoint can serve too few connections; otherwise empty."""
+        """Note for ``shmio-supervisor status`` if the endpoint can serve too few connections; otherwise empty."""
         logging.getLogger("grpc._cython.cygrpc").addFilter(_is_news)
 
     @property

@@ -104,7 +104,7 @@ class Injection(InjectionFollower):
         self.feed = feed
         self.inward = target.direction == "in"
         self.over = ""
-        """Reason why the injection has ended; empty while it lasts."""
+        """Why the injection has ended; empty while it lasts."""
         self.ends: dict[object, Callable[[], object]] = {}
         """Functions to call when the injection ends, by the object that added them."""
         frame = feed.block.latest()

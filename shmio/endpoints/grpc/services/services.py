@@ -41,8 +41,8 @@ class Services:
             virtual_time: The virtual time that the feeds use.
             wake_ups: The wake-ups that the feeds use.
             feeds: The feeds of all sources.
-            default_source: The source of paths that name no source; None: the only source, if there
-                is just one.
+            default_source: The source of paths that name no source; if None, the only source, if
+                there is just one.
 
         """
         topics = Topics(feeds, default_source)

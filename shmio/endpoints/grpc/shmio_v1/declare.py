@@ -54,7 +54,7 @@ class DeclareCall:
         Args:
             feeds: The feeds of all sources, by name.
             request: The request of the call.
-            lock: Lock that a call holds while it checks its declarations.
+            lock: The lock that each call holds while it checks its declarations.
 
         Raises:
             ConfigError: A declaration is not valid.
@@ -82,7 +82,7 @@ class DeclareCall:
         self._abandoned = False
         self._lifting: asyncio.Task[None] | None = None
         self.over = ""
-        """Reason why the call has to end before its injections; otherwise empty."""
+        """Why the call must end before its injections; otherwise empty."""
 
     async def open(self) -> bytes:
         """Create all injections or none, and return the first message.

@@ -55,7 +55,7 @@ class EventLog:
         self.began = after
         self.reader = EventReader(block, after=after)
         self.first = 0
-        """Index of the oldest entry, which is the number of entries dropped so far."""
+        """Index of the oldest entry. This is also the number of entries that were dropped so far."""
         self.missed = 0
         """Number of events that were overwritten in the ring before the log could read them."""
         self.listeners: dict[Callback, None] = {}  # in the order in which they came

@@ -201,7 +201,7 @@ class InjectCall(InjectionFollower):
         self._wake_ups = wake_ups
         self._options = options
         self.over = ""
-        """Reason why the call has to end; empty if it need not end.
+        """Why the call must end; empty if it need not.
 
         For example, another client has lifted the injection, or this client does not read.
         """

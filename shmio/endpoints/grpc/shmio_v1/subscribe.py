@@ -190,7 +190,7 @@ class WriteFollower:
 
         """
         self.failure = ""
-        """Reason why writes are missing; empty if none are missing."""
+        """Why writes are missing; empty if none are."""
         self._writes = writes
         self._commands = commands
         self._ring = ring

@@ -132,7 +132,7 @@ class Columns:
         self.places: list[tuple[Column, int]] = [(Column.TEXT, 0)] * len(registers)
         """Column and first slot of each register."""
         self.sizes = dict.fromkeys(Column, 0)
-        """Number of slots of each column."""
+        """Number of slots in each column."""
         self._numbers: list[tuple[Column, _NumberGroup]] = []
         self._others: list[_SingleElement] = []
         groups: dict[tuple[Column, str], list[int]] = {}

@@ -139,7 +139,7 @@ class Feed:
             writer: Number of this process's command queue.
             wake_ups: Wakes the feed when the block has a new frame or event.
             on_quality: Called with the source's name, and whether its quality is good.
-            virtual_time: The state of virtual time; None: time is real.
+            virtual_time: The state of virtual time; None if time is always real.
 
         """
         self.block = block
@@ -424,7 +424,7 @@ class Feeds(Mapping[str, Feed]):
             writer: Number of this process's command queue.
             wake_ups: Wakes the feeds when their blocks have new frames or events.
             on_quality: Called with a source's name, and whether its quality is good.
-            virtual_time: The state of virtual time; None: time is real.
+            virtual_time: The state of virtual time; None if time is always real.
 
         """
         self._segment = segment

@@ -44,9 +44,9 @@ class Outbox:
         self.states, self.events = Backlog(total), Backlog(total)
         self.dropped = 0
         self.failure = ""
-        """Why the outbox failed; empty if it has not failed."""
+        """Why the outbox has failed; empty if it has not."""
         self.on_failure: Callable[[], object] | None = None
-        """Called when the outbox fails: the stream may wait for ever if its client does not read."""
+        """Called when the outbox fails, because a stream may wait for ever if its client does not read."""
         self._waiting: OrderedDict[int, tuple[_Lane, Sized, float]] = OrderedDict()  # messages with their time in s
         self._next = 0
         self._waiter: asyncio.Future[None] | None = None
@@ -57,7 +57,7 @@ class Outbox:
         self._asked = False  # whether the reader waits
         self.losses = LossMonitor()
         self.refills: dict[Callable[[], object], None] = {}
-        """Functions to call once, as soon as no message waits."""
+        """Functions to call once, as soon as no message is waiting."""
 
     @property
     def busy(self) -> bool:
@@ -309,7 +309,7 @@ class OpenStreams:
 
     def __init__(self) -> None:
         self.changed: Callable[[], object] = lambda: None
-        """Called when the first stream opens, before it gets values, and when the last closes."""
+        """Called when the first stream opens, before it gets values, and when the last stream closes."""
         self._count = 0
 
     def __bool__(self) -> bool:

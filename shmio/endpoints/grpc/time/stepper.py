@@ -116,7 +116,7 @@ class Player:
 
         """
         self.dt_ns: int | None = None
-        """Size of each step, in ns; None: the step size."""
+        """Length of each step, in ns; None for the step size."""
         self.rate = 1.0
         """Speed, as a multiple of real time."""
         self._make = make

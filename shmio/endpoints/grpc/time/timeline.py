@@ -260,8 +260,8 @@ class Timeline:
             outboxes: The outboxes of all streams.
             open_streams: Counts the open streams. While no stream is open, no step waits for this
                 process.
-            play_dt_ns: Returns the size of the steps that this process plays, in ns; None: the step
-                size.
+            play_dt_ns: Returns the length of the steps that this process plays, in ns; None for the
+                step size.
 
         """
         self.time_topics = TimeTopics(virtual_time, self._now, lambda: self._clock.read().step_size_ns / 1e9)

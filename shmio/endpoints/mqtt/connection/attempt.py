@@ -70,9 +70,9 @@ class ConnectAttempt:
         Args:
             policy: Chooses the broker.
             protocol: The version of MQTT.
-            will: The will of the connection, or None.
+            will: The will of the connection; None for no will.
             most: Maximum number of messages that the broker may send without acknowledgement. Only
-                brokers with MQTT 5 learn this number.
+                brokers with MQTT 5 are told this number.
             wake: Called by the thread when the attempt ends, unless the attempt was abandoned.
 
         """
@@ -87,9 +87,9 @@ class ConnectAttempt:
         self.socket: socket.socket | None = None
         """The connected socket, from which nothing has been read yet."""
         self.sent = False
-        """True if a broker may have received a CONNECT with the bridge's client id and will."""
+        """True if a broker may have received a CONNECT with the bridge's client id and this will."""
         self.problem = ""
-        """Reason why the attempt failed; empty if it did not fail."""
+        """Why the attempt has failed; empty if it has not."""
         self._policy, self._protocol, self._will, self._most, self._wake = policy, protocol, will, most, wake
         self._lock = threading.Lock()
         self._abandoned = False

@@ -192,7 +192,7 @@ class BrokerConnection:
         """
         self.up = False
         self.is_ready: Callable[[], bool] = lambda: True
-        """Called after CONNACK until it returns True. Only then, the connection is ``up``."""
+        """Called after CONNACK until it returns True. Only then is the connection ``up``."""
         self.came_up = False
         """True once the connection has come up, until the caller resets it."""
         self.on_lost: Callable[[list[Message]], None] = lambda _: None
@@ -200,7 +200,7 @@ class BrokerConnection:
         self.problems = ConnectionProblems()
         self.connects = 0
         self.sent_bytes = 0
-        """Number of bytes of the topics and payloads that were sent."""
+        """Number of bytes in the topics and payloads that were sent."""
         self.subscribed = False
         """True if the broker has answered the last subscription."""
         self._policy, self._selector, self._wake, self._will, self._most = policy, selector, wake, will, most

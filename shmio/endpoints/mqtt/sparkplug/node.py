@@ -223,7 +223,7 @@ class EdgeNode:
         # in tenths of a second advances faster than attempts to connect do.
         self._session = now_ms() // 100 % _SEQUENCE
         self.alive = False
-        """True if the node has published its birth in this session, and not its death."""
+        """True if the node has published its birth in this session, and has not died since."""
         self._born: set[str] = set()
         self.metrics: dict[str, dict[str, Metric]] = {}
         """The metrics of each device by name, in the order in which they were defined."""

@@ -69,7 +69,7 @@ class PrimaryHost:
     def __init__(self, name: str) -> None:
         self.topic = f"{NAMESPACE}/STATE/{name}"
         self.online: bool | None = None
-        """True if the host is online; None if the host has published no state."""
+        """True if the host is online; None if the host has published no state here."""
         self._at_ms = float("-inf")
 
     def forget(self) -> None:
