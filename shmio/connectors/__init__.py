@@ -1,1 +1,1 @@
-"""Connectors, which read and write devices: one class for each protocol, run in one process for each source."""
+"""Connectors, which read and write devices. Each protocol has a class, and each source has a process."""

@@ -43,9 +43,9 @@ class _LoopHandle(NamedTuple):
 def run(worker: Worker) -> None:
     """Run the poll loop and the commands in two threads, and send reports from the calling thread.
 
-    So if a method of the source blocks, this delays neither commands nor reports. If the supervisor
-    writes a new configuration for a device, another loop replaces the present one, and takes over
-    the connection if it can.
+    So a blocked method of the source delays neither commands nor reports. If the supervisor writes
+    a new configuration for a device, a new loop replaces the present one, and takes over the
+    connection if possible.
     """
     sys.setswitchinterval(SWITCH_S)
     woken = threading.Event()

@@ -1,7 +1,8 @@
 """The base classes of sources: Connector, Computed and Replayed.
 
 A Connector reads a device, a Computed source calculates its values, and a Replayed source plays a
-recording. A loop calls the methods of each: ``poll_loop``, ``models.stepped`` or ``replay.loop``.
+recording. Each kind has a loop that calls its methods: ``poll_loop``, ``models.stepped`` and
+``replay.loop``.
 """
 
 from __future__ import annotations
@@ -47,11 +48,11 @@ class WriteLostError(ConnectorError):
 
 
 class UnconfirmedError(WriteLostError):
-    """The device did not confirm all writes in time. The connection still works, and stays open."""
+    """The device did not confirm all writes in time, but the connection still works and stays open."""
 
 
 class Connector(ABC):
-    """Base class for the protocol of one device.
+    """Base class of connectors. A connector implements the protocol of one device.
 
     The loop calls all methods in one thread, and none may block longer than ``timeout_s``. If a
     method raises an exception, the loop calls :meth:`close`, and later :meth:`connect` again. So a
@@ -69,7 +70,7 @@ class Connector(ABC):
     """True if the connector can write."""
 
     provenance: ClassVar[Provenance] = Provenance.LIVE
-    """Where the values come from, as each frame of the source says."""
+    """The origin of the values, which each frame of the source states."""
 
     register_quality: ClassVar[bool] = False
     """True if the device gives each register its own status and time.
@@ -91,11 +92,11 @@ class Connector(ABC):
     """
 
     register_options: ClassVar[frozenset[str] | None] = None
-    """The keys of ``Options`` that determine what is read or written, and not how to connect.
+    """The keys of ``Options`` that determine what is read or written, but not how to connect.
 
     If a reload changes only these keys and the layout, a new connector takes over the connection of
-    the old one by :meth:`take_over`. None: the connector cannot do this, so a reload restarts its
-    process.
+    the old one by :meth:`take_over`. None: the connector cannot take over a connection, so a reload
+    restarts its process.
     """
 
     cannot_browse: ClassVar[str] = "this connector cannot list what a device offers"
@@ -103,16 +104,16 @@ class Connector(ABC):
 
     @classmethod
     def for_layout(cls, layout: Layout) -> type[Connector]:  # noqa: ARG003  most read all layouts
-        """Return the connector class for a layout; it has the same ``Options``.
+        """Return the connector class to use for a layout; the class has the same ``Options``.
 
-        If a connector needs ``register_quality`` only for some layouts, this returns another class
-        for those.
+        By default, this is the class itself. A connector that needs ``register_quality`` only for
+        some layouts returns another class for these.
         """
         return cls
 
     @classmethod
     def browse_options(cls, url: str) -> dict[str, Any]:
-        """Return the keys of ``Options`` that the URL of ``shmio-supervisor browse`` stands for.
+        """Convert the URL given to ``shmio-supervisor browse`` to keys of ``Options``.
 
         Raises:
             ConfigError: The URL is not one of this connector, or the connector cannot browse.
@@ -167,7 +168,7 @@ class Connector(ABC):
     def take_over(self, other: Any) -> bool:  # noqa: ARG002  not every connector can
         """Take over the open connection of another connector, instead of :meth:`connect`.
 
-        No answer to a request of the other connector may become a value of this one.
+        An answer to a request of the other connector must never become a value of this one.
 
         Args:
             other: A connector of the same class, with the same options except for
@@ -201,7 +202,7 @@ class Connector(ABC):
         """Close the connection. The loop may call this at any time and more than once."""
 
     def describe(self) -> str:
-        """Return the parameters of the connection that were negotiated with the device, for the log."""
+        """Return, for the log, the parameters of the connection that were negotiated with the device."""
         return ""
 
     @property
@@ -257,7 +258,7 @@ class Connector(ABC):
         than one request of the protocol can carry.
 
         Args:
-            writes: What to write, in this order.
+            writes: The writes, in the order in which to carry them out.
 
         Returns:
             For each write, "" if the device confirmed it, or else the reason why the device refused
@@ -317,7 +318,7 @@ class Computed(ABC):
     """The source's own keys of ``[[source]]``. The struct must refuse unknown keys."""
 
     prompt: ClassVar[bool] = False
-    """True if the loop publishes written values at once, without waiting for a cycle."""
+    """True if the loop publishes written values at once, and not only in the next cycle."""
 
     timeout_s: float = 1.0
     """The longest time that a step may take, in s."""
@@ -337,7 +338,7 @@ class Computed(ABC):
 
     @property
     def connections(self) -> Mapping[str, str]:
-        """The topic from which each connected input gets its values, by the path of the input."""
+        """The topics that connected inputs get their values from, by the paths of the inputs."""
         return {}
 
     @property
@@ -355,7 +356,7 @@ class Computed(ABC):
         """
 
     def attach(self, writer: BlockWriter) -> None:  # noqa: B027  most need nothing of it
-        """Receive the object that writes the source's block; called once, before the methods below.
+        """Store the object that writes the source's block. This is called once, before the methods below.
 
         Raises:
             SegmentError: The block does not fit the source.
@@ -364,14 +365,14 @@ class Computed(ABC):
 
     @abstractmethod
     def resume(self, image: bytes) -> None:
-        """Continue from the last image of the previous process; called before :meth:`begin`."""
+        """Continue from the last image of the source's previous process. This is called before :meth:`begin`."""
 
     @abstractmethod
     def begin(self) -> bytes:
         """Return the image before the first step; for a ``prompt`` source, its present image."""
 
     def has_changed(self) -> bool:
-        """Return whether :meth:`begin` would return a changed image; called between two steps."""
+        """Return whether the result of :meth:`begin` would be a new image. This is called between two steps."""
         return False
 
     def interrupt(self) -> None:  # noqa: B027  most never wait
@@ -381,7 +382,7 @@ class Computed(ABC):
         """Release all resources of the source. The loop calls this last."""
 
     def save(self) -> bytes:
-        """Return the source's state beside its last image, for a snapshot. Called between two steps.
+        """Return the source's state for a snapshot, without its last image. This is called between two steps.
 
         Raises:
             SnapshotError: The source cannot save its state; the message says why.

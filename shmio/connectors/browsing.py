@@ -19,11 +19,12 @@ class Offer:
     """A value that a device offers, or a group of values.
 
     Attributes:
-        names: The name of each level from the top to this value, as the device spells it.
+        names: The names of all levels from the top down to this value, as the device spells them.
         type: The type in a tag table of a register with this value; empty for a group, and for a
             value that cannot be a register.
         columns: Other columns of the tag table: ``address``, ``unit``, ``comment``, ``writable``.
-        refused: Why the value cannot be a register; empty if it can, and for a group.
+        refused: Why the value cannot be a register; empty for a group and for a value that can be
+            one.
 
     """
 
@@ -72,12 +73,12 @@ class Wanted:
         return not self._globs
 
     def takes(self, names: Iterable[str]) -> bool:
-        """Return whether to list the value or group with these names."""
+        """Return whether the user wants to list the value or group with these names."""
         path = _path(names)
         return not self._globs or (path is not None and any(glob.matches(path) for glob in self._globs))
 
     def enters(self, names: Iterable[str]) -> bool:
-        """Return whether the group with these names may contain something to list."""
+        """Return whether the group with these names may contain something that the user wants to list."""
         path = _path(names)
         return not self._globs or (
             path is not None and any(glob.matches(path) or glob.reaches(path) for glob in self._globs)

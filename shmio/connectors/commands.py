@@ -1,9 +1,9 @@
 """Accepts or rejects the commands to a source, and carries out accepted ones in the next cycle.
 
-A command consists of items, which are writes. A separate thread accepts and rejects commands, so
-that a slow device does not delay this decision. In each cycle, the loop's thread writes all
-accepted items to the device in one batch, and derives the outcome of each item from the outcomes of
-the batch's writes. Then it reads the device, so that the next frame shows the new values.
+The items of a command are writes. A separate thread accepts and rejects commands, so that a slow device
+does not delay this decision. In each cycle, the loop's thread writes all accepted items to the device
+in one batch, and derives the outcome of each item from the outcomes of the batch's writes. Then it
+reads the device, so that the next frame shows the new values.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from shmio.segment import NO_WRITER, Command, CommandKind, EventKind, Record
 MAX_WAITING: Final = 256
 """The largest number of items that may wait for a cycle; further commands stay in their queues.
 
-While no items wait, a single command may have more.
+If no item waits, a single command with more items is accepted.
 """
 MAX_WAITING_BLOCKS: Final = 4
 """The largest number of bytes that may wait for a cycle, as a multiple of the block's size."""
 FAR_NS: Final = 1 << 62
-"""Deadline of a write that an injection has delayed: so late that the write never expires."""
+"""Deadline of a write that an injection has delayed. The deadline is so late that the write never expires."""
 TELL_NS: Final = 1_000_000_000
-"""Shortest time in ns between two reports of malformed commands from the same writer."""
+"""Minimum time in ns between two reports of malformed commands from the same writer."""
 
 _UNARMED: Final = "an injection toward a device needs `armed = true` in the source's configuration"
 _SUPERSEDED: Final = "superseded by a later write of the same cycle"
 _EXPONENTS: Final = {"REAL": b"\x7f\x80\0\0", "LREAL": b"\x7f\xf0\0\0\0\0\0\0"}
-"""The mask of the exponent bits, by type of number, most significant byte first.
+"""For each type of number, a mask of its exponent bits, with the most significant byte first.
 
 A number is NaN or infinite if all its exponent bits are set.
 """
@@ -58,9 +58,9 @@ log = logging.getLogger("shmio.source")
 
 
 class FiniteCheck:
-    """Refuses writes of NaN and infinities to REAL and LREAL registers that are not exempt.
+    """Refuses writes of NaN and infinities to REAL and LREAL registers, except to exempt registers.
 
-    The reason is that programs in devices seldom handle such values.
+    Programs in devices seldom handle such values.
     """
 
     def __init__(self, layout: Layout, allowed: Iterable[str]) -> None:
@@ -81,7 +81,7 @@ class FiniteCheck:
         self._names = {one.offset: one.path for one in over}  # by offset: numbers that are views of bytes
 
     def refusal(self, writes: Iterable[Write]) -> str:
-        """Return why these writes are refused, naming one register; empty if they are allowed.
+        """Return why these writes are refused, with the name of a register; empty if they are allowed.
 
         A write of only some bytes of a number is refused if it sets all exponent bits in those
         bytes. Otherwise, several such writes together could make the number NaN or infinite.
@@ -121,7 +121,7 @@ class Item(NamedTuple):
     bits: bytes | None = None
     """Mask of the bits to send to the device; None: all bits of the write.
 
-    Injections have taken the other bits.
+    Injections have taken or dropped the other bits.
     """
     data: bytes | None = None
     """The values after injections have changed them; None if they are unchanged."""
@@ -143,17 +143,18 @@ class Item(NamedTuple):
 
 
 def coalesce(items: Sequence[Item], size: int) -> tuple[list[Write], set[int]]:
-    """Merge items into writes. If several items write a bit, the value of the last item counts.
+    """Merge items into writes. If several items write the same bit, the last item's value counts.
 
-    Adjacent bytes become one write only if they belong to the same command. So if the device
-    refuses a write, this affects only one command.
+    Adjacent bytes become one write only if they belong to the same command. So a write that the
+    device refuses affects only one command.
 
     Args:
         items: Accepted items, oldest first.
         size: Size of the block in bytes.
 
     Returns:
-        The writes, and the indices of superseded items, all of whose bits later items overwrite.
+        The writes, and the indices of the superseded items, whose bits are all overwritten by later
+        items.
 
     """
     taken = bytearray(size)
@@ -260,7 +261,7 @@ def one_each(outcomes: Sequence[_Outcome], writes: Sequence[Write]) -> Sequence[
 
 
 def records(items: Sequence[Item], ends: Sequence[End]) -> Iterator[Record]:
-    """Yield the last events of items.
+    """Yield the events that end items.
 
     Consecutive items of a command share one event if the kind and text of their events are equal.
     """
@@ -352,10 +353,7 @@ class CommandProcessor:
         self._stopped = False
 
     def open(self) -> None:
-        """Start accepting commands.
-
-        Call it once the device is connected and its data match the layout.
-        """
+        """Start accepting commands. Call this once the device is connected and its data match the layout."""
         with self._lock:
             self._closed = ""
 
@@ -375,14 +373,14 @@ class CommandProcessor:
         self._make_room()
 
     def settle(self) -> None:
-        """Wait until each item with a published acceptance also waits for :meth:`carry_out`."""
+        """Wait until all items whose acceptance was published also wait for :meth:`carry_out`."""
         with self._verdict:
             pass
 
     def release(self, cycle: int) -> None:
-        """Accept the writes whose delay by an injection ends in this cycle.
+        """Accept delayed writes: those whose delay by an injection ends in this cycle.
 
-        Call it before :meth:`carry_out`.
+        Call this before :meth:`carry_out`.
         """
         for layer, write in self._injections.declared.release(cycle):
             command = Command(NO_WRITER, layer.id, self._writer.incarnation, FAR_NS, (write,))
@@ -390,7 +388,7 @@ class CommandProcessor:
 
     @property
     def injections(self) -> InjectionProcessor:
-        """The injections of the source."""
+        """The processor of the source's injections."""
         return self._injections
 
     @property
@@ -400,16 +398,16 @@ class CommandProcessor:
 
     @property
     def unconfirmed(self) -> bool:
-        """True while the outcomes of a batch are not known, so that :meth:`confirm` must follow."""
+        """True while the outcomes of the last batch are unknown, so that you must call :meth:`confirm`."""
         return self._unconfirmed is not None
 
     def carry_out(self, write: Callable[[Sequence[Write]], Sequence[str] | None]) -> None:
         """Write all waiting items in one batch, and publish the outcome of each.
 
         If two items write the same bit, the value of the item accepted later is written. If
-        ``write`` raises an exception, publish the outcomes, then raise the exception again. If
-        ``write`` returns None, call :meth:`confirm` until the batch is no longer ``unconfirmed``,
-        before you call this method again.
+        ``write`` raises an exception, this method publishes the outcomes, and then raises the
+        exception again. If ``write`` returns None, call :meth:`confirm` until the batch is no
+        longer ``unconfirmed``, and only then call this method again.
         """
         items = self._take(lambda _: True)
         now_ns = self._now_ns()
@@ -423,9 +421,10 @@ class CommandProcessor:
             self._make_room()
 
     def confirm(self, ask: Callable[[], Sequence[str] | None]) -> None:
-        """Publish the outcomes of the unconfirmed batch, if ``ask`` returns them.
+        """Publish the outcomes of the unconfirmed batch, unless ``ask`` returns None.
 
-        If ``ask`` raises an exception, publish the outcomes, then raise the exception again.
+        If ``ask`` raises an exception, this method publishes the outcomes, and then raises the
+        exception again.
         """
         if self._unconfirmed is not None:
             self._ask(self._unconfirmed, ask)

@@ -40,7 +40,7 @@ _ACTIVE: Final = State.ACTIVE
 
 @dataclass(frozen=True)
 class Owner:
-    """The owner of an injection: a command queue, and the process that used it to create the injection."""
+    """The owner of an injection: the command queue used to create it, and the process that used this queue."""
 
     writer: int
     pid: int
@@ -56,7 +56,7 @@ class CycleImage(NamedTuple):
 
 @dataclass
 class Layer:
-    """One injection, as the process of its source applies it.
+    """One injection, as the process of its source applies it to images and writes.
 
     ``cover`` is an array of the block's size, in which the bits that the layer covers are set.
     """
@@ -75,8 +75,7 @@ class Layer:
     def given(self) -> bool:
         """True if the layer covers ``/out`` and a client supplies its values.
 
-        That client receives the values that the layer hides, which are those of the device or of
-        inner layers.
+        The client receives the values that the layer hides: those of the device or of inner layers.
         """
         return self.direction is Direction.OUT
 
@@ -86,11 +85,11 @@ class Layer:
         return True
 
     def show(self, image: Bits, now: CycleImage) -> None:  # noqa: ARG002  the values do not depend on time
-        """Replace the covered bits of an image on ``/out`` by the layer's values, in place."""
+        """Replace the covered bits of an image of ``/out`` by the layer's values, in place."""
         image ^= (image ^ self.values) & self.cover
 
     def transform_write(self, write: Write, bits: Bits, now: CycleImage) -> bytes | None:  # noqa: ARG002
-        """Apply the layer to the given bits of a write to the device.
+        """Apply the layer to those bits of a write to the device that ``bits`` selects.
 
         Returns:
             The new data, or the same object if nothing changes. None if the bits must not reach the
@@ -101,10 +100,10 @@ class Layer:
 
 
 class DivertedWrite(NamedTuple):
-    """A write to the device after all layers were applied to it."""
+    """A write to the device, after all layers were applied to it."""
 
     met: list[tuple[Layer, list[Write]]]
-    """The layers that changed or took parts of the write, each with the parts that it received."""
+    """The layers that changed the write or took bits from it, each with the parts of the write that it received."""
     left: bytes
     """Mask of the bits that still go to the device."""
     data: bytes
@@ -132,7 +131,7 @@ class LayerStack:
         return ""
 
     def find(self, number: int) -> Layer | None:
-        """Return the layer with this injection number; None if there is none."""
+        """Return the layer with an injection number; None if there is none."""
         return next((layer for layer in self.layers if layer.id == number), None)
 
     def lift(self, which: Callable[[Layer], bool]) -> list[Layer]:
@@ -153,7 +152,7 @@ class LayerStack:
         return bytes(buffer)
 
     def seen(self, raw: bytes, inner: Iterable[Layer]) -> Bits:
-        """Return a copy of the image ``raw`` with the given layers over ``/out`` applied."""
+        """Return a copy of the image ``raw`` after applying the layers ``inner``, which cover ``/out``."""
         image = np.frombuffer(raw, np.uint8).copy()
         for layer in inner:
             layer.show(image, self.now)
@@ -178,9 +177,9 @@ class LayerStack:
         return [other for other in self.layers[self.layers.index(layer) + 1 :] if other.given]
 
     def inner_values(self, raw: bytes, layer: Layer) -> list[Write]:
-        """Return the values that inner layers over ``/out`` supply for bits that ``layer`` covers.
+        """Return the values that inner layers over ``/out`` give to bits that ``layer`` covers.
 
-        Leave out bits whose values come from the device.
+        Bits whose values come from the device are left out.
         """
         inner = self.inner(layer)
         bits = np.zeros(self.size, np.uint8)
@@ -189,10 +188,12 @@ class LayerStack:
         return merge(self.seen(raw, inner).tobytes(), bits.tobytes(), [(0, self.size)] if inner else [])
 
     def onward(self, raw: bytes, layer: Layer, write: Write) -> list[tuple[Layer, list[Write]]]:
-        """Return the parts of a client's values over ``/out`` that outer layers hide from readers.
+        """Return those parts of a write over ``/out`` by a layer's client that outer layers hide from readers.
 
-        Return each part with the layer whose client receives it. To its values, the layers between
-        ``layer`` and that layer are already applied.
+        Returns:
+            Each outer layer whose client receives parts, with these parts. All active layers inside
+            that outer layer are already applied to the values.
+
         """
         taken: list[tuple[Layer, list[Write]]] = []
         bits = np.full(len(write.data), write.mask or 0xFF, np.uint8)
@@ -210,8 +211,9 @@ class LayerStack:
 
         Args:
             write: The write.
-            above: The layer that sends the write, so that only layers inside it apply. None: no
-                layer sends the write, so that all layers apply.
+            above: The layer from which the write comes, as a value from its client or as a write
+                that it has delayed. Only layers inside it apply. None: the write comes from no
+                layer, and all layers apply.
 
         """
         met: list[tuple[Layer, list[Write]]] = []
@@ -237,7 +239,7 @@ class LayerStack:
 
 
 def shadow(injection: Layer, writes: Sequence[Write]) -> str:
-    """Set the values of a layer over ``/out``; return a message if it does not cover all bytes, or ""."""
+    """Set values of a layer over ``/out``; return "", or a message if the layer does not cover all written bytes."""
     if reason := uncovered(injection, writes):
         return reason
     for write in writes:
@@ -246,7 +248,7 @@ def shadow(injection: Layer, writes: Sequence[Write]) -> str:
 
 
 def uncovered(injection: Layer, writes: Iterable[Write]) -> str:
-    """Return a message that names written bytes that the layer does not cover; "" if it covers all."""
+    """Return a message about the first write to bytes that the layer does not cover; "" if there is none."""
     for write in writes:
         cover = injection.cover[write.offset : write.offset + len(write.data)]
         if len(cover) < len(write.data) or (~cover & (write.mask or 0xFF)).any():
@@ -271,7 +273,7 @@ def covering(size: int, writes: Sequence[Write]) -> Bits:
 
 
 def parts_of(write: Write, bits: Bits) -> list[Write]:
-    """Return the parts of a write that set bits of the mask ``bits``."""
+    """Return the parts of a write that set the bits in the mask ``bits``."""
     return [
         Write(write.offset + part.offset, part.mask, part.data)
         for part in merge(write.data, bits.tobytes(), [(0, len(write.data))])
@@ -282,7 +284,7 @@ def parts_of(write: Write, bits: Bits) -> list[Write]:
 
 
 class DelayedWrite(NamedTuple):
-    """A write that an injection delays, and the cycle and instance time at which it arrived."""
+    """A write that an injection delays, with the cycle and the instance time of its arrival."""
 
     write: Write
     cycle: int
@@ -308,7 +310,7 @@ class DeclaredLayer(Layer):
 
     @property
     def given(self) -> bool:
-        """False, because no client supplies the values of a declared injection."""
+        """False: no client supplies the values of a declared injection."""
         return False
 
     @property
@@ -341,7 +343,7 @@ class DeclaredLayer(Layer):
             self.operation.resume(seen)
 
     def advance(self, now: CycleImage, values: Sequence[Number | None]) -> bool:
-        """Evaluate the condition for the next image, and return whether the state changed.
+        """Evaluate the condition for the next image; return whether the injection's state has changed.
 
         ``values`` are the values that the condition reads.
         """
@@ -368,7 +370,7 @@ class DeclaredLayer(Layer):
             image ^= (image ^ changed) & self.cover
 
     def transform_write(self, write: Write, bits: Bits, now: CycleImage) -> bytes | None:
-        """Apply the operation to the given bits of a write to the device.
+        """Apply the operation to those bits of a write to the device that ``bits`` selects.
 
         Returns:
             The new data; None if the operation drops or delays these bits.
@@ -391,9 +393,9 @@ class DeclaredLayer(Layer):
         return bytes(old ^ (old ^ image[span]) & bits)
 
     def due(self, now: CycleImage) -> list[Write]:
-        """Remove and return the writes whose delay has passed.
+        """Remove and return the writes whose delay ends with this cycle.
 
-        ``now`` describes the cycle that is about to write them.
+        ``now`` describes the cycle, which will send them to the device.
         """
         due: list[Write] = []
         if not isinstance(self.operation, Delay):

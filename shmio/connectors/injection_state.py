@@ -21,7 +21,7 @@ _DECLARATION: Final = msgspec.json.Decoder(Declaration)
 
 
 class DeclaredState(msgspec.Struct, array_like=True, forbid_unknown_fields=True):
-    """The state of a declared injection. ``declaration`` is JSON."""
+    """The state of a declared injection. ``declaration`` is the declaration as JSON."""
 
     declaration: bytes
     seed: int
@@ -37,7 +37,7 @@ class DeclaredState(msgspec.Struct, array_like=True, forbid_unknown_fields=True)
 
 
 class LayerState(msgspec.Struct, array_like=True, forbid_unknown_fields=True):
-    """An injection. ``declared`` is None if a client gives its values."""
+    """The state of an injection. ``declared`` is None if a client gives the injection's values."""
 
     number: int
     direction: int
@@ -70,7 +70,7 @@ def _save_declared(layer: DeclaredLayer) -> DeclaredState:
 
 
 def make_layer(saved: LayerState, size: int, compiled: Callable[[Declaration], Program]) -> Layer:
-    """Create an injection with the state of a snapshot.
+    """Create an injection from its state in a snapshot.
 
     Args:
         saved: The state.
@@ -115,10 +115,10 @@ def _make_declared(
 
 
 def check_configured(layers: Sequence[Layer], wanted: Mapping[str, Declaration]) -> None:
-    """Check that a snapshot has the injections that the configuration declares.
+    """Check that a snapshot has exactly the injections that the configuration declares.
 
     Raises:
-        SnapshotError: It has others; the message names them.
+        SnapshotError: The snapshot has others; the message names them.
 
     """
     found = {one.name: one.program.declaration for one in layers if isinstance(one, DeclaredLayer) and one.configured}

@@ -47,16 +47,16 @@ from shmio.segment.events import EVENT_SLOTS
 from shmio.segment.injection_list import InjectionEntry
 
 LOOK_NS: Final = 400_000_000
-"""Interval in ns at which owners are checked, so that an injection ends within 1 s after its client."""
+"""Interval in ns for checking owners, so short that an injection ends within 1 s after its client."""
 SEED_BITS: Final = 53
 """Length of a generated seed in bits; every JSON reader represents such integers exactly."""
 CONFIGURED: Final = Owner(NO_WRITER, 0)
 """The owner of injections that the configuration declares."""
 
 Blocks = Callable[[], Mapping[str, Block]]
-"""Returns the present blocks of the instance by source name."""
+"""Function that returns the present blocks of the instance by source name."""
 OwnerOf = Callable[[int], Owner | None]
-"""Returns the process that uses the command queue of a writer; None if no live process does."""
+"""Function that returns the process that uses a writer's command queue; None if no live process does."""
 
 _DECODER: Final = msgspec.json.Decoder(Declaration)
 _OVER, _BAD = State.OVER, Quality.BAD
@@ -86,9 +86,9 @@ def blocks_of(segment: Segment) -> Mapping[str, Block]:
 class ConditionValues:
     """Reads the register values that conditions need in one cycle.
 
-    Each image is fetched once, and only if a condition needs it. The images are without injections,
-    so that no injection can influence its own condition. A value is unknown if its source has bad
-    quality or its register has a bad status.
+    Each source's image is fetched at most once, and only if a condition needs it. Injections are
+    not applied to the images, so that no injection can influence its own condition. A value is
+    unknown if its source has bad quality or its register has a bad status.
     """
 
     def __init__(self, own: str, image: Image, blocks: Mapping[str, Block], before: int | None) -> None:
@@ -131,10 +131,11 @@ class ConditionValues:
 
 
 def newest(block: Block, before: int | None) -> Frame | None:
-    """Return the newest frame of a block; if ``before`` is a step, the newest one before this step.
+    """Return the newest frame of a block.
 
-    So in each run, a source sees the same frames of other sources, whichever of them completes the
-    step first (the Jacobi method).
+    If ``before`` is a step, return the newest frame before this step. So in each run, a source sees
+    the same frames of other sources, whichever of them completes the step first (the Jacobi
+    method).
     """
     frame = block.latest()
     while frame is not None and before is not None and block.came_with(frame, before):
@@ -145,8 +146,8 @@ def newest(block: Block, before: int | None) -> Frame | None:
 class DeclaredInjections:
     """Adds, evaluates and lifts the declared injections of one source.
 
-    The loop's thread evaluates the injections by publishing images, and calls :meth:`release` and
-    :meth:`forget`. The command thread calls the other methods.
+    The loop's thread evaluates the injections whenever it publishes an image, and calls
+    :meth:`release` and :meth:`forget`. The command thread calls the other methods.
     """
 
     def __init__(self, publisher: LayerPublisher, blocks: Blocks) -> None:
@@ -170,7 +171,7 @@ class DeclaredInjections:
         return any(layer.program.foreign for layer in self._layers)
 
     def seen(self, frame: Frame) -> None:
-        """Continue from the last frame of the source's previous process."""
+        """Continue from ``frame``, the last frame of the source's previous process."""
         time_ns = self._time_ns(frame.cycle) if self._own.playhead is None else frame.clock_ns
         self._publisher.injections.now = CycleImage(frame.cycle, time_ns, frame.raw)
 
@@ -191,7 +192,7 @@ class DeclaredInjections:
         self._settle()
 
     def declare(self, command: Command, owner: Owner) -> str:
-        """Add the injection that a command declares; return why it cannot be added, or ""."""
+        """Add the injection that a command declares; return "", or why it cannot be added."""
         try:
             declaration = _DECODER.decode(b"".join(write.data for write in command.writes))
             for complaint in contradictions(declaration):
@@ -203,7 +204,7 @@ class DeclaredInjections:
         return self._add(layer, command)
 
     def lift(self, layer: DeclaredLayer, command: Command) -> str:
-        """Lift a configured injection; return why it cannot be lifted, or "".
+        """Lift a configured injection; return "", or why it cannot be lifted.
 
         The injection stays lifted until its declaration changes.
         """
@@ -217,7 +218,7 @@ class DeclaredInjections:
         return ""
 
     def follow(self) -> None:
-        """Add, replace and lift injections if the configuration has changed."""
+        """Add, replace and lift configured injections if the configuration has changed."""
         sequence = self._own.declared.sequence
         if sequence == self._configuration or sequence % 2:  # odd: a write is in progress, and a wake-up follows
             return
@@ -235,7 +236,7 @@ class DeclaredInjections:
                 self._add_configured(declaration)
 
     def settle(self) -> None:
-        """Update the list of declared layers after layers were added or lifted."""
+        """Update the list of declared injections after injections were added or lifted."""
         with self._output.lock:
             self._settle()
 
@@ -243,7 +244,7 @@ class DeclaredInjections:
         """Return the injections of a snapshot.
 
         Raises:
-            SnapshotError: They are damaged, or do not fit the configuration.
+            SnapshotError: The injections are damaged, or do not fit the configuration.
 
         """
         layers = [make_layer(one, self._own.layout.size, self._program) for one in saved]
@@ -251,7 +252,7 @@ class DeclaredInjections:
         return layers
 
     def restored(self) -> None:
-        """Continue with the injections of a snapshot. The caller holds the output's ``lock``."""
+        """Continue with restored injections of a snapshot. The caller holds the output's ``lock``."""
         self._settle()
 
     def _settle(self) -> None:
@@ -300,7 +301,7 @@ class DeclaredInjections:
         return program
 
     def rebind(self) -> None:
-        """Recompile the conditions that read a source changed by a reload."""
+        """Compile conditions again if they read a source that a reload has changed."""
         if not self.reads_other_sources:
             return
         blocks = dict(self._blocks_of())
@@ -369,7 +370,7 @@ class DeclaredInjections:
         return records
 
     def release(self, cycle: int) -> list[tuple[DeclaredLayer, Write]]:
-        """Return the delayed writes that are due in ``cycle``, each with its layer."""
+        """Return the delayed writes that are due in ``cycle``, each with the injection that delayed it."""
         for layer in self._layers:
             if layer.held:
                 break
@@ -428,7 +429,7 @@ def _injected_events(layer: DeclaredLayer, command: Command | None) -> Iterator[
 
 
 class InjectionProcessor:
-    """Adds and lifts the injections of one source, and stores the values that clients give them."""
+    """Adds and lifts the injections of one source, and stores the values that clients supply for them."""
 
     def __init__(self, output: Output, writable: bytes, refuse_in: str, owner_of: OwnerOf, blocks: Blocks) -> None:
         """Create the processor, and resume the injections of the source's previous process.
@@ -463,7 +464,7 @@ class InjectionProcessor:
         return max(0, self._look_ns - time.monotonic_ns())
 
     def toward_device(self, command: Command) -> Layer | None:
-        """Return the injection over ``/in`` to which this command gives values for the device, or None."""
+        """Return the injection over ``/in`` by which a command sends values to the device; None if there is none."""
         layer = self.injections.find(command.injection) if command.kind is CommandKind.SHADOW else None
         if layer is None or layer.direction is not Direction.IN or isinstance(layer, DeclaredLayer):
             return None
@@ -472,7 +473,9 @@ class InjectionProcessor:
     def take(self, command: Command) -> str:
         """Carry out an INJECT, DECLARE or LIFT command, or a SHADOW command over ``/out``.
 
-        Return why the command is rejected, or "".
+        Returns:
+            "", or why the command is rejected.
+
         """
         if command.kind in (CommandKind.INJECT, CommandKind.DECLARE):
             owner = self._owner_of(command.writer)
@@ -500,7 +503,8 @@ class InjectionProcessor:
         """Check the state of a snapshot, and return the function that restores it.
 
         The caller of that function holds the output's ``lock``, and then publishes an image and the
-        returned events. An injection without ``keep`` whose client does not run any more is kept.
+        returned events. An injection without ``keep`` is kept nevertheless if its client no longer
+        runs.
 
         Args:
             saved: The state of all injections.
@@ -547,10 +551,10 @@ class InjectionProcessor:
                 yield _activation_event(layer)
 
     def follow_changes(self) -> None:
-        """Apply changes of the configuration; in intervals of ``LOOK_NS``, check owners and conditions.
+        """Follow changes of the configuration; every ``LOOK_NS``, also check owners and conditions.
 
-        Lift each injection without ``keep`` whose client has ended. Compile conditions again if
-        they read sources that a reload has changed.
+        This lifts each injection without ``keep`` whose client has ended, and compiles conditions
+        again if they read sources that a reload has changed.
         """
         self.declared.follow()
         if self.patience_ns != 0:

@@ -1,4 +1,4 @@
-"""Publishes the images of a source with its injections applied, and the injections' list and events.
+"""Publishes the images of a source with its injections applied, and the list and events of the injections.
 
 The order of the injections is defined in :mod:`shmio.connectors.injection_layers`.
 """
@@ -20,18 +20,18 @@ from shmio.segment.events import EVENT_DATA_SIZE
 from shmio.segment.injection_list import InjectionEntry, encode, ranges_of
 
 EXTRA_FRAMES: Final = 4
-"""Largest number of frames in a period in addition to the frame of the cycle.
+"""Maximum number of frames in a period besides the frame of the cycle.
 
 At this rate, a ring has room for the frames of 8 s.
 """
 GROWTH: Final = 64
-"""Bytes reserved in the segment for each injection, because the numbers in its text get longer."""
+"""Number of bytes reserved in the segment for each injection: its JSON grows with the numbers in it."""
 
 
 class Image(NamedTuple):
     """An image of the block, and its metadata.
 
-    The times are those of :meth:`BlockWriter.publish`.
+    :meth:`BlockWriter.publish` explains the times.
     """
 
     raw: bytes
@@ -42,12 +42,12 @@ class Image(NamedTuple):
     reason: str
     asked_ns: int | None = None
     shown: bytes | None = None
-    """For a recorded image that injections had changed, the changed image that consumers saw.
+    """The image that consumers saw, if this is a recorded image that recorded injections had changed.
 
     None for any other image.
     """
     at: Stamp | None = None
-    """The times to publish the image with; None: the present time."""
+    """The times with which to publish the image; None: the present time."""
 
     @property
     def base(self) -> bytes:
@@ -58,7 +58,7 @@ class Image(NamedTuple):
 class Output:
     """Publishes images, and publishes the last image again when injections change.
 
-    Several threads may call it; ``lock`` serialises them. If injections change more often
+    Several threads may call the methods; ``lock`` serialises them. If injections change more often
     than ``EXTRA_FRAMES`` times in a period, several changes share a frame. Events about a change
     are published after the frame that shows the change.
     """
@@ -92,18 +92,19 @@ class Output:
 
     @property
     def raw(self) -> bytes:
-        """The image published last, without injections of this instance.
+        """The image published last, without this instance's injections.
 
-        Before this process has published an image, this is the last one of the source's previous
-        process, or all zeros.
+        If this process has not published an image yet, this is the last image of the source's
+        previous process; without one, all bytes are zero.
         """
         return bytes(self.writer.block.layout.size) if self._last is None else self._last.raw
 
     @property
     def base(self) -> bytes:
-        """The image to which injections are applied: usually :attr:`raw`.
+        """The image to which injections are applied, which is usually :attr:`raw`.
 
-        For a replay that shows recorded injections, this is the recorded image with these injections.
+        In a replay that shows recorded injections, this is the recorded image with the recorded
+        injections applied.
         """
         return self.raw if self._last is None else self._last.base
 
@@ -114,7 +115,7 @@ class Output:
 
     @property
     def source_ns(self) -> int:
-        """Time at which the device had the values of the image published last, UTC in ns since 1970.
+        """Time when the device had the values of the image published last, UTC in ns since 1970.
 
         0 if the device has not delivered an image yet.
         """
@@ -122,7 +123,7 @@ class Output:
 
     @property
     def next_ns(self) -> int:
-        """The earliest time of the next frame between two cycles, in ns of the ``now_ns`` clock."""
+        """The earliest time for a frame between two cycles, in ns of the clock ``now_ns``."""
         return self._next_ns
 
     @property
@@ -144,7 +145,7 @@ class Output:
         return self._last
 
     def replace(self, image: Image, records: Iterable[Record]) -> None:
-        """Publish an image in place of everything before it, then ``records``. The caller holds ``lock``."""
+        """Publish an image that replaces all pending changes, then ``records``. The caller holds ``lock``."""
         self._last = image
         self._pending = list(records)
         self._publish()
@@ -165,7 +166,7 @@ class Output:
             self._publish()
 
     def flush(self, *, now: bool = False) -> None:
-        """Publish the waiting changes, if their time has come or ``now`` is set."""
+        """Publish the waiting changes if their time has come, or if ``now`` is true."""
         with self.lock:
             if self._changed and (now or self._now_ns() >= self._next_ns):
                 self._publish()
@@ -221,7 +222,7 @@ class LayerPublisher:
         return self.output.injections
 
     def add(self, layer: Layer) -> str:
-        """Add a layer; return why it was refused, or "".
+        """Add a layer; return "", or why it was refused.
 
         The caller holds the output's ``lock``.
         """
@@ -246,7 +247,7 @@ class LayerPublisher:
         self.injections.add(layer)
 
     def lift(self, which: Callable[[Layer], bool], reason: str, command: Command | None = None) -> None:
-        """Remove the layers that ``which`` selects, and publish the reason."""
+        """Remove the layers that ``which`` selects, and publish events with the reason."""
         with self.output.lock:
             self.output.show(self.removed(which, reason, command))
 
@@ -254,7 +255,7 @@ class LayerPublisher:
         """Replace all layers. The caller holds the output's ``lock``, and then publishes the image ``base``.
 
         Raises:
-            ValueError: The list would be too long.
+            ValueError: The list of injections would be too long.
 
         """
         self._shown.clear()
@@ -266,7 +267,7 @@ class LayerPublisher:
             pass  # the clients of outer layers have got these values already
 
     def removed(self, which: Callable[[Layer], bool], reason: str, command: Command | None = None) -> list[Record]:
-        """Remove the layers that ``which`` selects, and return the events about this.
+        """Remove the layers that ``which`` selects, and return the events about their removal.
 
         The caller holds the output's ``lock``.
         """
@@ -286,7 +287,7 @@ class LayerPublisher:
         return [*lost_values, *self.inner_values(left, ends[0]), *ends] if ends else []
 
     def inner_values(self, layers: Iterable[Layer], end: Record) -> Iterator[Record]:
-        """Yield events with the values that the clients of ``layers`` now receive from inner layers.
+        """Yield events with the values that inner layers now supply to the clients of ``layers``.
 
         The events precede ``end``, the last event of the command that caused the change.
         """
@@ -295,10 +296,10 @@ class LayerPublisher:
             yield from _parts(record, self.injections.inner_values(self.output.base, layer))
 
     def computed(self, base: bytes) -> Iterator[Record]:
-        """Yield events about changes of the values that declared injections supply to clients' outer layers.
+        """Yield events about changed values that declared injections supply to the clients of outer layers.
 
-        Also yield events when the last such injection becomes inactive. Because no command causes
-        the events, their command number is 0, and ``item`` and ``items`` count them.
+        An event also follows when the last such injection becomes inactive. No command causes these
+        events, so their command number is 0, and ``item`` and ``items`` number them.
         """
         for layer in self.injections.layers:
             if not layer.given:
@@ -316,7 +317,7 @@ class LayerPublisher:
                 yield from (part._replace(item=item, items=len(parts)) for item, part in enumerate(parts))
 
     def created(self, layer: Layer, end: Record) -> Iterator[Record]:
-        """Yield the events about a client's new layer, with its direction, priority, ``keep`` and ranges."""
+        """Yield events about a client's new layer, which state its direction, priority, ``keep`` and ranges."""
         how = {
             "direction": layer.direction.name.lower(),
             "priority": layer.priority,
@@ -329,7 +330,7 @@ class LayerPublisher:
         """Write the list of injections into the segment. The caller holds the output's ``lock``.
 
         Raises:
-            ValueError: The list would be too long if it had ``growth`` more bytes.
+            ValueError: The list, with ``growth`` more bytes, would be too long for the segment.
 
         """
         items = (self._item(layer) for layer in self.injections.layers)
@@ -348,7 +349,7 @@ class LayerPublisher:
 
 
 def lost(layer: DeclaredLayer, reason: str) -> Iterator[Record]:
-    """Discard the writes that a declared injection delays, and yield their EXPIRED events."""
+    """Discard the writes that a declared injection delays, and yield an EXPIRED event for each."""
     reason = f"an injection delayed the write, and discarded it: {reason}"
     while layer.held:
         offset, mask, data = layer.held.popleft().write
@@ -358,7 +359,7 @@ def lost(layer: DeclaredLayer, reason: str) -> Iterator[Record]:
 def pieces(
     kind: EventKind, command: Command, place: int, writes: Iterable[Write], layer: Layer | None
 ) -> Iterator[Record]:
-    """Yield events with the data of ``writes``, parts of an item; a long part needs several events."""
+    """Yield events with the data of ``writes``, which are parts of an item. A long part needs several events."""
     name, number = (layer.name, layer.id) if layer else ("", 0)
     return _parts(Record(kind, name, command.writer, command.id, place, 1, injection=number), writes)
 
@@ -371,11 +372,11 @@ def _parts(record: Record, writes: Iterable[Write]) -> Iterator[Record]:
 
 
 def in_parts(record: Record, document: bytes) -> Iterator[Record]:
-    """Yield the events that carry a JSON document in parts."""
+    """Yield events like ``record`` that together carry a JSON document."""
     yield from _parts(record, [Write(0, 0, document)])
 
 
 def layer_event(kind: EventKind, layer: Layer, text: str, command: Command | None = None) -> Record:
-    """Return an event about an injection, caused by ``command``; None: by the injection's owner."""
+    """Return an event about an injection, caused by ``command``, or by the injection's owner if that is None."""
     writer, number = (layer.owner.writer, layer.id) if command is None else (command.writer, command.id)
     return Record(kind, text, writer, number, 0, 1, injection=layer.id)

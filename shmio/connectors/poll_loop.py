@@ -28,16 +28,16 @@ from shmio.logs import fields
 from shmio.segment import BlockWriter, EventKind, Provenance, Quality, Record
 
 RECONNECT: Final = Backoff(0.1, 2.0)
-"""The waiting times before attempts to connect again."""
+"""The waiting times between attempts to connect again."""
 STABLE_NS: Final = 1_000_000_000
-"""After a connection that lasted longer than this time in ns, the back-off starts anew."""
+"""Duration in ns after which a connection counts as stable, so that the next back-off starts anew."""
 CONFIRM_NS: Final = 10_000_000
-"""Longest time in ns that a cycle waits for the confirmation of its writes, but at most half a period.
+"""Maximum time in ns that a cycle waits for the confirmation of its writes; half a period if that is less.
 
-If the confirmation comes later, a later cycle notices it.
+A confirmation that comes later is handled in a later cycle.
 """
 _MEASURES: Final = re.compile(r"\b[0-9]+(?= (?:ms|s|bytes)\b)")
-"""Matches the numbers that may differ between two texts of the same reason: times and sizes."""
+"""Matches the numbers, such as times and sizes, in which two texts of the same reason may differ."""
 
 _Result = TypeVar("_Result")
 
@@ -47,8 +47,8 @@ log = logging.getLogger("shmio.source")
 class Due(NamedTuple):
     """The next cycle.
 
-    ``due_ns`` is the time at which it is due, which may have passed. ``skipped`` is the number of
-    cycles skipped before it.
+    ``due_ns`` is its due time, which may have passed. ``skipped`` is the number of cycles skipped
+    before it.
     """
 
     cycle: int
@@ -57,10 +57,10 @@ class Due(NamedTuple):
 
 
 class Schedule:
-    """Numbers the cycles from the start of the instance on, so that cycles lost by a restart show as a gap.
+    """Numbers the cycles since the start of the instance, so that cycles lost in a restart are visible as a gap.
 
-    A cycle that begins late still runs. A cycle whose whole period has passed is skipped, and counts
-    as an overrun.
+    A cycle that begins late still runs. A cycle whose whole period has passed is skipped, and
+    counts as an overrun.
     """
 
     def __init__(self, start_ns: int, period_ns: int) -> None:
@@ -69,7 +69,10 @@ class Schedule:
         self._last: int | None = None
 
     def moved(self, ahead_ns: int, lead: int) -> Schedule:
-        """Return a schedule for a clock that is ``ahead_ns`` ahead of this one's; cycle numbers are ``lead`` higher."""
+        """Return the schedule for a clock that is ``ahead_ns`` ahead of this schedule's clock.
+
+        Its cycle numbers are higher by ``lead``.
+        """
         return Schedule(self._start_ns - ahead_ns - lead * self._period_ns, self._period_ns)
 
     def next(self, now_ns: int) -> Due:
@@ -88,11 +91,11 @@ class Schedule:
         return self._start_ns + cycle * self._period_ns
 
     def at(self, now_ns: int) -> int:
-        """Return the number of the cycle that was due last; a later process begins with a higher one."""
+        """Return the number of the cycle that was due last. A later process begins with a higher number."""
         return (now_ns - self._start_ns) // self._period_ns
 
     def restart(self) -> None:
-        """Forget the last cycle, so that the time until the next one is an outage, and not an overrun."""
+        """Forget the last cycle, so that the time until the next one counts as an outage, not as an overrun."""
         self._last = None
 
 
@@ -106,7 +109,7 @@ class Counters:
     connects: int = 0
     round_trip_us: int = 0
     busy_since_ns: int = 0
-    """Time at which the loop called the source's method that is now running, in ns; 0 between calls."""
+    """Time in ns when the loop called the method of the source that is running now; 0 if none is running."""
 
     def watch(self, now_ns: Callable[[], int], hook: Callable[[], _Result]) -> _Result:
         """Call a method of the source, and record when the call began, so that others detect a hang."""
@@ -130,7 +133,7 @@ class QualityLog:
     def update(self, quality: Quality, reason: str, cycle: int, well: str = "") -> bool:
         """Report the quality if the quality or its reason has changed.
 
-        A change of the times and sizes in the text of a reason does not count.
+        A reason whose text differs only in times and sizes counts as unchanged.
 
         Args:
             quality: The present quality.
@@ -158,20 +161,20 @@ class QualityLog:
 
 
 class Clock(Protocol):
-    """The loop's view of time; tests provide their own."""
+    """The clock of the loop. Tests provide their own."""
 
     def now_ns(self) -> int:
         """Return the time of CLOCK_MONOTONIC in ns."""
 
     def wait_ns(self, duration_ns: int) -> bool:
-        """Wait for ``duration_ns``.
+        """Wait for ``duration_ns``, or until the loop must stop.
 
-        Return True as soon as the loop must stop, else False at the end.
+        Return whether the loop must stop.
         """
 
 
 class WallClock:
-    """The loop's clock in a live instance."""
+    """The loop's clock in a running instance."""
 
     def __init__(self) -> None:
         self._stopped = threading.Event()
@@ -181,9 +184,9 @@ class WallClock:
         return time.monotonic_ns()
 
     def wait_ns(self, duration_ns: int) -> bool:
-        """Wait for ``duration_ns``.
+        """Wait for ``duration_ns``, or until the loop must stop.
 
-        Return True as soon as the loop must stop, else False at the end.
+        Return whether the loop must stop.
         """
         return self._stopped.wait(max(0, duration_ns) / 1e9)
 
@@ -274,7 +277,7 @@ class SourceLoop:
         return self._quality_log.note
 
     def keep(self) -> None:
-        """At the end of the loop, keep the connection open, if nothing is in flight on it.
+        """Let the loop leave the connection open when it ends, unless a read or write is in flight.
 
         Call this before you stop the clock.
         """

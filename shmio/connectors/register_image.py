@@ -20,12 +20,12 @@ from shmio.model.statuses import (
 
 
 class Copy(NamedTuple):
-    """Registers whose bytes all occur in a device's answer, in another order.
+    """Registers whose bytes can be copied from a device's answer to the image in another order.
 
     Attributes:
-        sources: The offset in the answer of each byte.
-        targets: The offset in the image of each byte.
-        indices: The registers' indices in the layout.
+        sources: For each byte, the offset in the answer.
+        targets: For each byte, the offset in the image.
+        indices: The indices of the registers in the layout.
 
     """
 
@@ -35,7 +35,7 @@ class Copy(NamedTuple):
 
 
 def no_status_area() -> ConnectorError:
-    """Return the error of a connector with ``register_quality`` whose layout has no status area."""
+    """Return the error for a connector with ``register_quality`` whose layout has no status area."""
     return ConnectorError("this is a fault in shmio, please report it: the layout has no status area")
 
 
@@ -69,8 +69,8 @@ class RegisterImage:
         Args:
             index: The register's index in the layout.
             value: A value as for :meth:`Codec.encode_into`: text for times, lists for arrays.
-            source_ns: Time at which the device had the value, UTC in ns since 1970. 0: unknown, so
-                that readers use the time of the frame.
+            source_ns: Time at which the device had the value, UTC in ns since 1970. 0: the time is
+                unknown, so readers use the time of the frame.
             code: OPC UA status code. The value is stored even if the code is bad.
 
         Returns:
@@ -97,7 +97,7 @@ class RegisterImage:
     def copy(self, copy: Copy, answer: bytes) -> None:
         """Store the values of many registers, and make their statuses good.
 
-        Use it only for registers that never get a source time.
+        Use this only for registers that never get a source time.
         """
         self._bytes[copy.targets] = np.frombuffer(answer, np.uint8)[copy.sources]
         for index in self._not_good & copy.indices:

@@ -46,7 +46,7 @@ BROWSED = {
 
 
 _SEPARATE = {"mtconnect": "is a separate package; in a clone of shmio, run pip install ./examples/mtconnect"}
-"""Where to find the connectors that users of shmio need to install."""
+"""How to install the connectors that are in packages of their own, by name."""
 
 
 def names() -> list[str]:
@@ -61,9 +61,10 @@ def _offered() -> EntryPoints:
 
 
 def clash(name: str) -> str:
-    """Return a message if several packages offer a connector of this name; else "".
+    """Return a message if several connectors have this name; else "".
 
-    A package may also offer a connector under the name of a built-in one.
+    A package may offer a connector with the name of another package's connector, or of a built-in
+    one.
     """
     packages = sorted({_package(point) for point in _offered() if point.name == name})
     if name in BUILT_IN and packages:

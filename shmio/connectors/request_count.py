@@ -1,4 +1,4 @@
-"""The requests that a source sends in a cycle, as far as they are known without the device."""
+"""The requests that a source sends in a cycle, as far as shmio can tell without asking the device."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ class Requests:
     count: int
     """The largest number of requests in a cycle."""
     in_flight: int = 1
-    """Number of requests in flight that the device certainly accepts."""
+    """Number of requests that the device surely accepts in flight at once."""
     assumption: str = ""
     """The assumption, such as ``PDU of 240 bytes``; empty if there is none."""
 
     @property
     def round_trips(self) -> int:
-        """The number of successive round trips in a cycle."""
+        """The number of round trips in a cycle that follow one another."""
         return -(-self.count // max(1, self.in_flight))
 
 

@@ -32,8 +32,8 @@ def unresolved(host: str, error: socket.gaierror) -> ConnectorError:
 def look_up(host: str, port: int, timeout_s: float) -> Sequence[Place]:
     """Return the addresses of a host, as ``socket.getaddrinfo`` does.
 
-    The look-up runs in a thread of its own, which is abandoned after ``timeout_s``: if no name server
-    answers, the time-out of the system may be half a minute.
+    The look-up runs in a thread of its own, which this function abandons after ``timeout_s``,
+    because the system may wait half a minute for a name server.
 
     Raises:
         OSError: The host has no address, or no name server has answered within ``timeout_s``.

@@ -18,11 +18,12 @@ def written_registers(layout: Layout, write: Write, present: Callable[[int], Val
         layout: The layout of the block.
         write: The write. It may set some elements of an array, but must set any other register as a
             whole.
-        present: Returns the present value of an array, given its index in the layout, for the
-            elements that are not written. It raises ValueRangeError if the value is not known.
+        present: Function that returns the present value of an array, given the array's index in the
+            layout, for the elements that the write does not set. It raises ValueRangeError if the
+            value is unknown.
 
     Yields:
-        The index of each register, and its new value.
+        The index of each register in the layout, and its new value.
 
     Raises:
         ValueError: The write sets only a part of a value, or sets no register.

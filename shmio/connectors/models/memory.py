@@ -17,8 +17,8 @@ class Memory(Computed):
     """``connector = "memory"``: a value written to ``/in`` appears on ``/out`` at once.
 
     The registers begin with the initial values of the layout. A restarted process continues with
-    the last values. Use it for programs that publish signals, such as a remote simulator, an
-    operator panel or a test.
+    the last values. Use this source for programs that publish signals, such as a remote simulator,
+    an operator panel or a test.
     """
 
     class Options(msgspec.Struct, forbid_unknown_fields=True):
@@ -38,11 +38,11 @@ class Memory(Computed):
         return bytes(self._image)
 
     def save(self) -> bytes:
-        """Return the image."""
+        """Return the image, which is the whole state."""
         return bytes(self._image)
 
     def prepare_restore(self, data: bytes) -> Callable[[], None]:
-        """Check an image, and return the function that restores it."""
+        """Check an image from :meth:`save`, and return the function that restores it."""
         if len(data) != len(self._image):
             raise SnapshotError("its image has another size")
         return lambda: self.resume(data)

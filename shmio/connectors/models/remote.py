@@ -30,16 +30,16 @@ class Remote(Computed):
     """``connector = "remote"``: a program connected by Simulate of shmio.v1 computes each step.
 
     A step fails at once if no program is connected, and after ``timeout_ms`` if the program does
-    not answer. A register that the program does not compute keeps the value last written to it or
-    last read from its connected topic. The next step shows a new value.
+    not answer. A register that the program does not compute has the value that was last written to
+    it, or last read from its connected topic. Readers see a new value after the next step.
     """
 
     class Options(msgspec.Struct, forbid_unknown_fields=True):
         """Keys of the source.
 
         ``outputs`` and ``inouts`` are patterns of the registers that the model computes; at least
-        one pattern is needed. ``timeout_ms`` is in real time. It must be less than the 10 s for
-        which a step waits for its sources.
+        one pattern is needed. ``timeout_ms`` is real time, and must be less than the 10 s for which
+        a step waits for its sources.
         """
 
         outputs: list[str] = []
@@ -75,7 +75,7 @@ class Remote(Computed):
 
     @property
     def connections(self) -> Mapping[str, str]:
-        """The topic of each connected input, by the input's path, as configured."""
+        """The topics that connected inputs get their values from, by the paths of the inputs, as configured."""
         return self._options.connections
 
     @property
@@ -84,7 +84,7 @@ class Remote(Computed):
         return self._inputs
 
     def attach(self, writer: BlockWriter) -> None:
-        """Find the model channel in the source's block, which carries requests and answers."""
+        """Find the model channel in the source's block. The channel carries requests to the model, and answers."""
         link = writer.block.model_channel
         if link is None:
             raise SegmentError(f"source {writer.block.source}: its block has no link to a model")
@@ -104,12 +104,12 @@ class Remote(Computed):
     def resume(self, image: bytes) -> None:
         """Continue from the last image.
 
-        Any other state of the model is kept by the program that runs it.
+        The program that runs the model keeps all other state of the model.
         """
         self._images.resume(image)
 
     def begin(self) -> bytes:
-        """Return the present image.
+        """Return the present image, if a model is connected.
 
         Raises:
             ConnectorError: No model is connected.

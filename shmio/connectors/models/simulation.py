@@ -53,7 +53,7 @@ class Simulation(Computed):
 
     @property
     def connections(self) -> Mapping[str, str]:
-        """The topic of each connected input, by the input's path, as configured."""
+        """The topics that connected inputs get their values from, by the paths of the inputs, as configured."""
         return self._connections
 
     @property
@@ -62,13 +62,13 @@ class Simulation(Computed):
         return self._runner.inputs
 
     def connect(self, values: Mapping[str, Value], doubt: str) -> None:  # noqa: ARG002  models do not use it
-        """Set the values of inputs."""
+        """Set the values of inputs for the next step."""
         self._runner.connect(values)
 
     def resume(self, image: bytes) -> None:
         """Continue from the last image.
 
-        All other state of the model is lost when the process restarts.
+        The model loses all other state when the process restarts.
         """
         self._runner.resume(image)
 
@@ -81,7 +81,7 @@ class Simulation(Computed):
         return self._runner.save()
 
     def prepare_restore(self, data: bytes) -> Callable[[], None]:
-        """Check the model's state, and return the function that restores it."""
+        """Check a state from :meth:`save`, and return the function that restores it."""
         return self._runner.prepare_restore(data)
 
     def write(self, writes: Sequence[Write]) -> list[str]:
@@ -89,7 +89,7 @@ class Simulation(Computed):
         return self._runner.write(writes)
 
     def step(self, time_ns: int, dt_ns: int) -> bytes:
-        """Let the model compute a step, and return the new image."""
+        """Compute a step with the model, and return the new image."""
         return self._runner.step(time_ns, dt_ns)
 
     def close(self) -> None:
@@ -121,7 +121,8 @@ def make(options: Simulation.Options, layout: Layout | None) -> ModelRunner:
 class Request(msgspec.Struct):
     """A request to describe a model.
 
-    ``layout`` is the layout of the source's block as JSON; None if the model itself declares it.
+    ``layout`` is the layout of the source's block as JSON; None if the model itself declares its
+    registers.
     """
 
     options: Simulation.Options

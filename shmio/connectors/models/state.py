@@ -26,14 +26,15 @@ class SourceState(msgspec.Struct, array_like=True, forbid_unknown_fields=True):
 
     Attributes:
         step: The number of the last step.
-        time_ns: The instance's clock.
-        utc_ns: UTC at that time, by the frames of the source.
-        computed_ns: The instance's clock of the last computed image; None if there is none.
+        time_ns: The instance time in ns.
+        utc_ns: UTC in the source's frames at that time, in ns since 1970.
+        computed_ns: The instance time in ns of the last computed image; None if there is none.
         raw: The last image, without injections.
-        cycle, source_ns, quality, provenance, reason: Of the last frame.
-        seen: Cycle, instance time and image for which conditions were evaluated last.
+        cycle, source_ns, quality, provenance, reason: The fields of the last frame.
+        seen: Cycle, instance time and image with which conditions were evaluated last.
         layers: The injections.
         source: The state of the model, or of whatever computes the image.
+
     """
 
     step: int

@@ -1,7 +1,7 @@
 """The loop that runs computed sources, and the inputs that they read from other sources.
 
-In wall time, the loop computes each cycle of the source's schedule. In virtual time, it computes
-each step that is requested.
+In wall time, the loop computes each cycle of the source's schedule. In virtual time, the loop computes
+each requested step.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ RESTARTED: Final = "the source's process was restarted during this step; it cont
 class Inputs:
     """Reads the registers of other sources that are connected to one source's inputs.
 
-    From a source that takes part in steps, it reads the last frame before the present step, even if
-    that source has already completed the step (the Jacobi method). From any other source it reads
-    the newest frame. Use an object in one thread only.
+    If a source takes part in steps, its last frame before the present step counts, even if the
+    source has already completed the step (the Jacobi method). Otherwise its newest frame counts.
+    Use an object in one thread only.
     """
 
     def __init__(self, segment: Segment, connections: Mapping[str, Topic]) -> None:
@@ -55,7 +55,7 @@ class Inputs:
         self._found: dict[str, tuple[Block, RegisterCodec]] = {}
 
     def read(self, step: int | None) -> tuple[dict[str, Value], str]:
-        """Return values by the paths of inputs, and why the other inputs have no value.
+        """Return the values of inputs by path, and why other inputs have no value.
 
         The reason is empty if all inputs have a value. ``step`` is the present step; None in wall
         time.
@@ -94,7 +94,7 @@ class Inputs:
 def connected_inputs(source: Computed, block: Block, opened: Callable[[], Segment]) -> Inputs | None:
     """Return a reader of the values for a source's connected inputs; None if no input is connected.
 
-    ``opened`` opens the segment a second time, because the reader must notice reloads independently
+    ``opened`` opens the segment a second time, because the reader must handle reloads independently
     of the rest of the process.
     """
     if not source.connections:
@@ -124,7 +124,7 @@ def _frame(block: Block, step: int | None) -> tuple[Frame | None, str]:
 
 
 class StepClock(Protocol):
-    """What the loop needs of a clock. Tests implement it themselves."""
+    """The clock that the loop needs. Tests provide their own."""
 
     def now_ns(self) -> int:
         """Return the time of CLOCK_MONOTONIC in ns."""
@@ -136,7 +136,7 @@ class StepClock(Protocol):
         """
 
     def nudge(self) -> None:
-        """Wake the loop. Any thread may call it."""
+        """Wake the loop. Any thread may call this."""
 
 
 class PageClock:
@@ -162,11 +162,11 @@ class PageClock:
         return self._stopped
 
     def nudge(self) -> None:
-        """Wake the loop. Any thread may call it."""
+        """Wake the loop. Any thread may call this."""
         self._bell.ring()
 
     def stop(self) -> None:
-        """Stop the loop. Any thread may call it."""
+        """Stop the loop. Any thread may call this."""
         self._stopped = True
         self.nudge()
 
@@ -237,10 +237,7 @@ class SteppedLoop:
         return self._quality_log.note
 
     def run(self) -> None:
-        """Compute cycles and steps until the clock tells the loop to stop.
-
-        Then publish a bad frame.
-        """
+        """Compute cycles and steps until the clock stops the loop, then publish a bad frame."""
         try:
             self.begin()
             while not (self._live(state) if (state := self._page.read()).virtual else self._free_run()):
@@ -372,7 +369,7 @@ class SteppedLoop:
         )
 
     def check(self, data: bytes) -> None:
-        """Check whether a state can be restored, without a change.
+        """Check whether a state can be restored, without changing anything.
 
         Raises:
             SnapshotError: The state is damaged, or does not fit the source.

@@ -1,7 +1,7 @@
 """The loop that plays a recording, in wall time by the clock and in virtual time by steps.
 
 ``ReplayLoop`` decides which frames and events are due, and ``Player`` publishes them. ``moved`` and
-``Search`` carry out clients' requests to pause, seek and search.
+``Search`` carry out the requests of clients to pause, seek and search.
 """
 
 from __future__ import annotations
@@ -46,19 +46,19 @@ PIECE: Final = 64
 LATE_NS: Final = 10_000_000_000
 """In wall time, frames that are more than this late (instance time, ns) are skipped."""
 ASK_TURN_NS: Final = 1_000_000
-"""Period in ns at which to check whether a step has ended, if a request must wait for its end.
+"""Interval in ns for checking whether a step has ended, while a request waits for its end.
 
 The end of a step does not wake the loop.
 """
 BEHIND_NS: Final = 3_000_000_000
-"""A request younger than this, in ns, waits until everything due before it has been played."""
+"""Age in ns below which a request waits until everything due before it has been played."""
 AHEAD_NS: Final = 60_000_000_000
-"""The longest time in ns by which a request may lie in the future.
+"""Maximum time in ns by which a request may lie in the future.
 
-Requests may lie in the past without limit, because the process may have been delayed.
+A request may lie in the past by any time, because the process may have been delayed.
 """
 ANY = "any"
-"""Name of an event in a search that stands for every event that a replay publishes."""
+"""Event name in a search that matches every event that a replay publishes."""
 SEARCH_PIECE = 256
 """Number of entries that a search reads before the loop continues to play."""
 
@@ -76,11 +76,11 @@ _OF_INJECTIONS: Final = frozenset(
 )
 
 Asked = tuple[int, PlayheadRequest | None] | None
-"""The number of a request, and the request; None if no request waits."""
+"""The number and the content of a waiting request; the content is None if it is invalid. None: no request waits."""
 StampOf = Callable[[int, int], Stamp]
-"""Returns the time stamp of an entry.
+"""Function that returns the time stamp of an entry.
 
-Arguments: its position and its recorded instance time, in ns.
+Its arguments are the entry's position and the recorded instance time, both in ns.
 """
 
 log = logging.getLogger("shmio.source")
@@ -122,14 +122,14 @@ class Player:
         return None if self._next is None else self._next.position_ns
 
     def go(self, position_ns: int | None) -> None:
-        """Continue with the first entry at or after a position; with the recording's first entry if it is None."""
+        """Continue with the first entry at or after a position in ns; None: with the first entry of the recording."""
         self._entries = self._recorded.entries(position_ns)
         self._next = next(self._entries, None)
 
     def begin(self, position_ns: int, stamp: StampOf) -> None:
-        """Publish the last frame before a position, and continue with the entries from there on.
+        """Publish the last frame before a position in ns, and continue with the entries from the position on.
 
-        If there is no such frame, continue with the first entry of the recording.
+        If there is no frame before the position, continue with the first entry of the recording.
         """
         entry = self._recorded.newest(position_ns - 1)
         if entry is not None:
@@ -137,16 +137,16 @@ class Player:
         self.go(None if entry is None else position_ns)
 
     def again(self, position_ns: int, stale_ns: int, stamp: StampOf) -> None:
-        """Start the next round of a looped replay at a position.
+        """Start the next round of a looped replay at a position in ns.
 
-        If no frame is due within ``stale_ns`` from there, publish a bad frame.
+        If no frame is due within ``stale_ns`` after the position, publish a bad frame.
         """
         if self._recorded.newest(position_ns + stale_ns) is None:
             self.end(NOTHING, stamp(position_ns, position_ns))
         self.go(position_ns)
 
     def resume(self, position_ns: int) -> None:
-        """Continue after ``position_ns``, up to which the source's previous process has published."""
+        """Continue after ``position_ns``, the position that the source's previous process has reached."""
         self.go(position_ns + 1)
         entry = self._recorded.newest(position_ns)
         if entry is not None and isinstance(entry.item, Frame):
@@ -169,7 +169,7 @@ class Player:
         self.go(position_ns + 1)
 
     def play(self, until_ns: int, stamp: StampOf, most: int) -> bool:
-        """Publish at most ``most`` entries up to a position. Return whether more are left."""
+        """Publish the entries up to a position in ns, at most ``most`` entries. Return whether more are left."""
         for _ in range(most):
             if self._next is None or self._next.position_ns > until_ns:
                 return False
@@ -253,8 +253,8 @@ def moved(play: PlayState, ask: MoveRequest, clock_ns: int) -> tuple[PlayState, 
         clock_ns: The present instance time, in ns.
 
     Returns:
-        The new state, which applies from the request's time on; and the position to show in ns, or
-        None if the request does not seek.
+        The new state, which applies from the request's time on, and the position to show in ns
+        (None: the request does not seek).
 
     Raises:
         ValueRangeError: The request cannot be carried out.

@@ -41,7 +41,7 @@ _DAMAGED: Final = MissingFrames("not in the recording: it is damaged here")
 
 
 class Entry(NamedTuple):
-    """A frame, an event or a gap in a recording, and its position."""
+    """A frame, an event or a gap in a recording, with its position."""
 
     position_ns: int
     item: Frame | Event | MissingFrames
@@ -71,7 +71,7 @@ class RecordedSource:
         self._holes = [gap for gap in dump.gaps if gap.source == block.source and gap.what == "frames"]
 
     def entries(self, from_ns: int | None) -> Iterator[Entry]:
-        """Yield the entries from a position on (None: from the first one), in recorded order.
+        """Yield the entries from a position on (None: from the first entry), in recorded order.
 
         At a gap or damaged part, the item of the entry is a MissingFrames.
         """
@@ -122,7 +122,7 @@ class RecordedSource:
 
 
 class Span(NamedTuple):
-    """A part of a recording, from one position to another; the end is exclusive."""
+    """A part of a recording, from one position up to but not including another."""
 
     begin_ns: int
     end_ns: int
@@ -202,7 +202,7 @@ class Recording:
     def span(self, start: Moment | None, end: Moment | None) -> Span:
         """Return the part of the recording between two times.
 
-        None stands for its beginning or its end.
+        A ``start`` of None is the beginning of the recording, and an ``end`` of None is its end.
 
         Raises:
             RecordingError: A time is invalid, or no part of the recording lies between the times.
@@ -222,7 +222,7 @@ class Recording:
         return span
 
     def moment(self, key: str, text: Moment) -> int:
-        """Return the position in ns of a time, given as seconds from the beginning or as a date and time.
+        """Convert a time, given as seconds from the beginning or as a date and time, to a position in ns.
 
         A date and time without a zone is local. ``key`` is the configuration key, for error
         messages.

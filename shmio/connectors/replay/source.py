@@ -78,7 +78,7 @@ def files(options: Replay.Options) -> Sequence[str]:
 
 
 def chosen(recording: Recording, options: Replay.Options, name: str) -> tuple[Span, RecordedSource]:
-    """Return the part of the recording to play, and a reader of the source to play.
+    """Return the part of the recording that the options select, and a reader of the source to play.
 
     Raises:
         ConfigError: There is nothing to play. The message begins with the configuration key that is
@@ -107,14 +107,14 @@ class ReplayStart(NamedTuple):
 
     @property
     def at(self) -> Stamp:
-        """The time stamp for the start event, which is that of the position at which playing continues."""
+        """The time stamp for the start event, which belongs to the position where playing continues."""
         play, done_ns = self
         position_ns = play.begin_ns if done_ns is None else done_ns
         return stamp(play, position_ns, position_ns)
 
 
 def begin(source: Replay, block: Block, started_ns: int, blocks: Iterable[Block]) -> ReplayStart:
-    """Return the state to start from, and write it to the block's playhead.
+    """Return the state from which to start, and write this state to the block's playhead.
 
     If the playhead already belongs to this recording, continue from it. Otherwise follow the other
     sources that replay the recording, if there are any, or start as configured.
@@ -161,7 +161,7 @@ def _is_of(source: Replay, play: PlayState) -> bool:
 
 
 def as_others(source: Replay, heads: Iterable[Playhead]) -> PlayState | None:
-    """Return the newest playing state of the sources that replay the same recording; None if there are none."""
+    """Return the newest play state of the sources that replay the same recording; None if there are none."""
     plays = [play for head in heads if (play := head.read()) is not None and _is_of(source, play)]
     return max(plays, key=lambda play: play.anchor_ns, default=None)
 
@@ -186,7 +186,7 @@ def _as_configured(source: Replay, block: Block, started_ns: int) -> PlayState:
 
 
 def stamp(play: PlayState, position_ns: int, clock_ns: int) -> Stamp:
-    """Return the time stamp for a position; ``clock_ns`` is the recorded instance time in ns."""
+    """Return the time stamp for a position in ns; ``clock_ns`` is the recorded instance time in ns."""
     if not play.own_clock:
         clock_ns = play.due_ns(max(position_ns, play.position_ns))
     return Stamp(play.base_ns + position_ns, clock_ns)
