@@ -1,4 +1,4 @@
-"""``shmio-supervisor browse``: lists the registers that a device offers, as a tree or as a tag table."""
+"""``shmio-supervisor browse``: lists the values that a device offers, as a tree or as a tag table."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from shmio.wording import EXISTS, NOT_TOML, unknown
 
 
 def browse(arguments: argparse.Namespace) -> int:
-    """List the registers that a device offers; return 1 if the list is incomplete."""
+    """List the values that a device offers; return 1 if the list is incomplete."""
     output = arguments.output
     if output is not None and output.suffix != ".toml":
         raise ConfigError(f"{output}: {NOT_TOML}")
@@ -94,7 +94,7 @@ def _write(arguments: argparse.Namespace, found: Browsed) -> None:
 
 
 def tree(offers: list[Offer]) -> Iterator[str]:
-    """Yield the lines of a tree of registers: each group, followed by its contents."""
+    """Yield the lines of a tree of values: each group, followed by its contents."""
     by_names = {one.names: one for one in offers}
     children: dict[tuple[str, ...], dict[tuple[str, ...], None]] = {}
     for names in by_names:

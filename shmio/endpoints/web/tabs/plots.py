@@ -22,7 +22,7 @@ MAX_SIGNALS: Final = 200
 """Maximum number of registers that one page plots."""
 MAX_COLUMNS: Final = 4000
 RECORDED_S: Final = 2.0
-"""Time in s after which a published frame must be in the recorder's file."""
+"""Time in s within which a published frame reaches the recorder's file."""
 
 
 class Plotted(msgspec.Struct, forbid_unknown_fields=True):
