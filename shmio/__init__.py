@@ -25,7 +25,7 @@ _MODULES = {
     "connect": "shmio.client",
     "open_dump": "shmio.recording.dump",
 }
-"""The module of each public name."""
+"""The module that defines each public name."""
 
 __all__ = ["Cell", "__version__", "attach", "connect", "open_dump"]
 

@@ -1,4 +1,4 @@
-"""Computes back-off, the growing waits between repeated attempts."""
+"""Computes the growing waits between repeated attempts (back-off)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Backoff:
-    """Rule for the waits between attempts. It has no state: the caller counts the waits.
+    """Rule for the waits between attempts. An object has no state: the caller counts the waits.
 
     Attributes:
         first_s: The first wait, in s.

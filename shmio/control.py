@@ -1,23 +1,24 @@
 """Requests to a running supervisor, over a UNIX stream socket.
 
-A client sends one request on each connection, and gets one answer. Each is a line with a JSON
-object.
+A client sends one request on each connection, and gets one answer. Request and answer are each one
+line with a JSON object. The supervisor sends the answer at the time in the last column.
 
 ========================================  =================================================  =======================
-request                                   answer                                             given when
+request                                   answer                                             time of the answer
 ========================================  =================================================  =======================
-``{"do": "stop"}``                        ``{"ok": true}``                                   all is stopped
+``{"do": "stop"}``                        ``{"ok": true}``                                   all have stopped
 ``{"do": "restart", "name": "cell"}``     ``{"ok": true}``                                   the process runs again
 ``{"do": "reload"}``                      ``{"ok": true, "done": [lines], …}``               the change is done
-``{"do": "reload", "dry_run": true}``     ``{"ok": true, "faults": [lines], …}``             the new plan is made
+``{"do": "reload", "dry_run": true}``     ``{"ok": true, "faults": [lines], …}``             the plan is ready
 ``{"do": "where"}``                       ``{"ok": true, "config": …, "read_ns": …, …}``     at once
-``{"do": "disturb", "answers": "ok"}``    ``{"ok": true}``                                   an emulator does so
+``{"do": "disturb", "answers": "ok"}``    ``{"ok": true}``                                   at once
 anything else                             ``{"error": "…"}``                                 at once
 ========================================  =================================================  =======================
 
-The segment's header contains the socket's path. Only the supervisor's own user and root are served.
+The segment's header contains the socket's path. The supervisor serves only its own user and root.
 
-An emulator with ``faults = true`` has its own socket in the same folder, for ``disturb`` only.
+An emulator with ``faults = true`` has its own socket in the same folder, which accepts only
+``disturb``.
 """
 
 from __future__ import annotations
@@ -43,11 +44,11 @@ MAX_REQUEST_BYTES: Final = 4096
 MAX_ANSWER_BYTES: Final = 65536
 MAX_CLIENTS: Final = 8
 REQUEST_S: Final = 2.0
-"""Time in which a client must send its request, in s."""
+"""Time in s within which a client must send its request."""
 TURN_S: Final = 0.5
-"""Interval in s at which a waiting client checks that the supervisor is alive."""
+"""Interval in s at which a waiting client checks whether the supervisor is alive."""
 CONNECT_S: Final = 0.05
-"""Interval in s at which a client tries again while the supervisor has too many clients."""
+"""Interval in s at which a client tries again to connect while the supervisor has too many clients."""
 _TOO_MANY: Final = "too many control connections at once"
 _CREDENTIALS: Final = struct.Struct("iII")  # struct ucred: pid, uid, gid
 LINE_CHARS: Final = 2000
@@ -64,9 +65,8 @@ _MORE: Final = {
 }
 """For each list in an answer, the line that replaces the lines that do not fit.
 
-The lists are shortened in this order.
-
-``kept`` is missing because it always fits: it has at most 200 names of at most 40 characters.
+If an answer is too long, its lists are shortened in the order of these keys. The list ``kept`` has
+no key here because it always fits: it has at most 200 names of at most 40 characters.
 """
 
 
@@ -98,9 +98,10 @@ def socket_path(instance: str) -> str:
 
 
 def emulator_socket_path(control: str, name: str) -> str:
-    """Return the path of an emulator's control socket, beside that of its supervisor.
+    """Return the path of an emulator's control socket, in the folder of the socket ``control``.
 
-    Its file name contains a ``+``, which no instance's name contains.
+    ``control`` is the path of the supervisor's socket. The file name contains a ``+``, so that it
+    differs from every instance's socket: no instance's name contains one.
     """
     path = Path(control)
     return str(path.with_name(f"{path.stem}+{name}{path.suffix}"))
@@ -127,14 +128,14 @@ def _prepare(folder: Path, uid: int) -> str | None:
 
 
 def remove_socket(path: str) -> None:
-    """Remove a socket. A file of another kind stays, so that bind fails."""
+    """Remove a socket. Keep any other file at this path; binding to the path then fails."""
     with suppress(FileNotFoundError):
         if stat.S_ISSOCK(os.lstat(path).st_mode):
             Path(path).unlink()
 
 
 Answers = Literal["ok", "delay", "corrupt", "hang", "refuse"]
-"""How an emulator answers its clients."""
+"""How an emulator answers: correctly, late, with corrupt bytes, never, or by refusing connections."""
 ANSWERS: Final[tuple[Answers, ...]] = get_args(Answers)
 
 
@@ -181,7 +182,7 @@ class Peer(NamedTuple):
 
 
 class Answer:
-    """Answers the client that sent a request. It has no effect if the client has disconnected."""
+    """Sends the answer to one request; has no effect if the client has disconnected."""
 
     def __init__(self, server: ControlServer, client: socket.socket, peer: Peer) -> None:
         self._server = server
@@ -192,7 +193,7 @@ class Answer:
         """Called with each answer: why the request failed, or "" if it succeeded."""
 
     def ok(self, **values: object) -> None:
-        """Answer that the request succeeded. Lists of lines are shortened to fit."""
+        """Answer that the request succeeded, with ``values``; shorten lists of lines that do not fit."""
         self.ended("")
         self._server.answer(self._client, _shorten({"ok": True, **values}, MAX_ANSWER_BYTES - 1))
 
@@ -205,7 +206,8 @@ class Answer:
 class ControlServer:
     """The supervisor's side of the control socket. No method waits for a client.
 
-    It uses the supervisor's selector. The data of each selector key is the function to call.
+    The server registers its sockets with the supervisor's selector. When a socket is ready, the
+    supervisor calls the function that is the data of the socket's selector key.
     """
 
     def __init__(
@@ -322,7 +324,7 @@ class ControlServer:
             self._drop(client)
 
     def expire(self) -> None:
-        """Disconnect clients that have not sent a request in time."""
+        """Disconnect clients that have not sent their request within ``REQUEST_S``."""
         now = time.monotonic()
         for client, (_, deadline) in list(self._clients.items()):
             if deadline is not None and now > deadline:
@@ -336,7 +338,7 @@ class ControlServer:
     def retire(self) -> None:
         """Remove the socket, so that a new supervisor can create its own.
 
-        Clients still get answers.
+        Clients that are already connected still get their answers.
         """
         if self._listener.fileno() < 0:
             return

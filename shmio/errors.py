@@ -5,14 +5,14 @@
     ShmioError
     ├── ConfigError        the configuration is wrong; the message names the key
     │   └── DeclarationError     a declared injection is wrong; also a subclass of ValueRangeError
-    ├── LayoutError        a data-block source is wrong; ``diagnostics`` has file, line and column
+    ├── LayoutError        a layout source is wrong; ``diagnostics`` has file, line and column
     ├── ValueRangeError    a value does not fit its register's type
     ├── PathError          no such source or register
     ├── ConflictError      a name is in use for something else
     ├── WrongInstanceError the running instance of this name has another configuration file
     ├── SegmentError       the shared memory cannot be used
     │   ├── NotRunningError      no running instance of that name
-    │   │   └── UnfinishedError      the segment is incomplete: in creation, or its creator died
+    │   │   └── UnfinishedError      the segment is being created, or its creator died
     │   ├── AlreadyRunningError  the instance already has a supervisor
     │   └── FormatError          this version cannot read the segment's format
     ├── CommandError       a command cannot be sent to its source, or was not carried out
@@ -23,10 +23,10 @@
     ├── ModelError         a simulation model is declared wrongly, or its code failed
     ├── RecordingError     a recording cannot be written, or this version cannot read it
     ├── MissingLibraryError  an optional library is not installed; the message has the command for it
-    ├── EndpointError      an endpoint cannot use its address, or is at a limit
+    ├── EndpointError      an endpoint cannot use its address, or has reached a limit
     ├── RemoteError        an instance cannot be reached by gRPC, or does not answer as it should
     │   ├── LostError            nothing serves this address at present; also a subclass of NotRunningError
-    │   └── UnknownClientError   the endpoint requires a known client
+    │   └── UnknownClientError   the endpoint requires a token that it knows
     └── ControlError       the supervisor refused or did not answer
         └── UnreachableError     shmio cannot connect to the supervisor's socket
 
@@ -68,8 +68,8 @@ class Diagnostic(msgspec.Struct, frozen=True):
 class LayoutError(ShmioError):
     """A layout source cannot be compiled; ``str()`` is one line for each diagnostic.
 
-    ``diagnostics`` has them as objects with file, line and column, including warnings. It is empty
-    if the error is not about a source text.
+    ``diagnostics`` has errors and warnings as objects with file, line and column. It is empty if
+    the error is not about a source text.
     """
 
     def __init__(self, message: str, diagnostics: Sequence[Diagnostic] = ()) -> None:
@@ -145,8 +145,7 @@ class QualityError(ShmioError):
 class ConnectorError(ShmioError):
     """The device is absent or did not answer as the protocol demands.
 
-    On this error, the poll loop closes the connection. The next frame has the text of the error as
-    its reason.
+    The poll loop then closes the connection. The reason of the next frame is the text of the error.
     """
 
 
@@ -155,7 +154,7 @@ class MissingLibraryError(ShmioError, ImportError):
 
 
 class EndpointError(ShmioError):
-    """An endpoint cannot use its address or TLS files, or has reached a limit of clients."""
+    """An endpoint cannot use its address or TLS files, or has reached its limit of clients."""
 
 
 class ModelError(ShmioError):

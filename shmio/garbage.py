@@ -1,7 +1,7 @@
 """Garbage collection while a process starts.
 
-What a process creates at its start lives as long as the process: modules, layouts, tables. The
-collector would go through all of it again and again, and find nothing.
+The objects that a process creates at its start, such as modules, layouts and tables, live as long as
+the process. The collector would go through all of them again and again, and free nothing.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ import gc
 
 
 def pause() -> None:
-    """Collect nothing until :func:`resume`."""
+    """Switch garbage collection off until :func:`resume`."""
     gc.disable()
 
 
 def resume() -> None:
-    """Collect again, but only what is created from now on. Without :func:`pause`, do nothing."""
+    """Switch garbage collection on again, except for all present objects; do nothing if it is on."""
     if not gc.isenabled():
         gc.freeze()
         gc.enable()

@@ -85,7 +85,7 @@ FORMATTERS: Final[Mapping[str, Callable[[str, str | None], logging.Formatter]]] 
     "text": LineFormatter,
     "json": JsonFormatter,
 }
-"""For each value of ``[instance] log_format``, the class of the formatter."""
+"""The class of the formatter for each value of ``[instance] log_format``."""
 
 
 class RotatingLog(logging.handlers.RotatingFileHandler):
@@ -151,7 +151,7 @@ def setup(
     Args:
         file: The log file.
         process: The process name in each line.
-        source: The source name in each line.
+        source: The source name in each line; None for a process that serves no single source.
         form: Format of the lines: ``text`` or ``json``.
         console: True to write records to standard error as well.
         streams: True if standard output and error go to this file. They are redirected to each new file.
@@ -191,12 +191,12 @@ def fields(**values: object) -> dict[str, dict[str, object]]:
 
 
 def stamp(time_s: float) -> str:
-    """Return a UNIX time as text, in UTC. Such texts sort in the order of time."""
+    """Return a UNIX time as UTC in ISO 8601; sorting such texts sorts the times."""
     return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
 
 
 def with_fields(message: str, fields: Mapping[str, object]) -> str:
-    """Return a message with extra fields after it."""
+    """Return a message followed by its extra fields, as ``key=value``."""
     return " ".join([message, *(f"{key}={value}" for key, value in fields.items())])
 
 
@@ -208,9 +208,9 @@ def printable(text: str) -> str:
 
 
 MAX_LINES: Final = 20
-"""Maximum number of records of one kind in an interval."""
+"""Maximum number of records of one kind that :class:`LogRateLimit` passes in an interval."""
 TURN_S: Final = 10.0
-"""Length of the interval, in s."""
+"""Length of an interval of :class:`LogRateLimit`, in s."""
 
 
 class LogRateLimit(logging.Filter):

@@ -23,9 +23,9 @@ _OPERATIONS: Final[Mapping[str, Mapping[str, str]]] = {
     "drop": {},
     "flip": {"bits": "bits"},
 }
-"""For each operation, its keys and the corresponding fields of its message.
+"""For each operation of a declaration, its keys and the corresponding fields of its message.
 
-An operation whose only key is ``value`` has no message of its own: its field is the value.
+An operation whose only key is ``value`` has no message of its own: the field is the value itself.
 """
 _COMMON: Final = ("probability", "start_s", "end_s", "when", "for_s", "times", "seed", "priority")
 _DISTRIBUTIONS: Final = {"uniform": wire.Noise.DISTRIBUTION_UNIFORM, "gaussian": wire.Noise.DISTRIBUTION_GAUSSIAN}
@@ -36,7 +36,7 @@ def value_to_wire(value: object, path: str) -> wire.Value:
 
     Args:
         value: The value.
-        path: The register, for error messages.
+        path: Path of the register, for error messages.
 
     Raises:
         ValueRangeError: Values of this kind cannot be sent.

@@ -1,4 +1,4 @@
-"""Ends a process when its parent process ends, however that happens."""
+"""Ends a process when its parent process ends, even if the parent is killed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def end_with_parent(parent: int) -> bool:
     """Let the kernel end this process with SIGKILL when its parent ends.
 
     Args:
-        parent: Id of the parent process, as the parent knows it.
+        parent: Pid of the parent process, which the parent has passed on.
 
     Returns:
         False if the parent has already ended.

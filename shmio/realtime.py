@@ -1,4 +1,4 @@
-"""Real-time priority (sched(7)). A process that has it runs before all processes that do not."""
+"""Real-time priority (sched(7)). A thread with it runs before all threads without it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from shmio.errors import ConfigError
 
 
 def prioritise(priority: int) -> None:
-    """Give the calling thread, and threads that it starts later, this priority of SCHED_FIFO.
+    """Give the calling thread, and threads that it starts later, this priority, with SCHED_FIFO.
 
     Raises:
         ConfigError: This user may not use the priority. The message contains the remedy.
@@ -25,7 +25,7 @@ def prioritise(priority: int) -> None:
 
 
 def check(priority: int) -> None:
-    """Raise ConfigError unless processes of this user may have the priority."""
+    """Raise ConfigError unless processes of this user may use this priority."""
     refused: list[ConfigError] = []
 
     def attempt() -> None:

@@ -1,4 +1,4 @@
-"""Phrases that messages share, so that the same fault reads the same everywhere."""
+"""Phrases that messages share, so that all parts of shmio report a fault in the same words."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ MAX_NAMES: Final = 30
 
 
 def counted(count: int, noun: str) -> str:
-    """Return a number with its noun, such as ``1 node`` or ``7 nodes``."""
+    """Return a number with its noun in singular or plural, such as ``1 node`` or ``7 nodes``."""
     return f"{count} {noun}{'s' * (count != 1)}"
 
 
 def near(word: str, names: Iterable[str]) -> list[str]:
-    """Return a list with only the name most similar to ``word``, ignoring case; empty if none is similar."""
+    """Return a list of the one name most similar to ``word``, ignoring case; empty if no name is similar."""
     import difflib  # noqa: PLC0415  takes 1 ms, and most processes report no such fault
 
     folded = {name.lower(): name for name in names}
@@ -34,7 +34,7 @@ def did_you_mean(names: Sequence[str]) -> str:
 
 
 def listed(names: Iterable[str]) -> str:
-    """Return ``valid: a, b, c`` with at most ``MAX_NAMES`` names; ``there are none`` without names."""
+    """Return ``valid: a, b, c`` with at most ``MAX_NAMES`` names; ``there are none`` if there are no names."""
     known = list(names)
     if not known:
         return "there are none"
@@ -42,13 +42,14 @@ def listed(names: Iterable[str]) -> str:
 
 
 def unknown(what: str, word: object, names: Iterable[str], of: str = "") -> str:
-    """Return ``unknown WHAT 'word'; did you mean 'name'?``; if no name is similar, all valid names instead.
+    """Return ``unknown WHAT 'word'; did you mean 'name'?``; if no name is similar, list the valid names instead.
 
     Args:
         what: The kind of thing, such as ``source``.
         word: The word that the user wrote.
         names: All valid names.
-        of: What has these names, if the message does not say this before.
+        of: What has these names, such as ``model lift``; the text then is ``unknown WHAT 'word' of
+            OF; …``.
 
     """
     known = list(names)
@@ -58,7 +59,7 @@ def unknown(what: str, word: object, names: Iterable[str], of: str = "") -> str:
 
 
 def already_named(name: str, first: str) -> str:
-    """Return the message about a name that is given twice; ``first`` is the key of the section that has it."""
+    """Return the message about a name that two sections have; ``first`` is the key of the first section."""
     return f"{name!r} is already the name of {first}; choose another name"
 
 
@@ -67,7 +68,7 @@ IN_USE: Final = "another program uses this address (ss -ltnp shows which), or th
 NOT_TOML: Final = "a tag table is TOML; choose a name that ends in .toml"
 EMPTY: Final = "the recording is empty"
 PLAIN_REMEDY: Final = "give certificate and key, or write insecure = true in the same section"
-"""The remedy against plain text in the sections that have a certificate of their own."""
+"""The remedy for plain text, for sections that have their own ``certificate`` and ``key``."""
 
 
 _NOT_LISTENING: Final = {
@@ -88,12 +89,12 @@ def larger_than(most_bytes: int) -> str:
 
 
 def plain_text(address: object, remedy: str) -> str:
-    """Return the message about an address that is open to other hosts without encryption."""
+    """Return the message about an address that other hosts can reach without encryption, with the remedy."""
     return f"other hosts can reach {address} in plain text; {remedy}"
 
 
 def name_one(what: str, names: Iterable[str]) -> str:
-    """Return the message about a name that is missing although there is not exactly one thing of this kind."""
+    """Return the message for a caller who named none of several things, or for whom there is none to name."""
     known = list(names)
     return (
         f"there are several {what}s; name one of them: {', '.join(known[:MAX_NAMES])}"

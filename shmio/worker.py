@@ -1,4 +1,4 @@
-"""Base of all child processes: role, log, heartbeat, report, and stop on request.
+"""Base of all child processes: handles their log, heartbeat, reports, reloads and stop requests.
 
 A worker's ``__main__`` is one line: ``raise SystemExit(worker.main(run))``, where ``run(worker)``
 does the work of the process. The exit status is 0 if the worker stopped as requested, 1 if it
@@ -36,7 +36,7 @@ STDIN = 0
 
 
 class Worker:
-    """A child process of the instance. Only ``stopping`` may be used outside the main thread."""
+    """A child process of the instance. Threads other than the main thread may use only ``stopping``."""
 
     def __init__(self, spec: dict[str, Any]) -> None:
         self.name: str = spec["name"]
@@ -83,7 +83,7 @@ class Worker:
             raise SegmentError(f"the segment of instance {self.segment.instance!r} was removed; this process ends")
 
     def running(self) -> None:
-        """Report that start-up is over."""
+        """Report to the supervisor that this process has started and is running."""
         garbage.resume()
         self.report(activity=Activity.RUNNING)
         self.log.info("the process is running")
@@ -94,7 +94,7 @@ class Worker:
         note: str | None = None,
         activity: Activity | None = None,
     ) -> None:
-        """Send a heartbeat, and update the given values in the process table."""
+        """Send a heartbeat, and update the process table: values that are None stay unchanged."""
         old = self._report
         self._report = Report(
             old.pid,
@@ -112,7 +112,7 @@ class Worker:
 
         Args:
             readers: For each reader, its block and the number of the last frame that it has read.
-                The slowest reader of each block counts.
+                Only the slowest reader of each block is reported.
 
         """
         slowest: dict[Block, int] = {}
@@ -127,7 +127,7 @@ class Worker:
     def on_stop(self, call: Callable[[], object]) -> None:
         """Call ``call`` in another thread when a stop is requested.
 
-        If a stop has already been requested, call it now.
+        If a stop has already been requested, call ``call`` now, in this thread.
         """
         self._on_stop = call
         if self.stopping.is_set():
@@ -136,7 +136,7 @@ class Worker:
     def on_reread(self, call: Callable[[], object]) -> None:
         """Call ``call`` in another thread at each SIGHUP, which asks a process to reread its files.
 
-        If a SIGHUP has come since the process started, also call ``call`` now.
+        If a SIGHUP has come since the process started, also call ``call`` now, in this thread.
         """
         self._on_reread = call
         if self._rereads:
@@ -145,9 +145,9 @@ class Worker:
     def revised(self) -> dict[str, Any] | None:
         """Return the configuration in a new process description from the supervisor.
 
-        None if the description has not changed since the start or since the last call that returned
-        a configuration. The supervisor writes a new description to the file that is this process's
-        standard input, and then sends SIGHUP.
+        Return None if no new description has come since the start, or since the last call that
+        returned a configuration. The supervisor writes a new description to the file that is this
+        process's standard input, and then sends SIGHUP.
         """
         try:
             spec = json.loads(os.pread(STDIN, MAX_SPEC_BYTES, 0))
@@ -184,9 +184,9 @@ class Worker:
 
 
 class Reload:
-    """A reload, from the moment at which this process has read its new configuration.
+    """The part of a worker in a reload, after it has read its new configuration.
 
-    Create it before you stop any work, so that it notices if the supervisor ends meanwhile.
+    Create the object before you stop any work, so that it notices if the supervisor ends meanwhile.
     """
 
     def __init__(self, worker: Worker, woken: threading.Event) -> None:

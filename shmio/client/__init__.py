@@ -1,4 +1,4 @@
-"""The client of ``shmio.v1``: registers of an instance on this host or another, as numpy arrays.
+"""The client of ``shmio.v1``: registers of an instance, on this host or another one, as numpy arrays.
 
 Five lines::
 
@@ -81,16 +81,16 @@ def connect(
     token_in_plain_text: bool = False,
     timeout_s: float = 10.0,
 ) -> Client:
-    """Return a client of an endpoint. The client connects when you first call one of its methods.
+    """Return a client of an endpoint. The client connects at the first call of one of its methods.
 
     Args:
         address: ``HOST:PORT`` or ``unix:PATH``.
-        ca: PEM file of the certificate authority to trust. With it, the client uses TLS.
+        ca: PEM file of the certificate authority to trust; None: the client does not use TLS.
         certificate: PEM file of a client certificate, if the endpoint needs one.
         key: PEM file of the certificate's key.
         token: Token of this client, if the endpoint needs one.
-        token_in_plain_text: Whether to send the token to another host without TLS.
-        timeout_s: Time-out in s of calls that the endpoint answers immediately.
+        token_in_plain_text: Whether the client may send the token to another host without TLS.
+        timeout_s: Time-out in s of each call that the endpoint should answer immediately.
 
     Raises:
         OSError: A file cannot be read.

@@ -1,4 +1,4 @@
-"""Targets, requests, answers, and errors from gRPC, for both clients. This module does no I/O."""
+"""Endpoints' addresses, requests, answers and gRPC errors, for both clients. This module does no I/O."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ WRITE_PATIENCE_S: Final = 30.0
 _SEARCH_PATIENCE_S: Final = 600.0
 """Time-out of a search in a recording, in s."""
 SNAPSHOT_S: Final = 100.0
-"""Time-out in s of a call that saves or restores a snapshot; the instance itself gives up earlier."""
+"""Time-out in s of a call that saves or restores a snapshot. The instance's own time-outs are shorter."""
 OPTIONS: Final = [
     ("grpc.max_receive_message_length", 64 << 20),
     ("grpc.keepalive_time_ms", 20_000),
@@ -63,13 +63,13 @@ _PLAIN: Final = {
     "Cancelling all calls": "the endpoint has stopped",
     "Socket closed": "the endpoint has stopped",
 }
-"""Texts that replace long error messages of gRPC, by a part of the message."""
+"""Short texts that replace error messages of gRPC, by a part of the message."""
 _TLS: Final = {
     "Hostname Verification": "its certificate does not name this host; use a name or address from the certificate",
     "WRONG_VERSION_NUMBER": "the endpoint does not use TLS; leave the CA out (ca, --ca)",
     "CERTIFICATE_VERIFY_FAILED": "its certificate is not from the CA given (ca, --ca), or has expired",
 }
-"""Texts that replace gRPC's messages about TLS errors, by a part of the message."""
+"""Texts that replace gRPC's messages about TLS errors, by a part of gRPC's message."""
 _UNIX: Final = "unix:"
 _MEANING: Final = {
     grpc.StatusCode.UNAVAILABLE: "no instance serves there, or it has ended",
@@ -115,7 +115,7 @@ class Target:
 
     @property
     def metadata(self) -> tuple[tuple[str, str], ...]:
-        """The metadata of every call."""
+        """The gRPC metadata of every call: the token, if there is one."""
         return () if self.token is None else (("authorization", f"Bearer {self.token}"),)
 
     def error(self, error: Any) -> ShmioError:
@@ -205,7 +205,7 @@ def assignments(values: Mapping[str, object]) -> list[Any]:
 
 
 def outcomes(paths: Iterable[str], found: Any) -> list[Outcome]:
-    """Return the outcomes in an answer, in the order of the paths."""
+    """Return an outcome for each path, in the order of the paths, from the outcomes in an answer."""
     ends = list(found)
     paths = list(paths)
     if len(ends) == 1:
@@ -240,7 +240,7 @@ class Stepped:
 
 
 def steps_requests(count: int, dt_s: float | None) -> list[Any]:
-    """Return the requests for Steps.
+    """Return the requests that start a stream of steps (Steps).
 
     Raises:
         ValueRangeError: The count or the length is out of range.
@@ -300,7 +300,7 @@ def replay_request(changes: ReplayChanges) -> Any:
 
 
 def replay_status(found: Any) -> list[ReplayStatus]:
-    """Return the state of the replay in the answer of the call Replay."""
+    """Return the status of each replay in the answer of the call Replay."""
     return [
         ReplayStatus(
             one.source, one.time_s, one.position_s, one.length_s, one.speed, one.paused, one.loop, one.over,
@@ -311,7 +311,7 @@ def replay_status(found: Any) -> list[ReplayStatus]:
 
 
 def snapshot(found: Any) -> SnapshotInfo:
-    """Convert a snapshot of the wire."""
+    """Convert a message about a snapshot."""
     return SnapshotInfo(
         found.name, found.instance, found.saved_s, found.time_ns, found.step, found.size_bytes, dict(found.left_out),
         found.problem,

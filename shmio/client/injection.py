@@ -23,7 +23,7 @@ _MAX_WAITING: Final = 4096
 
 Given = Array | list[Any]
 Arrays = Mapping[Column, Given | tuple[Given, Given]]
-"""Values by column: either all values of the column in the table, or (slots, values)."""
+"""Values by column: for the whole column, or (slots, values) for a part of it."""
 Raw = Iterable[Piece | tuple[int, bytes] | tuple[int, bytes, int]]
 """Each item is (offset, bytes) or (offset, bytes, mask): see :class:`Piece`."""
 Ranges = Iterable[tuple[int, int] | tuple[int, int, int]]
@@ -61,7 +61,7 @@ def inject_request(
 
 
 class ShadowState:
-    """An injection of this client, with its table of registers."""
+    """State of an injection of this client: its table of registers, and its unread originals."""
 
     def __init__(self, found: Any) -> None:
         """Read the endpoint's first answer. Raise RemoteError if it is None or invalid."""
@@ -77,9 +77,10 @@ class ShadowState:
     def request(
         self, values: Mapping[str, object], arrays: Arrays | None, raw: Raw, *, answered: bool
     ) -> tuple[int, bytes]:
-        """Build a message that sets values. Return its sequence number, and the message.
+        """Return the sequence number and the bytes of a message that gives values.
 
-        The sequence number is 0 unless ``answered`` asks the endpoint to answer.
+        With ``answered``, the message asks the endpoint for an answer. Without it, the sequence
+        number is 0.
 
         Raises:
             ValueRangeError: A value is wrong.
@@ -112,7 +113,7 @@ class ShadowState:
             part.values = np.asarray(values, DTYPES[column]).tobytes()
 
     def keep(self, found: Any) -> None:
-        """Store the originals of a message. Raise RemoteError if too many are unread."""
+        """Store a message with originals until they are read. Raise RemoteError if too many are unread."""
         if found.originals:
             if len(self._waiting) >= _MAX_WAITING:
                 raise RemoteError(

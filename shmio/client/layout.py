@@ -1,4 +1,4 @@
-"""Layouts received from an endpoint, which decode raw frames."""
+"""Layouts of sources, received from an endpoint. They decode raw frames."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MAX_REGISTERS: Final = 1 << 20
 
 @dataclass(frozen=True, kw_only=True)
 class BlockLayout(Layout):
-    """Layout of a source's block, with more properties of the source.
+    """Layout of a source's block, with further properties of the source.
 
     Attributes:
         source: Name of the source.
@@ -68,7 +68,7 @@ class BlockLayout(Layout):
         return np.frombuffer(image, self._dtype)[0]  # type: ignore[no-any-return]
 
     def value(self, image: bytes, path: str) -> Any:
-        """Return a register's value from a raw frame, as in :meth:`array`, but BOOLs as bools.
+        """Return a register's value from a raw frame: as in :meth:`array`, but a BOOL is a bool.
 
         Raises:
             PathError: There is no such register.

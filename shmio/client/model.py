@@ -1,4 +1,4 @@
-"""Messages between an endpoint and a program that serves a model. This module does no I/O."""
+"""Messages between an endpoint and a program that is the model of a source. This module does no I/O."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from shmio.wording import unknown
 RETRY_S: Final = 0.25
 """Time between two attempts to join, in s."""
 PATIENCE_S: Final = 10.0
-"""Time for which a model waits for an instance that does not run, in s."""
+"""Time in s for which a model tries again to join an instance that does not run."""
 _WHOLE: Final = frozenset({Column.INT32, Column.INT64, Column.UINT64})
 _FAILURE_CHARACTERS: Final = 400
 
@@ -58,9 +58,9 @@ class Work:
     """A step for the model to compute.
 
     Attributes:
-        time_s: Simulation time after the step.
-        dt_s: Length of the step.
-        doubt: Reason why inputs may be wrong; empty if there is none.
+        time_s: Simulation time after the step, in s.
+        dt_s: Length of the step, in s.
+        doubt: Reason why the inputs may be wrong; empty if there is none.
         refused: Reason why the previous answer was refused; empty if it was accepted.
     """
 
@@ -86,7 +86,7 @@ class Work:
 
 
 class Part:
-    """A source that a program computes, with its inputs and outputs."""
+    """Reads the requested steps of a source that a program computes, and makes the answers."""
 
     def __init__(self, found: Any) -> None:
         """Read the endpoint's first answer. Raise RemoteError if it is None or invalid."""
@@ -104,7 +104,11 @@ class Part:
         self.period_s: float = joined.period_ns / 1e9
 
     def take(self, found: Any) -> Work:
-        """Return the step that a message requests. Raise RemoteError if the message is invalid."""
+        """Return the step that a message requests, and update the inputs.
+
+        Raises:
+            RemoteError: The message is invalid.
+        """
         if found.WhichOneof("what") != "work":
             raise RemoteError("the endpoint sent something other than a step")
         work = found.work
@@ -148,13 +152,13 @@ class Part:
 
 
 class Member:
-    """A source that a client has joined as its model.
+    """The source whose model this program is.
 
     Attributes:
         inputs: Present inputs by path.
-        outputs: Outputs by path, with the values that consumers saw when the client joined.
+        outputs: Outputs by path, with the values that consumers saw when the model joined.
         computed: True if a model computed these outputs; otherwise, they are initial values.
-        clock: State of the clock when the client joined.
+        clock: State of the clock when the model joined.
         period_s: Time between two steps while time is real, in s.
     """
 
@@ -181,7 +185,7 @@ def join_request(source: str, name: str) -> bytes:
 
 
 class Rejoining:
-    """Lets a model join again after a lost connection, with the outputs that it computed before."""
+    """Remembers a model's outputs, so that it can join again with them after a lost connection."""
 
     def __init__(self, patience_s: float) -> None:
         self._patience_s = patience_s

@@ -48,7 +48,7 @@ FIELDS: Final = {
 _NEAR_CANDIDATES: Final = 500
 _SHOWN: Final = 200
 MAX_SLOTS: Final = 1 << 22
-"""Largest number of elements in a table. No endpoint sends larger tables."""
+"""Largest number of elements in a table; no endpoint sends a larger table."""
 
 
 # -- messages with packed arrays as bytes --------------------------------------------------------------------
@@ -147,7 +147,7 @@ class Register(model.Register, frozen=True, gc=False, kw_only=True):
 
 
 def unknown(path: str, paths: Sequence[str], what: str) -> PathError:
-    """Return an error for a path that is not among ``paths``."""
+    """Return the error for a path that is not among ``paths``, the paths of ``what``."""
     near = difflib.get_close_matches(path, paths[:_NEAR_CANDIDATES], n=3)
     like = f"; {did_you_mean(near)}" if near else ""
     return PathError(f"{path[:_SHOWN]}: this path is not among {what}{like}")
@@ -264,7 +264,7 @@ class Table:
         }
 
     def apply(self, values: Any) -> tuple[Change, ...]:
-        """Copy a message's values into the arrays, and return them as changes.
+        """Copy the values of a message into the arrays, and return these values.
 
         Raises:
             RemoteError: The values are invalid.
@@ -281,7 +281,7 @@ class Table:
         return changes
 
     def read(self, values: Any) -> tuple[Change, ...]:
-        """Return a message's values. Raise RemoteError if they are invalid."""
+        """Return a message's values, without changing the arrays. Raise RemoteError if they are invalid."""
         try:
             return tuple(self._read(values))
         except (ValueError, KeyError) as error:
@@ -301,7 +301,7 @@ class Table:
                 yield Change(column, slots, new)
 
     def take_statuses(self, found: Any) -> list[int]:
-        """Copy a message's statuses, and return the indices of their registers.
+        """Store the registers' statuses from a message, and return the indices of these registers.
 
         Raises:
             RemoteError: The statuses are invalid.

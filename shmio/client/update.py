@@ -24,7 +24,7 @@ class Piece(NamedTuple):
 class Update:
     """One frame of a source, or a change of its quality.
 
-    If the table has the direction ``in``, the update has the values that a command wrote.
+    If the direction of its table is ``in``, it has instead the values that a command wrote.
     ``update[path]`` is the latest value of a register.
 
     Attributes:
@@ -33,7 +33,7 @@ class Update:
         source_ns: UTC time of the values, in ns; 0 if there are no values yet.
         marked: True if the update also says which registers are invalid or injected.
         missed: Number of frames lost before this one. It is counted only with ``every_frame``.
-        ended: True if a reload has removed the source, or all requested registers.
+        ended: True if a reload has removed the source, or all of its requested registers.
         image: The frame as consumers see it, if ``frames`` was requested.
         raw: The frame as the source delivered it, if ``frames`` was requested.
         age_ns: Age of the frame in ns, after a read.
@@ -104,9 +104,9 @@ class Update:
         return [self.reading(place) for place in places]
 
     def reading(self, place: int, register: model.Register | None = None) -> Reading:
-        """Return the reading of the register at index ``place``.
+        """Return the reading of the register at index ``place`` of the table.
 
-        ``register`` is the description to put in the reading; None for the table's description.
+        ``register`` is the description of the register for the reading; None for that of the table.
         """
         found = self.table.registers[place]
         value: Any = self.table.value(place) if self.source_ns else None
@@ -177,13 +177,13 @@ _PROVENANCES = {int(provenance): provenance for provenance in Provenance}
 
 
 class Tables:
-    """The tables of one stream, or of a client's reads, by number."""
+    """The tables that one stream, or the reads of a client, have received so far, by number."""
 
     def __init__(self) -> None:
         self.known: dict[int, Table] = {}
 
     def updates(self, found: Any) -> Iterator[Update]:
-        """Yield the updates of a message, which may also have tables.
+        """Yield the updates of a message, after adding the tables that the message has.
 
         Each update changes the table's arrays in place, so use it before you take the next.
 
@@ -201,7 +201,7 @@ class Tables:
             yield Update(table, update)
 
     def all_of(self, found: Any) -> Iterator[Update]:
-        """Yield all updates of a stream's message. Updates that end a source come last."""
+        """Yield all updates of a stream's message; those about sources that have ended come last."""
         yield from self.updates(found)
         for end in found.ended:
             direction = "in" if end.direction == wire.DIRECTION_IN else "out"
@@ -228,7 +228,7 @@ class Snapshot:
             yield from update.table.paths
 
     def of(self, path: str) -> Update:
-        """Return the update that has a register. The path may omit the source if there is only one.
+        """Return the update that has a register. The path may omit the source if only one was read.
 
         Raises:
             PathError: No update has the register.

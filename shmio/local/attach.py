@@ -179,7 +179,7 @@ class Attachment:
         """Read the registers that patterns name, whatever their quality: see :class:`shmio.Cell`.
 
         Raises:
-            PathError: A pattern names nothing.
+            PathError: A pattern matches no register.
             NotRunningError: The instance has stopped.
         """
         self._segment.require_running()
@@ -361,7 +361,7 @@ class Attachment:
             The outcome of each value, in the given order.
 
         Raises:
-            PathError: A path names nothing, or the paths belong to several sources.
+            PathError: A path names no register, or the paths belong to several sources.
             ValueRangeError: A value does not fit its register, or a register is given twice.
             CommandError: A register is not writable, or the source's queue has no room.
                 After any of these errors nothing has been sent.
@@ -388,7 +388,7 @@ class Attachment:
             The shadow; leaving its ``with`` block lifts it.
 
         Raises:
-            PathError: A path names nothing, or the paths differ in source or direction.
+            PathError: A path names no register, or the paths differ in source or direction.
             CommandError: The source refuses, or does not answer.
             NotRunningError: The instance has stopped.
         """
@@ -415,7 +415,7 @@ class Attachment:
             timeout_s: The iterator ends after this time without a command; None waits forever.
 
         Raises:
-            PathError: A path names nothing, or the paths belong to several sources.
+            PathError: A path names no register, or the paths belong to several sources.
             NotRunningError: The instance has stopped.
         """
         block, topics = _of_one_source("call", paths, self._blocks(), written=True)

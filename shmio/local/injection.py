@@ -123,7 +123,7 @@ class Shadow:
             ``/in`` returns the outcomes of a write to the device.
 
         Raises:
-            PathError: A path names nothing.
+            PathError: A path names no register.
             ValueRangeError: A value does not fit its register, or a register is given twice.
             CommandError: The source's queue has no room.
                 After any of these errors nothing has been sent.

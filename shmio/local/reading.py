@@ -64,7 +64,7 @@ class View:
 
     @property
     def reason(self) -> str:
-        """Reason why the quality is not good; empty if it is."""
+        """Reason why the quality is not good; empty if it is good."""
         return self.block.assess(self.frame)[1]
 
     def __getitem__(self, path: str) -> Value:

@@ -1,4 +1,4 @@
-"""The interface of a running cell, on this host or another: docs/reference/cell.md."""
+"""The interface of a running cell, on this host or another one; see docs/reference/cell.md."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Update(Protocol):
 
     @property
     def reason(self) -> str:
-        """Reason why the quality is not good; empty if it is. With ``ended``: what a reload has removed."""
+        """Reason why the quality is not good; empty if it is good. If ``ended``, what a reload has removed."""
 
     @property
     def provenance(self) -> Provenance:
@@ -78,8 +78,8 @@ class Update(Protocol):
     def ended(self) -> bool:
         """True if a reload has removed the source or its subscribed registers.
 
-        Then no more updates of the source follow. When all sources have ended, the iteration waits
-        until it is closed or the instance ends.
+        No more updates of the source follow. When all sources have ended, the iteration waits until
+        it is closed or the instance ends.
         """
 
     @property
@@ -101,7 +101,7 @@ class Subscription(Closable, Protocol):
         """Wait for the next update.
 
         Raises:
-            PathError: A pattern names nothing; only the first call raises this.
+            PathError: A pattern matches no register; only the first call raises this.
             ValueRangeError: There is no pattern, or an option is wrong; only the first call raises
                 this.
             NotRunningError: The instance has ended.
@@ -133,12 +133,12 @@ class Shadow(Closable, Protocol):
         """Number of the injection. Any program may lift the injection by its number."""
 
     def set(self, values: Mapping[str, object]) -> list[Outcome]:
-        """Give values by path, and return the outcome of each.
+        """Give values by path to the injection, and return the outcome of each value.
 
         An outcome is ``rejected`` if the injection does not cover the path, or has been lifted.
 
-        On a remote cell, all values of one call have the same outcome, the worst of them. A wrong
-        path or value is also ``rejected`` there, and a lifted injection may raise RemoteError.
+        On a remote cell, all values of one call have the same outcome: the worst of them. There, a
+        wrong path or value is also ``rejected``, and a lifted injection may raise RemoteError.
 
         Raises:
             PathError: There is no such register (only on this host).
@@ -150,7 +150,7 @@ class Shadow(Closable, Protocol):
 class Campaign(Closable, Protocol):
     """Declared injections that this program has created, and their events.
 
-    Iterate over the campaign for the events. The iteration ends when all injections are lifted.
+    Iterate over the campaign to get the events. The iteration ends when all injections are lifted.
     Closing the campaign lifts the remaining injections, unless they were created with ``keep``.
     """
 
@@ -175,10 +175,10 @@ class ReadsClock(Protocol):
 class Cell(Closable, Protocol):
     """A running cell.
 
-    :func:`shmio.attach` returns a cell on this host, :func:`shmio.connect` a remote one, by gRPC.
-    The methods raise the errors of :mod:`shmio.errors`. If the instance has ended or cannot be
-    reached, every method raises NotRunningError; only ``sources`` and ``clock`` of a cell on this
-    host then return the last state instead.
+    :func:`shmio.attach` returns a cell on this host; :func:`shmio.connect` returns a remote cell,
+    which uses gRPC. The methods raise the errors of :mod:`shmio.errors`. If the instance has ended
+    or cannot be reached, every method raises NotRunningError, except ``sources`` and ``clock`` of a
+    cell on this host: they return the last state.
     """
 
     @property
@@ -186,7 +186,7 @@ class Cell(Closable, Protocol):
         """Names of the sources."""
 
     def layouts(self, *sources: str) -> Mapping[str, Layout]:
-        """Return the layouts of these sources, or of all sources, by source.
+        """Return the layouts of these sources, by source; of all sources if none is named.
 
         Raises:
             PathError: There is no such source.
@@ -199,26 +199,26 @@ class Cell(Closable, Protocol):
             patterns: Paths, array elements, slices, structures, globs, or names of sources.
 
         Returns:
-            One reading of each register that the patterns name, in the order of the patterns. All
+            One reading of each register that matches a pattern, in the order of the patterns. All
             readings of one source come from the same frame.
 
         Raises:
-            PathError: A pattern names nothing.
+            PathError: A pattern matches no register.
         """
 
     def subscribe(self, *patterns: str, every_frame: bool = False, max_rate_hz: float = 0.0) -> Subscription:
-        """Follow registers: the iterator returns their present values, then each change.
+        """Follow registers: the iterator returns first their present values, then each change.
 
         Args:
             patterns: As for :meth:`get`.
             every_frame: Whether to return an update for each frame, in order, and to count lost
                 frames. Otherwise, a slow reader gets only the newest values.
-            max_rate_hz: Maximum number of updates per second of each source; 0: no limit. Only
-                without ``every_frame``.
+            max_rate_hz: Maximum number of updates per second of each source; 0: no limit. It must
+                be 0 with ``every_frame``.
         """
 
     def events(self, *sources: str) -> Events:
-        """Follow the events of these sources, or of all sources, from now on.
+        """Follow the events of these sources from now on; of all sources if none is named.
 
         Events are about commands and their outcomes, injections, changes of quality, notes, and
         starts and stops of a source's process.
@@ -236,10 +236,10 @@ class Cell(Closable, Protocol):
                 three cycles if that is longer.
 
         Returns:
-            The outcome of each value, under the path that you gave, in the same order.
+            The outcome of each value, with the path that you gave, in the order of ``values``.
 
         Raises:
-            PathError: A path names nothing. On this host also: the paths belong to several sources,
+            PathError: A path names no register. On this host also: the paths belong to several sources,
                 there are no values, or a path ends in ``/out``.
             ValueRangeError: A value does not fit its register, or a register is given twice. On a
                 remote cell also: the values belong to several sources, or there are none.
@@ -249,21 +249,23 @@ class Cell(Closable, Protocol):
         """
 
     def inject(self, *patterns: str, priority: int = 0, keep: bool = False, name: str = "") -> Shadow:
-        """Create an injection over registers of one source, either ``/out`` (default) or ``/in``.
+        """Create an injection over registers of one source, for consumers or for the device.
 
         Args:
-            patterns: As for :meth:`get`.
+            patterns: As for :meth:`get`. Patterns that end in ``/in`` cover the values that are
+                written to the device. Patterns that end in ``/out``, or in neither, cover the
+                values that consumers see. All patterns must have the same direction.
             priority: An injection with a higher priority covers those with a lower one.
             keep: Whether the injection stays when this program ends, until a program lifts it.
             name: Name of the injection in events and lists.
 
         Raises:
-            PathError: A pattern names nothing, or the patterns differ in source or direction.
+            PathError: A pattern matches no register, or the patterns differ in source or direction.
             CommandError: The source refuses the injection, or does not answer.
         """
 
     def declare(self, declarations: Iterable[Any], *, keep: bool = False) -> Campaign:
-        """Create all declared injections, or none of them. Their sources run them on their own.
+        """Create all of these declared injections, or none. Their sources run them on their own.
 
         Args:
             declarations: Mappings with the keys of an ``[[injection]]`` table, or
@@ -276,7 +278,7 @@ class Cell(Closable, Protocol):
         """
 
     def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
-        """Return the present injections of these sources, or of all sources.
+        """Return the existing injections of these sources; of all sources if none is named.
 
         Within a source, the innermost injection comes first.
         """
@@ -290,7 +292,9 @@ class Cell(Closable, Protocol):
         """
 
     def lift_all(self, *sources: str) -> list[Lifted]:
-        """Lift all injections of these sources, or of all sources, whichever program created them.
+        """Lift all injections of these sources, whichever program created them.
+
+        Without arguments, lift the injections of all sources.
 
         Returns:
             The result for each injection.
@@ -301,13 +305,13 @@ class Cell(Closable, Protocol):
 
     @property
     def clock(self) -> ReadsClock:
-        """Function that reads the instance's clock: ``cell.clock()`` returns its state."""
+        """Function that reads the instance's clock: ``cell.clock()`` returns the clock's state."""
 
     def real_sources(self) -> list[str]:
-        """Return the names of the sources that no step moves, such as sources with a real device."""
+        """Return the names of the sources that steps do not advance, such as those with a real device."""
 
     def step(self, dt_s: float | None = None, count: int = 1) -> Clock:
-        """Take control of time, move it by steps, and wait until all sources have done them.
+        """Take control of time, advance it by steps, and wait until all sources have done the steps.
 
         Args:
             dt_s: Length of each step in s, from 1 us to 1 h; None: the step size.
@@ -322,7 +326,9 @@ class Cell(Closable, Protocol):
         """
 
     def play(self, rate: float = 1.0, dt_s: float | None = None) -> Clock:
-        """Take control of time, and start to step it until :meth:`pause`. Return the clock's state.
+        """Take control of time, and step it in the background until :meth:`pause`.
+
+        Return the clock's state at once.
 
         Args:
             rate: Speed relative to real time; above 0, at most 1000.
@@ -343,7 +349,9 @@ class Cell(Closable, Protocol):
         """
 
     def release(self) -> Clock:
-        """Let real time run again, from the present virtual time. Return the clock's state.
+        """Return to real time, and return the clock's state.
+
+        The clock continues from the present virtual time.
 
         Raises:
             TimeError: Another program owns time, or time was virtual from the instance's start.
@@ -352,13 +360,13 @@ class Cell(Closable, Protocol):
     def save_snapshot(self, name: str, *, partial: bool = False) -> SnapshotInfo:
         """Save the state of the instance to a file of this name, in the instance's folder.
 
-        The state is the clock, the models, the images, the injections, and the emulators that
-        follow the instance's clock. A snapshot of the same name is replaced.
+        The snapshot has the state of the clock, the models, the images, the injections, and the
+        emulators that follow the instance's clock. It replaces a snapshot of the same name.
 
         Args:
             name: Name of the snapshot: letters, digits, ``_``, ``-`` and ``.``.
             partial: Whether to save the rest if the state of some processes cannot be saved. The
-                result names them.
+                result's ``left_out`` names these processes.
 
         Raises:
             SnapshotError: The state of a process cannot be saved, or the file cannot be written.
@@ -368,12 +376,12 @@ class Cell(Closable, Protocol):
     def restore_snapshot(self, name: str) -> SnapshotInfo:
         """Restore a snapshot of this instance, or of one with the same configuration.
 
-        Time continues from the snapshot's; it may go back. The result names what is not in the
-        snapshot, and therefore stays as it is.
+        Time continues from the time of the snapshot, so it may go back. Processes that are not in
+        the snapshot keep their present state; the result's ``left_out`` names them.
 
         Raises:
-            SnapshotError: There is no such snapshot, or it does not fit the instance; nothing has
-                been changed. Or a process could not restore its state; then its data are bad.
+            SnapshotError: There is no such snapshot, or it does not fit the instance, and nothing
+                was changed; or a process could not restore its state, and its data are bad.
             TimeError: Time is real, or another program owns it.
         """
 
@@ -388,7 +396,7 @@ class Cell(Closable, Protocol):
         """
 
     def replay(self, **changes: Unpack[ReplayChanges]) -> list[ReplayStatus]:
-        """Control the replays of recordings, and return their status.
+        """Change the replays of recordings, and return their status.
 
         Without arguments, only return the status.
 

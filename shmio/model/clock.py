@@ -18,7 +18,7 @@ MAX_RATE: Final = 1000.0
 
 
 class ClockMode(IntEnum):
-    """Mode of the clock: real time (wall time), or time that only steps move."""
+    """Mode of the clock: wall time (real time), or virtual time, which only steps move."""
 
     WALL = 0
     VIRTUAL = 1
@@ -77,16 +77,19 @@ class Clock(NamedTuple):
 
     @property
     def basis(self) -> tuple[ClockMode, int, int, int]:
-        """The values that determine clock and cycles in wall time; taking and releasing time changes them."""
+        """The values that determine clock and cycles in wall time; take-over and release change them."""
         return self.mode, self.step, self.resumed_ns, self.offset_ns
 
     def lead(self, period_ns: int) -> int:
-        """Return the number to add to ``clock // period`` to get the cycle in wall time."""
+        """Return the number to add to ``clock // period`` to get the cycle of a source in wall time.
+
+        ``period_ns`` is the source's period.
+        """
         return self.step - self.resumed_ns // period_ns
 
 
 class ClockStatus(msgspec.Struct):
-    """Status of the instance's clock. ``mode`` is wall or virtual; ``step`` is the last finished step.
+    """Status of the instance's clock. ``mode`` is wall or virtual; ``step``: number of the last finished step.
 
     ``note`` says which processes a step waits for, why the last step failed, or on which sources it
     had no effect. Before the first step, it says how to return to real time.
@@ -102,7 +105,7 @@ class ClockStatus(msgspec.Struct):
 
 
 def clock_status(state: Clock) -> ClockStatus:
-    """Convert the state of the clock page to the units of a status."""
+    """Convert the state of a clock to a status, which has times in s and ms."""
     return ClockStatus(
         str(state.mode), state.present_ns / 1e9, state.done, state.step_size_ns / 1e6, state.playing, state.rate,
         state.note,
@@ -110,6 +113,6 @@ def clock_status(state: Clock) -> ClockStatus:
 
 
 def check_step(dt_ns: float) -> None:
-    """Raise ValueRangeError if a step may not have this length."""
+    """Raise ValueRangeError unless the length of a step, in ns, is from 1 us to 1 h."""
     if not MIN_STEP_NS <= dt_ns <= MAX_STEP_NS:
         raise ValueRangeError(f"the length of a step must be from 0.001 ms to 3600000 ms (1 h), not {dt_ns / 1e6:g} ms")

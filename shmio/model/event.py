@@ -49,25 +49,28 @@ class EventKind(StrEnum):
     NOTED = "noted"
     """A program added a note."""
     SAVED = "saved"
-    """The state of the source was saved in the snapshot of this name."""
+    """The state of the source was saved in a snapshot; the event's text is the snapshot's name."""
     RESTORED = "restored"
-    """The state of the snapshot of this name was restored; time may have gone back."""
+    """The state of the source was restored from a snapshot; time may have gone back.
+
+    The event's text is the snapshot's name.
+    """
     REMOVED = "removed"
     """A reload has removed the source; no more events follow."""
     OTHER = "other"
-    """A kind that only a later version of shmio knows."""
+    """The event has a kind that only a later version of shmio knows."""
 
 
 class Event(msgspec.Struct, frozen=True):
     """An event of a source.
 
-    A write of more than 256 bytes has several events, one for each part.
+    A write of more than 256 bytes causes several events, one for each part.
 
     Attributes:
         source: Name of the source.
         kind: Kind of the event.
-        number: Number of the event; 0 with ``removed``. The numbers of a source's events ascend until a
-            reload replaces the source.
+        number: Number of the event; 0 with ``removed``. The numbers of a source's events ascend
+            until a reload replaces the source.
         frame: Number of the last frame before the event.
         cycle: Cycle of the source's schedule.
         incarnation: Number of times that the source's process has been started, including the

@@ -1,4 +1,4 @@
-"""Injections, in the form that programs, segments and endpoints share."""
+"""Types of injections that programs, segments and endpoints share."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ class Running(msgspec.Struct, Generic[DeclarationT], frozen=True):
         declaration: The declaration: in a segment a ``Declaration``, for programs a mapping with
             the keys of an ``[[injection]]`` table.
         state: ``waiting``, ``active``, ``over``, or ``lifted`` before its end.
-        seed: Seed of all random numbers of the run: that of the declaration, or else a random seed
-            that the source chose.
-        runs: Number of activations.
+        seed: Seed of all random numbers of the injection: the seed of the declaration, or else a
+            random seed that the source chose.
+        runs: Number of activations so far.
         cycle: Cycle of the last activation.
         time_ns: The instance's clock at the last activation, in ns.
     """
@@ -32,20 +32,20 @@ class Running(msgspec.Struct, Generic[DeclarationT], frozen=True):
 
 
 class Injection(msgspec.Struct, Generic[DeclarationT], frozen=True, omit_defaults=True):
-    """A present injection. In lists, the innermost of each source comes first.
+    """An existing injection. In lists, the innermost injection of each source comes first.
 
     Attributes:
         number: Number of the injection. Any program may lift the injection by its number.
-        direction: ``out`` or ``in``.
+        direction: ``out``: the injection covers what consumers see; ``in``: what the device gets.
         priority: An injection with a higher priority covers those with a lower one.
         keep: True if the injection stays when the program that created it ends.
         name: Name of the injection.
-        writer: Number of the command queue that the injection came from; 4294967295: the
+        writer: Number of the command queue through which the injection was created; 4294967295: the
             configuration declares the injection.
         pid: Process that created the injection; 0: the configuration declares the injection.
         ranges: The covered bits, as (offset in bytes, size in bytes, mask).
         running: State of a declared injection; None: a program gives the values.
-        source: Name of the source; empty in the segment, where the name of the block tells it.
+        source: Name of the source; empty in the segment, where the injection's block has the name.
     """
 
     number: int = msgspec.field(name="id")

@@ -1,4 +1,4 @@
-"""Status of a source that replays a recording, and changes that a program may request."""
+"""The status of a source that replays a recording, and the changes that a program may request."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ class ReplayStatus(msgspec.Struct, frozen=True):
 
 
 class ReplayChanges(TypedDict, total=False):
-    """Requested changes of a replay.
+    """Requested changes of replays. A missing key requests no change.
 
-    A time is given in seconds from the start of the played range, or as a date and time.
+    Give a time in seconds from the start of the played range, or as text: a date and time.
     """
 
     paused: bool
@@ -55,8 +55,8 @@ class ReplayChanges(TypedDict, total=False):
     change: str
     """Path of a register: play to its next change, and pause there."""
     event: str
-    """Kind of event: play to the next one, and pause there."""
+    """Kind of event: play to the next event of this kind, and pause there."""
     jump: bool
     """With ``change`` or ``event``: go there at once instead of playing."""
     sources: Iterable[str]
-    """Change only the replays of these sources, and of others that replay the same recording."""
+    """Names of sources: change only their replays, and those of other sources with the same recording."""

@@ -1,4 +1,4 @@
-"""Snapshots: what programs learn of one, and the decoding of its parts."""
+"""Snapshots: a description for programs, and the decoding of their parts."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ class SnapshotInfo(msgspec.Struct, frozen=True):
     Attributes:
         name: Name of the snapshot.
         instance: Name of the instance that was saved.
-        saved_s: UTC at which it was saved, in s since 1970.
-        time_ns: The instance's clock, in ns.
-        step: Number of the last step.
-        size_bytes: Size of the file.
-        left_out: For each process that is not in the snapshot, the reason. Empty if nothing is missing.
-        problem: Why the snapshot cannot be read; only ``name`` is valid then. Empty if it can be read.
+        saved_s: UTC at which the snapshot was saved, in s since 1970.
+        time_ns: The instance's clock at that time, in ns.
+        step: Number of the last step at that time.
+        size_bytes: Size of the snapshot's file.
+        left_out: For each process whose state is not in the snapshot, the reason; empty if no process
+            is missing.
+        problem: Why the snapshot cannot be read; then only ``name`` is valid. Empty if it can be read.
     """
 
     name: str
@@ -42,7 +43,7 @@ def decode_part(data: bytes, kind: type[Part], what: str = "its state") -> Part:
     Args:
         data: The encoded part.
         kind: The type of the part.
-        what: The part, as the message names it.
+        what: The name of the part, for the message.
 
     Raises:
         SnapshotError: The data do not have this type.

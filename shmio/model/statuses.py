@@ -45,7 +45,7 @@ BAD_DEVICE_FAILURE: Final = 0x808B0000
 BAD_NO_DATA: Final = 0x809B0000
 
 _NAMED: Final = 0xFFFF0000
-"""The half of a code that its name stands for; the other half has flags."""
+"""The bits of a code that determine its name; the other half of the code has flags."""
 _NAMES: Final = {  # those codes of OPC 10000-6, annex A.2, that data sources use
     0x00000000: "Good",
     0x002D0000: "GoodSubscriptionTransferred",
@@ -201,7 +201,7 @@ class RegisterStatus(NamedTuple):
 
     @property
     def quality(self) -> Quality:
-        """Quality that the severity of the code means. The reserved severity means bad."""
+        """The quality that corresponds to the severity of the code; bad for the reserved severity."""
         return quality_of(self.code)
 
     @property
@@ -211,25 +211,25 @@ class RegisterStatus(NamedTuple):
 
     @property
     def reason(self) -> str:
-        """Reason why the quality is not good; empty if it is."""
+        """Reason why the quality is not good; empty if it is good."""
         if self.waits:
             return f"no data yet ({_NAMES[BAD_WAITING_FOR_INITIAL_DATA]})"
         return "" if self.quality is Quality.GOOD else f"the device reports {describe(self.code)}"
 
 
 def describe(code: int) -> str:
-    """Return a status code as text: its name if it is known, and its number."""
+    """Return a status code as text: its name and number; if the name is unknown, only the number."""
     name = _NAMES.get(code & _NAMED)
     return f"{name} (0x{code:08X})" if name else f"status 0x{code:08X}"
 
 
 def worse(quality: Quality, reason: str, status: RegisterStatus) -> tuple[Quality, str]:
-    """Return the worse of a frame's quality and that of a register's status, with its reason."""
+    """Return the worse of two qualities, that of a frame and that of a register's status, with its reason."""
     return (quality, reason) if quality <= status.quality else (status.quality, status.reason)
 
 
 def quality_of(code: int) -> Quality:
-    """Return the quality that the severity of a status code means. The reserved severity means bad."""
+    """Return the quality that corresponds to the severity of a status code; bad for the reserved severity."""
     return _QUALITIES[code >> 30]
 
 
@@ -249,7 +249,10 @@ class StatusArea:
         self._first_bits = [8 * register.offset + (register.bit or 0) for register in layout.own]
 
     def index(self, register: Register) -> int:
-        """Return the index of the layout's own register that contains this register, element or part."""
+        """Return the index, in the layout, of the register that contains a register, element or part.
+
+        A register of a tag table over the block gets the index of the block's own register.
+        """
         return bisect_right(self._first_bits, 8 * register.offset + (register.bit or 0)) - 1
 
     def indices(self, registers: Iterable[Register]) -> list[int]:
@@ -275,7 +278,7 @@ class StatusArea:
         return _QUALITIES[image[self.codes_offset + _CODE_BYTES * index + self._severity_at] >> 6]
 
     def worst(self, image: Buffer, indices: Iterable[int]) -> tuple[int, RegisterStatus]:
-        """Return the worst of the statuses at these indices, as (index, status); the first if several are equal."""
+        """Return (index, status) of the worst status at these indices; of the first one if several are equal."""
         found = min(indices, key=lambda index: self.quality(image, index))
         return found, self.get(image, found)
 
@@ -284,12 +287,12 @@ class StatusArea:
         self.write(image, index, status.code, status.source_ns)
 
     def write(self, image: bytearray, index: int, code: int, source_ns: int) -> None:
-        """Write code and time of a status: :meth:`put` for those who write thousands."""
+        """Write code and time of a register's status: as :meth:`put`, but faster for many registers."""
         self._code.pack_into(image, self.codes_offset + _CODE_BYTES * index, code)
         self._time.pack_into(image, self.times_offset + _TIME_BYTES * index, source_ns)
 
     def write_time(self, image: bytearray, index: int, source_ns: int) -> None:
-        """Write the time of a status whose code stays the same."""
+        """Write the time of a register's status, and keep its code."""
         self._time.pack_into(image, self.times_offset + _TIME_BYTES * index, source_ns)
 
 
@@ -334,7 +337,7 @@ class _StatusCodec:
 
 
 def trusted_codec(register: Register, layout: Layout) -> RegisterCodec:
-    """Return a codec of a register that decodes the value as None while the register's status is bad."""
+    """Return a codec of a register that decodes the value as None if the register's status is bad."""
     area = status_area(layout)
     return codec(register, layout.byte_order) if area is None else _StatusCodec(register, layout, area)
 

@@ -38,7 +38,7 @@ class Provenance(IntEnum):
 class Column(IntEnum):
     """The array in which a client stores values of a type.
 
-    Each number is that of the array's field in the message ``Values`` of shmio.v1.
+    The number of a column is the number of the array's field in the message ``Values`` of shmio.v1.
     """
 
     BOOL = 1
@@ -59,7 +59,7 @@ class Reading(msgspec.Struct, frozen=True):
             and comment.
         value: The last known value, even while the quality is bad; None if there never was a value.
         quality: Quality of the value.
-        reason: Reason why the quality is not good; empty if it is.
+        reason: Reason why the quality is not good; empty if it is good.
         provenance: Where the value comes from: live, simulated, replayed or injected.
         source_time: The source's time stamp, UTC in s; None if there never was a value.
         age_s: Age of the value by the source's clock, in s; None if there never was a frame. In
@@ -84,7 +84,7 @@ class Reading(msgspec.Struct, frozen=True):
 
 WRITE_TIMEOUT_S: Final = 2.0
 WRITE_MIN_PERIODS: Final = 3
-"""A write may wait for this number of cycles by default, or for WRITE_TIMEOUT_S if that is longer."""
+"""By default, a write may wait for this number of cycles, or for WRITE_TIMEOUT_S if that is longer."""
 
 
 class OutcomeKind(StrEnum):
@@ -93,7 +93,7 @@ class OutcomeKind(StrEnum):
     WRITTEN = "written"
     """The device confirmed the value."""
     TAKEN = "taken"
-    """An injection over ``/in`` took the value in the device's place."""
+    """An injection over ``/in`` took the value, so the device did not get it."""
     SHADOWED = "shadowed"
     """An injection over ``/out`` got the value, and consumers see it."""
     ACCEPTED = "accepted"

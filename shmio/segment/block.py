@@ -607,7 +607,7 @@ class FrameFollower(Cursor[Frame]):
         self.quality = Quality.BAD
         """Present quality, as of the last call of :meth:`take` or :meth:`became_stale`."""
         self.reason = "no data yet"
-        """Reason why the quality is not good; empty if it is."""
+        """Reason why the quality is not good; empty if it is good."""
         self._notice_gaps = notice_gaps
         self._most_behind = None
         if catch_up_s is not None:

@@ -1,4 +1,4 @@
-"""Events of sources."""
+"""Iterators over the events of sources."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Events(AsyncIterator[Event]):
 
     @classmethod
     async def begin(cls, stream: Stream) -> Self:
-        """Wait until the endpoint follows the sources, and return the iterator."""
+        """Return an iterator over the stream's events, as soon as the endpoint follows the sources."""
         try:
             await stream.first()
         except BaseException:

@@ -17,9 +17,9 @@ from shmio.errors import RemoteError
 
 Outputs = Mapping[str, object] | None
 Step = Callable[[float, float, Values], Outputs | Awaitable[Outputs]]
-"""Function of ``(time_s, dt_s, inputs)`` that returns the outputs at the end of a step.
+"""Function of ``(time_s, dt_s, inputs)`` that returns the outputs at the end of a step by path.
 
-It may be a coroutine function.
+It may be a coroutine function. Times are in s.
 """
 CLOSED: Final = grpc.aio.UsageError
 """Error that grpcio raises for a call on a closed channel."""
@@ -77,7 +77,7 @@ class Stream(AsyncIterator[Any]):
         return found
 
     async def first(self) -> Any:
-        """Return the first answer; None if the stream was closed. Raise RemoteError after a time-out."""
+        """Return the first answer; None if the stream was closed. Raise RemoteError if none comes in time."""
         try:
             async with asyncio.timeout(calls.WRITE_PATIENCE_S):
                 return await anext(self, None)
@@ -98,7 +98,7 @@ class Stream(AsyncIterator[Any]):
 
 
 class Duplex(Stream):
-    """A stream that can send further requests. Its first use sends the first requests."""
+    """A stream that can send further requests. It sends its first requests when it is first used."""
 
     def __init__(self, channel: Channel, method: Any, *first: Any) -> None:
         super().__init__(channel, method)
@@ -113,7 +113,7 @@ class Duplex(Stream):
     async def write(self, *requests: Any) -> None:
         """Send requests.
 
-        If the stream has ended, this drops them, and the next read raises the reason.
+        If the stream has ended, the requests are lost, and the next read raises the reason.
         """
         async with self._lock:
             requests, self._first = (*self._first, *requests), ()
@@ -138,7 +138,7 @@ def _closing() -> Iterator[None]:
 
 
 class Condition(asyncio.Condition):
-    """Condition for which several tasks can wait, each with its own time-out."""
+    """Condition on which several tasks can wait, each with its own time-out."""
 
     async def wait_until(self, predicate: Callable[[], bool], timeout_s: float | None = None) -> bool:
         """Wait until the predicate is true. Return False after a time-out."""

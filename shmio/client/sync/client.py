@@ -40,9 +40,9 @@ from shmio.wire.shmio_v1_pb2_grpc import ShmioStub
 
 
 class Client:
-    """Client of an instance; several threads may use it. Close it, or use ``with``.
+    """Client of an instance. Several threads may use it. Close it, or use ``with``.
 
-    A client has the methods of :class:`shmio.Cell`, and more.
+    A client has all methods of :class:`shmio.Cell`, and others.
 
     Raises:
         PathError, ValueRangeError, CommandError, QualityError: In the same cases as for a local
@@ -83,12 +83,12 @@ class Client:
         return list(self.layouts())
 
     def get(self, *patterns: str) -> list[Reading]:
-        """Read the registers that patterns name, whatever their quality: see :class:`shmio.Cell`.
+        """Read the registers that match the patterns, whatever their quality: see :class:`shmio.Cell`.
 
-        The first call also fetches the layouts; so does the first call after a reload.
+        The first call, and the first call after each reload, also fetch the layouts.
 
         Raises:
-            PathError: A pattern names nothing.
+            PathError: A pattern matches no register.
             ValueRangeError: The registers are too many for one call.
         """
         if self._layouts is not None:
@@ -112,7 +112,7 @@ class Client:
         ]
 
     def status(self) -> dict[str, Any]:
-        """Return the state of the instance, as ``shmio-supervisor status --json`` prints it."""
+        """Return the status of the instance, as ``shmio-supervisor status --json`` prints it."""
         return calls.status(self._call(self._stub.GetStatus, wire.GetStatusRequest()))
 
     def read(self, *patterns: str, originals: bool = False) -> Snapshot:
@@ -120,11 +120,11 @@ class Client:
 
         Args:
             patterns: Paths, elements, slices, structures, globs, or the names of sources.
-            originals: Whether to also read the values that the source delivered, without
+            originals: Whether also to read the values that the source delivered, without
                 injections.
 
         Raises:
-            PathError: A pattern names nothing.
+            PathError: A pattern matches no register.
             ValueRangeError: The registers are too many for one call.
         """
         request = calls.read_request(patterns, originals=originals)
@@ -147,19 +147,19 @@ class Client:
         max_rate_hz: float = 0.0,
         deadband: float = 0.0,
     ) -> Subscription:
-        """Subscribe to registers: the present values come first, then changes (:class:`Update`).
+        """Subscribe to registers: the first updates have the present values, later ones the changes.
 
         Args:
             patterns: As for :meth:`read`.
-            every_frame: Whether to receive each frame, in order, and count lost frames. Otherwise,
-                each update has the newest frame.
-            frames: Whether to receive raw frames of the sources instead of values.
+            every_frame: Whether to receive an update for each frame, in order, and a count of lost
+                frames. Otherwise, each update is about the newest frame.
+            frames: Whether to receive the raw frames of the sources instead of values.
             max_rate_hz: Maximum number of updates per second of each source; 0 for no limit.
-            deadband: A number's change up to this size is not reported.
+            deadband: Changes of a number by at most this amount are not reported.
 
         Returns:
-            An iterator over updates. The first iteration raises PathError if a pattern names
-            nothing.
+            An iterator over updates (:class:`Update`). Its first step raises PathError if a pattern
+            matches no register.
         """
         request = calls.subscribe_request(
             patterns, every_frame=every_frame, frames=frames, max_rate_hz=max_rate_hz, deadband=deadband
@@ -180,19 +180,19 @@ class Client:
         return Events.begin(Stream(self._channel, self._stub.Events, wire.EventsRequest(sources=sources)))
 
     def set(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
-        """Write values to one source, and wait for the outcomes: see :meth:`write`."""
+        """Write values to one source, and wait for their outcomes: the same as :meth:`write`."""
         return self.write(values, timeout_s)
 
     def write(
         self, values: Mapping[str, object], timeout_s: float | None = None, *, until_accepted: bool = False
     ) -> list[Outcome]:
-        """Write registers, arrays or elements of one source as one command: all or none.
+        """Write values to one source as one command: the source accepts all values or none.
 
         Args:
-            values: Values by path.
+            values: Values by path: of registers, arrays or elements.
             timeout_s: Time in s that the values may wait for a cycle of the source; None for 2 s,
                 or three cycles if that is longer.
-            until_accepted: Whether to return when the source has accepted the values, without
+            until_accepted: Whether to return as soon as the source has accepted the values, without
                 waiting for the device.
 
         Returns:
@@ -218,24 +218,26 @@ class Client:
         for_s: float | None = None,
         originals: bool = False,
     ) -> Shadow:
-        """Create an injection over registers of one source, either all in /out or all in /in.
+        """Create an injection over registers of one source, for consumers or for the device.
 
-        The injection is lifted when you close it, at the end of its ``with`` block, when this
-        program ends, or after ``for_s``.
+        Patterns that end in ``/in`` cover values written to the device. All others cover the values
+        that consumers see. All patterns must have the same direction. The injection is lifted when
+        you close it, at the end of its ``with`` block, when this program ends, or after
+        ``for_s``.
 
         Args:
             patterns: Registers, elements, slices, structures or globs.
-            ranges: Bytes and bits of a frame to cover, in addition to the registers or without any.
-            source: Source of the ranges if there is no pattern, such as ``cell`` or ``cell/in``.
+            ranges: Bytes and bits of a frame to cover, in addition to registers or instead of them.
+            source: Source of the ranges if you give no pattern, such as ``cell`` or ``cell/in``.
             priority: Injections with a higher priority cover those with a lower one.
             keep: Whether the injection stays when this program ends, until somebody lifts it.
             name: Name in the list of injections.
             for_s: Time in s after which the injection is lifted; None for no limit.
-            originals: Whether to receive the covered values. To read them, iterate over the
-                injection.
+            originals: Whether to receive the values that the injection covers. To read them,
+                iterate over the injection.
 
         Raises:
-            PathError: A pattern names nothing.
+            PathError: A pattern matches no register.
             ValueRangeError: An argument is out of range.
             CommandError: The source refuses the injection.
         """
@@ -246,13 +248,15 @@ class Client:
         return Shadow.create(self._channel, self._inject, first)
 
     def declare(self, declarations: Iterable[Mapping[str, Any] | msgspec.Struct], *, keep: bool = False) -> Campaign:
-        """Create declared injections, all or none. Their sources run them without this program.
+        """Create all of these declared injections, or none. Their sources run them on their own.
 
         The injections are lifted when you close the campaign, at the end of its ``with``
-        block, or when this program ends. Iterate over the campaign for its events.
+        block, or when this program ends. Iterate over the campaign to get the events of its
+        injections.
 
         Args:
-            declarations: Mappings with the keys of an ``[[injection]]`` table.
+            declarations: Mappings with the keys of an ``[[injection]]`` table, or
+                :class:`shmio.config.Declaration` objects.
             keep: Whether the injections stay when this program ends, until they are over or lifted.
 
         Raises:
@@ -263,7 +267,7 @@ class Client:
         return Campaign.create(Stream(self._channel, self._stub.Declare, request), self.lift, keep=keep)
 
     def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
-        """Return the present injections of these sources; of all sources if none is named.
+        """Return the existing injections of these sources; of all sources if none is named.
 
         Within a source, the innermost injection comes first.
         """
@@ -280,9 +284,9 @@ class Client:
         self._call(self._stub.Lift, wire.LiftRequest(source=source, number=number))
 
     def lift_all(self, *sources: str) -> list[Lifted]:
-        """Lift all injections of these sources; of all sources if none is named.
+        """Lift all injections of these sources, whichever program created them.
 
-        It does not matter which program created them. Return the result for each injection.
+        Without arguments, lift the injections of all sources. Return the result for each injection.
 
         Raises:
             CommandError: Some injections were not lifted.
@@ -319,7 +323,9 @@ class Client:
         start: Callable[[Simulation], object] | None = None,
         patience_s: float = PATIENCE_S,
     ) -> None:
-        """Run as the model of a source until this client is closed, or the thread is interrupted.
+        """Compute the steps of a source, as its model, until this client is closed.
+
+        After a lost connection, join the source again.
 
         Args:
             source: Name of the source.
@@ -327,7 +333,8 @@ class Client:
                 it raises an error, the step fails, and the logger ``shmio.client`` logs the reason.
             name: Name of the model in messages.
             start: Called with the :class:`Simulation` each time the model has joined.
-            patience_s: Time in s to wait for an instance that does not run.
+            patience_s: Time in s for which to try again if the instance does not run or the
+                connection is lost.
 
         Raises:
             PathError, CommandError, ConflictError, LostError, RemoteError: As for
@@ -362,7 +369,9 @@ class Client:
         return [one["name"] for one in (self.status())["processes"] if one.get("real_time")]
 
     def step(self, dt_s: float | None = None, count: int = 1) -> Clock:
-        """Take control of time, and advance it by steps. Return when all streams have the changes.
+        """Take control of time, and advance it by steps.
+
+        Return when the endpoint has sent the changes to all streams.
 
         Args:
             dt_s: Length of each step in s; None for the step size.
@@ -388,7 +397,7 @@ class Client:
         return self.clock()
 
     def steps(self, count: int = 0, dt_s: float | None = None) -> Steps:
-        """Take control of time, and do ``count`` steps in one call: see :class:`Steps`.
+        """Return an iterator that takes control of time and does ``count`` steps: see :class:`Steps`.
 
         Raises:
             ValueRangeError: The count or the step size is out of range.
@@ -397,7 +406,7 @@ class Client:
         return Steps(Duplex(self._channel, self._stub.Steps, *requests), count)
 
     def set_step_size(self, dt_s: float) -> Clock:
-        """Take control of time, and set the step size: the length of steps requested without one.
+        """Take control of time, and set the step size, which is the default length of a step.
 
         Args:
             dt_s: The size in s.
@@ -409,7 +418,7 @@ class Client:
         return self._move(self._stub.SetStepSize, wire.SetStepSizeRequest(dt_ns=calls.ns(dt_s)))
 
     def play(self, rate: float = 1.0, dt_s: float | None = None) -> Clock:
-        """Take control of time, and let the endpoint step it until :meth:`pause`.
+        """Take control of time, and let the endpoint step it continuously until :meth:`pause`.
 
         Args:
             rate: Speed of the clock relative to real time.
@@ -426,7 +435,7 @@ class Client:
         return self._move(self._stub.Pause, wire.PauseRequest())
 
     def release(self) -> Clock:
-        """Let real time run again, from the present virtual time.
+        """Return to real time; the clock continues from the present virtual time.
 
         Raises:
             TimeError: Another program owns time, or time was virtual from the instance's start.
@@ -439,8 +448,8 @@ class Client:
         Without arguments, only return the status.
 
         Args:
-            changes: Requested changes: see :class:`shmio.model.replay.ReplayChanges`. A replay that is resumed
-                at its end starts again.
+            changes: Requested changes: see :class:`shmio.model.replay.ReplayChanges`. If you resume
+                a replay at its end, it starts again.
 
         Raises:
             ValueRangeError: A speed or a time is out of range.
@@ -459,7 +468,7 @@ class Client:
         return self._snapshot(self._stub.SaveSnapshot, wire.SaveSnapshotRequest(name=name, partial=partial))
 
     def restore_snapshot(self, name: str) -> SnapshotInfo:
-        """Restore a snapshot; time may go back: see :class:`shmio.Cell`.
+        """Restore a snapshot, which may set time back: see :class:`shmio.Cell`.
 
         Raises:
             SnapshotError: The snapshot cannot be restored; the message says why.
@@ -543,12 +552,12 @@ class Subscription(Iterator[Update]):
 
 
 class Steps(Iterator[Stepped]):
-    """Steps time on one stream; this is cheaper than one call for each step.
+    """Steps time on one stream, which is cheaper than one call for each step.
 
     Use it in one thread, and close it, or use ``with``. Iterate over the steps that
-    :meth:`Client.steps` requested. A step arrives when all streams have its changes; meanwhile, the
-    endpoint already computes the next steps. To do something between steps, call :meth:`step`
-    instead.
+    :meth:`Client.steps` requested. The iterator returns a step when the endpoint has sent its
+    changes to all streams; meanwhile, the endpoint already computes the next steps. To do something
+    between two steps, call :meth:`step` instead of iterating.
     """
 
     def __init__(self, stream: Duplex, count: int) -> None:
@@ -578,7 +587,7 @@ class Steps(Iterator[Stepped]):
                 raise
 
     def step(self, dt_s: float | None = None) -> Stepped:
-        """Request one more step, and wait for this step and all earlier ones.
+        """Request one more step, and wait until this step and all earlier ones are done.
 
         Raises:
             ShmioError: As for the iteration.
@@ -605,7 +614,7 @@ class Steps(Iterator[Stepped]):
 
 
 class Simulation(Member, Iterator[Work]):
-    """A source that this program computes: iterate over the steps, and answer each.
+    """A source that this program computes: iterate over the requested steps, and answer each of them.
 
     Use it in one thread, and close it, or use ``with``. Other threads may only call
     :meth:`close`.
@@ -663,7 +672,7 @@ class Simulation(Member, Iterator[Work]):
         self._stream.write(data)
 
     def close(self) -> None:
-        """Leave the source; steps fail until another model joins."""
+        """Leave the source. Its steps fail until another model joins it."""
         self._stream.close()
 
     def __enter__(self) -> Self:

@@ -18,9 +18,9 @@ from shmio.model.values import Outcome
 class Shadow(Iterator[Update]):
     """An injection to which this program gives values.
 
-    Iterate over it to receive the originals, which are the values that the injection covers.
-    Several threads may give values, but only one may iterate. ``table`` has the covered registers
-    with their latest originals.
+    Iterate over it to receive the originals: the values that the injection covers. Several threads
+    may give values, but only one may iterate. ``table`` has the covered registers with their latest
+    originals.
     """
 
     def __init__(self, channel: Channel, stream: Duplex, state: injection.ShadowState) -> None:
@@ -58,11 +58,11 @@ class Shadow(Iterator[Update]):
         Args:
             values: Values by path.
             arrays: Values by the columns of ``table``.
-            raw: Values as raw bytes.
+            raw: Values as raw bytes: see :data:`shmio.client.injection.Raw`.
 
         Returns:
-            An outcome for each value. All values have the same outcome: the worst one. It is
-            ``rejected`` if a path or value is wrong, or the injection does not cover the path.
+            An outcome for each value. All values have the same outcome: the worst of them. It is
+            ``rejected`` if a path or value is wrong, or if the injection does not cover a path.
 
         Raises:
             ValueRangeError: A value has an unsupported Python type.
@@ -95,7 +95,7 @@ class Shadow(Iterator[Update]):
     ) -> None:
         """Give values as in :meth:`set`, without waiting for their outcomes.
 
-        A wrong value ends the injection; the next call raises the error.
+        A wrong value ends the injection; the error is raised by the next call.
         """
         with self._changed:
             self._check()
@@ -159,11 +159,11 @@ class Lift(Protocol):
 
 
 class Campaign(Iterator[InjectionEvent]):
-    """Declared injections that were created together.
+    """Declared injections that this program has created in one call.
 
-    To follow their events, iterate over the campaign in one thread. The iteration ends when all
-    injections have ended. ``declared`` has the injections in the order of the declarations, with
-    their seeds.
+    Iterate over the campaign, in one thread, to get the events of the injections. The iteration ends
+    when all injections have ended. ``declared`` has the injections with their seeds, in the order
+    of the declarations.
     """
 
     def __init__(self, stream: Stream, first: Any, lift: Lift, *, keep: bool) -> None:

@@ -17,7 +17,7 @@ from shmio.errors import RemoteError
 
 Outputs = Mapping[str, object] | None
 Step = Callable[[float, float, Values], Outputs]
-"""Function of ``(time_s, dt_s, inputs)`` that returns the outputs at the end of a step."""
+"""Function of ``(time_s, dt_s, inputs)`` that returns the outputs at the end of a step by path; times in s."""
 CLOSED: Final = ValueError
 """Error that grpcio raises for a call on a closed channel."""
 sleep: Final = time.sleep
@@ -70,7 +70,7 @@ class Stream(Iterator[Any]):
             self._channel.target.fail(error)
 
     def first(self) -> Any:
-        """Return the first answer; None if the stream was closed. Raise RemoteError after a time-out."""
+        """Return the first answer; None if the stream was closed. Raise RemoteError if none comes in time."""
         late = threading.Event()
 
         def give_up() -> None:
@@ -128,7 +128,7 @@ class Duplex(Stream):
 
 
 class Condition(threading.Condition):
-    """Condition for which several threads can wait, each with a time-out."""
+    """Condition on which several threads can wait, each with its own time-out."""
 
     def wait_until(self, predicate: Callable[[], bool], timeout_s: float | None = None) -> bool:
         """Wait until the predicate is true. Return False after a time-out."""

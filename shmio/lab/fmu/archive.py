@@ -60,7 +60,7 @@ def export_fmu(config: Path, file: Path, patterns: Sequence[str]) -> Exported:
     Raises:
         ConfigError: The instance cannot be exported; the message says why.
         LayoutError: A layout cannot be compiled.
-        PathError: A pattern names nothing.
+        PathError: A pattern matches no register.
 
     """
     machine = _PLATFORMS.get(platform.machine())

@@ -49,7 +49,7 @@ def groups_of(lab: Laboratory, patterns: Sequence[str]) -> tuple[list[Group], li
         patterns: Registers to export; all if empty.
 
     Raises:
-        PathError: A pattern names nothing.
+        PathError: A pattern matches no register.
         ConfigError: There are too many variables, or none.
 
     """
