@@ -1,1 +1,1 @@
-"""A cell on this host: attach to its shared memory, read, write, inject, step, replay."""
+"""A cell on this host: attaches to its shared memory to read, write, inject, step and replay."""

@@ -8,8 +8,9 @@ For example::
         for view in cell.stream("cell"):
             print(view.cycle, view["Robot_800/Axs1_Pos"], view.missed)
 
-Attaching maps the shared memory read-only. The program takes no lock, does not register, and needs
-no server. A program that also writes occupies one of the process table's external slots.
+Attaching maps the shared memory read-only. The program then holds no lock, is not registered with
+the instance, and needs no server. A program that also writes (``writable``) maps the memory
+writable, and occupies one of the external slots of the process table.
 """
 
 from __future__ import annotations
@@ -128,7 +129,7 @@ class Attachment:
         return self._segment.shared.current()
 
     def layouts(self, *sources: str) -> Mapping[str, Layout]:
-        """Return the layouts of these sources (default: all), by source.
+        """Return the layouts of these sources, by source; of all sources if none is named.
 
         Raises:
             PathError: There is no such source.
@@ -137,7 +138,7 @@ class Attachment:
         return Layouts({source: self.block(source) for source in sources} if sources else self._blocks())
 
     def real_sources(self) -> list[str]:
-        """Return the names of the sources that steps do not affect, such as those with a device."""
+        """Return the names of the sources that steps do not advance, such as those with a real device."""
         self._segment.require_running()
         return [source for source, block in self._blocks().items() if not block.attributes.stepped]
 
@@ -158,7 +159,7 @@ class Attachment:
         return blocks[source]
 
     def resolve(self, path: str) -> tuple[Block, Register]:
-        """Find the block and the register that a path names.
+        """Return the block and the register that a path names.
 
         Args:
             path: Path of a register or element; the source may be omitted if there is only one.
@@ -176,7 +177,7 @@ class Attachment:
         return block, look_up(block.layout, topic)
 
     def get(self, *patterns: str) -> list[Reading]:
-        """Read the registers that patterns name, whatever their quality: see :class:`shmio.Cell`.
+        """Read the registers that match the patterns, whatever their quality: see :class:`shmio.Cell`.
 
         Raises:
             PathError: A pattern matches no register.
@@ -189,9 +190,9 @@ class Attachment:
         return [reading(blocks[source], register, frames[source]) for source, register in chosen]
 
     def subscribe(self, *patterns: str, every_frame: bool = False, max_rate_hz: float = 0.0) -> Subscription:
-        """Follow registers: get their present values, then each change. See :class:`shmio.Cell`.
+        """Return an iterator over the present values of registers, then each change.
 
-        Closing the subscription or the attachment ends it.
+        See :class:`shmio.Cell`. The iterator ends when you close it or the attachment.
         """
         subscription = Subscription(
             self._segment, self._blocks, patterns, every_frame=every_frame, max_rate_hz=max_rate_hz
@@ -200,9 +201,9 @@ class Attachment:
         return subscription
 
     def events(self, *sources: str) -> Events:
-        """Follow the events of these sources (default: all) from now on: see :class:`shmio.Cell`.
+        """Follow the events of these sources from now on; of all sources if none is named.
 
-        Closing the iterator or the attachment ends it.
+        See :class:`shmio.Cell`. The iterator ends when you close it or the attachment.
 
         Raises:
             PathError: There is no such source.
@@ -264,7 +265,7 @@ class Attachment:
 
         Args:
             source: Name of the source; None if there is only one.
-            timeout_s: The iterator ends after this time without a frame; None waits forever.
+            timeout_s: The iterator ends after this time in s without a frame; None: it waits forever.
 
         Raises:
             PathError: There is no such source.
@@ -314,7 +315,7 @@ class Attachment:
         Args:
             source: Name of the source; None if there is only one.
             after: The given frame; None: the newest frame at the time of the call.
-            timeout_s: Time-out in s; None waits forever.
+            timeout_s: Time-out in s; None: wait forever.
 
         Returns:
             The newest frame, or None if none came in time.
@@ -338,7 +339,7 @@ class Attachment:
             cursor = block.cursor(after=0)
 
     def set(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
-        """Write values as :meth:`write` does; each outcome has the path that you gave.
+        """Write values as :meth:`write` does, but return outcomes with the paths that you gave.
 
         Raises:
             PathError, ValueRangeError, CommandError: As for :meth:`write`; nothing has been sent.
@@ -353,7 +354,7 @@ class Attachment:
         The source accepts all values or none. The attachment must be ``writable``.
 
         Args:
-            values: Values by path: registers, whole arrays, elements, slices or bits of one source.
+            values: Values by path: of registers, whole arrays, elements, slices or bits.
             timeout_s: Time in s that the values may wait for a cycle of the source; None: 2 s, or
                 three cycles if that is longer.
 
@@ -364,13 +365,13 @@ class Attachment:
             PathError: A path names no register, or the paths belong to several sources.
             ValueRangeError: A value does not fit its register, or a register is given twice.
             CommandError: A register is not writable, or the source's queue has no room.
-                After any of these errors nothing has been sent.
+                After any of these errors, nothing has been sent.
         """
         block, topics = _of_one_source("write", values, self._blocks(), written=True)
         return self._source_writer(block).write(by_path(topics, values), timeout_s)
 
     def inject(self, *paths: str, priority: int = 0, keep: bool = False, name: str = "") -> Shadow:
-        """Create a shadow: an injection that gives values to registers of one source.
+        """Create a shadow: an injection over registers of one source, to which this program gives values.
 
         The attachment must be ``writable``.
 
@@ -379,8 +380,8 @@ class Attachment:
                 ``/in``, the shadow takes the values that others write. With ``/out``, or without a
                 suffix, it replaces the values that consumers see. All paths must have the same
                 direction.
-            priority: If several shadows cover a register, the shadow with the highest priority is
-                outermost. Among equal priorities, the newest is outermost.
+            priority: If several injections cover a register, the one with the highest priority is
+                outermost: its values count. Among equal priorities, the newest is outermost.
             keep: Whether the shadow stays when this program ends, until a program lifts it.
             name: Name of the injection in events and lists.
 
@@ -406,13 +407,14 @@ class Attachment:
         return Shadow(source_writer, number, direction, events, partial(self._next, block), keep=keep, names=names)
 
     def written(self, *paths: str, timeout_s: float | None = None) -> Iterator[ObservedWrite]:
-        """Iterate over the commands that write to registers of one source, from now on.
+        """Iterate over the commands that write to registers of one source from now on.
 
         The iterator yields accepted commands in order, each when its outcome is known.
 
         Args:
             paths: Registers, structures or patterns of one source.
-            timeout_s: The iterator ends after this time without a command; None waits forever.
+            timeout_s: The iterator ends after this time in s without a command; None: it waits
+                forever.
 
         Raises:
             PathError: A path names no register, or the paths belong to several sources.
@@ -423,7 +425,7 @@ class Attachment:
         return written(block, patterns, block.events.cursor(), partial(self._next, block), timeout_s)
 
     def declare(self, declarations: Iterable[Mapping[str, Any] | Declaration], *, keep: bool = False) -> Campaign:
-        """Create all declared injections, or none of them. Their sources run them on their own.
+        """Create all of these declared injections, or none. Their sources run them on their own.
 
         An injection ends as its declaration says, or when a program lifts it. The attachment must
         be ``writable``. See docs/reference/injections.md.
@@ -433,8 +435,8 @@ class Attachment:
             keep: Whether the injections continue when this program ends.
 
         Returns:
-            The created injections. Iterate over the result to get their events. Leaving the
-            ``with`` block lifts them, unless ``keep`` is set.
+            The created injections, as a campaign. Iterate over it to get their events. Leaving its
+            ``with`` block lifts the injections, unless ``keep`` is set.
 
         Raises:
             DeclarationError: A declaration is wrong.
@@ -447,9 +449,9 @@ class Attachment:
         return campaign
 
     def injections(self, *sources: str) -> list[Injection[Mapping[str, Any]]]:
-        """Return the existing injections of these sources (default: all).
+        """Return the existing injections of these sources; of all sources if none is named.
 
-        The injections of a source begin with the innermost.
+        Within a source, the innermost injection comes first.
 
         Raises:
             PathError: There is no such source.
@@ -481,7 +483,9 @@ class Attachment:
         self._source_writer(block).lift(number)
 
     def lift_all(self, *sources: str) -> list[Lifted]:
-        """Lift all injections of these sources (default: all), whichever program created them.
+        """Lift all injections of these sources, whichever program created them.
+
+        Without arguments, lift the injections of all sources.
 
         Returns:
             The lifted injections.
@@ -503,7 +507,7 @@ class Attachment:
 
         Args:
             text: The note, 1 to 256 bytes in UTF-8.
-            source: Name of the source; None: the first one.
+            source: Name of the source; None: the instance's first source.
 
         Raises:
             PathError: There is no such source.
@@ -516,15 +520,15 @@ class Attachment:
     def clock(self) -> Clock:
         """State of the instance's clock: wall time, or virtual time with its last step.
 
-        You may also call it (``clock()``), as for any :class:`shmio.Cell`.
+        Calling the attribute (``clock()``) returns the same state, as for any :class:`shmio.Cell`.
         """
         return self._segment.clock.read()
 
     def step(self, dt_s: float | None = None, count: int = 1) -> Clock:
-        """Step time, and wait until all sources on the instance clock have done each step.
+        """Step time, and wait after each step until all sources on the instance clock have done it.
 
         The first call of this method, :meth:`pause` or :meth:`play` takes control of time: from
-        then on, only steps move it. This program owns time until it calls :meth:`release` or
+        then on, only steps move time. This program owns time until it calls :meth:`release` or
         detaches. The attachment must be ``writable``.
 
         Args:
@@ -548,7 +552,7 @@ class Attachment:
         return self.clock
 
     def play(self, rate: float = 1.0, dt_s: float | None = None) -> Clock:
-        """Start to step time in a thread, until :meth:`pause`; return the state of the clock.
+        """Step time continuously, in a thread, until :meth:`pause`; return the state of the clock.
 
         Args:
             rate: Speed relative to real time; above 0, at most 1000.
@@ -597,13 +601,13 @@ class Attachment:
         return self._snapshots.save(name, partial=partial)
 
     def restore_snapshot(self, name: str) -> SnapshotInfo:
-        """Restore a snapshot; time may go back: see :class:`shmio.Cell`.
+        """Restore a snapshot, which may set time back: see :class:`shmio.Cell`.
 
         The attachment must be ``writable``.
 
         Raises:
-            SnapshotError: There is no such snapshot, or it does not fit the instance; nothing has
-                been changed. Or a process could not restore its state; then its data are bad.
+            SnapshotError: There is no such snapshot, or it does not fit the instance, and nothing
+                was changed; or a process could not restore its state, and its data are bad.
             TimeError: Time is real, or another program owns it.
         """
         return self._snapshots.restore(name)
@@ -651,10 +655,10 @@ class Attachment:
             following.end()
 
     def close(self) -> None:
-        """Detach from the instance.
+        """Detach from the instance, and give up the ownership of time.
 
         Raises:
-            TimeError: A step has failed while time was played.
+            TimeError: A step has failed while this program played time.
         """
         with self._lock:
             self._detached = True
@@ -683,8 +687,8 @@ def attach(instance: str | None = None, *, writable: bool = False) -> Attachment
             instance may do this.
 
     Raises:
-        NotRunningError: The instance is not running. Or you gave no name, and no instance or
-            several instances are running.
+        NotRunningError: The instance is not running; or ``instance`` is None, and not exactly one
+            instance is running.
         FormatError: Another version of shmio made the segment.
         SegmentError: The segment cannot be opened, for example because you have no permission.
     """

@@ -14,15 +14,18 @@ from shmio.segment.block import Block
 from shmio.segment.segment import Segment
 
 MAX_PATHS: Final = 2048
-"""Maximum number of paths in an event: the number of bits in the data of an event.
+"""Maximum number of paths in an event, which is the number of bits in the data of an event.
 
-If an injection covers more registers, its events have only the first paths.
+If an injection covers more registers, its events have only the first of their paths.
 """
 _KINDS: Final = {int(kind): EventKind(str(kind)) for kind in segment_events.EventKind}
 
 
 class EventReader:
-    """Reads a block's events in order, with their registers and values. Use it from one thread."""
+    """Reads a block's events in order, with the registers and values that they are about.
+
+    Use it from one thread.
+    """
 
     def __init__(self, block: Block, *, after: int | None = None) -> None:
         """Start after event ``after`` (default: the newest one)."""
@@ -65,7 +68,7 @@ class EventReader:
         return None
 
     def removed(self, instance: str) -> Event:
-        """Create the REMOVED event: the last event of a source that a reload has removed."""
+        """Return the REMOVED event, which comes last for a source that a reload has removed."""
         last, source = self._last, self.block.source
         times = (0, 0, 0) if last is None else (last.frame, last.cycle, last.incarnation)
         reason = f"source {source!r} was removed from instance {instance!r} by a reload"
@@ -82,7 +85,7 @@ class EventReader:
 
 
 class Events(Following[Event]):
-    """Events of a local instance. Implements :class:`shmio.model.cell.Events`."""
+    """Iterator over events of a local instance. Implements :class:`shmio.model.cell.Events`."""
 
     def __init__(self, segment: Segment, blocks: Callable[[], Mapping[str, Block]], followed: Iterable[Block]) -> None:
         """Start to follow the events of blocks.

@@ -1,4 +1,4 @@
-"""Injections of a local program: shadows, to which it gives values, and declared injections."""
+"""Injections of a local program: shadows, to which the program gives values, and declared injections."""
 
 from __future__ import annotations
 
@@ -43,17 +43,17 @@ if the instance has stopped.
 
 
 class ObservedWrite(msgspec.Struct, frozen=True):
-    """The values that one command wrote to a source, or the part of them that an injection took.
+    """The values that one command wrote to a source, or those of them that an injection took.
 
     Attributes:
         values: Values by path within the block. If only a part of an array or integer was written,
             the paths are those of the written elements or bits.
         writer: Number of the command queue, as in events.
         command: Number that the writer gave the command, as in events.
-        clock_ns: Time of the instance's clock.
-        utc_ns: UTC time.
-        missed: Number of events lost since the previous item. Some of them may have been about
-            writes, which are then missing.
+        clock_ns: Time of the instance's clock, in ns.
+        utc_ns: UTC time, in ns.
+        missed: Number of events lost since the previous command. Some of them may have been about
+            writes, which are then missing here.
     """
 
     values: Mapping[str, Value]
@@ -67,9 +67,9 @@ class ObservedWrite(msgspec.Struct, frozen=True):
 class Shadow:
     """An injection over registers of one source, to which this program gives values.
 
-    Before the program gives values, a shadow over ``/out`` changes nothing for consumers. A shadow
-    over ``/in`` then keeps all writes from the device. Leaving the ``with`` block lifts the shadow,
-    unless it was created with ``keep``.
+    Until the program gives values, a shadow over ``/out`` changes nothing for consumers. A shadow
+    over ``/in`` takes all writes to its registers from the start, so the device gets none of them.
+    Leaving the ``with`` block lifts the shadow, unless it was created with ``keep``.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class Shadow:
         self._names = names
 
     def set(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
-        """Give values to consumers. A shadow over ``/in`` gives them to the device instead.
+        """Give values: to consumers if the shadow is over ``/out``, to the device if it is over ``/in``.
 
         Args:
             values: Values by path, with or without the source.
@@ -119,14 +119,14 @@ class Shadow:
 
         Returns:
             The outcome of each value, with the path that you gave. SHADOWED: consumers see the
-            value. REJECTED: the shadow does not cover the path, or was lifted. A shadow over
-            ``/in`` returns the outcomes of a write to the device.
+            value. REJECTED: the shadow does not cover the path, or was lifted. For a shadow over
+            ``/in``, the outcomes are those of a write to the device.
 
         Raises:
             PathError: A path names no register.
             ValueRangeError: A value does not fit its register, or a register is given twice.
             CommandError: The source's queue has no room.
-                After any of these errors nothing has been sent.
+                After any of these errors, nothing has been sent.
         """
         paths = by_path([parse_topic(path, (self.source,), self.source) for path in values], values)
         return as_given(values, self._source_writer.shadow(self.number, paths, timeout_s))
@@ -135,13 +135,13 @@ class Shadow:
         """Iterate over the commands whose values this shadow has taken since its creation.
 
         A shadow over ``/in`` takes the writes of other programs. A shadow over ``/out`` takes the
-        values of inner shadows; the values that the source delivers are in the frames. If there are
-        two iterators, each command goes to one of them. The iterator ends when the shadow is
-        lifted.
+        values of inner shadows. (It also covers the values that the source delivers, but these are
+        in the frames.) If there are two iterators, each command goes to only one of them. The
+        iterator ends when the shadow is lifted.
 
         Args:
-            timeout_s: The iterator also ends after this time without such a command; None waits
-                forever.
+            timeout_s: The iterator also ends after this time in s without such a command; None: it
+                waits forever.
 
         Raises:
             NotRunningError: The instance has stopped.
@@ -167,7 +167,7 @@ class Shadow:
     def lift(self) -> None:
         """Lift the shadow.
 
-        Consumers or the device then get the values that they would get without it.
+        Consumers, or the device, then get the values that they would get without the shadow.
 
         Raises:
             CommandError: The shadow was lifted already, or the source does not answer.
@@ -202,7 +202,7 @@ def written(
         patterns: Patterns of registers.
         events: A cursor of the block's events.
         next_event: Waits for the cursor's next event.
-        timeout_s: The iterator ends after this time without a command; None waits forever.
+        timeout_s: The iterator ends after this time in s without a command; None: it waits forever.
 
     Raises:
         PathError: The patterns name no register.
@@ -262,7 +262,7 @@ def compile_declarations(
     """Compile declarations for this instance.
 
     Args:
-        declarations: What to compile.
+        declarations: The declarations.
         blocks: The instance's blocks, by source.
         wanted: Called before each declaration, because compiling many declarations over a large
             layout takes seconds. If it returns False, the compilation is cancelled.
@@ -336,9 +336,10 @@ def _read(declarations: Iterable[Mapping[str, Any] | Declaration]) -> list[Decla
 class Campaign(Following[InjectionEvent]):
     """Declared injections that this program has created.
 
-    Iterate over the campaign to get their events. The iteration ends when all injections are
-    lifted. It leaves out events that were overwritten before the program read them. Leaving the
-    ``with`` block lifts the remaining injections, unless they were created with ``keep``.
+    Iterate over the campaign to get the events of its injections. The iteration ends when all
+    injections are lifted, and leaves out events that were overwritten before the program read them.
+    Leaving the ``with`` block lifts the remaining injections, unless they were created with
+    ``keep``.
     """
 
     def __init__(
@@ -443,7 +444,11 @@ def lift_all(injections: Iterable[tuple[SourceWriter, int]]) -> None:
 
 
 def by_path(topics: Iterable[Topic], values: Mapping[str, object]) -> dict[str, object]:
-    """Return values by the paths of their topics, instead of the paths that the caller gave.
+    """Return the same values by the canonical paths of their topics, instead of the caller's paths.
+
+    Args:
+        topics: The topic of each value, in the order of ``values``.
+        values: Values by path, as the caller gave it.
 
     Raises:
         ValueRangeError: Two topics have the same path.
@@ -457,7 +462,7 @@ def by_path(topics: Iterable[Topic], values: Mapping[str, object]) -> dict[str, 
 
 
 def as_given(paths: Iterable[str], outcomes: Iterable[Outcome]) -> list[Outcome]:
-    """Return outcomes with the paths that the caller gave."""
+    """Return the outcomes with the paths ``paths``, which the caller gave, instead of canonical paths."""
     return [msgspec.structs.replace(outcome, path=path) for path, outcome in zip(paths, outcomes, strict=True)]
 
 

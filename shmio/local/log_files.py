@@ -1,4 +1,4 @@
-"""Read the log files of a local instance: the last lines of all files, and new lines as they come."""
+"""Read the log files of a local instance: the last lines of all files, and new lines as they are written."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from shmio.logs import with_fields
 _LINE = re.compile(
     r"(?P<time>[0-9T:.-]+Z) (?P<level>[A-Z]+) +(?P<process>.+?)\[(?P<pid>[0-9]{1,10})\] (?P<text>.*)", re.DOTALL
 )
-"""The form in which shmio.logs writes a line of text."""
+"""Matches a line of text that :mod:`shmio.logs` has written."""
 
 MAX_LINE_BYTES: Final = 65536
 TAIL_BYTES: Final = 65536
-"""Size in bytes of the pieces in which the end of a file is read, backwards."""
+"""Size in bytes of the pieces in which a file is read backwards from its end."""
 _STAMP = re.compile(rb'(?:\{"time": ?")?(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{6}Z)[" ]')
-"""The start of a record's line, as text or as JSON."""
+"""Matches the start of a record's line, in text or in JSON."""
 _FIRST_STAMP = re.compile(rb"\n(?=" + _STAMP.pattern + rb")")
 
 # inotify(7): events of a folder that concern its log files.
@@ -49,10 +49,10 @@ class _JsonLine(msgspec.Struct):
 
 
 def parse_line(line: str) -> dict[str, Any]:
-    """Split a line, which is text or JSON, into its fields.
+    """Split a line, which is text or JSON, into its parts.
 
-    For a continuation, such as a line of a traceback, all fields but the text are None. The text of
-    a line in JSON includes the fields and the traceback of the record.
+    For a continuation line, such as a line of a traceback, all parts except the text are None. For a
+    line in JSON, the text includes the fields and the traceback of the record.
     """
     if line.startswith("{"):
         with suppress(msgspec.MsgspecError, RecursionError):
@@ -80,7 +80,8 @@ def as_text(line: str) -> str:
 def last_lines(files: Iterable[Path], count: int) -> list[bytes]:
     """Return the last ``count`` lines of all files together, in the order of their time stamps.
 
-    A line without a time stamp, such as a line of a traceback, stays after the line before it.
+    A line without a time stamp, such as a line of a traceback, follows the line before it in its
+    file.
     """
     merged = heapq.merge(*(_stamped(file, count) for file in files), key=lambda entry: entry[0])
     return list(deque((line for _, line in merged), maxlen=count))
@@ -123,9 +124,10 @@ def _lines(stream: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
 
 
 class Follower:
-    """Returns the new lines of log files. After a rotation, it reads the old file to its end first.
+    """Reads new lines of log files as they are written. Use it as a context manager.
 
-    It waits with inotify, so that idle files cost nothing. Use it as a context manager.
+    After a rotation, the follower reads the rest of the old file, then the new file. It waits with
+    inotify, so that idle files cost nothing.
     """
 
     def __init__(self, files: Iterable[Path]) -> None:
@@ -156,7 +158,7 @@ class Follower:
                 stream.close()
 
     def wait(self) -> list[bytes]:
-        """Wait for an event in the folders; return the new complete lines."""
+        """Wait for a change in the folders of the files, and return the new complete lines."""
         os.read(self._fd, _EVENT_ROOM)
         return [line for file in self._files for line in self._new(file)]
 

@@ -1,4 +1,4 @@
-"""Values that a local program reads: single registers, and frames with their layout."""
+"""What a local program reads: values of single registers, and frames with their layout."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 class View:
     """A copy of a frame, which never changes, with the layout that decodes it.
 
-    ``missed`` is the number of frames lost between the previous frame of the stream and this frame.
+    ``missed`` is the number of frames lost between the previous frame of a stream and this frame.
     """
 
     block: Block
@@ -40,7 +40,7 @@ class View:
 
     @property
     def section(self) -> int:
-        """Index that identifies the block within this run of the instance.
+        """Index that identifies the frame's block within this run of the instance.
 
         If a reload replaces a source's block, the new block has another index, and its frame
         numbers start again at 1.
@@ -59,7 +59,7 @@ class View:
 
     @property
     def quality(self) -> Quality:
-        """Present quality: a frame becomes bad when it is too old."""
+        """The frame's quality now: a frame becomes bad when it is too old."""
         return self.block.assess(self.frame)[0]
 
     @property
@@ -79,7 +79,7 @@ class View:
         return self._decode(topic.path, self.frame.image)
 
     def original(self, path: str) -> Value:
-        """Return the value that the source delivered, without injections.
+        """Return the value that the source delivered for a register, without injections.
 
         Args:
             path: Path of a register or element.
@@ -108,7 +108,7 @@ class View:
     def array(self) -> np.ndarray[Any, np.dtype[Any]]:
         """The decoded frame: a numpy structured array of shape (1,), with a field for each register.
 
-        The fields are named by the registers' paths.
+        The name of a field is the path of its register.
         """
         return _frame_codec(self.layout).decode(self.frame.image)
 
@@ -121,7 +121,7 @@ def _frame_codec(layout: Layout) -> FrameCodec:
 
 
 def reading(block: Block, register: Register, frame: Frame | None, *, aged: bool = True) -> Reading:
-    """Read one register of a frame.
+    """Return the reading of one register in a frame.
 
     Args:
         block: The frame's block.

@@ -1,4 +1,4 @@
-"""Control replays from a local program. The sources of one recording always move together.
+"""Control replays from a local program. All sources that replay the same recording move together.
 
 This module also parses the times and dates that users give.
 """
@@ -31,7 +31,7 @@ from shmio.segment.playhead import (
 from shmio.segment.segment import Segment
 
 ANSWER_S: Final = 5.0
-"""Time-out in s for an answer that needs no search."""
+"""Time-out in s for the answer of a source to a request that needs no search."""
 _SEARCH_S: Final = 600.0
 _TURN_NS: Final = 500_000_000
 """Interval in ns at which a wait for an answer checks whether the caller has given up."""
@@ -41,17 +41,17 @@ class ReplayRequest(msgspec.Struct, frozen=True, omit_defaults=True):
     """A request to change replays. A field that is None or empty requests no change.
 
     Attributes:
-        paused: Whether to pause.
+        paused: True: pause; False: resume.
         speed: Speed relative to the instance's clock, 0.01 to 1000.
-        seek: Position to go to: seconds from the start, or a date and time, which is local unless
-            it has a time zone.
+        seek: Position to go to: seconds from the start, or a date and time, which is in local time
+            unless it has a time zone.
         until: Position at which to pause once, in the same form as ``seek``.
-        loop: Whether to start again at the end.
+        loop: Whether to start again when the end is reached.
         change: Path of a register: play until its next change, and pause there.
         event: Kind of event: play until the next event of this kind, and pause there.
-        jump: With ``change`` or ``event``: go to its position at once instead of playing.
-        sources: Names of sources. All sources that replay the same recordings are included. Empty:
-            all replays.
+        jump: With ``change`` or ``event``: whether to go there at once instead of playing.
+        sources: Names of the sources to change. Other sources that replay the same recordings change
+            with them. Empty: all replays.
     """
 
     paused: bool | None = None
@@ -71,9 +71,9 @@ class ReplayRequest(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class Replays:
-    """The replays of an instance.
+    """Controls the replays of an instance.
 
-    Several threads may use it. Only one program at a time can move the replays.
+    Several threads may use an object. Only one program at a time can move the replays.
     """
 
     def __init__(self, segment: Segment) -> None:
@@ -93,8 +93,8 @@ class Replays:
         """Return the status of each replay.
 
         Args:
-            sources: Names of sources. All sources that replay the same recordings are included.
-                Empty: all replays.
+            sources: Names of sources. The result also has other sources that replay the same
+                recordings. Empty: all replays.
 
         Raises:
             CommandError: The instance replays no recording.
@@ -120,7 +120,7 @@ class Replays:
         return self.change(ReplayRequest(paused=False, speed=speed))
 
     def speed(self, speed: float) -> list[ReplayStatus]:
-        """Set the speed relative to the instance's clock, 0.01 to 1000, and return the status.
+        """Set the speed of all replays relative to the instance's clock, 0.01 to 1000; return their status.
 
         Raises:
             ValueRangeError: The speed is out of range.
@@ -128,7 +128,7 @@ class Replays:
         return self.change(ReplayRequest(speed=speed))
 
     def seek(self, to: float | str) -> list[ReplayStatus]:
-        """Go to a position, and return the status.
+        """Move all replays to a position, and return their status.
 
         Args:
             to: Seconds from the start, or a date and time.
@@ -139,15 +139,20 @@ class Replays:
         return self.change(ReplayRequest(seek=str(to)))
 
     def loop(self, on: bool = True) -> list[ReplayStatus]:
-        """Set whether replays start again at the end, and return their status."""
+        """Set whether all replays start again when they reach the end, and return their status."""
         return self.change(ReplayRequest(loop=on))
 
     def play_until(self, to: float | str) -> list[ReplayStatus]:
-        """Play up to a position, in the same form as for :meth:`seek`, and pause there."""
+        """Play up to a position, given as for :meth:`seek`, and pause there.
+
+        Return the status when playing has started.
+        """
         return self.change(ReplayRequest(paused=False, until=str(to)))
 
     def to_change(self, path: str, *, jump: bool = False) -> list[ReplayStatus]:
         """Play until the next change of a register, and pause there.
+
+        Return the status when playing has started.
 
         Args:
             path: Path of the register.
@@ -161,6 +166,8 @@ class Replays:
 
     def to_event(self, kind: str, *, jump: bool = False) -> list[ReplayStatus]:
         """Play until the next event of a kind, of any source, and pause there.
+
+        Return the status when playing has started.
 
         Args:
             kind: Kind of event, such as ``accepted`` or ``noted``, or ``any``.
@@ -176,7 +183,7 @@ class Replays:
 
         Args:
             wanted: The request.
-            given_up: Called at intervals during a search. The search ends when it returns True.
+            given_up: Called at intervals during a search. If it returns True, the search ends.
 
         Raises:
             ValueRangeError: The speed or a position is out of range.
@@ -389,7 +396,7 @@ def moment_ns(text: str, begin_ns: int) -> int:
         UTC in ns.
 
     Raises:
-        ValueError: The text is neither.
+        ValueError: The text is neither a number of seconds nor a date and time.
     """
     try:
         return begin_ns + round(float(text) * 1e9)

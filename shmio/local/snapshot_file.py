@@ -1,9 +1,9 @@
-"""The files of snapshots.
+"""Writes, reads, lists and deletes the files of snapshots.
 
 A file has a header of 56 bytes (little-endian): the magic ``SHMIOSNP``, u32 version 1, u32 size of
-the description, u64 size of the states, SHA-256 of both together. The description is JSON, the
-states are one MessagePack map: bytes by the name of the process. A file is complete before it gets
-its name, and replaces an older file of that name.
+the description, u64 size of the states, and the SHA-256 of description and states together. The
+description follows as JSON, then the states as one MessagePack map from the name of each process to
+bytes. A file gets its name only when it is complete; it then replaces an older file of that name.
 """
 
 from __future__ import annotations
@@ -53,23 +53,24 @@ class SnapshotHead(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def check_name(name: str) -> None:
-    """Raise SnapshotError if a snapshot cannot have this name."""
+    """Raise SnapshotError if this cannot be the name of a snapshot."""
     if not _NAME.fullmatch(name):
         raise SnapshotError(f"{name!r:.80} cannot be a snapshot's name; use up to 63 letters, digits, '_', '-' and '.'")
 
 
 def file_of(folder: Path, name: str) -> Path:
-    """Return the file of a snapshot; raise SnapshotError if the name is invalid."""
+    """Return the path of a snapshot's file; raise SnapshotError if the snapshot's name is invalid."""
     check_name(name)
     return folder / f"{name}{SUFFIX}"
 
 
 @contextmanager
 def work_folder(folder: Path) -> Iterator[Path]:
-    """Create a folder for the states, inside the folder of snapshots, and remove it at the end.
+    """Provide a work folder for states, inside the folder of snapshots, during a ``with`` block.
 
-    Also remove those of programs that were killed. If this creates the folder of snapshots and no
-    snapshot is saved, remove it again, because it may belong to another user than the instance.
+    Also remove work folders that killed programs have left. If the folder of snapshots did not exist
+    and no snapshot is saved, remove it again: this program may run as another user than the
+    instance, which could then not write to the folder.
 
     Raises:
         SnapshotError: The folder cannot be created.
@@ -108,7 +109,13 @@ def _tidy(folder: Path) -> None:
 
 
 def write_snapshot(file: Path, work: Path, head: SnapshotHead, states: Mapping[str, bytes]) -> SnapshotInfo:
-    """Write a snapshot. If this fails, an older file of this name stays.
+    """Write a snapshot. If that fails, an older file of this name stays.
+
+    Args:
+        file: The new file.
+        work: The work folder, in which the file is written first.
+        head: The description.
+        states: The states, by name of the process.
 
     Raises:
         SnapshotError: The states are too large, or the file cannot be written.
@@ -130,7 +137,7 @@ def write_snapshot(file: Path, work: Path, head: SnapshotHead, states: Mapping[s
 
 
 def read_snapshot(file: Path) -> tuple[SnapshotInfo, SnapshotHead, dict[str, bytes]]:
-    """Read a snapshot.
+    """Return a snapshot's information for programs, its description, and its states by process name.
 
     Raises:
         SnapshotError: There is no such snapshot, it is damaged, or another version has written it.
@@ -151,9 +158,9 @@ def read_snapshot(file: Path) -> tuple[SnapshotInfo, SnapshotHead, dict[str, byt
 
 
 def list_snapshots(folder: Path) -> list[SnapshotInfo]:
-    """Return the snapshots of a folder, the oldest first; if there are too many, only the newest files.
+    """Return the snapshots of a folder, the oldest first; at most ``MAX_LISTED``, those of the newest files.
 
-    A damaged description is reported, not raised.
+    If the description of a snapshot is damaged, the ``problem`` of its entry says so.
 
     Raises:
         SnapshotError: The folder cannot be read.

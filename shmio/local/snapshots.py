@@ -1,8 +1,8 @@
 """Saves the state of an instance in virtual time, and restores it.
 
-The program that owns time asks each process that takes part, by the clock page: the computed
-sources, and the emulators that follow the instance's clock. Each process writes its state to a file
-in a temporary folder, or reads it there.
+Computed sources, and emulators that follow the instance's clock, take part in snapshots. The program
+that owns time asks their processes through the clock page. Each process then writes its state to a
+file in a temporary folder, or restores its state from such a file.
 """
 
 from __future__ import annotations
@@ -45,30 +45,33 @@ _UNKNOWN: Final = (
 )
 
 Refusals = dict[str, str]
-"""The reasons of the processes that have refused a request, by name of the process."""
+"""For each process that has refused a request, by its name: the reason."""
 
 
 class States(Protocol):
-    """The states of the processes that take part in snapshots, by name of the process."""
+    """Asks the processes that take part in snapshots for their states, and restores the states.
+
+    ``work`` is a folder for temporary files. States and refusals are by name of the process.
+    """
 
     def names(self) -> tuple[list[str], Refusals]:
-        """Return the processes that take part, and why others do not."""
+        """Return the names of the processes that take part, and why the others do not."""
 
     def save(self, name: str, names: list[str], work: Path) -> tuple[dict[str, bytes], Refusals]:
-        """Return the states, for the snapshot ``name``."""
+        """Return the states of the processes ``names`` for the snapshot ``name``, and the refusals."""
 
     def check(self, name: str, states: Mapping[str, bytes], work: Path) -> Refusals:
-        """Check whether all states can be restored, without a change."""
+        """Check, without any change, whether all states can be restored; return the refusals."""
 
     def restore(self, name: str, states: Mapping[str, bytes], work: Path) -> Refusals:
-        """Restore the states that :meth:`check` has checked."""
+        """Restore the states that :meth:`check` has checked; return the refusals."""
 
 
 class StillTime(Protocol):
-    """An object that moves time, and can keep it still."""
+    """An object that moves the instance's time, and can keep it from moving."""
 
     def still(self) -> AbstractContextManager[Coordinator]:
-        """Own time while the ``with`` block runs. Raise TimeError if that is not possible."""
+        """Own time, and do not move it, during a ``with`` block. Raise TimeError if that is not possible."""
 
 
 class Snapshots:
@@ -123,8 +126,9 @@ class Snapshots:
         """Restore a snapshot, of this instance or of another one with the same configuration.
 
         Raises:
-            SnapshotError: There is no such snapshot, it is damaged, or it does not fit: nothing was
-                changed. Or a process could not restore its state: it has its old state, or bad data.
+            SnapshotError: There is no such snapshot, it is damaged or does not fit the instance, and
+                nothing was changed; or a process could not restore its state, and has its old state
+                or bad data.
             TimeError: Time is real, or another program owns it.
         """
         folder = self._folder()
@@ -216,13 +220,13 @@ def snapshot_folder(segment: Segment) -> Path:
 
 
 class ProcessStates:
-    """The states of an instance's processes, which are asked by the clock page."""
+    """Asks the processes of an instance for their states through the clock page: see :class:`States`."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
 
     def names(self) -> tuple[list[str], Refusals]:
-        """Return the processes that take part, and why others do not.
+        """Return the names of the processes that take part, and why the others do not.
 
         Raises:
             SnapshotError: A source replays a recording, or a process does not run.
@@ -248,12 +252,12 @@ class ProcessStates:
         return names, left_out
 
     def save(self, name: str, names: list[str], work: Path) -> tuple[dict[str, bytes], Refusals]:
-        """Ask the processes to save their states, and return these."""
+        """Ask the processes to save their states; return the states and the refusals."""
         refusals = self._ask(StateAction.SAVE, name, names, work)
         return {one: self._read(work / f"{one}{PART}") for one in names if one not in refusals}, refusals
 
     def check(self, name: str, states: Mapping[str, bytes], work: Path) -> Refusals:
-        """Ask the processes to check the states."""
+        """Ask the processes to check their states; return the refusals."""
         try:
             for one, state in states.items():
                 write_new(work / f"{one}{PART}", state)
@@ -262,7 +266,7 @@ class ProcessStates:
         return self._ask(StateAction.CHECK, name, list(states), work)
 
     def restore(self, name: str, states: Mapping[str, bytes], work: Path) -> Refusals:
-        """Ask the processes to restore the states that they have checked."""
+        """Ask the processes to restore the states that they have checked; return the refusals."""
         return self._ask(StateAction.RESTORE, name, list(states), work)
 
     def _ask(self, action: StateAction, name: str, names: list[str], work: Path) -> Refusals:

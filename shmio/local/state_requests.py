@@ -1,4 +1,4 @@
-"""Answers requests to save or restore the state of a process: the process's side of snapshots."""
+"""Answers requests to save, check or restore the state of this process, for snapshots."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from shmio.errors import ShmioError, SnapshotError
 from shmio.segment.clock import ClockPage, StateAction, StateRequest
 
 MAX_PART_BYTES: Final = 256 << 20
-"""Largest state of one process."""
+"""Maximum size of the state of one process, in bytes."""
 PART, REFUSAL = ".part", ".refused"
-"""Suffixes of the files with a process's state, and with the reason for its refusal."""
+"""Suffixes of the file with a process's state, and of the file with the reason for its refusal."""
 WORK: Final = re.compile(r"\.work-[0-9a-f]{16}")
 
 log = logging.getLogger("shmio.snapshot")
 
 
 class StateKeeper(Protocol):
-    """An object that has the state of a process. Its methods raise ShmioError."""
+    """An object that saves and restores the state of a process. Its methods raise ShmioError to refuse."""
 
     def save(self, name: str) -> bytes:
-        """Return the state, for the snapshot ``name``."""
+        """Return the present state, encoded, for the snapshot ``name``."""
 
     def check(self, data: bytes) -> None:
-        """Check whether a state can be restored, without a change."""
+        """Check, without any change, whether an encoded state can be restored."""
 
     def restore(self, data: bytes, name: str) -> None:
-        """Restore a state of the snapshot ``name``."""
+        """Restore an encoded state from the snapshot ``name``."""
 
 
 class StateRequests:
-    """Serves the requests on the clock page. Use it in one thread, between two steps."""
+    """Serves the requests of the clock page for one process. Use it in one thread, between two steps."""
 
     def __init__(self, page: ClockPage, slot: int, name: str, folder: Path, keeper: StateKeeper) -> None:
         """Start with the next request.
@@ -52,7 +52,7 @@ class StateRequests:
         self._answered = page.state_request().number
 
     def serve(self) -> None:
-        """Carry out the present request, if it is new, and answer it."""
+        """Carry out and answer the last request, unless it was answered before."""
         request = self._page.state_request()
         if request.number == self._answered:
             return
@@ -91,7 +91,7 @@ def _refuse(file: Path, reason: str) -> None:
 
 
 def write_new(file: Path, *data: bytes, sync: bool = False) -> None:
-    """Write a file that does not exist yet; with ``sync``, wait until it is on the disk. Raises OSError."""
+    """Write a file that does not exist yet; with ``sync``, wait until it is on the disk. Raise OSError on failure."""
     descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     with os.fdopen(descriptor, "wb") as stream:
         stream.writelines(data)
@@ -101,7 +101,7 @@ def write_new(file: Path, *data: bytes, sync: bool = False) -> None:
 
 
 def open_file(file: Path) -> BinaryIO:
-    """Open a regular file to read it. Raise OSError for any other, without waiting for a FIFO's writer."""
+    """Open a regular file to read it. For any other kind of file, such as a FIFO, raise OSError at once."""
     stream = open(file, "rb", opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK))  # noqa: SIM115
     if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
         stream.close()

@@ -24,7 +24,7 @@ SILENT_S = 5.0
 
 
 class ProcessStatus(msgspec.Struct, kw_only=True):
-    """Status of one process. If the process is not alive, ``uptime_s`` is 0 and ``pid`` is null."""
+    """Status of one process. While the process is not alive, ``uptime_s`` is 0 and ``pid`` is null."""
 
     name: str
     kind: str
@@ -39,8 +39,8 @@ class ProcessStatus(msgspec.Struct, kw_only=True):
 class ReaderStatus(msgspec.Struct):
     """How far a process that reads a source's frames is behind.
 
-    ``frames`` is the number of complete frames that it has not read. ``lag_s`` is the time since the
-    oldest of them was published.
+    ``frames`` is the number of complete frames that the process has not read. ``lag_s`` is the time
+    in s since the oldest of these frames was published.
     """
 
     process: str
@@ -52,8 +52,8 @@ class SourceStatus(ProcessStatus, kw_only=True):
     """Status of a source: its process, and the newest frame of its block.
 
     ``cycle`` is null before the first frame. ``real_time`` is true if the source does not use the
-    instance clock, so steps do not move it. ``readers`` are the processes of the instance that read
-    the source's frames, the slowest first.
+    instance clock, so that steps do not advance it. ``readers`` are the processes of the instance
+    that read the source's frames, the slowest first.
     """
 
     quality: str
@@ -75,7 +75,8 @@ class SupervisorStatus(msgspec.Struct):
 class InstanceStatus(msgspec.Struct):
     """Status of an instance.
 
-    ``supervisor`` is null if it is dead; ``segment`` and ``clock`` are null without a segment.
+    ``supervisor`` is null if the supervisor is dead; ``segment`` and ``clock`` are null if there is
+    no segment.
     """
 
     instance: str | None
@@ -99,8 +100,8 @@ def read_status(instance: str, config: str | None = None, file: Path | None = No
 
     Args:
         instance: Name of the instance.
-        config: Option with which the commands that the note recommends name the configuration, such
-            as ``-c plc.toml``. Empty: they need no option. None: unknown.
+        config: Option that names the configuration in commands, such as ``-c plc.toml``; the note
+            recommends commands with this option. Empty: they need no option. None: unknown.
         file: Configuration file from which the instance must have been started; None: any.
 
     Raises:
@@ -123,7 +124,7 @@ def status_of(segment: Segment, remedy: str, asking: str = "") -> InstanceStatus
 
     Args:
         segment: The segment.
-        remedy: Advice for the note if the supervisor is dead.
+        remedy: Advice to give in the note if the supervisor is dead.
         asking: Kind of the calling process, if it belongs to the instance; else empty. The result
             reports that process as alive, because a process cannot see its own lock.
     """
@@ -178,9 +179,9 @@ def _state(state: InstanceState, processes: list[SourceStatus | ProcessStatus], 
 
 
 def complaint(kind: str, note: str) -> str:
-    """Return the note of a running process if it reports a problem, else an empty text.
+    """Return the note of a running process if it is about a problem, else an empty text.
 
-    The note ``to FILE`` of a recorder is no problem, nor is ``active: …`` of the alerts.
+    A recorder's note ``to FILE`` and the alerts' note ``active: …`` are not about a problem.
     """
     harmless = {"recorder": "to ", "alerts": "active: "}.get(kind)
     if harmless is not None:
@@ -192,8 +193,7 @@ def assess(running: Sequence[bool], qualities: Sequence[Quality | None], note: s
     """Return the state of a started instance: degraded if any part has a problem, else running.
 
     Args:
-        running: For each process, whether it runs and its note reports no problem
-            (:func:`complaint`).
+        running: For each process, True if it runs and reports no problem (:func:`complaint`).
         qualities: Quality of each source's newest frame; None: the source has published no frame
             yet.
         note: Any other problem of the instance.

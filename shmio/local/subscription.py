@@ -36,8 +36,8 @@ Item = TypeVar("Item")
 class Following(Generic[Item]):
     """Base of iterators over frames or events of several blocks.
 
-    One thread may iterate, and any thread may close the iterator. For each followed block, a relay
-    wakes the iterator at each frame and each event.
+    One thread may iterate; any thread may close the iterator. For each block that the iterator
+    follows, a :class:`Relay` wakes it at each frame and each event.
     """
 
     def __init__(self, segment: Segment) -> None:
@@ -89,7 +89,7 @@ class Following(Generic[Item]):
         self._relays.pop(block.section).join()
 
     def end(self) -> None:
-        """End the iteration, and wait until nothing reads the mapped memory."""
+        """End the iteration, and wait until no thread reads the mapped memory any more."""
         self._closed = True
         with self._lock:
             self._stop()
@@ -134,7 +134,7 @@ class Update(msgspec.Struct, frozen=True):
 
 
 class Subscription(Following[Update]):
-    """Updates of registers of a local instance.
+    """Iterator over updates of registers of a local instance.
 
     Implements :class:`shmio.model.cell.Subscription`.
     """

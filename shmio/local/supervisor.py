@@ -11,7 +11,9 @@ from shmio.segment import Segment
 
 
 def ask_supervisor(segment: Segment, request: control.Request, timeout_s: float) -> dict[str, Any]:
-    """Send a request to the supervisor, and return its answer.
+    """Send a request to the supervisor of a segment's instance, and return its answer.
+
+    ``timeout_s`` is the longest time to wait for the answer, in s.
 
     Raises:
         ControlError: The supervisor refuses, does not answer, or seems to be dead.

@@ -1,4 +1,4 @@
-"""Control an instance's time: take it over, step it, play it, and release it."""
+"""Control an instance's time: take over time, step it, play it (step it continuously), and release it."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from shmio.segment.processes import ProcessSlot
 from shmio.segment.segment import Segment
 
 _TURN_NS: Final = 100_000_000
-"""Interval in ns at which a wait for the owner of time checks whether that process has died."""
+"""Interval in ns at which a program that waits for the owner of time checks whether the owner has died."""
 _DISPATCHERS: Final = frozenset({"alerts", "emulator", "grpc", "mqtt", "recorder"})
-"""Kinds of processes that act when a step is done. Steps may wait until these have delivered the step."""
+"""Kinds of processes that deliver finished steps. Each step may wait until they have delivered it."""
 _PATIENCE_S: Final = 2.0
-"""Time in s to wait until the owner of time gives up its ownership.
+"""Longest time in s to wait for the owner of time to give up its ownership.
 
-The gRPC endpoint gives it up when its clients are idle.
+The gRPC endpoint gives up its ownership while its clients are idle.
 """
 _LATE_NS: Final = 500_000_000
 """If playing is late by more than this time in ns, it does not catch up."""
@@ -47,8 +47,8 @@ class Step(msgspec.Struct, frozen=True):
 
     Attributes:
         number: Number of the step.
-        time_ns: The instance's clock after the step.
-        dt_ns: Length of the step.
+        time_ns: The instance's clock after the step, in ns.
+        dt_ns: Length of the step, in ns.
     """
 
     number: int
@@ -57,10 +57,10 @@ class Step(msgspec.Struct, frozen=True):
 
 
 class StepWait(NamedTuple):
-    """What a step waits for: that a doorbell's value differs from ``seen``, at most ``rest_ns``.
+    """What a step waits for: until a doorbell's value differs from ``seen``, for at most ``rest_ns`` ns.
 
-    The doorbell is that of ``block``, whose source has not answered yet. If ``block`` is None, it
-    is the doorbell that processes ring when they have delivered a step.
+    The doorbell is that of ``block``, whose source has not done the step yet. If ``block`` is None,
+    it is the doorbell that processes ring when they have delivered a step.
     """
 
     block: Block | None
@@ -72,8 +72,9 @@ class Coordinator:
     """Moves the time of one instance, which one program at a time owns. Several threads may use it.
 
     A step begins when the coordinator writes the step's number to the clock page. Each source that
-    uses the instance clock then publishes a frame for the step, and the step is ``done``. Finally,
-    this process and others deliver the frames of the step to remote programs and recordings.
+    uses the instance clock then publishes a frame for the step. When all have done so, the step is
+    ``done``. Finally, this process and others deliver the frames of the step to remote programs and
+    recordings.
     """
 
     def __init__(
@@ -115,11 +116,12 @@ class Coordinator:
         return self._segment.clock.read()
 
     def take_over(self, patience_s: float = 0.0, *, steps: bool = False) -> None:
-        """Take over time: from now on only steps move it.
+        """Take over time: from now on, only steps move it. Do nothing if this program owns time.
 
         Args:
             patience_s: Time to wait, in s, until an owner that does not play gives up time.
-            steps: Whether a step follows at once. If so, the clock gets no note about stopped time.
+            steps: Whether a step follows at once. Otherwise, a note of the clock says that time has
+                stopped.
 
         Raises:
             TimeError: Another living process owns time, and is playing or does not give it up.
@@ -195,7 +197,7 @@ class Coordinator:
             self._write(self.read()._replace(step_size_ns=dt_ns))
 
     def set_playing(self, playing: bool, rate: float = 1.0) -> None:
-        """Take over time, and announce whether this process plays it, and at which rate.
+        """Take over time, and write to the clock page whether this process plays time, and at which rate.
 
         Raises:
             ValueRangeError: The rate is not above 0 and at most 1000.
@@ -235,8 +237,8 @@ class Coordinator:
     def stepping(self, dt_ns: int | None = None) -> Generator[StepWait, None, Step]:
         """Do a step without blocking: yield what to wait for, and continue when resumed.
 
-        Close the generator if you do not run it to its end. Call no other method of this
-        coordinator meanwhile.
+        If you do not run the generator to its end, close it. Until then, call no other method of
+        this coordinator.
         """
         self.take_over(steps=True)
         before = self.read()
@@ -274,7 +276,7 @@ class Coordinator:
             )  # fmt: skip
 
     def announce(self) -> None:
-        """Wait until all processes that deliver steps have noticed that time has jumped.
+        """Announce that time has jumped, and wait until all processes that deliver steps have noticed it.
 
         Raises:
             TimeError: A process did not notice it within the hard time-out.
@@ -434,8 +436,8 @@ class Coordinator:
 class Timekeeper:
     """Steps or plays an instance's time.
 
-    It owns time from the first step until :meth:`close`. Use it from one thread; it plays in another
-    thread of its own.
+    The timekeeper owns time from the first step until :meth:`close`. Use it from one thread; it
+    plays in a thread of its own.
     """
 
     def __init__(self, segment: Segment, coordinator: Coordinator | None = None) -> None:
@@ -465,7 +467,7 @@ class Timekeeper:
 
     @contextmanager
     def still(self) -> Iterator[Coordinator]:
-        """Own time while the ``with`` block runs, and yield the coordinator. No step is made meanwhile.
+        """Own time, and do not move it, during a ``with`` block; yield the coordinator.
 
         Raises:
             TimeError: Another program owns time, time is being played, or time is real.
@@ -514,7 +516,7 @@ class Timekeeper:
             raise failure
 
     def release(self) -> None:
-        """Return to real time.
+        """Return to real time. The clock continues from the present virtual time.
 
         Raises:
             TimeError: Another program owns time, time was virtual from the instance's start, or a

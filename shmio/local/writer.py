@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 _MODELS: Final = frozenset({"simulation", "remote"})  # connectors with registers that only a model writes
 PATIENCE_S: Final = 1.0
-"""Time in s after a command's deadline in which the device's answer may still arrive."""
+"""Time in s for which to wait for the device's answer after the deadline of a command."""
 RETIRED: Final = "the source was changed or removed by a reload"
 _UNKNOWN: Final = "; it is not known whether the value was written"
 RESTARTED: Final = f"the source was restarted meanwhile{_UNKNOWN}"
@@ -45,7 +45,7 @@ SILENT: Final = f"the source gave no answer in time{_UNKNOWN}"
 
 
 class CommandSender:
-    """Puts commands into one writer's queue of a block.
+    """Puts commands into the queue of one writer, in one block.
 
     This process must have locked the process slot to which the queue belongs.
     """
@@ -71,14 +71,15 @@ class CommandSender:
             writes: The items.
             deadline_ns: Time after which the source must not start the command, CLOCK_MONOTONIC.
             kind: Kind of command.
-            injection: Number of the injection to lift, or to give values to.
-            options: Options of the injection to create.
+            injection: Number of the injection to lift, or to give values to; 0: none.
+            options: Options of the injection to create, if the command creates one.
 
         Returns:
             The command's number.
 
         Raises:
-            CommandError: The queue is full, or too small for the command.
+            CommandError: The queue is full or too small for the command, or the command has too many
+                items.
         """
         source = self.block.source
         if (len(writes) > 0) == (kind in EMPTY) or len(writes) > MAX_WRITES:
@@ -118,7 +119,7 @@ class PendingCommand(msgspec.Struct):
 
     @property
     def values(self) -> list[tuple[str, range]]:
-        """Path of each value, and the range of its items."""
+        """For each value of the command, its path and the range of its items."""
         values, first = [], 0
         for path, group in groupby(self.paths):
             stop = first + len(list(group))
@@ -138,9 +139,9 @@ class SourceWriter:
         self._sender = CommandSender(block, writer)
 
     def prepare(self) -> None:
-        """Determine now which bits are writable, so that the first :meth:`submit` is fast.
+        """Determine which bits are writable, so that the first :meth:`submit` is fast.
 
-        For a large layout, this takes seconds.
+        This takes seconds for a large layout.
         """
         _ = self._writable
 
@@ -152,7 +153,7 @@ class SourceWriter:
 
     @property
     def timeout_s(self) -> float:
-        """Default time that a command may wait for the source, in s."""
+        """Time in s that a command may wait for the source, if no other time is given."""
         return max(WRITE_TIMEOUT_S, WRITE_MIN_PERIODS * self.block.period_ns / 1e9)
 
     @cached_property
@@ -170,24 +171,26 @@ class SourceWriter:
             PathError: There is no such register.
             ValueRangeError: A value does not fit its register.
             CommandError: A register is not writable, or the queue has no room.
-                After any of these errors nothing has been sent.
+                After any of these errors, nothing has been sent.
         """
         return self._send_values({path: (self._register(path), value) for path, value in values.items()}, timeout_s)
 
     def shadow(self, injection: int, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
-        """Give values to an injection, for consumers (``/out``) or for the device (``/in``).
+        """Give values to an injection, and wait for the outcome of each value.
+
+        An injection over ``/out`` gives the values to consumers; one over ``/in``, to the device.
 
         Raises:
             PathError: There is no such register.
             ValueRangeError: A value does not fit its register.
             CommandError: The queue has no room.
-                After any of these errors nothing has been sent.
+                After any of these errors, nothing has been sent.
         """
         found = {path: (find(self.block.layout, path), value) for path, value in values.items()}
         return self.outcomes(self._send_values(found, timeout_s, CommandKind.SHADOW, injection))
 
     def joined(self, values: Mapping[str, object], raw: Iterable[Write] = ()) -> list[Write]:
-        """Encode values as writes, add the writes ``raw``, and join adjacent writes.
+        """Return values by path, encoded, and the writes ``raw``; adjacent writes are joined to one.
 
         Raises:
             PathError: There is no such register.
@@ -215,7 +218,7 @@ class SourceWriter:
     def inject(
         self, patterns: Iterable[str], timeout_s: float | None = None, **options: Unpack[InjectionOptions]
     ) -> int:
-        """Create an injection over all registers that patterns name, and return its number.
+        """Create an injection over all registers that match the patterns, and return its number.
 
         Consumers see no change until the injection gets values. See
         :func:`shmio.layout.values.write.cover` for the patterns.
@@ -350,7 +353,7 @@ class SourceWriter:
         return PendingCommand(number, paths, incarnation, deadline_ns + round(PATIENCE_S * 1e9), events)
 
     def outcomes(self, ticket: PendingCommand) -> list[Outcome]:
-        """Wait until a command has ended, and return the outcomes of its values in their order."""
+        """Wait until a command has ended, and return the outcomes of its values, in the values' order."""
         return [Outcome(path, OutcomeKind[kind.name], text) for path, (kind, text) in self._ends(ticket)]
 
     def _ends(self, ticket: PendingCommand) -> list[tuple[str, End]]:
@@ -363,7 +366,7 @@ class SourceWriter:
     def write(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
         """Send values as one command, and wait for their outcomes.
 
-        It raises the same errors as :meth:`submit`.
+        The method raises the same errors as :meth:`submit`.
         """
         return self.outcomes(self.submit(values, timeout_s))
 

@@ -1,8 +1,9 @@
 """The block of a source in shared memory: its frames and events, which readers copy or follow.
 
 The source's process calls :meth:`BlockWriter.publish` for each frame. Readers copy the newest frame
-(:meth:`Block.latest`), or read each frame in order: with :class:`Cursor`, or with
-:class:`FrameFollower`, which also reports changes of the quality. The ring is in C: ``ring.h``.
+(:meth:`Block.latest`), or read each frame in order, with :class:`Cursor` or with
+:class:`FrameFollower`, which also reports changes of the quality. The ring is written in C
+(``ring.h``).
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ class Frame(NamedTuple):
     Attributes:
         number: Number of the frame in its ring, from 1.
         cycle: Cycle of the source's schedule; in virtual time, the number of the step.
-        publish_ns: CLOCK_MONOTONIC at publication; in virtual time, the virtual clock's equivalent.
+        publish_ns: CLOCK_MONOTONIC at publication; in virtual time, its equivalent on the virtual
+            clock.
         clock_ns: The instance's clock at publication.
         source_ns: The source's time stamp, UTC. A bad frame repeats the last image and its time
             stamp. 0: the source has never delivered an image, and all bytes of the image are zero.
@@ -54,7 +56,7 @@ class Frame(NamedTuple):
         event: Number of the last event before the frame.
         delay_us: Maximum age of the image at publication, in us: the time that the device took to
             answer.
-        reason: Reason why the quality is not good.
+        reason: Reason why the quality is not good; empty if it is good.
         raw: The image that the source delivered, in its own byte order.
         effective: The image with injections, which consumers see; None if no injection is active.
     """
@@ -75,19 +77,19 @@ class Frame(NamedTuple):
 
     @property
     def image(self) -> bytes:
-        """The image that consumers see: ``effective``, or ``raw`` if that is None."""
+        """The image that consumers see: ``effective``; ``raw`` if ``effective`` is None."""
         return self.raw if self.effective is None else self.effective
 
     def age_ns(self, now_ns: int) -> int:
         """Return the maximum age of the image in ns: the time since the source requested it.
 
         Args:
-            now_ns: The present time by the block's clock, :meth:`Block.now_ns`.
+            now_ns: The present time on the block's clock (:meth:`Block.now_ns`).
         """
         return now_ns - self.publish_ns + 1000 * self.delay_us
 
     def assess(self, stale_ns: int, now_ns: int) -> tuple[Quality, str]:
-        """Return the quality at ``now_ns`` and its reason; a frame older than ``stale_ns`` is bad."""
+        """Return the quality at the time ``now_ns``, and its reason; a frame older than ``stale_ns`` is bad."""
         if self.quality is not Quality.BAD:
             age_ns = self.age_ns(now_ns)
             if age_ns > stale_ns:
@@ -100,7 +102,7 @@ _PROVENANCES: Final = tuple(Provenance)
 
 
 def decode_frame(fields: FrameTuple) -> Frame:
-    """Convert the tuple that :class:`Ring` returns for a frame."""
+    """Convert the tuple that :class:`Ring` returns for a frame to a :class:`Frame`."""
     (number, cycle, publish_ns, clock_ns, source_ns, incarnation, quality, provenance, event, delay_us, reason,
      raw, effective) = fields  # fmt: skip
     return Frame(
@@ -117,7 +119,7 @@ Entry = TypeVar("Entry")
 _POLL_NS: Final = 1_000_000_000
 """Interval in ns at which a waiting reader checks whether its block has been retired.
 
-The doorbell is not enough: a supervisor may retire the block and die before it rings.
+To wait for the doorbell is not enough: a supervisor may retire the block and die before it rings.
 """
 
 
@@ -161,7 +163,7 @@ class Cursor(Generic[Entry]):
         return missed
 
     def resume(self, *, after: int) -> None:
-        """Continue after the entry with this number. Entries in between do not count as missed."""
+        """Continue after the entry with this number. Entries that this skips do not count as missed."""
         self._last = after
 
     def poll(self) -> Entry | None:
@@ -182,7 +184,7 @@ class Cursor(Generic[Entry]):
         return None
 
     def next(self, timeout_s: float | None = None) -> Entry | None:
-        """Return the next entry, waiting at most ``timeout_s`` (None: forever).
+        """Return the next entry, and wait for it for at most ``timeout_s`` seconds (None: forever).
 
         Return None if no entry came in time, or if a reload has retired the block and all its
         entries have been read.
@@ -234,7 +236,7 @@ class Attributes(msgspec.Struct, frozen=True):
 
 
 class EventRing:
-    """Reading side of a block's events."""
+    """The ring of a block's events, for readers."""
 
     def __init__(self, ring: Ring, retired: Callable[[], bool]) -> None:
         self.ring = ring
@@ -250,12 +252,12 @@ class EventRing:
         return None if fields is None else decode_event(fields)
 
     def cursor(self, *, after: int | None = None) -> Cursor[Event]:
-        """Return a cursor that starts after event ``after`` (default: the newest one)."""
+        """Return a cursor that starts after the event with number ``after``; None: after the newest event."""
         return Cursor(self.ring, decode_event, self.head() if after is None else after, self._retired)
 
 
 class Block:
-    """Reading side of a block. Readers never delay the writer.
+    """A block of a source, for readers. Readers never delay the writer.
 
     Several threads may use a block; a :class:`Cursor` belongs to one thread.
     """
@@ -308,7 +310,7 @@ class Block:
 
     @property
     def statuses(self) -> StatusArea | None:
-        """The status area of the block's images; None if the source gives no statuses to registers."""
+        """The status area of the block's images; None if the source gives its registers no statuses."""
         return status_area(self.layout)
 
     @property
@@ -337,8 +339,9 @@ class Block:
     def now_ns(self) -> int:
         """Return the present time in ns on the clock that determines the age of frames.
 
-        For a replay, this is the clock of its playhead. For any other source that uses the instance
-        clock, it is that clock. For all other sources, it is CLOCK_MONOTONIC.
+        If the source replays a recording, this is the clock of its playhead. If it uses the
+        instance clock in another way, it is that clock. For all other sources, it is
+        CLOCK_MONOTONIC.
         """
         if self.playhead is not None:
             return self.playhead.now_ns()
@@ -349,7 +352,7 @@ class Block:
         return frame.assess(self.stale_ns, self.now_ns())
 
     def came_with(self, frame: Frame, step: int) -> bool:
-        """Return whether a frame belongs to a step of virtual time, or to a later step.
+        """Return whether a frame belongs to the step of virtual time with this number, or to a later one.
 
         For a block that replays a recording, ``step`` must be the present step. For a block that
         does not use the instance clock, the result is always False.
@@ -379,7 +382,7 @@ class Block:
         return None if fields is None else decode_frame(fields)
 
     def reader_lag(self, slot: ProcessSlot) -> ReaderLag | None:
-        """Return how far a process's slowest reader is behind; None if the process does not read the block."""
+        """Return how far the slowest reader in a process is behind; None if the process does not read the block."""
         return self._readers.read(slot.index, slot.report.pid, self.ring.head())
 
     def report_reader(self, slot: ProcessSlot, last: int | None) -> None:
@@ -400,12 +403,12 @@ class Block:
         self._readers.write(slot.index, ReportedPosition(os.getpid(), frames, last, behind_ns, at_ns))
 
     def cursor(self, *, after: int | None = None) -> Cursor[Frame]:
-        """Return a cursor that starts after frame ``after`` (default: the newest one)."""
+        """Return a cursor that starts after the frame with number ``after``; None: after the newest frame."""
         return Cursor(self.ring, decode_frame, self.ring.head() if after is None else after, self._retired)
 
 
 class Layouts(Mapping[str, "Layout"]):
-    """Layouts of blocks, by source. Each is read from the segment when it is first used."""
+    """Layouts of blocks, by source. A layout is read from the segment when it is first used."""
 
     def __init__(self, blocks: Mapping[str, Block]) -> None:
         self._blocks = blocks
@@ -436,9 +439,9 @@ class Stamp(NamedTuple):
     """The times of one publication, in ns.
 
     Attributes:
-        publish_ns: CLOCK_MONOTONIC; in virtual time, the virtual clock's equivalent.
+        publish_ns: CLOCK_MONOTONIC; in virtual time, its equivalent on the virtual clock.
         clock_ns: The instance's clock.
-        utc_ns: UTC. Only events use it. 0: the present time.
+        utc_ns: UTC, which only events have; 0: the present time.
     """
 
     publish_ns: int
@@ -447,7 +450,7 @@ class Stamp(NamedTuple):
 
 
 class BlockWriter:
-    """Writing side of a block, in the source's process. Several threads may use it."""
+    """A block, for the process of its source, which writes it. Several threads may use it."""
 
     def __init__(self, block: Block, clock_ns: Callable[[int], int], at: Stamp | None = None) -> None:
         """Increase the block's incarnation by one, and publish the STARTED event.
@@ -496,12 +499,13 @@ class BlockWriter:
         Args:
             raw: The image that the source delivers, ``layout.size`` bytes.
             cycle: Cycle of the source's schedule.
-            source_ns: The source's time stamp, UTC; None: now; 0: there is no image yet.
+            source_ns: The source's time stamp, UTC in ns; None: now; 0: there is no image yet.
             quality: Quality of the image.
             provenance: Where the image comes from.
             reason: Reason why the quality is not good; cut at 256 bytes.
             effective: The image that consumers see; None: ``raw``.
-            asked_ns: Time of the request to the device, on the clock of :meth:`now_ns`; None: now.
+            asked_ns: Time of the request to the device in ns, on the clock of :meth:`now_ns`; None:
+                now.
             at: Times of the publication; None: now.
 
         Returns:
@@ -574,7 +578,7 @@ class QualityChange(Enum):
     """The quality is no longer bad, or the first frame is not bad."""
     BAD = "bad"
     GAP = "gap"
-    """The quality is not bad, but the previous frame had become stale before the new one came."""
+    """The quality is not bad, but the previous frame had become stale before the new frame came."""
 
 
 _BAD: Final = Quality.BAD  # each frame needs these, and looking up a member of an enum is slow
@@ -582,7 +586,7 @@ _NONE: Final = QualityChange.NONE
 
 
 class FrameFollower(Cursor[Frame]):
-    """Reads a block's frames from the newest one on, and tracks the quality.
+    """Reads a block's frames from the newest frame on, and tracks the quality.
 
     Use it from one thread.
 
@@ -619,7 +623,7 @@ class FrameFollower(Cursor[Frame]):
         return self.quality is _BAD and self.frame is not None and self.frame.quality is not _BAD
 
     def read(self, limit: int) -> Iterator[Frame]:
-        """Yield at most ``limit`` new frames. If too many are unread, skip to the newest first."""
+        """Yield at most ``limit`` new frames; if more than ``most_behind`` are unread, first skip to the newest."""
         if self._most_behind is not None and self.behind > self._most_behind:
             newest = self._ring.head()
             self.missed += newest - 1 - self._last
@@ -641,7 +645,7 @@ class FrameFollower(Cursor[Frame]):
         return frame
 
     def take(self, frame: Frame, *, aged: bool = True) -> QualityChange:
-        """Record a frame as the last one, and return the change of the quality.
+        """Take a frame as the last frame, and return how the quality has changed.
 
         Args:
             frame: The frame.
@@ -679,6 +683,6 @@ class FrameFollower(Cursor[Frame]):
         return True
 
     def restart(self) -> None:
-        """Forget the last frame, and start again with the newest one."""
+        """Forget the last frame, and start again with the newest frame."""
         self._last = max(0, self._ring.head() - 1)
         self.frame, self.quality, self.reason = None, Quality.BAD, "no data yet"

@@ -1,9 +1,8 @@
 """Find the registers that differ between two images of a block.
 
-The comparison is of bytes, not of values: a NaN whose bytes stay the same has not changed, but a
-change from 0.0 to -0.0 counts. For a BOOL, only its bit is compared. Padding is ignored. If the
-layout has a status area, a change of a register's status code counts, but not a change of its
-source time alone.
+A scan compares bytes, not values: a NaN whose bytes stay the same has not changed, but a change from
+0.0 to -0.0 counts. For a BOOL, only its bit is compared. Padding is ignored. If the layout has a
+status area, a change of a register's status code counts, but not a change of its source time alone.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ class ChangeScan:
 
     @classmethod
     def joined(cls, parts: Iterable[bytes]) -> ChangeScan:
-        """Create a scan from parts that :func:`entries` has encoded."""
+        """Create a scan of all registers in ``parts``, which :func:`entries` has encoded."""
         scan = cls(())
         scan._table = b"".join(parts)
         return scan
@@ -50,7 +49,7 @@ class ChangeScan:
 
 
 def entries(registers: Sequence[Register], index: int, statuses: StatusArea | None = None) -> bytes:
-    """Encode a part of a scan that reports ``index`` if any of these registers has changed."""
+    """Encode a part of a scan: the scan reports ``index`` if any of these registers has changed."""
     found = [_ENTRY.pack(*run, index) for register in registers for run in runs(register)]
     if statuses is not None:
         indices = dict.fromkeys(statuses.indices(registers))

@@ -1,14 +1,14 @@
 """The clock page: the instance's time, the requested step, and the steps that processes delivered.
 
 docs/reference/segment-format.md describes its bytes. Only the owner of time writes the instance's
-time, the requested step and a request to save or restore state. Each process writes the number of
-the step that it has delivered, and of the request that it has answered. The page has a doorbell for
-each process, which wakes the process when it must act on a change.
+time, the requested step, and requests to save or restore state. Each process writes the number of
+the last step that it has delivered, and the number of the last request that it has answered. The
+page has a doorbell for each process, which wakes the process when it must act on a change.
 
-When a program releases time (``Coordinator.release``), real time continues from the last virtual
-time, and cycles continue from the number of the last step. So neither ever decreases. The page has
-``offset_ns``, ``resumed_ns`` and the number of the last step. From these, every process computes
-the same clock and cycles, even a process that starts later:
+When a program releases time (``Coordinator.release``), the clock continues from the last virtual
+time, and cycles continue from the number of the last step. So neither clock nor cycles ever
+decrease. The page has ``offset_ns``, ``resumed_ns`` and the number of the last step. From these,
+every process computes the same clock and cycles, even a process that starts later:
 
 - clock = CLOCK_MONOTONIC - ``started`` + ``offset_ns``;
 - cycle of a block = clock // period + lead, where lead = step - ``resumed_ns`` // period.
@@ -33,7 +33,7 @@ from shmio.segment.doorbell import Doorbell
 from shmio.segment.header import Header, cut, text
 
 SIMULATED_UTC_NS: Final = 946_684_800_000_000_000
-"""UTC of clock 0 for an instance whose time is virtual from the start: 2000-01-01."""
+"""UTC in ns at clock 0 for an instance whose time is virtual from the start: 2000-01-01."""
 
 _SLOTS_AT: Final = 8
 _STEPPED_AT: Final = 12
@@ -57,20 +57,20 @@ _REFUSED: Final = 1 << 63
 
 
 class StateAction(IntEnum):
-    """What processes are asked to do with their state."""
+    """What a :class:`StateRequest` asks processes to do with their state."""
 
     NONE = 0
     SAVE = 1
     CHECK = 2
-    """Check the state of a snapshot, without a change."""
+    """Check, without any change, whether the state of a snapshot can be restored."""
     RESTORE = 3
 
 
 class StateRequest(NamedTuple):
     """A request of the owner of time to all processes that take part in snapshots.
 
-    ``folder`` is the name of the folder with their states, inside the instance's snapshot folder.
-    ``name`` is the snapshot's name, ``pid`` the process that asks.
+    ``folder`` is the name of the folder for their states, inside the instance's folder of snapshots.
+    ``name`` is the name of the snapshot, and ``pid`` is the process that makes the request.
     """
 
     number: int = 0
@@ -102,7 +102,7 @@ class DoubleBuffer:
         self._complaint = complaint
 
     def read(self, size: int) -> bytes:
-        """Return the first ``size`` bytes; raise SegmentError if both copies are corrupt."""
+        """Return the first ``size`` bytes of the value; raise SegmentError if both copies are corrupt."""
         for at in self._copies * _ATTEMPTS:
             data = _atomics.cell_read(self._memory, at, size)
             if data is not None:
@@ -110,7 +110,7 @@ class DoubleBuffer:
         raise SegmentError(self._complaint)
 
     def write(self, data: bytes) -> None:
-        """Write one copy, then the other. Only the owner may call this."""
+        """Write the value to one copy, then to the other. Only the value's owner may call this."""
         for at in self._copies:
             _atomics.cell_write(self._memory, at, data)
 
@@ -168,7 +168,7 @@ class ClockPage:
         return self._stepped
 
     def read(self) -> Clock:
-        """Return the present state. If the owner of time has died, ``playing`` is False.
+        """Return the present state of the clock. If the owner of time has died, ``playing`` is False.
 
         Raises:
             SegmentError: The page is corrupt.
@@ -181,7 +181,7 @@ class ClockPage:
         return state._replace(time_ns=time.monotonic_ns() - self._started_ns + state.offset_ns)
 
     def last_written(self) -> Clock:
-        """Return the state as last written, even by a dead process.
+        """Return the state of the clock as it was last written, even by a process that has died.
 
         Raises:
             SegmentError: The page is corrupt.
@@ -194,7 +194,7 @@ class ClockPage:
         return state
 
     def write(self, state: Clock, *, ring: bool = True) -> None:
-        """Write the page and ring its doorbell. Only the owner of time may call this.
+        """Write the state of the clock, and ring the page's doorbell. Only the owner of time may call this.
 
         Pass ``ring=False`` if no waiting process has to act on the change yet.
         """
@@ -205,10 +205,10 @@ class ClockPage:
             self.bell.ring()
 
     def now_ns(self) -> int:
-        """Return the present time in ns from which the age of frames on the instance clock is computed.
+        """Return the present publish time in ns, from which the age of frames on the instance clock is computed.
 
         It equals CLOCK_MONOTONIC until a program takes control of time for the first time. From
-        then on, it follows the instance's clock.
+        then on, it moves with the instance's clock.
         """
         mode, flags, _, time_ns, dt_ns = _TIME.unpack(self._state.read(_TIME.size))  # not all: this is called often
         if not mode:
@@ -222,23 +222,23 @@ class ClockPage:
         return self.now_ns() - self._started_ns
 
     def monotonic_ns(self, time_ns: int) -> int:
-        """Convert a time of the instance's clock to a publish time of frames, in ns."""
+        """Convert a time of the instance's clock to the publish time that a frame gets then, in ns."""
         return self._started_ns + time_ns
 
     def utc_ns(self, monotonic_ns: int) -> int:
         """Convert a publish time of frames, such as :meth:`now_ns`, to UTC in ns.
 
-        If time is virtual from the start, UTC begins at ``SIMULATED_UTC_NS`` in each run.
+        If time is virtual from the instance's start, UTC begins at ``SIMULATED_UTC_NS`` in each run.
         """
         since_ns = monotonic_ns - self._started_ns
         return (SIMULATED_UTC_NS if self._stepped else self._started_utc_ns) + since_ns
 
     def slot_bell(self, index: int) -> Doorbell:
-        """Return the doorbell that wakes the process in a slot when it must act on a change."""
+        """Return the doorbell of the process in a slot. It wakes the process when it must act on a change."""
         return Doorbell(self._memory, self._entry(index) + 8)
 
     def delivered(self, index: int) -> int | None:
-        """Return the last step that the process in a slot has delivered to its clients.
+        """Return the number of the last step that the process in a slot has delivered to its clients.
 
         None: steps do not wait for this process.
         """
@@ -248,14 +248,14 @@ class ClockPage:
     def deliver(self, index: int, step: int) -> None:
         """Record that the process in a slot has delivered all frames and events up to this step.
 
-        Only that process may call it. From the first call on, each step waits until the process has
-        delivered it or has died.
+        Only that process may call this. From the first call on, each step waits until the process
+        has delivered the step or has died.
         """
         _atomics.store64(self._memory, self._entry(index), step + 1)
         self.delivered_bell.ring()
 
     def abstain(self, index: int) -> None:
-        """Stop steps from waiting for the process in a slot until it calls :meth:`deliver` again.
+        """Let steps no longer wait for the process in a slot, until it calls :meth:`deliver` again.
 
         Only that process may call this.
         """
@@ -273,23 +273,26 @@ class ClockPage:
         return StateRequest(number, StateAction(known), text(folder), text(name), pid)
 
     def request_state(self, request: StateRequest) -> None:
-        """Ask processes to save or restore their state. Only the owner of time may call this.
+        """Write a request to save, check or restore state. Only the owner of time may call this.
 
-        The caller then rings the doorbells of these processes.
+        The caller must then ring the doorbells of the processes that take part.
         """
         folder, name = request.folder.encode(), request.name.encode()
         self._request.write(_REQUEST.pack(request.number, request.action, request.pid, folder, name))
 
     def state_answer(self, index: int) -> tuple[int, bool]:
-        """Return the last request that the process in a slot has answered, and whether it was carried out.
+        """Return the number of the last request that the process in a slot has answered, and if it succeeded.
 
-        The number of the request is 0 if there is none.
+        The number is 0 if the process has answered none.
         """
         answer = _atomics.load64(self._memory, self._answers_at + 8 * index)
         return answer & ~_REFUSED, not answer & _REFUSED
 
     def answer_state(self, index: int, number: int, *, done: bool) -> None:
-        """Record that the process in a slot has answered a request. Only that process may call this."""
+        """Record that the process in a slot has answered request ``number``. Only that process may call this.
+
+        ``done`` is True if the process has carried out the request.
+        """
         _atomics.store64(self._memory, self._answers_at + 8 * index, number if done else number | _REFUSED)
         self.delivered_bell.ring()
 
@@ -298,7 +301,7 @@ class ClockPage:
 
 
 def time_lock(head: Header) -> int:
-    """Return the number of the byte that the owner of time locks; it follows the bytes of the slots."""
+    """Return the number of the byte that the owner of time locks; the slots' lock bytes come before it."""
     return head.process_capacity + 1
 
 

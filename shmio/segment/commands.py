@@ -2,8 +2,8 @@
 
 A block has one queue for each writer, so that writers never compete, and one doorbell for all
 queues. The source decides whether and in which order to execute commands, and reports the outcomes
-as events. From the events, readers collect the outcomes of a command (:class:`CommandOutcomes`) and
-its writes (:class:`CommandAssembler`).
+as events. Readers of the events collect the outcomes of a command with :class:`CommandOutcomes`, and
+its writes with :class:`CommandAssembler`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from shmio.segment import _atomics
 from shmio.segment.events import DONE, ENDS, Event, EventKind
 
 WRITERS: Final = 8
-"""Number of command queues of a block; processes.py assigns each queue to a writer."""
+"""Number of command queues of a block; ``processes.py`` assigns each queue to a writer."""
 _MIN_CAPACITY: Final = 1 << 14
 MAX_WRITES: Final = 4096
 """Maximum number of items in a command."""
@@ -46,8 +46,9 @@ _PID_SHIFT: Final = 40  # pids have at most 22 bits: proc(5)
 def first_number(pid: int) -> int:
     """Return the number of the first command of a writer in a process.
 
-    The number contains the pid, so that the events of a command tell which process sent it. The
-    rest is random, because outcomes of commands of the queue's previous owner may still follow.
+    The number contains the pid, so that the events of a command show which process sent it. The rest
+    is random, to differ from the numbers of the queue's previous owner, whose outcomes may still
+    follow.
     """
     return pid << _PID_SHIFT | secrets.randbits(_PID_SHIFT - 1) | 1
 
@@ -58,12 +59,12 @@ def pid_of(number: int) -> int:
 
 
 class CommandKind(IntEnum):
-    """Kind of a command. It determines what the command's items mean."""
+    """Kind of a command, which determines what the items of the command mean."""
 
     WRITE = 1
-    """Write the items to the device, or to injections that cover them."""
+    """Write the items to the device; injections over ``/in`` take the items that they cover."""
     INJECT = 2
-    """Create an injection that covers the bits that are set in the items' data.
+    """Create an injection over the bits that are set in the items' data.
 
     The injection gets the command's number.
     """
@@ -110,15 +111,15 @@ class Command(msgspec.Struct, frozen=True):
     Attributes:
         writer: Number of the writer's queue.
         id: Number that the writer gave the command.
-        incarnation: Incarnation of the source's process that the command is for. Other incarnations
-            reject the command.
+        incarnation: Incarnation of the source's process for which the command is meant. Any other
+            incarnation rejects the command.
         deadline_ns: Time after which the source must not start the command, CLOCK_MONOTONIC.
         writes: The items.
         kind: Kind of command.
-        injection: Number of the injection to lift, or to give values to.
+        injection: Number of the injection to lift, or to give values to; 0: none.
         direction: With INJECT: the direction.
-        priority: With INJECT: the priority; the injection with the highest is outermost.
-        keep: With INJECT: whether the injection outlives its client.
+        priority: With INJECT: the priority; the injection with the highest priority is outermost.
+        keep: With INJECT: whether the injection stays when the program that created it ends.
         name: With INJECT: the name of the injection. With NOTE: the note. At most MAX_NAME_BYTES in
             UTF-8.
     """
@@ -179,7 +180,7 @@ class Command(msgspec.Struct, frozen=True):
 
 
 def capacity_for(layout_size: int) -> int:
-    """Return the capacity of a queue in bytes: a power of two, at least 4 times ``layout_size``."""
+    """Return the capacity of a queue in bytes: a power of two, at least 4 times the size of the layout."""
     wanted = max(_MIN_CAPACITY, 4 * layout_size)
     return 1 << (wanted - 1).bit_length()
 
@@ -190,7 +191,7 @@ def section_size(layout_size: int) -> int:
 
 
 def section_header(layout_size: int) -> bytes:
-    """Return the first bytes of a commands section."""
+    """Return the first bytes of a new commands section; all others are zero."""
     capacity = capacity_for(layout_size)
     return _SECTION.pack(WRITERS, _atomics.QUEUE_HEADER_SIZE + capacity, capacity, 0)
 
@@ -218,16 +219,18 @@ class CommandQueues:
             raise ValueError("the queues do not fit in the commands section")
 
     def push(self, writer: int, record: bytes) -> bool:
-        """Append a record to a writer's queue, and ring the doorbell; return False if there is no room."""
+        """Append a record to a writer's queue, and ring the doorbell; return False if the queue has no room."""
         taken = _atomics.queue_push(self._memory, self._queue(writer), self.capacity, record)
         self.wake()  # even if the queue is full: a writer may have died before it rang
         return taken
 
     def pop(self, writer: int) -> bytes | None:
-        """Remove and return the oldest record of a writer's queue. Only the source may call it.
+        """Remove and return the oldest record of a writer's queue; None if the queue is empty.
+
+        Only the source may call this.
 
         Raises:
-            ValueError: The queue was corrupt, and is empty now.
+            ValueError: The queue was corrupt, and has been emptied.
         """
         return _atomics.queue_pop(self._memory, self._queue(writer), self.capacity)
 
@@ -236,7 +239,7 @@ class CommandQueues:
         return _atomics.bell(self._memory, self._offset + _BELL_AT)
 
     def wait(self, seen: int, timeout_ns: int = -1) -> None:
-        """Wait until the doorbell's value differs from ``seen``, at most ``timeout_ns`` (negative: forever)."""
+        """Wait until the doorbell's value differs from ``seen``, for at most ``timeout_ns`` (negative: forever)."""
         _atomics.bell_wait(self._memory, self._offset + _BELL_AT, seen, timeout_ns)
 
     def wake(self) -> None:
@@ -250,7 +253,7 @@ class CommandQueues:
 
 
 NO_COMMAND: Final = (0, 0, 0)
-"""Value of ``Event.command_key`` that stands for no command."""
+"""The ``Event.command_key`` of an event that is not about a command."""
 
 
 class CommandWrites(NamedTuple):
@@ -258,7 +261,7 @@ class CommandWrites(NamedTuple):
 
     injection: int
     event: Event
-    """The last event about these writes, which tells their time and writer."""
+    """The last event about these writes, which has their time and writer."""
     writes: tuple[Write, ...]
 
 
@@ -266,8 +269,8 @@ class CommandAssembler:
     """Collects the writes of each command from events of one kind (default: DIVERTED).
 
     Pass all events of a block in order to :meth:`follow`. The writes of a command are complete when
-    an event of another kind, or one about another command, follows. Writes without a command
-    (number 0) are complete with their last item.
+    an event of another kind, or about another command, follows. Writes without a command (number 0)
+    are complete with their last item.
     """
 
     def __init__(self, kind: EventKind = EventKind.DIVERTED) -> None:
@@ -297,11 +300,11 @@ class CommandAssembler:
 
 
 End = tuple[EventKind, str]
-"""Outcome of an item, and the reason. The kind is ACCEPTED or one of ``ENDS``."""
+"""Outcome of an item, and the reason: one of ``ENDS``, or ACCEPTED if the caller waits only for that."""
 
 
 def worst(ends: Sequence[End]) -> End:
-    """Return the first outcome that is not a success; if there is none, the first outcome."""
+    """Return the first outcome that is not a success; if all are successes, the first outcome."""
     return next((end for end in ends if end[0] not in DONE), ends[0])
 
 
@@ -352,7 +355,7 @@ def decode_writes(
 
     If a write covers only a part of a register, the paths are those of its elements or bits.
     ``names`` are registers of tag tables over the block. If writes set bits of such a register, the
-    result contains the register's path and value, and no other path for these bits.
+    result has that register's path and value, and no other path for these bits.
     """
     found: dict[str, Value] = {}
     if names:

@@ -1,4 +1,4 @@
-"""Doorbells in shared memory: processes wait on them, and a relay passes them on to event loops."""
+"""Doorbells in shared memory, on which processes wait, and relays, which wake event loops at each ring."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from shmio.segment import _atomics
 TURN_NS: Final = 200_000_000
 """Maximum time in ns between two notifications of a relay.
 
-At each notification, listeners also check the age of frames, and look for changes that ring no
-doorbell.
+At each notification, the programs that a relay wakes also check the age of frames, and look for
+changes that ring no doorbell.
 """
 _STOP_AGAIN_S: Final = 0.01
 """Interval in s at which :meth:`Relay.join` repeats its request, because the thread may miss one."""
@@ -37,7 +37,7 @@ class Doorbell:
         _atomics.bell_ring(self._memory, self._offset)
 
     def wait(self, seen: int, timeout_ns: int = -1) -> int:
-        """Wait until the value differs from ``seen``, at most ``timeout_ns`` (negative: forever).
+        """Wait until the value differs from ``seen``, for at most ``timeout_ns`` (negative: forever).
 
         Returns:
             The value after the wait.
@@ -45,15 +45,15 @@ class Doorbell:
         return _atomics.bell_wait(self._memory, self._offset, seen, timeout_ns)
 
     def relay(self, shared: bytearray, descriptor: int, turn_ns: int) -> None:
-        """Make ``descriptor`` readable at each ring.
+        """Make ``descriptor`` readable at each ring, until the relay is stopped.
 
-        :class:`Relay` runs this in its thread until it is stopped.
+        :class:`Relay` runs this in its thread.
         """
         _atomics.bell_relay(self._memory, self._offset, shared, descriptor, turn_ns)
 
 
 class WakeSource(Protocol):
-    """Something that a :class:`Relay` can wait for: a :class:`Doorbell`, or a ring with a doorbell."""
+    """An object that a :class:`Relay` can wait for: a :class:`Doorbell`, or a ring with a doorbell."""
 
     def relay(self, shared: bytearray, descriptor: int, turn_ns: int, /) -> None:
         """Make ``descriptor`` readable at each ring, until the relay is stopped; do not hold the GIL."""
@@ -62,9 +62,9 @@ class WakeSource(Protocol):
 class Relay:
     """Wakes an event loop, through a file descriptor, when a doorbell rings.
 
-    A thread waits for the doorbell without the GIL (``relay.h``). It makes ``descriptor`` readable
-    at the start, after each ring, and after ``turn_ns`` without a ring. The descriptor stays
-    readable until the loop calls :meth:`acknowledge`.
+    A thread waits for the doorbell without the GIL (``relay.h``). The thread makes ``descriptor``
+    readable at the start, after each ring, and after ``turn_ns`` without a ring. The descriptor
+    stays readable until the loop calls :meth:`acknowledge`.
     """
 
     def __init__(self, word: WakeSource, name: str, turn_ns: int = TURN_NS) -> None:
@@ -95,7 +95,7 @@ class Relay:
         _atomics.relay_stop(self._shared)
 
     def join(self) -> None:
-        """Stop the thread, and wait until it has ended, at most ``turn_ns``."""
+        """Stop the thread, and wait until it has ended, which takes at most ``turn_ns``."""
         while self._thread.is_alive():
             self.stop()
             self._thread.join(_STOP_AGAIN_S)

@@ -1,8 +1,8 @@
 """Events of a block: commands and their outcomes, injections, changes of quality, starts and ends.
 
-An event ring works like a frame ring, and the same process writes both. Each event names the last
-frame before it, and each frame names the last event before it. So the order of frames and events is
-known.
+An event ring works like a frame ring, and the same process writes both. Each event has the number of
+the last frame before it, and each frame has the number of the last event before it. So the order of
+frames and events is known.
 """
 
 from __future__ import annotations
@@ -59,12 +59,12 @@ class EventKind(IntEnum):
     If a command lifted it, the event ends the command.
     """
     SHADOWED = 14
-    """A client gave these values to an injection. The last frame before the event is the first with them."""
+    """A client gave these values to an injection. The last frame before the event is the first with the values."""
     ACTIVATED = 15
     """A declared injection became active.
 
-    If it covers ``/out``, the last frame before the event is the first that it changes. ``item`` is
-    the number of activations so far.
+    If the injection covers ``/out``, the last frame before the event is the first that it changes.
+    ``item`` is the number of activations so far.
     """
     DEACTIVATED = 16
     """A declared injection is no longer active."""
@@ -73,7 +73,10 @@ class EventKind(IntEnum):
     SAVED = 18
     """The state of the source was saved in a snapshot, whose name is the event's text."""
     RESTORED = 19
-    """The state of a snapshot was restored. Time may have gone back. The next frame shows this state."""
+    """The state of the source was restored from a snapshot, whose name is the event's text.
+
+    Time may have gone back. The next frame shows the restored state.
+    """
 
     def __str__(self) -> str:
         return self.name.lower()
@@ -93,9 +96,9 @@ ENDS: Final = frozenset(
         EventKind.NOTED,
     }
 )
-"""Kinds of events that tell the outcome of an item; REJECTED is the outcome of a whole command."""
+"""Kinds of events that are the outcome of an item; REJECTED is the outcome of a whole command."""
 DONE: Final = frozenset({EventKind.WRITTEN, EventKind.TAKEN, EventKind.SHADOWED})
-"""The kinds of :data:`ENDS` that are successes: the device, consumers or an injection got the value."""
+"""Those kinds in :data:`ENDS` that are successes: the device, consumers or an injection got the value."""
 
 
 class Event(NamedTuple):
@@ -107,17 +110,19 @@ class Event(NamedTuple):
             kind.
         frame: Number of the last frame before the event.
         cycle: Cycle of the source's schedule.
-        publish_ns: CLOCK_MONOTONIC at publication; in virtual time, the virtual clock's equivalent.
+        publish_ns: CLOCK_MONOTONIC at publication in ns; in virtual time, its equivalent on the
+            virtual clock.
         clock_ns: The instance's clock at publication, in ns.
         utc_ns: UTC at publication, in ns.
         incarnation: Number of times that the source's process has been started, including the
             present start.
         quality: Quality after the event.
-        writer: Number of the command queue that the command came from, or NO_WRITER.
+        writer: Number of the queue that the command came from; NO_WRITER: it came from
+            none.
         command: Number that the writer gave the command; 0: none.
         item: Index of the first item of the command that the event is about.
         items: Number of the command's items that the event is about.
-        offset: Offset of the first item's write.
+        offset: Offset of the first item's write in the image, in bytes.
         mask: Mask of the first item's write; 0: whole bytes.
         size: Size of the first item's write in bytes.
         data: The written bytes, with ACCEPTED, DIVERTED, SHADOWED and INJECTED only.
@@ -147,7 +152,7 @@ class Event(NamedTuple):
 
     @property
     def command_key(self) -> tuple[int, int, int]:
-        """Unique key of the command in its block: incarnation, writer and number."""
+        """Key that identifies the event's command within its block: incarnation, writer and number."""
         return self.incarnation, self.writer, self.command
 
 
@@ -167,14 +172,14 @@ class Record(NamedTuple):
     injection: int = 0
 
     def pack(self) -> bytes:
-        """Encode the payload, EVENT_SIZE bytes."""
+        """Encode the record as the payload of an event, EVENT_SIZE bytes."""
         what = (self.kind, len(self.data), self.writer, self.command)
         packed = _RECORD.pack(*what, self.item, self.offset, self.mask, self.items, self.size, self.injection)
         return packed + self.data.ljust(EVENT_DATA_SIZE, b"\0")
 
 
 def decode_event(fields: FrameTuple) -> Event:
-    """Decode an event, and check its fields' bounds, because another process wrote the bytes."""
+    """Decode an event, and check the bounds of its fields, because another process wrote the bytes."""
     number, cycle, publish_ns, clock_ns, utc_ns, incarnation, quality, _, frame, _, text, raw, _ = fields
     kind, data_size, writer, command, item, offset, mask, items, size, injection = _RECORD.unpack_from(raw)
     data = raw[_RECORD.size : _RECORD.size + min(data_size, EVENT_DATA_SIZE)]

@@ -1,6 +1,6 @@
 """Explain events: find the registers, values, direction and writer that they are about.
 
-This module imports numpy, which takes time, so import the module only when you need it.
+Import this module only when you need it: it imports numpy, which takes time.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _INWARD: Final = frozenset(
         EventKind.REJECTED,
     }
 )
-"""Kinds of events about writes to the device, even if an injection took the write."""
+"""Kinds of events that are about writes to the device, even if an injection took the write."""
 _WITH_VALUES: Final = frozenset({EventKind.ACCEPTED, EventKind.DIVERTED, EventKind.SHADOWED})
 _OF_WRITES: Final = frozenset({*_INWARD, EventKind.DIVERTED, EventKind.SHADOWED})
 _OF_INJECTIONS: Final = frozenset(
@@ -58,7 +58,7 @@ class Place(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The value as text."""
+        """The value as text for users."""
         return to_text(self.value, self.register)
 
     @property
@@ -72,11 +72,13 @@ class Explained(NamedTuple):
 
     Attributes:
         places: The registers that the event concerns.
-        direction: ``in``, ``out`` or empty.
+        direction: ``in``: data for the device; ``out``: data for consumers; empty: unknown or
+            neither.
         by: The client that caused the event, such as ``grpc``, ``mqtt`` or ``program 1``; empty: no
             client caused it, or the client is unknown.
-        definition: Definition of the new injection. Only the last event of the definition has it.
-        partial: True if the event has a part of a definition, and further parts follow.
+        definition: Definition of a new injection. If the definition takes several events, only the
+            last of them has it.
+        partial: True if the event has a part of a definition, and events with further parts follow.
     """
 
     places: tuple[Place, ...]
@@ -124,7 +126,7 @@ class Explainer:
                 self._injections[one.number] = _Injection(one.direction, places)
 
     def resume(self, present: Sequence[Injection[Any]], newest: int) -> None:
-        """Continue after events were lost, among them possibly the ends of commands or injections.
+        """Continue after events were lost, which may have been the ends of commands or injections.
 
         Args:
             present: The injections that exist now.
@@ -266,7 +268,7 @@ def _is_whole(register: Register, bits: bytearray) -> bool:
 
 
 def by(writer: int) -> str:
-    """Return the name of a command queue's owner, an endpoint or a program; empty if it has none."""
+    """Return the name of the endpoint or program that owns a command queue; empty if there is none."""
     if writer == NO_WRITER:
         return ""
     return _ROLES.get(writer, f"program {writer + 1}" if writer < EXTERNAL_SLOTS else f"writer {writer}")
@@ -285,7 +287,7 @@ def kind_of(event: Event) -> str:
 
 
 def object_of(event: Event, explained: Explained) -> dict[str, Any]:
-    """Return what an event is about, as an object for JSON; ``data`` is in hexadecimal digits."""
+    """Return what an event is about, as a JSON object; its ``data`` is in hexadecimal digits."""
     places = explained.places
     return {
         "by": explained.by,
@@ -306,8 +308,8 @@ def _json(value: Any) -> str:
 def cells_of(explained: Explained, dumps: Callable[[Any], str] = _json) -> tuple[str, ...]:
     """Return what an event is about, as cells of a table with the columns of ``ABOUT``.
 
-    If the event concerns several registers, the cell with the value is a JSON object that ``dumps``
-    has encoded.
+    If the event concerns several registers, the cell with the value is a JSON object of all values
+    by path, which ``dumps`` encodes.
     """
     places = explained.places
     valued = [place for place in places if place.valued]

@@ -71,7 +71,7 @@ class SectionKind(IntEnum):
 
 
 class Header(msgspec.Struct, frozen=True):
-    """The header's fixed fields. Offsets and sizes are in bytes, times in ns."""
+    """The fields of the header that never change. Offsets and sizes are in bytes, times in ns."""
 
     epoch: int
     size: int
@@ -139,7 +139,7 @@ class SectionEntry(msgspec.Struct, frozen=True):
     """An entry of the section table.
 
     If the section belongs to a block, ``layout`` is the index of the block's layout section.
-    Otherwise it is the section's own index.
+    Otherwise, ``layout`` is the index of the section itself.
     """
 
     kind: int
@@ -181,7 +181,7 @@ def change_sections(
 
 
 def table_state(memory: memoryview) -> tuple[int, int]:
-    """Return the generation of the section table, and its number of entries.
+    """Return (generation, number of entries) of the section table.
 
     Each change of the table increases the generation.
     """
@@ -190,12 +190,16 @@ def table_state(memory: memoryview) -> tuple[int, int]:
 
 
 def retired(memory: memoryview, header: Header, index: int) -> bool:
-    """Return whether an entry is retired."""
+    """Return whether the entry of the section table with this index is retired."""
     return _atomics.load64(memory, header.sections_offset + index * SECTION_SIZE) & _RETIRED != 0
 
 
 def read_sections(memory: memoryview, header: Header, count: int, name: str) -> list[SectionEntry]:
-    """Read the first ``count`` entries; raise FormatError if a section is not within the segment."""
+    """Return the first ``count`` entries of the section table.
+
+    Raises:
+        FormatError: A section is not within the segment.
+    """
     if count > header.section_capacity:
         raise FormatError(
             f"{name}: the header counts {count} sections, but the section table has room for {header.section_capacity}"
@@ -217,7 +221,7 @@ def finish(memory: memoryview) -> None:
 
 
 def write_control(memory: memoryview, path: str) -> None:
-    """Write the path of the control socket."""
+    """Write the path of the supervisor's control socket."""
     memory[CONTROL_OFFSET : CONTROL_OFFSET + CONTROL_SIZE] = path.encode().ljust(CONTROL_SIZE, b"\0")
 
 
@@ -244,7 +248,8 @@ def _config_field(file: Path) -> bytes:
 def write_supervised_since(memory: memoryview, since_ns: int) -> None:
     """Write the time at which the supervisor started, CLOCK_MONOTONIC in ns.
 
-    Call this only if the instance's clock was not 0 at that time.
+    Call this only if the instance's clock was not 0 at that time; the start of the instance is the
+    default.
     """
     _atomics.store64(memory, SUPERVISED_SINCE_OFFSET, since_ns)
 
@@ -279,7 +284,7 @@ def text(field: bytes) -> str:
 
 
 def cut(message: str, size: int) -> bytes:
-    """Encode a text in at most ``size`` bytes of UTF-8, cut at a whole character."""
+    """Encode a text as UTF-8, cut after the last whole character within ``size`` bytes."""
     data = message.encode()
     return data if len(data) <= size else data[:size].decode("utf-8", "ignore").encode()
 

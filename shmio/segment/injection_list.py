@@ -1,8 +1,8 @@
-"""Lists of a block's injections: the existing ones, and those that the configuration declares.
+"""Lists of a block's injections: the existing injections, and those that the configuration declares.
 
 Each list is a section of the block: a cell (docs/reference/segment-format.md) with a JSON document
-of at most LIST_SIZE bytes. The source writes the list of existing injections, which every process
-can read, and from which the source resumes them after a restart. The supervisor writes the list of
+of at most LIST_SIZE bytes. The source writes the list of existing injections. Every process can read
+it; after a restart, the source continues the injections in it. The supervisor writes the list of
 configured injections.
 """
 
@@ -67,7 +67,7 @@ _Item = TypeVar("_Item")
 
 
 def ranges_of(cover: bytes) -> tuple[tuple[int, int, int], ...]:
-    """Return the set bits of an image as ranges (offset, size, mask), one for each run of equal bytes."""
+    """Return the set bits of an image as ranges (offset, size, mask): one for each run of equal bytes except 0."""
     ranges: list[tuple[int, int, int]] = []
     for at, bits in enumerate(cover):
         if not bits:
@@ -82,8 +82,12 @@ def ranges_of(cover: bytes) -> tuple[tuple[int, int, int], ...]:
 def encode(items: Iterable[bytes], growth: int = 0) -> bytes:
     """Join JSON items to a document.
 
+    Args:
+        items: The items, each encoded as JSON.
+        growth: Number of bytes by which the document must be able to grow later.
+
     Raises:
-        ValueError: The document would be too long if it had ``growth`` more bytes.
+        ValueError: The document, with ``growth`` more bytes, would be too long.
     """
     document = b"[" + b",".join(items) + b"]"
     if len(document) + growth > LIST_SIZE:
@@ -106,7 +110,7 @@ class ListCell(Generic[_Item]):
 
     @property
     def sequence(self) -> int:
-        """Sequence number of the cell, which changes with each :meth:`write`."""
+        """Sequence number of the cell; each :meth:`write` changes it."""
         return _atomics.load64(self._memory, self._offset)
 
     def read(self) -> tuple[_Item, ...]:
@@ -146,5 +150,9 @@ def declared_cell(memory: memoryview, offset: int, size: int) -> DeclaredCell:
 
 
 def declared_document(declarations: Iterable[Declaration]) -> bytes:
-    """Encode configured injections as a document; raise ValueError if the document is too long."""
+    """Encode the injections that the configuration declares as a document.
+
+    Raises:
+        ValueError: The document is too long.
+    """
     return encode(msgspec.json.encode(declaration) for declaration in declarations)

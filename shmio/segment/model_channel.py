@@ -1,8 +1,8 @@
 """The channel between a source and its remote model: requests for steps, and their answers.
 
-docs/reference/segment-format.md describes its section. The source's process writes requests. The
-process to which the model is connected locks the channel as long as the connection lasts, and
-writes the model's name and answers.
+docs/reference/segment-format.md describes the channel's section. The source's process writes the
+requests. The process to which the model is connected locks the channel as long as the connection
+lasts, and writes the model's name and answers.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _COMPUTED: Final = 1  # flag: a model has done a step
 
 
 class ModelPorts(NamedTuple):
-    """Inputs and outputs of a remote model. An in-out register is both an input and an output."""
+    """Inputs and outputs of a remote model. A register that the model both reads and computes is in both."""
 
     inputs: tuple[Register, ...]
     """Registers that the model reads."""
@@ -59,9 +59,9 @@ class ModelRequest(NamedTuple):
     Attributes:
         number: Number of the request; the same step may be requested again.
         step: Number of the step.
-        time_ns: The instance's clock after the step.
-        dt_ns: Length of the step.
-        until_ns: Time at which the source stops waiting for the answer, CLOCK_MONOTONIC.
+        time_ns: The instance's clock after the step, in ns.
+        dt_ns: Length of the step, in ns.
+        until_ns: Time at which the source stops waiting for the answer, CLOCK_MONOTONIC in ns.
         doubt: Reason why the model's inputs may be wrong; empty: there is none.
         commanded: The block's image with the values that the model reads.
         shown: The block's image with the present values of the model's outputs.
@@ -80,8 +80,8 @@ class ModelRequest(NamedTuple):
 class ModelAnswer(NamedTuple):
     """A model's answer to a request.
 
-    ``image`` is the block's image with the computed outputs. If the step failed, ``failure`` is the
-    reason, and ``image`` is not used.
+    ``image`` is the block's image with the computed outputs. ``failure`` is None, or the reason why
+    the step failed; in that case, ``image`` is not used.
     """
 
     image: bytes
@@ -89,13 +89,19 @@ class ModelAnswer(NamedTuple):
 
 
 def model_ports(layout: Layout, outputs: Sequence[str], inouts: Sequence[str]) -> ModelPorts:
-    """Find a model's inputs and outputs. All registers that ``outputs`` does not name are inputs.
+    """Find a model's inputs and outputs.
 
-    Registers of tag tables over the block have no values of their own, and are neither.
+    Registers of tag tables over the block have no values of their own, so they are neither.
+
+    Args:
+        layout: The layout of the block.
+        outputs: Patterns of the registers that the model computes and does not read. All other
+            registers are inputs.
+        inouts: Patterns of the registers that the model both reads and computes.
 
     Raises:
-        ConfigError: A pattern names no register, or ``outputs`` and ``inouts`` name the same one.
-            The message starts with the key.
+        ConfigError: A pattern matches no register, or a register matches both ``outputs`` and
+            ``inouts``. The message starts with the key.
     """
     layout = layout.base
     computed, both = (_named(layout, *item) for item in (("outputs", outputs), ("inouts", inouts)))
@@ -125,7 +131,7 @@ def _named(layout: Layout, key: str, patterns: Sequence[str]) -> set[int]:
 
 
 def section(ring_header: bytes, slot_bytes: int) -> tuple[int, bytes]:
-    """Return the size and the first bytes of a new section, whose two rings have ``ring_header``."""
+    """Return the size and the first bytes of a new section; its two rings both start with ``ring_header``."""
     ring_size = _atomics.RING_HEADER_SIZE + SLOTS * slot_bytes
     begin = _SIZE.pack(ring_size).ljust(_RINGS_AT, b"\0") + ring_header.ljust(ring_size, b"\0") + ring_header
     return _RINGS_AT + 2 * ring_size, begin
@@ -166,14 +172,17 @@ class ModelChannel:
         return ConnectedModel(number, pid, text(name))
 
     def computed(self) -> bool:
-        """Return whether the connected model or an earlier one has computed a step."""
+        """Return whether the connected model, or a model before it, has computed a step."""
         data = _atomics.cell_read(self._memory, self._offset + _JOINED_AT, _JOINED.size)
         return data is not None and _JOINED.unpack(data)[1] == _COMPUTED
 
     # ---- for the source's process --------------------------------------------------------------------------------
 
     def ask(self, ask: ModelRequest, publish_ns: int) -> int:
-        """Send a request, and return its number; ``publish_ns`` is the publish time of the frame."""
+        """Send a request to the model, and return the request's number.
+
+        ``publish_ns`` is the publish time of the frame that the source will publish for the step.
+        """
         return self.asked.publish(
             ask.commanded, ask.shown, ask.step, publish_ns, ask.time_ns, ask.until_ns,
             Quality.UNCERTAIN if ask.doubt else Quality.GOOD, Provenance.SIMULATED, ask.dt_ns, 0,
@@ -181,7 +190,7 @@ class ModelChannel:
         )  # fmt: skip
 
     def answer_to(self, number: int) -> ModelAnswer | None:
-        """Return the newest answer if it is for this request, else None.
+        """Return the model's newest answer if it belongs to the request with this number, else None.
 
         So an answer that comes too late is never used.
         """
@@ -194,7 +203,7 @@ class ModelChannel:
     # ---- for the process that writes the model's answers -----------------------------------------------------------
 
     def join(self, name: str) -> bool:
-        """Lock the channel for a model; return False if another process has locked it."""
+        """Lock the channel for a model with this name; return False if another process has locked it."""
         if not self._shared.try_lock(self._lock_byte):
             return False
         self._write(ConnectedModel(self._read().number + 1, os.getpid(), name), _COMPUTED if self.computed() else 0)
@@ -227,7 +236,7 @@ class ModelChannel:
             ask: The request.
             now_ns: The present time, CLOCK_MONOTONIC.
             image: The block's image with the computed outputs.
-            failure: Reason why the step failed; None: it succeeded.
+            failure: Reason why the step failed; None: the step succeeded.
         """
         if failure is None and not self.computed():
             self._write(self._read(), _COMPUTED)

@@ -1,8 +1,8 @@
 """The playhead of a block that replays a recording: its position, and requests to move it.
 
-docs/reference/segment-format.md describes its section. The source's process writes the state. To
-move the playhead, a program locks the section, writes a request, and waits for the answer. A
-position is a time of the recorded instance's clock, in ns since its start.
+docs/reference/segment-format.md describes the playhead's section. The source's process writes the
+state. To move the playhead, a program locks the section, writes a request, and waits for the answer.
+A position is a time of the recorded instance's clock, in ns since that instance's start.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from shmio.segment.header import cut, text
 from shmio.segment.shm import SharedObject
 
 OWN_WORDS: Final = "replay: "
-"""Prefix of the reasons and event texts that the replay itself creates; recorded texts have none."""
+"""Prefix of the reasons and event texts that the replay itself creates; recorded texts do not have it."""
 MIN_SPEED: Final = 0.01
 MAX_SPEED: Final = 1000.0
 
@@ -53,7 +53,7 @@ class PlayState(NamedTuple):
         anchor_ns: The anchor: a time of the instance's clock from which the position is computed.
         position_ns: Position at the anchor. From there, the playhead moves ``speed`` times as fast
             as the instance's clock.
-        until_ns: Position at which the replay stops.
+        until_ns: Position at which the replay pauses or, if it is the end, starts again (``loop``).
         base_ns: Publish time, as in a frame, that corresponds to position 0.
         utc_ns: UTC of position 0.
         speed: Speed relative to the instance's clock.
@@ -88,9 +88,9 @@ class PlayState(NamedTuple):
     head: int = 0
 
     def reach_ns(self, clock_ns: int) -> int:
-        """Return the position at a time of the instance's clock.
+        """Return the position at a time of the instance's clock, as if the recording had no end.
 
-        The result may lie after the end of the recording.
+        The result may therefore lie after the end of the recording.
         """
         if self.paused or clock_ns <= self.anchor_ns:
             return self.position_ns
@@ -99,18 +99,18 @@ class PlayState(NamedTuple):
 
     @property
     def wraps(self) -> bool:
-        """True if the replay starts again when it reaches the end."""
+        """True if the replay will reach the end of the played range, and then start again."""
         return self.loop and self.until_ns >= self.end_ns
 
     def at_ns(self, clock_ns: int) -> int:
-        """Return the position at a time of the instance's clock."""
+        """Return the position at a time of the instance's clock, which is always within the played range."""
         reach_ns = self.reach_ns(clock_ns)
         if reach_ns >= self.end_ns and self.wraps and not self.paused:
             return self.begin_ns + (reach_ns - self.begin_ns) % (self.end_ns - self.begin_ns)
         return min(reach_ns, self.until_ns)
 
     def due_ns(self, position_ns: int) -> int:
-        """Return the time of the instance's clock at which the playhead first reaches a later position."""
+        """Return the time of the instance's clock at which the playhead reaches a position after the anchor."""
         ahead_ns = position_ns - self.position_ns
         clock_ns = self.anchor_ns + (ahead_ns if self.speed == 1 else math.ceil(ahead_ns / self.speed))
         while not self.paused and self.reach_ns(clock_ns) < position_ns:  # rounding may make it too early
@@ -118,7 +118,7 @@ class PlayState(NamedTuple):
         return clock_ns
 
     def next_round(self) -> PlayState:
-        """Return the state at the start of the next round, for a replay that plays in a loop."""
+        """Return the state at the start of the next round of a replay that plays in a loop."""
         return self._replace(anchor_ns=self.due_ns(self.end_ns), position_ns=self.begin_ns)
 
     def settled(self, clock_ns: int) -> PlayState:
@@ -136,11 +136,11 @@ class PlayState(NamedTuple):
         return self.anchored(clock_ns)._replace(paused=True, until_ns=self.end_ns)
 
     def anchored(self, clock_ns: int) -> PlayState:
-        """Return the same state with the anchor at this time of the instance's clock."""
+        """Return the same state, described by an anchor at this time of the instance's clock."""
         return self._replace(anchor_ns=clock_ns, position_ns=self.at_ns(clock_ns))
 
     def moved_as(self, other: PlayState) -> PlayState:
-        """Return this state with position, speed, pause and loop of another replay."""
+        """Return this state with the position, the speed, and the flags for pause, loop and end of another replay."""
         return self._replace(
             anchor_ns=other.anchor_ns,
             position_ns=other.position_ns,
@@ -155,8 +155,9 @@ class PlayState(NamedTuple):
 class MoveRequest(msgspec.Struct, tag="move", forbid_unknown_fields=True, omit_defaults=True):
     """A request to change a replay at time ``clock_ns`` of the instance's clock.
 
-    A field that is None changes nothing. The replay pauses once, at the position ``until_ns``; if
-    ``position_ns`` is given and ``until_ns`` is None, it plays to the end.
+    A field that is None changes nothing, with one exception: if ``position_ns`` is given and
+    ``until_ns`` is None, the replay plays to the end. At the position ``until_ns``, the replay
+    pauses once.
     """
 
     clock_ns: int
@@ -181,8 +182,8 @@ class FindRequest(msgspec.Struct, tag="find", forbid_unknown_fields=True, omit_d
 class PlayheadAnswer(msgspec.Struct, omit_defaults=True):
     """The answer to a request.
 
-    If the request failed, ``error`` is the reason; else it is empty. ``position_ns`` is the position
-    that a search has found; None: the search has found nothing.
+    ``error`` is the reason why the request failed; empty: it succeeded. ``position_ns`` is the
+    position that a search has found; None: the search has found nothing.
     """
 
     error: str = ""
@@ -229,22 +230,22 @@ class Playhead:
         )  # fmt: skip
 
     def now_ns(self) -> int:
-        """Return the present time from which the age of frames is computed, in ns.
+        """Return the present time in ns from which the age of frames is computed.
 
-        This is the publish time of a frame at the present position.
+        It is the publish time that a frame at the present position has.
         """
         play = self.read()
         return time.monotonic_ns() if play is None else play.base_ns + play.at_ns(self._clock.present_ns())
 
     def came_now(self, number: int) -> bool:
-        """Return whether a frame was published in the present step of virtual time."""
+        """Return whether the frame with this number was published in the present step of virtual time."""
         play, state = self.read(), self._clock.last_written()
         return play is not None and state.stepping and play.begun == state.step and number > play.head
 
     def clock_ns(self, publish_ns: int) -> int:
-        """Return the ``clock_ns`` of a frame or event that is published now.
+        """Return the ``clock_ns`` for a frame or event that is published now.
 
-        ``publish_ns`` is its publish time.
+        ``publish_ns`` is the publish time of the frame or event.
         """
         play = self.read()
         return self._clock.present_ns() if play is None or not play.own_clock else publish_ns - play.base_ns
@@ -262,7 +263,7 @@ class Playhead:
         self._state.write(data)
 
     def asks(self, answered: int) -> tuple[int, PlayheadRequest | None] | None:
-        """Return (number, content) of the last request; None if its number is ``answered``.
+        """Return (number, content) of the last request; None if ``answered`` is its number.
 
         The content is None if the request is invalid.
         """
@@ -296,7 +297,7 @@ class Playhead:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Lock the section within a ``with`` block, so that only this program makes requests.
+        """Lock the playhead during a ``with`` block, so that only this program makes requests.
 
         Raises:
             CommandError: Another program did not release the lock in time.
@@ -332,7 +333,7 @@ class Playhead:
         return number
 
     def found(self, number: int) -> PlayheadAnswer | None:
-        """Return the answer to a request; None if the source has not answered it yet."""
+        """Return the answer to the request with this number; None if the source has not answered it yet."""
         play = self.read()
         if play is None or play.asked != number:
             return None

@@ -1,9 +1,9 @@
-"""The process table: the instance's processes, their state and counters.
+"""The process table: the processes of the instance, with their states and counters.
 
-The table has a slot for each process; the process is the *worker* of the slot. The supervisor
-writes the slot's name, kind and digest, and the cell :class:`Supervised`. The worker locks its
-slot, and writes its heartbeat and the cell :class:`Report`. The kernel releases the lock when the
-worker dies, so others always notice its death.
+The table has a slot for each process, which is the *worker* of the slot. The supervisor writes the
+slot's name, kind and digest, and the cell :class:`Supervised`. The worker locks its slot, and writes
+its heartbeat and the cell :class:`Report`. The kernel releases the lock when the worker dies, so
+others always notice its death.
 """
 
 from __future__ import annotations
@@ -49,20 +49,20 @@ COUNTERS: Final[Mapping[str, tuple[str, ...]]] = {
 
 
 EXTERNAL_SLOTS: Final = 4
-"""Number of external slots, which are for programs that write but do not belong to the instance.
+"""Number of external slots: slots for programs that write but do not belong to the instance.
 
-They are the last slots of the table, and have the first command queues.
+They are the last slots of the table. Their programs have the first command queues.
 """
 
 WRITERS: Final[Mapping[str, int]] = {"grpc": 4, "mqtt": 5, "opcua": 6}
-"""The number of the command queue of each process of the instance that sends commands.
+"""For each process of the instance that sends commands: the number of its command queue.
 
-The keys are the names of the processes, which equal their kinds.
+The keys are the names of the processes, which are also their kinds.
 """
 
 
 class Phase(IntEnum):
-    """State of a process as its supervisor sees it."""
+    """State of a process, as the supervisor sees it."""
 
     STOPPED = 0
     STARTING = 1
@@ -75,7 +75,7 @@ class Phase(IntEnum):
 
 
 class Activity(IntEnum):
-    """State of a worker as it reports it."""
+    """State of a worker, as the worker itself reports it."""
 
     NONE = 0
     STARTING = 1
@@ -112,8 +112,9 @@ class Supervised(msgspec.Struct, frozen=True):
 class Report(msgspec.Struct, frozen=True):
     """The worker's part of a slot.
 
-    :data:`COUNTERS` names the counters. ``note`` describes a problem of the worker. In an external
-    slot, the counter is the number of the user, and the note is the name of the program.
+    :data:`COUNTERS` names the counters. ``note`` describes a problem of the worker; empty: there is
+    none. In an external slot, the only counter is the user's number, and the note is the program's
+    name.
     """
 
     pid: int = 0
@@ -167,7 +168,7 @@ class ProcessSlot:
     def report(self) -> Report:
         """The worker's part, as last written.
 
-        Between a restart and the new worker's first report, this is the part of the previous worker.
+        After a restart, it is the part of the previous worker until the new worker's first report.
         """
         data = _atomics.cell_read(self._memory, self._offset + _REPORT_AT, _REPORT.size)
         if data is None:
@@ -188,7 +189,7 @@ class ProcessSlot:
 
     @property
     def heartbeat_ns(self) -> int:
-        """Time of the worker's last heartbeat, CLOCK_MONOTONIC in ns; 0 before the first."""
+        """Time of the worker's last heartbeat, CLOCK_MONOTONIC in ns; 0 before the first heartbeat."""
         return _atomics.load64(self._memory, self._offset + _HEARTBEAT_AT)
 
     def beat(self) -> None:
@@ -200,17 +201,17 @@ class ProcessSlot:
         return self._shared.try_lock(self.index + 1)
 
     def alive(self) -> bool:
-        """Return whether the slot's process is alive: whether a process has locked the slot.
+        """Return whether the slot's process is alive, that is, whether it has locked the slot.
 
-        A lock by this segment object itself does not count.
+        A lock that this segment object itself holds does not count.
         """
         return self._shared.locked(self.index + 1)
 
 
 class ProcessTable(Sequence[ProcessSlot]):
-    """The slots of the instance's processes, in order.
+    """The slots of the instance's processes, in the order of the table.
 
-    ``external`` are the slots for other programs.
+    ``external`` has the slots for other programs.
     """
 
     def __init__(self, shared: SharedObject, memory: memoryview, header: Header) -> None:
@@ -233,7 +234,7 @@ class ProcessTable(Sequence[ProcessSlot]):
             _FIXED.pack_into(memory, at, name.encode(), kind.encode(), 0 if writer is None else writer + 1)
 
     def require(self, count: int) -> None:
-        """Raise SegmentError unless ``count`` processes can be added."""
+        """Raise SegmentError unless the table has vacant slots for ``count`` more processes."""
         vacant = self._header.process_capacity - len(self.external) - len(self._slots)
         if count > vacant:
             raise SegmentError(
@@ -279,7 +280,7 @@ class ProcessTable(Sequence[ProcessSlot]):
         return iter(self._slots)
 
     def find(self, name: str) -> ProcessSlot:
-        """Return the slot with this name; KeyError if there is none."""
+        """Return the slot with this name; raise KeyError if there is none."""
         for slot in self._slots:
             if slot.name == name:
                 return slot

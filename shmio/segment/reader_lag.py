@@ -1,8 +1,8 @@
 """How far each process that reads a source's frames is behind.
 
-The block of a source has a table with an entry for each process of the instance. The process writes
-its entry with each heartbeat, for the slowest of its readers. Programs from outside map the segment
-read-only, and have no entry.
+The block of a source has a table with an entry for each process of the instance. With each
+heartbeat, a process writes its entry, which describes the slowest of its readers. Programs that do
+not belong to the instance have no entry.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class ReaderLag(NamedTuple):
     """How far a process's slowest reader of a source is behind.
 
     Attributes:
-        frames: Number of complete frames that it has not read.
+        frames: Number of complete frames that the reader has not read.
         behind_ns: Time in ns since the oldest of these frames was published; 0 if there is none.
     """
 
@@ -38,10 +38,10 @@ class ReportedPosition(NamedTuple):
     """What a process reports about its slowest reader of a source. Times are in ns.
 
     Attributes:
-        pid: The process; 0: it does not read the source.
-        frames: Number of frames that the reader had not read.
+        pid: Pid of the process; 0: the process does not read the source.
+        frames: Number of frames that the reader had not read at the report.
         last: Number of the last frame that the reader had read.
-        behind_ns: Time since the first unread frame was published.
+        behind_ns: Time from the publication of the first unread frame to the report.
         at_ns: CLOCK_MONOTONIC at the report.
     """
 
@@ -53,7 +53,7 @@ class ReportedPosition(NamedTuple):
 
 
 class ReaderTable:
-    """The entries of all processes that read one source, by the index of their slots."""
+    """The entries of all processes for one source, by the index of their slots."""
 
     def __init__(self, memory: memoryview, offset: int, size: int) -> None:
         if size != TABLE_SIZE:
@@ -70,8 +70,9 @@ class ReaderTable:
 
         Args:
             slot: Index of the process's slot.
-            pid: The process that has the slot now. Entries of earlier processes do not count.
-            head: Number of the newest frame.
+            pid: Pid of the process that has the slot now. An entry of an earlier process does not
+                count.
+            head: Number of the source's newest frame.
 
         """
         data = _atomics.cell_read(self._memory, self._offset + slot * _STRIDE, _ENTRY.size)

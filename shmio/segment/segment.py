@@ -40,7 +40,7 @@ from shmio.segment.shm import SharedObject
 from shmio.version import __version__
 
 PREFIX = "shmio-"
-"""Prefix of the name of each segment."""
+"""Prefix of the name of each segment; the name of the instance follows."""
 
 
 def _align(size: int, to: int) -> int:
@@ -56,9 +56,9 @@ _OWN_SECTIONS = 1  # sections of no block: the clock page
 _SPARE_PROCESSES = 16 + EXTERNAL_SLOTS
 _EVENT_STRIDE = _align(_atomics.RAW_OFFSET + EVENT_SIZE, 64)
 _FIRST_LINK = 2
-"""Determines the lock byte of a block's model channel or playhead.
+"""Determines which byte to lock for a block's model channel or playhead.
 
-The lock byte is the number of process slots + this number + the index of the block's layout section.
+Its number is the number of process slots + this number + the index of the block's layout section.
 """
 
 _RING = struct.Struct("<8Iqq")
@@ -69,7 +69,7 @@ class Origin(msgspec.Struct, frozen=True):
     """Start time of an instance that replays a recording.
 
     ``clock_ns`` is the instance's clock at the start of the instance. ``started_utc_ns`` is the UTC
-    time at which that clock is 0.
+    in ns at which that clock would have been 0.
     """
 
     clock_ns: int
@@ -96,7 +96,7 @@ class BlockSpec(msgspec.Struct, frozen=True):
 
     @property
     def slots(self) -> int:
-        """Number of frames in the ring: a power of two, at least 8.
+        """Number of frames that the ring can hold: a power of two, at least 8.
 
         The ring holds the frames of at least 8 s, unless ``ring_bytes`` is too small for that.
         """
@@ -112,7 +112,7 @@ class BlockSpec(msgspec.Struct, frozen=True):
         return sum(_align(size, 64) for _, size, _ in self.sections())
 
     def sections(self) -> list[tuple[SectionKind, int, bytes]]:
-        """Return kind, size in bytes and first bytes of each section. All other bytes are zero."""
+        """Return (kind, size in bytes, first bytes) of each section; the other bytes of a section are zero."""
         layout, attributes = self.layout.to_json(), msgspec.json.encode(self.attributes)
         effective = _atomics.RAW_OFFSET + _align(self.layout.size, 8)
         slot = self.slot_bytes, self.layout.size, 0, _atomics.RAW_OFFSET, effective, 0, 0
@@ -216,7 +216,7 @@ def read_block(
 def wake(memory: memoryview, entries: Iterable[SectionEntry]) -> None:
     """Wake all processes that wait at doorbells in these sections.
 
-    A needless wake-up is harmless.
+    Processes that are woken for no reason continue to wait.
     """
     for entry in entries:
         with suppress(ValueError):  # no process waits at an inconsistent section
@@ -346,9 +346,10 @@ class Segment:
             mode: Mode of the instance.
             control: Path of the control socket.
             config: Resolved path of the configuration file.
-            group: Group whose members may read the segment.
+            group: Group whose members may read the segment; None: only this user may.
             stepped: Whether time is virtual from the start.
-            origin: Start time of an instance that replays a recording; None: the clock is 0 now.
+            origin: Start time of an instance that replays a recording; None: the clock starts at 0
+                now.
 
         Raises:
             AlreadyRunningError: A segment of this name exists, with or without a living supervisor
@@ -396,7 +397,7 @@ class Segment:
             raise
 
     def again(self) -> Segment:
-        """Open a private segment once more, as another process would open a shared one."""
+        """Open a private segment once more, as another process would open the segment of an instance."""
         shared = self.shared.again()
         try:
             return Segment(shared, self.instance)
@@ -534,7 +535,7 @@ class Segment:
             )
 
     def reserve(self, add: Sequence[BlockSpec]) -> int:
-        """Reserve room for the blocks ``add``, so that :meth:`change` cannot fail.
+        """Reserve room for the blocks ``add``, so that :meth:`change` cannot fail for lack of room.
 
         Returns:
             The offset of the reserved room.
@@ -557,8 +558,8 @@ class Segment:
     def change(self, add: Sequence[BlockSpec] = (), retire: Sequence[str] = ()) -> None:
         """Add blocks, then retire blocks. Only the supervisor may call this.
 
-        Readers see the changes in this order. If a source is in both ``add`` and ``retire``, the
-        new block replaces the old one.
+        Readers see the changes in this order. If a source is in both ``add`` and ``retire``, its new
+        block replaces its old block.
 
         Raises:
             SegmentError: There is no room; nothing has changed.
@@ -570,7 +571,7 @@ class Segment:
     def end_replaced(self) -> None:
         """Finish a :meth:`change` during which the supervisor died.
 
-        Wake processes that wait at retired blocks.
+        Then wake the processes that wait at retired blocks.
         """
         replaced = {block.section for block in self._known.values() if block not in self.blocks.values()}
         parts = enumerate(self._sections())
@@ -586,7 +587,7 @@ class Segment:
         wake(self.memory, ended.values())
 
     def clock_ns(self, now_ns: int) -> int:
-        """Convert a publish time of frames to the instance's clock, in ns."""
+        """Convert a publish time, as frames have it, to a time of the instance's clock, in ns."""
         return now_ns - self.header.started_ns
 
     def writer(self, source: str, at: Stamp | None = None) -> BlockWriter:
@@ -644,8 +645,8 @@ class Segment:
     def lead_to(self, control: str, config: Path) -> None:
         """Write the start time, control socket and configuration of a supervisor that takes over.
 
-        Only that supervisor may call this. Processes that opened the segment before keep the old
-        paths.
+        Only that supervisor may call this. Processes that have opened the segment before still have
+        the old paths.
         """
         header.write_supervised_since(self.memory, time.monotonic_ns())
         header.write_control(self.memory, control)
@@ -653,7 +654,7 @@ class Segment:
         self.header = Header.read(self.memory, self.shared.name)
 
     def unlink(self) -> None:
-        """Remove the segment's name if the name still belongs to this segment.
+        """Remove the segment's name, unless the name belongs to another segment by now.
 
         Call this only when the instance stops cleanly.
         """

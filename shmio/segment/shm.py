@@ -1,7 +1,7 @@
 """A POSIX shared-memory object: create, open, lock, map and unlink. Linux only.
 
-This module uses posix-ipc, because with ``multiprocessing.shared_memory`` a process that has
-attached to a segment unlinks it at its end, even if others still use the segment.
+This module uses posix-ipc. With ``multiprocessing.shared_memory``, a process that has attached to a
+segment would unlink it at the process's end, even if others still use the segment.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ class SharedObject:
     """An open shared-memory object with its mapping and its byte locks.
 
     The locks are *open file description* locks (fcntl(2)). The kernel releases them when the
-    process dies, however it dies. They belong to this object and not to the process, so two objects
-    in one process exclude each other.
+    process dies, for whatever reason. They belong to this Python object, not to the process: two
+    objects in one process cannot lock the same byte.
     """
 
     def __init__(self, name: str, fd: int, *, writable: bool, private: bool = False) -> None:
@@ -43,7 +43,7 @@ class SharedObject:
 
     @classmethod
     def create(cls, name: str, group: str | None = None) -> SharedObject:
-        """Create an empty object with mode 0600, or 0640 with a group.
+        """Create an empty object with mode 0600; if ``group`` is not None, with this group and mode 0640.
 
         Raises:
             FileExistsError: An object of this name exists already.
@@ -68,7 +68,7 @@ class SharedObject:
 
     @classmethod
     def private(cls, name: str) -> SharedObject:
-        """Create an empty object that no other program can open, and that ends with its last use."""
+        """Create an empty object that no other program can open, and that is freed after its last use."""
         return cls(name, os.memfd_create(name, os.MFD_CLOEXEC), writable=True, private=True)
 
     @classmethod
@@ -122,8 +122,8 @@ class SharedObject:
     def map(self) -> mmap.mmap:
         """Map the whole object, read-only unless it was opened writable.
 
-        All calls return the same mapping until the object grows. An older mapping stays valid as
-        long as it is referenced.
+        All calls return the same mapping until the object grows. A mapping from before then stays
+        valid as long as it is referenced.
         """
         if self._map is None or len(self._map) < self.size:
             access = mmap.PROT_READ | (mmap.PROT_WRITE if self.writable else 0)
@@ -147,7 +147,7 @@ class SharedObject:
         fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, struct.pack(_FLOCK, fcntl.F_UNLCK, os.SEEK_SET, byte, 1, 0))
 
     def locked(self, byte: int) -> bool:
-        """Return whether another object has locked the byte. This object may be read-only."""
+        """Return whether another object has locked the byte. This works even if this object is read-only."""
         query = struct.pack(_FLOCK, fcntl.F_RDLCK, os.SEEK_SET, byte, 1, 0)
         answer = fcntl.fcntl(self._fd, fcntl.F_OFD_GETLK, query)
         kind: int = struct.unpack(_FLOCK, answer)[0]
@@ -160,8 +160,8 @@ class SharedObject:
     def current(self) -> bool:
         """Return whether the name still refers to this object.
 
-        Return False if the name was removed or reused. A private object has no name, and is always
-        current.
+        Return False if the name was removed, or belongs to a new object. A private object, which has
+        no name, is always current.
         """
         if self._private:
             return True

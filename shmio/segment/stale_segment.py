@@ -1,6 +1,6 @@
-"""Claim or clear a stale segment: one whose supervisor is dead.
+"""Claim or clear a stale segment, which is a segment whose supervisor is dead.
 
-Processes that the supervisor started may still run.
+Processes that the supervisor has started may still run.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Worker(NamedTuple):
 
 
 def claim(instance: str) -> SharedObject | None:
-    """Take the supervisor's lock of an instance's stale segment, which only one caller can get.
+    """Lock the stale segment of an instance as its supervisor. Only one caller can get this lock.
 
     Returns:
         The segment's object; None if there is no segment.
@@ -80,7 +80,7 @@ def read(shared: SharedObject, instance: str) -> Segment:
 
 
 def living(instance: str) -> bool:
-    """Return whether any process of the instance runs, whatever its version of shmio.
+    """Return whether any process of the instance runs, even one of another version of shmio.
 
     Raises:
         SegmentError: This user may not open the segment.
@@ -108,7 +108,7 @@ def clear(instance: str, forget_control: Callable[[str], object] = lambda _: Non
 
     Raises:
         AlreadyRunningError: A supervisor is alive.
-        SegmentError: A process cannot be identified, or does not end; the segment stays.
+        SegmentError: A process cannot be identified, or does not end; then the segment is kept.
     """
     shared = claim(instance)
     if shared is None:
@@ -215,7 +215,8 @@ def _opened(workers: Iterable[Worker]) -> Iterator[list[Worker]]:
 def holder(slot: ProcessSlot, shared: SharedObject) -> Worker | None:
     """Return the process that has locked a slot; None if it is unknown or has ended.
 
-    A process that has not mapped the segment does not count: it has reused the pid of the worker.
+    If the process with the worker's pid has not mapped the segment, the worker has ended, and the
+    process has got the same pid.
     """
     pid = slot.report.pid
     if not pid:
@@ -249,7 +250,7 @@ def _maps(pid: int, inode: int, right: str = "") -> bool:
 
 
 def end(instance: str, workers: Iterable[Worker]) -> None:
-    """End processes by SIGTERM, after ``GRACE_S`` by SIGKILL, and wait until they have ended.
+    """End processes by SIGTERM, and after ``GRACE_S`` by SIGKILL; wait until they have ended.
 
     Raises:
         SegmentError: Some processes do not end, or belong to another user. The message names them.
