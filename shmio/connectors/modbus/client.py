@@ -2,9 +2,10 @@
 
 Each answer must have the transaction, unit and function of the request, and exactly the requested
 length. Any other answer ends the connection, and so does a time-out, so that the client never mistakes
-a late answer for the next one. There is one exception: the caller may stop waiting for a read. Then
-the client remembers the transaction, and discards the answer if it comes late. shmio does not use the
-client of pymodbus, which skips all unexpected answers, and repeats writes after a time-out.
+a late answer for the answer to the next request. There is one exception: a caller of ``read`` may stop
+waiting before the time-out. Then the client remembers the transaction, and discards the answer if it
+comes late. shmio does not use the client of pymodbus, which skips all unexpected answers, and repeats
+writes after a time-out.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ _HEADER: Final = 7
 _MAX_PDU: Final = 253
 _FAILED: Final = 0x80
 MAX_ABANDONED: Final = 256
-"""Maximum number of abandoned requests whose late answers are still recognized."""
+"""Maximum number of requests without an answer whose late answers are still recognized and discarded."""
 
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE, ACKNOWLEDGE, BUSY = 1, 2, 3, 4, 5, 6
 PARITY, NO_PATH, NO_ANSWER = 8, 10, 11
@@ -66,7 +67,7 @@ class ModbusClient:
         """True if any byte of the last request may have left this host."""
 
     def begin(self) -> None:
-        """Start the time-out of the requests that follow."""
+        """Start the time-out for the requests that follow."""
         self._deadline_ns = time.monotonic_ns() + self._timeout_ms * 1_000_000
 
     @property
@@ -94,7 +95,7 @@ class ModbusClient:
             raise self._explained(error) from None
 
     def close(self) -> None:
-        """Close the connection. It may be called at any time and more than once."""
+        """Close the connection. You may call this at any time and more than once."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -102,21 +103,21 @@ class ModbusClient:
         self._abandoned.clear()
 
     def read(self, unit: int, table: Table, start: int, count: int, until_ns: int | None = None) -> bytes:
-        """Read entries of a table; return their bytes as the device sends them, bits packed from the lowest.
+        """Read entries of a table; return the device's bytes. Bits are packed into bytes from the lowest bit on.
 
         Args:
             unit: Unit id.
             table: The table.
             start: First entry.
             count: Number of entries.
-            until_ns: When to give up with SilentError, in ns of CLOCK_MONOTONIC; the connection then stays
-                open. If None, wait until the time-out, which closes the connection.
+            until_ns: Time at which to raise SilentError, in ns of CLOCK_MONOTONIC; the connection
+                then stays open. None: wait until the time-out, which closes the connection.
 
         Raises:
             RefusedError: The device refuses the request. The connection stays open.
             SilentError: There is no answer by ``until_ns``. The connection stays open.
-            ConnectorError: The connection is lost, the answer is wrong, or none came within the time-out.
-                The connection is closed.
+            ConnectorError: The connection is lost, the answer is wrong, or none came within the
+                time-out. The connection is closed.
 
         """
         size = -(-count // 8) if table.of_bits else 2 * count
@@ -126,7 +127,12 @@ class ModbusClient:
         return answer[1:]
 
     def write(self, unit: int, function: int, data: bytes) -> None:
-        """Write, and check the confirmation, which repeats the beginning of the request.
+        """Send a write request, and check the confirmation, which repeats the beginning of the request.
+
+        Args:
+            unit: Unit id.
+            function: Function code.
+            data: The request after the function code.
 
         Raises:
             RefusedError: The device refuses the request. The connection stays open.
@@ -138,7 +144,12 @@ class ModbusClient:
             raise self._failed("it confirmed another write")
 
     def call(self, unit: int, function: int, data: bytes, size: int, until_ns: int | None = None) -> bytes:
-        """Send a request; return the data of the answer, which must have ``size`` bytes."""
+        """Send a request; return the data of the answer, which must have ``size`` bytes.
+
+        Raises:
+            RefusedError, SilentError, ConnectorError: As for :meth:`read`.
+
+        """
         self.sent = False
         if self._socket is None:
             raise ConnectorError(f"not connected to {self.peer}")

@@ -39,7 +39,7 @@ GATEWAY_RETRY_NS: Final = 1_000_000_000
 MAX_UNIT_RETRY_NS: Final = 10_000_000_000
 """Longest pause before a silent unit is asked again."""
 MAX_COPIES: Final = 10_000
-"""Maximum number of requests for which the connector caches where their bytes belong in the image."""
+"""Maximum number of requests for which the connector remembers where their bytes belong in the image."""
 _STATUS: Final = {
     client.ILLEGAL_FUNCTION: BAD_NOT_SUPPORTED,
     client.ILLEGAL_ADDRESS: BAD_OUT_OF_RANGE,
@@ -139,9 +139,9 @@ class ModbusConnector(Connector):
     """Reads all registers of a layout in each cycle.
 
     If the device refuses a request, the connector splits it until it finds the refused addresses.
-    Only these are bad. The connector tries them again every 10 s, also on a new connection. A unit
-    that does not answer takes its share of the time-out; then the connector pauses for 1 s, and later
-    up to 10 s, before it asks the unit again.
+    Only the registers at these addresses are bad. The connector tries the addresses again every 10
+    s, also on a new connection. It waits for a silent unit for this unit's share of the time-out,
+    and asks the unit again after 1 s, and later after up to 10 s.
     """
 
     Options = ModbusOptions
@@ -188,7 +188,7 @@ class ModbusConnector(Connector):
         return self._options.timeout / 1000
 
     def describe(self) -> str:
-        """Return the peer and the number of requests of a cycle as a text for logs."""
+        """Return, for the log, the peer and the number of requests in a cycle."""
         return f"to {self._client.peer} in {len(self._refusals.requests)} requests a cycle"
 
     def cycle_requests(self) -> CycleRequests:
@@ -208,7 +208,7 @@ class ModbusConnector(Connector):
         self._no_masks.clear()
 
     def take_over(self, other: ModbusConnector) -> bool:
-        """Take over the connection of another connector, and what it knows of the units."""
+        """Take over the connection of another connector, and its knowledge about the units."""
         if not other._client.connected:
             return False
         self._client, other._client = other._client, self._client
@@ -391,8 +391,8 @@ class ModbusConnector(Connector):
     def write(self, writes: Sequence[Write]) -> list[str]:
         """Write to the device, one write after the other: see :meth:`Connector.write`.
 
-        If several writes together make up a whole value, the connector joins them to one write, in
-        place of the last of them.
+        If several writes together make up a whole value, the connector joins them into one write,
+        and sends it in place of the last one.
         """
         if not self._client.connected:
             raise WriteLostError(f"not connected to {self._client.peer}", [Lost.UNSENT] * len(writes))

@@ -42,7 +42,7 @@ class ReadRequest:
     elements: tuple[Element, ...]
 
     def halves(self) -> list[ReadRequest]:
-        """Return two requests that together read the same elements, or only this one if it has one address."""
+        """Return two requests that together read the same elements; only this one if it has just one address."""
         addresses = sorted({(one.start, one.size) for one in self.elements})
         if len(addresses) == 1:
             return [self]
@@ -57,13 +57,13 @@ class ReadRequest:
 RETRY_NS: Final = 10_000_000_000
 """Pause before a refused address is tried again."""
 MAX_PROBES: Final = 20
-"""Maximum number of additional requests of a cycle that search for refused addresses or retry them."""
+"""Maximum number of additional requests in a cycle that search for refused addresses or try them again."""
 Place = tuple[int, Table, int]
 """An entry of a device: unit id, table, and number in the table."""
 
 
 class Limits(NamedTuple):
-    """Limits of a read request: its maximum size in words, or in bits, and its gaps."""
+    """Limits of a read request. ``words`` and ``bits`` are the maximum numbers of words and of bits in a request."""
 
     words: int
     bits: int
@@ -115,7 +115,7 @@ def _request(elements: Sequence[Element]) -> ReadRequest:
 
 @dataclass
 class Refusals:
-    """Keeps the addresses that a device refuses, and the requests without them. It outlives connections."""
+    """Plans requests without the addresses that a device refuses, and remembers these across connections."""
 
     elements: Sequence[Element]
     limits: Limits
@@ -124,7 +124,7 @@ class Refusals:
     refused: dict[Element, tuple[int, int]] = field(default_factory=dict)
     """The refused elements, each with the time to try it again (ns of CLOCK_MONOTONIC) and its status."""
     suspects: dict[ReadRequest, int] = field(default_factory=dict)
-    """Halves of refused requests that have not been answered yet, with the status of the refusal."""
+    """Halves of refused requests that have not been answered yet, each with the status of the refusal."""
 
     def __post_init__(self) -> None:
         self.requests = plan(self.elements, self.limits)
@@ -154,7 +154,7 @@ class Refusals:
         return first
 
     def due(self, now_ns: int, most: int) -> list[ReadRequest]:
-        """Return requests that retry refused addresses whose pause is over, at most ``most``."""
+        """Return requests for refused addresses whose pause is over, at most ``most`` requests."""
         found: dict[tuple[Place, int], list[Element]] = {}
         for one, (retry_ns, _) in self.refused.items():
             if retry_ns <= now_ns:
@@ -162,7 +162,10 @@ class Refusals:
         return [_request(some) for some in list(found.values())[: max(0, most)]]
 
     def accept(self, request: ReadRequest) -> None:
-        """Read the addresses of this request together with the others again, since the device answers it now."""
+        """Treat the addresses of a request as no longer refused, because the device has answered the request.
+
+        From now on, these addresses are read together with others again.
+        """
         for one in request.elements:
             self.refused.pop(one, None)
         refused = {

@@ -31,7 +31,7 @@ _ARROW: Final = " -> "
 
 
 class Place(NamedTuple):
-    """A value in the messages of a topic.
+    """The place of a value in the messages of a topic.
 
     ``steps`` is the path of the value in JSON. If it is None, the payload is the value as text.
     """
@@ -58,7 +58,7 @@ class Metric(NamedTuple):
 
 
 class Address(NamedTuple):
-    """Where a register is read (``source``), and where its writes are published (``target``).
+    """The place where a register is read (``source``), and where its writes are published (``target``).
 
     If ``target`` is None, writes are published on ``source``.
     """

@@ -61,7 +61,7 @@ class Listener:
             self._payloads[topic], self._size = kept, size
 
     def wait(self, until_s: float) -> None:
-        """Listen until ``until_s`` (CLOCK_MONOTONIC, in s), or until there are too many messages."""
+        """Listen until ``until_s`` (CLOCK_MONOTONIC, in s), or until the messages exceed a limit."""
         with self._changed:
             self._changed.wait_for(lambda: self.incomplete, max(0.0, until_s - time.monotonic()))
 

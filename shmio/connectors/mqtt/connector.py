@@ -29,11 +29,11 @@ from shmio.layout.values.write import Write
 from shmio.wording import counted
 
 TIMEOUTS: Final = 4
-"""The longest time that connecting may take, as a multiple of the option ``timeout``."""
+"""Maximum time for connecting, as a multiple of the option ``timeout``."""
 FIRST_S: Final = 0.1
-"""Maximum time for which a new connection waits for retained messages, in s."""
+"""Maximum time in s for which a new connection waits for retained messages."""
 ECHO_S: Final = 0.2
-"""Maximum time for which an acknowledged write waits for its message to come back from the broker, in s."""
+"""Maximum time in s for which an acknowledged write waits until the broker has sent the message back."""
 
 
 @dataclass
@@ -106,7 +106,7 @@ class MqttConnector(Connector):
         return f"to {self._options.address} as {self._client_id}, MQTT {version}, {secured}, {self._store.describe()}"
 
     def cycle_requests(self) -> CycleRequests:
-        """Return the number of subscriptions. A cycle needs no requests."""
+        """Return a description with the number of subscriptions. A cycle sends no requests."""
         return CycleRequests(counted(len(self._store.filters), "subscription"), note="the broker sends their messages")
 
     def connect(self) -> None:
@@ -141,7 +141,7 @@ class MqttConnector(Connector):
         link.check()
 
     def take_over(self, other: MqttConnector) -> bool:
-        """Take over the connection, and the newest messages of the topics that both connectors have."""
+        """Take over the connection of ``other``, and the newest messages of the topics that both connectors have."""
         link, store = other._link, self._store
         if link is None:
             return False
@@ -194,7 +194,7 @@ class MqttConnector(Connector):
         return self._store.image(time.monotonic_ns())
 
     def close(self) -> None:
-        """Close the connection. It may be called at any time and more than once."""
+        """Close the connection. You may call this at any time and more than once."""
         if self._link is not None:
             self._link.close()
             self._last_number = self._link.last_number
@@ -203,7 +203,9 @@ class MqttConnector(Connector):
     # -- writing -------------------------------------------------------------------------------------------------------
 
     def send(self, writes: Sequence[Write]) -> None:
-        """Publish the written values, with as many messages as may be unacknowledged at a time.
+        """Publish the written values: first as many messages as may be unacknowledged at a time.
+
+        :meth:`confirm` publishes the others.
 
         Raises:
             WriteLostError: The connection is lost.

@@ -65,7 +65,7 @@ def extract(document: Any, steps: Steps) -> Any:
 def assign(document: Any, steps: Steps, value: Any) -> Any:
     """Return the document with ``value`` at a path.
 
-    Missing objects and arrays are added.
+    Objects and arrays that are missing on the way are added.
 
     Raises:
         ValueError: The path leads through a value of another kind, or array elements before the

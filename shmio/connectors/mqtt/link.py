@@ -1,8 +1,8 @@
 """One connection to a broker. Its own thread receives the packets.
 
-The broker keeps no session for the client, so that it never delivers messages of an old connection on
-a new one. The client sends a PINGREQ at least every half time-out. The answer shows that the broker is
-alive, and that its messages are not delayed.
+The broker keeps no session for the client, and so never delivers messages of an old connection on a new
+one. The client sends a PINGREQ at least once in every half of the time-out. The answer shows that the
+broker is alive, and that its messages are not delayed.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ from shmio.logs import printable
 RECEIVE_BYTES: Final = 1 << 15
 """Number of bytes to receive from the socket at once."""
 MAX_PACKET_BYTES: Final = (1 << 24) + (1 << 17)
-"""Largest packet accepted; a larger one ends the connection.
+"""Largest packet accepted, in bytes; a larger one ends the connection.
 
-It has room for the largest payload that ``max_payload_bytes`` allows.
+Such a packet has room for the largest payload that ``max_payload_bytes`` allows.
 """
 MAX_FILTERS: Final = 8
-"""Largest number of filters in a SUBSCRIBE.
+"""Maximum number of filters in a SUBSCRIBE.
 
-Some brokers disconnect clients that send more (AWS IoT Core).
+Some brokers (AWS IoT Core) disconnect clients that send more.
 """
 MAX_IN_FLIGHT: Final = 20
 HEAD_BYTES: Final = 128
-"""Largest size of a PUBLISH without its topic and payload."""
+"""Maximum size in bytes of a PUBLISH without its topic and payload."""
 CLOSE_S: Final = 0.5
 _TURN_S: Final = 1.0
 _Result = TypeVar("_Result")
@@ -168,7 +168,7 @@ class Publication:
 
 
 class Link:
-    """A connection to a broker. Create it, then call :meth:`open`."""
+    """A connection to a broker. Create the object, then call :meth:`open`."""
 
     def __init__(
         self,
@@ -225,7 +225,7 @@ class Link:
         Args:
             version: The version of MQTT.
             filters: The topic filters to subscribe to.
-            until_s: When to give up, s of CLOCK_MONOTONIC.
+            until_s: Time at which to give up, in s of CLOCK_MONOTONIC.
 
         Returns:
             The filters that the broker refuses.
@@ -342,7 +342,7 @@ class Link:
         return client
 
     def hand_over(self, deliver: Deliver, wake: Callable[[], None], inherit: Callable[[], _Result]) -> _Result:
-        """Deliver messages to another object from now on.
+        """From now on, deliver messages to another object.
 
         Args:
             deliver: As for the constructor.
@@ -360,7 +360,7 @@ class Link:
             return found
 
     def close(self) -> None:
-        """Close the connection; it may be called more than once."""
+        """Close the connection. You may call this more than once."""
         self._closing = True
         client, thread = self._client, self._thread
         if client is None:
@@ -399,7 +399,7 @@ class Link:
         return self._client.ping() if self._client is not None else 0
 
     def answered(self, number: int) -> bool:
-        """Return whether the broker has answered this PINGREQ, or the connection is lost."""
+        """Return whether the broker has answered a PINGREQ; also return True if the connection is lost."""
         return self._client is None or self._client.pongs >= number or bool(self._failure)
 
     # -- publishing ----------------------------------------------------------------------------------------------------
@@ -410,7 +410,7 @@ class Link:
         return bool(size <= self._limits.get("MaximumPacketSize", size))
 
     def await_room(self, until_s: float) -> bool:
-        """Wait until few enough messages are unacknowledged to send another one.
+        """Wait until so few messages are unacknowledged that another one may be sent.
 
         Returns:
             Whether another message may be sent by ``until_s``, a time of CLOCK_MONOTONIC.
@@ -447,7 +447,7 @@ class Link:
         return info.mid
 
     def wait_acknowledged(self, numbers: Iterable[int], until_s: float) -> bool:
-        """Wait until the broker has acknowledged these messages; return whether it has by ``until_s``.
+        """Wait until the broker has acknowledged these messages; return False if it has not by ``until_s``.
 
         Raises:
             ConnectorError: The connection is lost.
@@ -457,7 +457,7 @@ class Link:
         return self._seen(lambda: wanted <= self._acks.keys(), until_s)
 
     def outcome(self, number: int, topic: str, *, retain: bool) -> str | None:
-        """Return "" if the broker has accepted a message, else why it was refused; None if there is no answer."""
+        """Return "" if the broker has accepted a message, or why not; None if the broker has not answered yet."""
         code = self._acks.get(number)
         if code is None:
             return None
@@ -468,16 +468,16 @@ class Link:
         return ""
 
     def forget(self) -> None:
-        """Forget the messages of the last writes, because their numbers will be used again."""
+        """Forget the messages of the last writes, because new messages will have the same numbers."""
         with self._condition:
             self._in_flight.clear()
             self._acks.clear()
 
     def wait_answered(self, number: int, until_s: float) -> bool:
-        """Wait until the broker has answered a PINGREQ, and has thus read all messages before it.
+        """Wait until the broker has answered a PINGREQ, and so has read all messages before it.
 
         Returns:
-            Whether it has by ``until_s``.
+            False if there is no answer by ``until_s``, a time of CLOCK_MONOTONIC.
 
         Raises:
             ConnectorError: The connection is lost.

@@ -107,7 +107,7 @@ def encode(metric: wire.Metric, datatype: int, value: Any, field: str | None) ->
         metric: The metric of the command.
         datatype: The metric's data type, as its birth states it.
         value: The value.
-        field: The field of the message that has the value in the birth; None if this is not known.
+        field: The field of the protobuf message in which the birth had the value; None if unknown.
 
     Raises:
         ValueError: The value does not fit the data type.

@@ -19,7 +19,7 @@ _Texts = Annotated[list[_Text], msgspec.Meta(min_length=1, max_length=100)]
 class Will(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
     """A topic that says whether a device is online.
 
-    Usually, this is the topic of the device's last will.
+    This is usually the topic of the device's last will.
     """
 
     topic: _Text
@@ -36,7 +36,7 @@ class Will(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True
 
 
 class MqttOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
-    """Address of the broker, how to read and publish, and when a value is good.
+    """The broker's address, how to read and publish values, and when a value is good.
 
     Raises:
         ValueError: Some keys contradict each other.
@@ -56,19 +56,19 @@ class MqttOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_on
     retain: bool = False
     """True to publish written values with the retain flag."""
     max_age_ms: _Age | dict[_Text, _Age] | None = None
-    """Age in ms above which a topic's last message is too old; 0 if it never is.
+    """Age in ms above which a topic's last message is too old; 0: no message is ever too old.
 
     A single number applies to all registers; a table has a number for each pattern of registers.
     """
     will: _Text | Annotated[list[Will], msgspec.Meta(max_length=1000)] = msgspec.field(default_factory=list)
     time: _Text | None = None
-    """Path of the source time in JSON payloads. If None, it is the time when the message was received."""
+    """Path of the source time in JSON payloads. None: the source time is the time of receipt."""
     texts: tuple[_Text, _Text] = ("false", "true")
     """The texts published for a BOOL register: the first for false, the second for true."""
     templates: Annotated[dict[_Text, str], msgspec.Meta(max_length=10_000)] = msgspec.field(default_factory=dict)
-    """By topic, the JSON document into which written values are inserted; default: an empty object."""
+    """For each topic, the JSON document into which written values are inserted; default: an empty object."""
     rebirth: bool = True
-    """True to request births from Sparkplug nodes."""
+    """True to ask Sparkplug nodes for their births."""
     max_payload_bytes: Annotated[int, msgspec.Meta(ge=100, le=1 << 24)] = 1 << 20
     """The largest payload whose values are read, in bytes."""
     username: Annotated[str, msgspec.Meta(min_length=1, max_length=256)] | None = None
@@ -77,7 +77,7 @@ class MqttOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_on
     certificate: str | None = None
     key: str | None = None
     insecure: bool = False
-    """True to allow plain text to other hosts."""
+    """True to allow unencrypted connections to other hosts."""
 
     def __post_init__(self) -> None:
         parts = urlsplit(self.url)

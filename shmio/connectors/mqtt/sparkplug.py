@@ -32,13 +32,13 @@ from shmio.wire import sparkplug_b_pb2 as wire
 
 REBIRTH: Final = "Node Control/Rebirth"
 MAX_METRICS: Final = 100_000
-"""Largest number of metrics in a message."""
+"""Maximum number of metrics in a message."""
 MAX_ALIASES: Final = 1_000_000
-"""Largest number of aliases of a node and all its devices."""
+"""Maximum number of aliases of a node with all its devices."""
 ASK: Final = Backoff(1.0, 60.0)
 """The waiting times before shmio asks a node again for its birth."""
 CALM_NS: Final = 120_000_000_000
-"""Time in ns without a request to a node after which the waiting times start again with the shortest."""
+"""The waiting times start again with the shortest if shmio has not asked the node for this time in ns."""
 KINDS: Final = ("NBIRTH", "NDATA", "NDEATH", "DBIRTH", "DDATA", "DDEATH")
 _SEQUENCE: Final = 256
 _BAD: Final = 0x80000000
@@ -92,7 +92,7 @@ class Device(Origin):
         return f"{self} is not online: it {'has died' if self.died else 'has sent no birth'}"
 
     def order_of(self, index: int) -> int:
-        """Return the order of the message with the newest value of a register."""
+        """Return the ``order`` of the message with the newest value of a register."""
         found = self._found.get(index)
         return self._birth_order if found is None else found[1]
 
@@ -120,13 +120,13 @@ class Device(Origin):
         self.end(died=False)
 
     def end(self, *, died: bool) -> None:
-        """Discard the values and metrics of the device. It has none until its next birth."""
+        """Discard the device's values and metrics until its next birth. ``died`` is true if the device has died."""
         self.born, self.died, self.missed = False, died, False
         self.metrics.clear()
         self._found.clear()
 
     def inherit(self, other: Device) -> None:
-        """Take the values of the same device of an earlier layout."""
+        """Take over the values of ``other``, the same device in the layout before a reload."""
         self.born, self.died, self.message = other.born, other.died, other.message
         self._birth_order = other._birth_order
         self.metrics = {name: known for name, known in other.metrics.items() if name in self.wanted}
@@ -137,12 +137,12 @@ class Device(Origin):
         self.missed = other.missed or (other.born and not self.wanted.keys() <= other.wanted.keys())
 
     def begin(self, order: int) -> None:
-        """Prepare for the metrics of a birth of the device: discard all earlier values and metrics."""
+        """Discard all earlier values and metrics, because a birth of the device follows."""
         self.end(died=False)
         self.born, self._birth_order = True, order
 
     def take(self, known: _Known, one: wire.Metric, message: Message, sent_ms: int) -> None:
-        """Store a value of a metric."""
+        """Store the value of a metric, which a message has reported, for the metric's registers."""
         at_ms = one.timestamp if one.HasField("timestamp") else sent_ms
         source_ns = at_ms * 1_000_000 if 0 < at_ms <= _MAX_MS else message.utc_ns
         found: Found | ValueFaultError
@@ -155,7 +155,7 @@ class Device(Origin):
             self._found[index] = found, message.order
 
     def command(self, values: Mapping[str, Any], now_ms: int) -> tuple[str, bytes]:
-        """Return the topic and the payload of a command that sets metrics, given by name, to values.
+        """Return topic and payload of a command that sets metrics to values. ``values`` are by metric name.
 
         Raises:
             ValueError: The device is offline, or a value does not fit its metric.
@@ -176,7 +176,7 @@ class Device(Origin):
 
 
 class Node:
-    """An edge node."""
+    """A Sparkplug edge node, with its devices."""
 
     def __init__(self, group: str, name: str) -> None:
         self._group, self._name = group, name
@@ -191,15 +191,15 @@ class Node:
         return f"{self._group}/{self._name}"
 
     def topic(self, kind: str, device: str = "") -> str:
-        """Return the topic of the node's or a device's messages of a kind, such as ``DDATA``."""
+        """Return the topic on which the node, or one of its devices, sends messages of a kind such as ``DDATA``."""
         return "/".join((NAMESPACE, self._group, kind, self._name, *((device,) if device else ())))
 
     @property
     def filters(self) -> list[str]:
         """The topic filters for all messages of the node.
 
-        All kinds of messages share one sequence of numbers. If one kind were left out, its numbers
-        would seem to be lost.
+        Messages of all kinds are numbered together. If the client did not subscribe to one kind,
+        messages would seem to be lost.
         """
         return [self.topic(kind, "+" if kind.startswith("D") else "") for kind in KINDS]
 
@@ -213,7 +213,7 @@ class Node:
         return self.devices.setdefault(name, Device(self, name))
 
     def reset(self) -> None:
-        """Forget all messages, and note that shmio must ask the node for its birth."""
+        """Forget all messages, and remember to ask the node for its birth."""
         self._born, self._ask = False, True
         self._session: int | None = None
         self._next: int | None = None
@@ -222,10 +222,10 @@ class Node:
             device.reset()
 
     def inherit(self, other: Node) -> None:
-        """Take the values of the same node of an earlier layout.
+        """Take over the values of ``other``, the same node in the layout before a reload.
 
-        The births of the node had the definitions of other metrics, which were not kept. So if more
-        metrics are wanted now, shmio must ask for a birth.
+        ``other`` has not kept the definitions of metrics that no register had. So if the new layout
+        has further metrics, shmio must ask for a birth.
         """
         self._born, self._ask, self._session, self._next = other._born, other._ask, other._session, other._next
         self._asks, self._asked_ns = other._asks, other._asked_ns
@@ -379,7 +379,7 @@ class Host:
         self._nodes: dict[tuple[str, str], Node] = {}
 
     def origin(self, address: Metric, index: int) -> Device:
-        """Return the node or device of a metric, and note that the register ``index`` has this metric."""
+        """Return the node or device of a metric, and remember that the register ``index`` has the metric's value."""
         node = self._nodes.setdefault((address.group, address.node), Node(address.group, address.node))
         device = node.device(address.device)
         device.wanted.setdefault(address.name, []).append(index)
@@ -402,7 +402,7 @@ class Host:
         return all(node.born and all(device.born for device in node.devices.values()) for node in self._nodes.values())
 
     def take(self, message: Message, topic: str) -> None:
-        """Process a message, unless it is a retained one, which may be from an earlier session."""
+        """Process a message, except for a retained one, which may be from an earlier session."""
         levels = topic.split("/")
         if message.retained or not 4 <= len(levels) <= 5 or levels[2] not in KINDS:
             return
@@ -414,13 +414,13 @@ class Host:
         node.take(levels[2], levels[4] if len(levels) == 5 else "", message)
 
     def requests(self, now_ns: int) -> Iterator[tuple[str, bytes]]:
-        """Yield the topics and payloads of the requests for births that are due."""
+        """Yield topic and payload of each request for a birth that is due."""
         for node in self._nodes.values():
             if (found := node.request(now_ns)) is not None:
                 yield found
 
     def inherit(self, other: Host) -> None:
-        """Take the values of the nodes that an earlier layout also has."""
+        """Take over the values of the nodes that the layout before a reload had, too."""
         for key, node in self._nodes.items():
             if (before := other._nodes.get(key)) is not None:
                 node.inherit(before)

@@ -208,10 +208,11 @@ class Store:
             self._all_changed = True
 
     def inherit(self, other: Store) -> list[str]:
-        """Take the messages of an earlier layout's store.
+        """Take over the messages of ``other``, the store of the layout before a reload.
 
         Returns:
-            The filters to subscribe to, also again, for what the other store does not know.
+            The filters to subscribe to for what ``other`` does not know, even if a subscription
+            exists already.
 
         """
         with self._changed, other._changed:
@@ -225,7 +226,7 @@ class Store:
         return [one for one in self.filters if one in fresh]
 
     def refuse(self, topic: str) -> None:
-        """Note that the broker refuses the subscription to a topic."""
+        """Remember that the broker refuses the subscription to a topic."""
         log.warning("the broker refuses the subscription to %s", topic)
         with self._changed:
             self._all_changed = True
@@ -323,7 +324,7 @@ class Store:
         raise ValueRangeError("the present value is not known")
 
     def command(self, values: Mapping[int, Any]) -> tuple[str, bytes]:
-        """Return topic and payload of a Sparkplug command; all registers must belong to one device.
+        """Return topic and payload of a Sparkplug command; all its registers must belong to one device.
 
         Raises:
             ValueError: The device is offline, or a value does not fit its metric.
@@ -340,33 +341,33 @@ class Store:
             return device.command(named, time.time_ns() // 1_000_000)
 
     def requests(self, now_ns: int) -> list[tuple[str, bytes]]:
-        """Return the topics and payloads of the rebirth requests that are due."""
+        """Return topic and payload of each rebirth request that is due."""
         if not self.host:
             return []
         with self._changed:
             return list(self.host.requests(now_ns))
 
     def expect(self, topic: str, payload: bytes) -> None:
-        """Note that a payload is about to be published, and will come back, if its topic is also read."""
+        """Remember that a payload is about to be published and will come back; do nothing if its topic is not read."""
         with self._changed:
             if topic in self._topics and not self._topics[topic].refused:
                 self._expected[topic] = payload
 
     def await_expected(self, until_s: float) -> bool:
-        """Wait until the published payloads have come back; return whether they have by ``until_s``.
+        """Wait until all expected payloads have come back.
 
-        ``until_s`` is a time of CLOCK_MONOTONIC.
+        Return False if some have not come back by ``until_s``, a time of CLOCK_MONOTONIC.
         """
         return self.wait(lambda: not self._expected, until_s)
 
     def expect_nothing(self) -> None:
-        """Forget the published payloads that have not come back."""
+        """Forget the expected payloads that have not come back."""
         with self._changed:
             self._expected.clear()
 
     @property
     def complete(self) -> bool:
-        """True if no topic, will or Sparkplug device is still without a first message."""
+        """True if each topic, will and Sparkplug device has a first message, or the broker has refused it."""
         return (
             all(one.message is not None or one.refused for one in self._topics.values())
             and all(watch.there is not None for watch in self._watches)
@@ -374,9 +375,10 @@ class Store:
         )
 
     def wait(self, condition: Callable[[], bool], until_s: float) -> bool:
-        """Wait until ``condition`` holds, at most until ``until_s``; return whether it holds.
+        """Wait until ``condition`` returns true.
 
-        ``until_s`` is a time of CLOCK_MONOTONIC. The condition is checked after each message.
+        Return False if it does not by ``until_s``, a time of CLOCK_MONOTONIC. The condition is
+        checked after each message.
         """
         with self._changed:
             self._waiting += 1

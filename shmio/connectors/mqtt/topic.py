@@ -1,4 +1,4 @@
-"""Where registers get their values: the newest message of a topic or of a Sparkplug device."""
+"""The origins of registers' values: the newest messages of topics and of Sparkplug devices."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ _UNITS: Final = ((1e11, 10**9), (1e14, 10**6), (1e17, 10**3))
 
 
 class Message(msgspec.Struct, frozen=True, gc=False):
-    """A received message; ``order`` is its number since the source started."""
+    """A received message; ``order`` counts the messages since the source started."""
 
     payload: bytes
     retained: bool
-    """True if the message was retained, so that its time of publication is unknown."""
+    """True if the broker had stored the message, so that its time of publication is unknown."""
     order: int
     monotonic_ns: int
     utc_ns: int
 
 
 class Found(msgspec.Struct, frozen=True):
-    """What a message contains for a register: text as bytes, or a JSON value."""
+    """What a message contains for a register: a text as bytes, or a JSON value."""
 
     value: Any
     source_ns: int
@@ -42,7 +42,7 @@ class Found(msgspec.Struct, frozen=True):
 
 
 class Origin(ABC):
-    """Where registers get their values: a topic, or a device of Sparkplug."""
+    """The origin of registers' values: a topic, or a Sparkplug device."""
 
     message: Message | None = None
     """The newest message; None if there is none."""
@@ -50,7 +50,7 @@ class Origin(ABC):
     @property
     @abstractmethod
     def fault(self) -> int:
-        """The status that makes all registers bad; GOOD if there is none."""
+        """The status that makes all registers of this origin bad; GOOD if there is none."""
 
     @property
     def offline(self) -> str:
@@ -59,7 +59,7 @@ class Origin(ABC):
 
     @abstractmethod
     def order_of(self, index: int) -> int:
-        """Return the order of the message with the newest value of a register."""
+        """Return the ``order`` of the message with the newest value of a register."""
 
     @abstractmethod
     def find(self, index: int) -> Found:
@@ -98,11 +98,11 @@ class Topic(Origin):
 
     @property
     def fault(self) -> int:
-        """The status that makes all registers bad; GOOD if there is none."""
+        """The status that makes all registers of the topic bad; GOOD if there is none."""
         return BAD_USER_ACCESS_DENIED if self.refused else GOOD
 
     def order_of(self, index: int) -> int:  # noqa: ARG002  each message is for all registers
-        """Return the order of the newest message."""
+        """Return the ``order`` of the newest message, which has values for all registers."""
         return self.message.order if self.message is not None else 0
 
     def find(self, index: int) -> Found:
@@ -142,7 +142,7 @@ class Topic(Origin):
         self.refused = False
 
     def inherit(self, other: Topic) -> None:
-        """Take the message of the same topic from an earlier layout."""
+        """Take over the message of ``other``, the same topic in the layout before a reload."""
         self.message, self.refused = other.message, other.refused
 
 

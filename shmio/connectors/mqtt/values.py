@@ -29,11 +29,11 @@ _WHOLE: Final = re.compile(r"[+-]?[0-9]{1,20}")
 _NO_NUMBER: Final = {"nan": math.nan, "inf": math.inf, "infinity": math.inf, "-inf": -math.inf, "-infinity": -math.inf}
 _BOOLS: Final = {"true": True, "false": False, "1": True, "0": False, "on": True, "off": False}
 _EXACT: Final = 1 << 53
-"""Every whole number up to this one has an exact float."""
+"""Every whole number up to this one can be represented exactly by a float."""
 MAX_PLAIN: Final = 40
-"""Longest payload, in bytes, that the converter first tries to read as a plain number."""
+"""Size in bytes of the longest payload that the converter first tries to read as a plain number."""
 SHOWN: Final = 40
-"""Largest number of characters that a message shows of a wrong value."""
+"""Maximum number of characters of a wrong value that a message to the user shows."""
 
 
 class ValueConverter:
@@ -84,7 +84,9 @@ class ValueConverter:
     def from_json(self, found: Any) -> Value:
         """Return the value of the register for a JSON value.
 
-        It raises the same errors as :meth:`from_text`.
+        Raises:
+            ValueFaultError, ValueRangeError: As for :meth:`from_text`.
+
         """
         register = self._register
         if not register.dims:
@@ -166,7 +168,7 @@ class ValueConverter:
         return found
 
     def to_value(self, value: Value) -> Any:
-        """Return the value for the device: without the register's scale, and an array as nested lists.
+        """Return the value to send to the device: without the register's scale, and an array as nested lists.
 
         Raises:
             ValueError: The value is not valid.

@@ -38,14 +38,17 @@ class Watch:
         self.reset()
 
     def reset(self) -> None:
-        """Forget what was received."""
+        """Forget what the messages have said."""
         self.there: bool | None = None
         """True if the device is online; None before the first message about it."""
         self._gone_order = 0
         self._said = ""
 
     def inherit(self, watches: Iterable[Watch]) -> bool:
-        """Take what was received by the same watch of an earlier layout, if there is one; return whether there is."""
+        """Take over what the messages have said to the same watch in the layout before a reload.
+
+        Return False if ``watches``, which are those of the earlier layout, do not contain it.
+        """
         for other in watches:
             if (other.place, other._good) == (self.place, self._good):
                 self.there, self._gone_order, self._said = other.there, other._gone_order, other._said
@@ -75,7 +78,7 @@ class Watch:
             self._gone_order = message.order
 
     def refuse(self) -> None:
-        """Note that the broker refuses the subscription, so that the device counts as offline."""
+        """Treat the device as offline, because the broker refuses the subscription."""
         self._said, self.there = "unknown, because the broker refused the subscription", False
 
     def _text(self, payload: bytes) -> str:
@@ -85,7 +88,7 @@ class Watch:
         return str(found).lower() if isinstance(found, bool) else str(found)
 
     def fault(self, message: Message | None) -> int:
-        """Return the status to show instead of the values in a message of the device; GOOD if they are valid."""
+        """Return the status to show instead of the values in a message from the device; GOOD if the values count."""
         if self.there is None:
             return BAD_WAITING_FOR_INITIAL_DATA
         if not self.there:

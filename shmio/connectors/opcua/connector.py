@@ -54,7 +54,7 @@ CONNECT_TIMEOUTS: Final = 3
 """Maximum time for connecting, as a multiple of the time-out."""
 CLOSE_S: Final = 0.5
 MAX_REPORTED: Final = 20
-"""Maximum number of faulty registers that the log names per connection."""
+"""Maximum number of faulty registers that the log names in each connection."""
 
 _NO_DEADBAND: Final = "a member of a structure has no dead-band: the server sends each change of the structure"
 
@@ -198,11 +198,11 @@ class OpcUaConnector(Connector):
 
     @property
     def doubt(self) -> str:
-        """Why values may stop changing although they can be read; empty if there is no reason."""
+        """Why values may have stopped changing although they can be read; empty if there is no such reason."""
         return self._link.doubt if self._link is not None else ""
 
     def describe(self) -> str:
-        """Return the peer and the mode of reading, as a text for logs."""
+        """Return, for the log, the peer and the mode of reading."""
         options = self._options
         how = f"{options.security}, {options.policy}" if options.security != "None" else "no security"
         sessions = self._link.sessions if self._link is not None else []
@@ -211,7 +211,7 @@ class OpcUaConnector(Connector):
         return f"to {options.peer}, {len(self._nodes)} nodes, {mode}, sessions={len(sessions)}, {how}"
 
     def cycle_requests(self) -> CycleRequests:
-        """Return the requests that a cycle makes. In mode ``subscribe`` there are none."""
+        """Return the requests that a cycle sends; in mode ``subscribe``, a cycle sends none."""
         options, nodes = self._options, len(self._nodes)
         reads = counted(nodes, "node")
         if options.mode == "subscribe":
@@ -226,7 +226,7 @@ class OpcUaConnector(Connector):
         return CycleRequests(reads, (Requests(count, count),), note)
 
     def connect(self) -> None:
-        """Open the sessions, and wait, at most for the time-out, for the first value of each node.
+        """Open the sessions, and wait for the first value of each node, but at most for the time-out.
 
         Raises:
             ConnectorError: The server cannot be reached, or refuses the client.
@@ -246,7 +246,7 @@ class OpcUaConnector(Connector):
             raise
 
     def take_over(self, other: OpcUaConnector) -> bool:
-        """Take over the sessions, and the newest values of the nodes that both connectors have."""
+        """Take over the sessions of ``other``, and the newest values of the nodes that both connectors have."""
         link = other._link
         if link is None:
             return False
@@ -283,7 +283,7 @@ class OpcUaConnector(Connector):
             return bytes(image)
 
     def close(self) -> None:
-        """Close all sessions. It may be called at any time and more than once."""
+        """Close all sessions. You may call this at any time and more than once."""
         if self._link is not None:
             self._link.close()
             self._link = None
@@ -363,7 +363,7 @@ class OpcUaConnector(Connector):
     # -- writing -------------------------------------------------------------------------------------------------------
 
     def send(self, writes: Sequence[Write]) -> None:
-        """Start to write to the nodes, in the thread of the sessions.
+        """Let the thread of the sessions write to the nodes; :meth:`confirm` waits for the outcomes.
 
         Raises:
             WriteLostError: A session is lost.
@@ -400,7 +400,7 @@ class OpcUaConnector(Connector):
         """Wait until the nodes are written and read back, so that the next image has the new values.
 
         Raises:
-            WriteLostError: A session was lost before all writes had their answers.
+            WriteLostError: A session was lost before the server had answered all writes.
 
         """
         link, sending = self._link, self._sending

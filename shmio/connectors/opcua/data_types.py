@@ -20,24 +20,24 @@ _MAX_ANCESTORS: Final = 16
 _HAS_ENCODING, _HAS_SUBTYPE = 38, 45
 _TEXT: Final = re.compile(r"(?:ns=([0-9]+);)?([isgb])=(.*)", re.DOTALL)
 _ABSTRACT: Final = {26: decode.VARIANT, 27: decode.VARIANT, 28: decode.VARIANT, 29: decode.INT32}
-"""How values of Number, Integer, UInteger and Enumeration are encoded."""
+"""The encodings of values whose data type is Number, Integer, UInteger or Enumeration."""
 
 Structures = Mapping[NodeKey, Structure]
 """Structures by the node ids of their encodings."""
 
 
 class Asked(Protocol):
-    """The requests of a session that :class:`DataTypes` needs."""
+    """The part of a session that :class:`DataTypes` needs."""
 
     async def read(self, nodes: Sequence[Any], attribute: Any) -> list[Sample]:
         """Read an attribute of nodes."""
 
     async def origins(self, nodes: Sequence[Any], reference: Any) -> list[Any]:
-        """Return for each node a node that refers to it by ``reference``; None if no node does."""
+        """For each node, return a node that refers to it by ``reference``; None if there is none."""
 
 
 class DataTypes:
-    """The structures that some nodes have as values, as far as the server defines them."""
+    """The structures that nodes have as values, as far as the server defines these structures."""
 
     def __init__(self, session: Asked) -> None:
         """Create the object without a request; :meth:`learn` sends the requests."""
@@ -157,7 +157,7 @@ class DataTypes:
 
 
 def encodings_of(sample: Sample) -> Iterable[NodeKey]:
-    """Return the node ids of the encodings of a value's structures, each once."""
+    """Return the node ids of the encodings of the structures in a value, each once."""
     if sample.kind != decode.EXTENSION:
         return set()
     values = sample.value if sample.dims is not None else [sample.value]

@@ -1,8 +1,8 @@
-"""Reads values from the answers of a server, read responses and publish responses, and encodes single values.
+"""Reads values from a server's read responses and publish responses, and encodes single values.
 
-The library's own decoding builds an object for each field, which is too slow for thousands of values
-a cycle, and sets no limit to the memory that a short message can demand. This decoder reads only what
-a source needs, and checks each length against the received bytes. Encoding: OPC 10000-6, section 5.2.
+The library's own decoding builds an object for each field, which is too slow for thousands of values a
+cycle, and sets no limit to the memory that a short message can demand. This decoder reads only what a
+source needs, and checks each length against the received bytes. Encoding: OPC 10000-6, section 5.2.
 """
 
 from __future__ import annotations
@@ -84,9 +84,9 @@ class Sample(NamedTuple):
 class Publication(NamedTuple):
     """Content of a publish response.
 
-    ``keep_alive`` is true if the response has no notifications. ``values`` are pairs of a monitored
-    item's number and its sample. ``closed`` is the status code with which the server ended the
-    subscription, or 0.
+    ``keep_alive`` is true if the response has no notifications, and only shows that the server is
+    alive. ``values`` are pairs of a monitored item's number and its sample. ``closed`` is the
+    status code with which the server ended the subscription, or 0.
     """
 
     subscription: int
@@ -97,7 +97,7 @@ class Publication(NamedTuple):
 
 
 def check_fault(data: bytes) -> None:
-    """Raise FaultError if the server refuses the request, MalformedError if the response is malformed."""
+    """Raise FaultError if the server refuses the request, or MalformedError if the response is malformed."""
     Reader(data).header(None)
 
 
@@ -131,17 +131,17 @@ def publish_response(data: bytes) -> Publication:
 
 
 NodeKey = tuple[int, int, int | str | bytes]
-"""A node id that can be compared: the type of its identifier (2 for a number), its namespace, the identifier."""
+"""A node id that can be compared: the type of its identifier (2 for a number), its namespace and its identifier."""
 
 
 def node_key(found: tuple[int, int, int | str | bytes]) -> NodeKey:
-    """Return a node id in the form that can be compared: all numbers have the same type."""
+    """Convert a node id to the form that can be compared, in which all numbers have the same type."""
     form, namespace, identifier = found
     return max(form, 2), namespace, identifier
 
 
 class Reader:
-    """Reads a message, or a part of one, from its beginning. Each method reads the item after which it is named."""
+    """Reads a message, or a part of one, from its beginning. Each method reads the item that it is named after."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
@@ -151,7 +151,7 @@ class Reader:
         """Read the type and the header of a response.
 
         Args:
-            expected: Number of the response's type; None if any will do.
+            expected: Number of the response's type; None: any type is right.
 
         Raises:
             FaultError: The server refuses the request.
@@ -172,7 +172,7 @@ class Reader:
 
     @property
     def left(self) -> int:
-        """Number of bytes that were not read yet."""
+        """Number of bytes not yet read."""
         return len(self._data) - self._at
 
     def skip(self, size: int) -> None:
@@ -203,7 +203,7 @@ class Reader:
         return int(_INT.unpack_from(self._data, self._at - 4)[0])
 
     def count(self, least: int = 1) -> int:
-        """Read the length of an array; return 0 for a null.
+        """Read the length of an array; return 0 for a null array.
 
         Args:
             least: Minimum number of bytes of an element.
@@ -221,13 +221,13 @@ class Reader:
         return count
 
     def chunk(self) -> bytes | None:
-        """Read a length and that many bytes; return None for a null."""
+        """Read a length, and that number of bytes; return None if the length stands for null."""
         self.skip(4)
         size = int(_INT.unpack_from(self._data, self._at - 4)[0])
         return None if size < 0 else self.take(size)
 
     def text(self) -> str:
-        """Read a String; return an empty text for a null."""
+        """Read a String; return "" for a null String."""
         return (self.chunk() or b"").decode("utf-8", "replace")
 
     def time(self) -> int:
@@ -264,7 +264,7 @@ class Reader:
         return found
 
     def type_id(self) -> int:
-        """Read a node id; return its number in the standard's namespace, or -1 if it has none there."""
+        """Read a node id; return its number if it is a number in the standard's namespace, or else -1."""
         form, namespace, identifier = self.node_id()
         return int(identifier) if form < 3 and namespace == 0 else -1
 
@@ -314,7 +314,7 @@ class Reader:
         return Sample(kind, value, dims, code, max(source_ns, 0) or max(server_ns, 0))
 
     def variant(self, depth: int) -> tuple[int, Any, tuple[int, ...] | None]:
-        """Read a variant; return its type, value and dimensions."""
+        """Read a variant; return the number of its built-in type, its value and its dimensions."""
         mask = self.u8()
         kind = mask & 0x3F
         if not mask & 0x80:
@@ -400,7 +400,7 @@ def encoded(kind: int, value: Any) -> bytes:
 
 
 def size_of(kind: int) -> int:
-    """Return how many bytes a value of a built-in type has at least."""
+    """Return the minimum size in bytes of a value of a built-in type."""
     return _STRUCTS[kind].size if kind in _STRUCTS else 1
 
 

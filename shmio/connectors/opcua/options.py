@@ -23,12 +23,12 @@ class OpcUaOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_o
 
     url: Annotated[str, msgspec.Meta(min_length=1, max_length=1000)]
     timeout: Annotated[int, msgspec.Meta(ge=10, le=600_000)] = 4000
-    """Time-out in ms for each answer, and for the silence of the server."""
+    """Time-out in ms for each answer, and maximum time in ms for which the server may be silent."""
     mode: Literal["subscribe", "poll"] = "subscribe"
     nodes: Literal["addresses", "siemens"] = "addresses"
-    """What node ids are made from: the layout's addresses, or the names of an S7-1500's data block."""
+    """The origin of node ids: the addresses in the layout, or the names in an S7-1500's data block."""
     sampling_ms: Annotated[int, msgspec.Meta(ge=-1, le=3_600_000)] = 50
-    """Interval in ms at which the server samples a node. 0 is its fastest, -1 the publishing interval."""
+    """Interval in ms at which the server samples a node. 0: the fastest it can; -1: the publishing interval."""
     publishing_ms: Annotated[int, msgspec.Meta(ge=1, le=3_600_000)] = 100
     queue: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 1
     """Maximum number of samples of a node that the server keeps between two publications."""
@@ -45,10 +45,10 @@ class OpcUaOptions(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_o
     username: Annotated[str, msgspec.Meta(min_length=1, max_length=256)] | None = None
     password_file: str | None = None
     user_certificate: str | None = None
-    """File of the certificate by which the server knows the user."""
+    """File of the certificate with which the user logs in."""
     user_key: str | None = None
     insecure: bool = False
-    """True to allow a password over an unencrypted channel to another host."""
+    """True to allow sending a password to another host over an unencrypted channel."""
 
     def __post_init__(self) -> None:
         parts = urlsplit(self.url)
@@ -104,10 +104,10 @@ class Credentials:
 
     Attributes:
         application_uri: The client's URI, which is also in its certificate.
-        identity: The client's certificate and its private key, as objects of the library
-            cryptography; None without security.
-        password: The user's password; empty without one.
-        user: The user's certificate and its private key; None without one.
+        identity: The client's certificate and private key, as objects of the library cryptography;
+            None without security.
+        password: The user's password; empty if there is none.
+        user: The user's certificate and private key; None if the user has no certificate.
 
     """
 

@@ -1,8 +1,8 @@
 """One session with an OPC UA server, with the nodes that it reads and the subscriptions for them.
 
 The session uses asyncua for the channel, the security and the requests, but watches the connection
-itself. It ends at the first error. The connector then opens a new session with new objects, so that
-no late answer of the old session can be mistaken for one of the new session.
+itself. The session ends at the first error. The connector then opens a new session with new objects, so
+that no late answer of the old session can be mistaken for one of the new session.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from shmio.model.statuses import BAD_NODE_ID_UNKNOWN, BAD_WAITING_FOR_INITIAL_DA
 MAX_CHUNK_BYTES: Final = 65_535
 MAX_MESSAGE_BYTES: Final = 64 << 20
 MAX_PER_CALL: Final = 1_000
-"""Maximum number of nodes in a request; the server may have a lower limit."""
+"""Maximum number of nodes in a request. The server may have a lower limit, which then applies."""
 MAX_PUBLISH_REQUESTS: Final = 20
 RETRY_S: Final = 10.0
 """Interval in s at which the session requests nodes again that the server did not know."""
@@ -86,10 +86,10 @@ class Item:
     index: int
     """Index of the node in the source's layout, which a reload may change."""
     handle: int
-    """The client's number of the monitored item, which no other item has during the connection."""
+    """The client's number of the monitored item. No other item gets this number during the connection."""
     address: Address
     deadband: float
-    """Dead-band in the numbers of the node, before scaling; 0 if there is none."""
+    """Dead-band of the node's own numbers, to which no scale is applied; 0 if there is none."""
     session: int = 0
     """Index of the session that reads the node."""
     node: Any = None
@@ -104,7 +104,7 @@ class Item:
     last: Sample | None = None
     """The newest sample with a value."""
     settles_ns: int = 0
-    """Time (ns of CLOCK_MONOTONIC) until which samples from before the last write may arrive; 0 if none may."""
+    """Time (ns of CLOCK_MONOTONIC) until which samples from before the last write may arrive; 0: none will arrive."""
     written_ns: int = 0
     """Source time of the value that was read back after the last write."""
     is_structure: bool = False
@@ -112,7 +112,7 @@ class Item:
     structures: Structures = field(default_factory=dict)
     """The structures that the node may have as values."""
     unread: bool = False
-    """True if the newest value does not fit these structures."""
+    """True if the newest value does not fit the known structures."""
     skipped: bool = False
     """True if a sample was skipped because it may be from before the last write."""
 
@@ -124,7 +124,7 @@ class Subscription:
     number: int
     publishing_s: float
     silent_s: float
-    """Time in s without a message from the server after which the subscription counts as lost."""
+    """The subscription counts as lost after this time in s without a message from the server."""
     alive_ns: int
     sequence: int = 0
     items: list[Item] = field(default_factory=list)
@@ -469,11 +469,11 @@ class Session:
             item.structures = types.structures
 
     async def read(self, nodes: Sequence[Any], attribute: Any) -> list[Sample]:
-        """Read an attribute of nodes."""
+        """Read an attribute of each node."""
         return await self._samples(nodes, attribute)
 
     async def origins(self, nodes: Sequence[Any], reference: Any) -> list[Any]:
-        """Return for each node a node that refers to it by ``reference``; None if no node does."""
+        """For each node, return a node that refers to it by ``reference``; None if there is none."""
         found: list[Any] = []
         for at in range(0, len(nodes), _ORIGINS_AT_ONCE):
             part = nodes[at : at + _ORIGINS_AT_ONCE]
@@ -494,7 +494,7 @@ class Session:
         return found
 
     async def browse(self, nodes: Sequence[Any], most: int) -> tuple[list[list[Any]], bool]:
-        """Return the hierarchical references from nodes to objects and variables. An unknown node has none.
+        """Return the hierarchical references from nodes to objects and variables. Unknown nodes have none.
 
         Args:
             nodes: The node ids.
@@ -552,7 +552,7 @@ class Session:
         self._deliver(list(zip(items, await self._samples([item.node for item in items]), strict=True)))
 
     async def read_back(self, items: Sequence[Item]) -> None:
-        """Read nodes that were just written, and deliver the samples before any older ones can arrive."""
+        """Read nodes that were just written, and deliver the samples before older ones can arrive."""
         found = await self._samples([item.node for item in items])
         now_ns = time.monotonic_ns()
         for item, sample in zip(items, found, strict=True):
@@ -577,9 +577,10 @@ class Session:
         return found.code >> 30 == 0 and found.dims == (count,)
 
     async def write(self, values: Sequence[tuple[Item, str | None, Sample]]) -> list[int]:
-        """Write whole values, or the elements in an index range; return the status code of each write.
+        """Write whole values, or elements of arrays; return the status code of each write.
 
-        ``values`` has at most :attr:`per_write` writes, and no node twice.
+        Each write has an index range, or None for the whole value. There may be at most
+        :attr:`per_write` writes, and only one for each node.
         """
         request = ua.WriteRequest()
         for item, elements, sample in values:
@@ -597,7 +598,7 @@ class Session:
 
     @property
     def ready(self) -> bool:
-        """True if the connection is open, as far as is known."""
+        """True if the connection is open, as far as the client knows."""
         return self._protocol is not None and self._protocol.transport is not None and not self.failure.done()
 
     @property
@@ -611,7 +612,7 @@ class Session:
         return len(self._subscriptions)
 
     def check(self) -> str:
-        """Return why the session may be dead, or an empty text. Any thread may call it."""
+        """Return why the session may be dead; "" if there is no sign of this. Any thread may call this."""
         now_ns = time.monotonic_ns()
         options = self._options
         for one in tuple(self._subscriptions.values()):
@@ -797,10 +798,10 @@ class Session:
         return self._items
 
     def switch(self, kept: Sequence[Item], new: Sequence[Item], deliver: Deliver) -> list[Item]:
-        """Read other nodes from now on: those in ``kept``, which it reads now, and those in ``new``.
+        """From now on, read the nodes in ``kept``, which the session already reads, and in ``new``, and no others.
 
-        Call :meth:`follow` next. No sample of another node is delivered any more, and no sample is
-        delivered to the previous function.
+        Samples of these nodes go to ``deliver``, and the previous function gets no more samples.
+        Call :meth:`follow` next.
 
         Returns:
             The nodes that the session no longer reads.
@@ -814,7 +815,7 @@ class Session:
         return [item for item in present if item.handle not in self._by_handle]
 
     async def follow(self, gone: Sequence[Item], new: Sequence[Item]) -> None:
-        """End the subscriptions to the nodes that are no longer read, and resolve and subscribe to the new ones."""
+        """End the subscriptions to nodes that are no longer read; resolve the new nodes and subscribe to them."""
         for one in [*self._subscriptions.values()]:
             await self._unsubscribe(one, [item for item in gone if item.subscription is one])
         await self._resolve(new)
@@ -828,7 +829,7 @@ class Session:
         self._retrying = asyncio.create_task(self._retry())
 
     async def learn_again(self) -> None:
-        """Ask again for the definitions of all structures. They may have changed."""
+        """Ask the server again for the definitions of all structures, which may have changed."""
         await self._learn(self._items)
 
     async def _unsubscribe(self, subscription: Subscription, items: Sequence[Item]) -> None:
@@ -1059,7 +1060,7 @@ def _explained_code(code: int, options: OpcUaOptions) -> str:
 
 
 def bound_decoding() -> None:
-    """Make the library refuse arrays of nulls: a short message could declare any number of them."""
+    """Make the library refuse arrays of nulls, because a short message can claim to have any number of nulls."""
     original = ua_binary.unpack_uatype_array
 
     def unpack(vtype: Any, data: Any) -> Any:

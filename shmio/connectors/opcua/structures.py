@@ -51,7 +51,10 @@ class Definition(NamedTuple):
 
 
 class Field(NamedTuple):
-    """A member of a structure; ``kind`` is its built-in type unless it is a structure itself."""
+    """A member of a structure.
+
+    ``kind`` is the number of the member's built-in type, unless the member is a structure itself.
+    """
 
     name: str
     kind: int
@@ -78,7 +81,7 @@ class Structure:
 
 
 class Members(NamedTuple):
-    """The value of a structure. In ``values``, a member that is absent at present is None."""
+    """The value of a structure. In ``values``, None stands for a member that is absent at present."""
 
     structure: Structure
     values: dict[str, Found | None]
@@ -264,7 +267,8 @@ def find(found: Found, member: Member) -> Sample:
     """Return the member of a value that ``member`` names.
 
     Raises:
-        AbsentError: The value does not have this optional member, alternative of a union, or element.
+        AbsentError: The value lacks this optional member, alternative of a union, or element at
+            present.
         MismatchError: The data type has no such member, or ``member`` names a structure.
 
     """
@@ -345,7 +349,7 @@ class ChangedValue:
         return now if index is None else now._replace(value=now.value[index], dims=None)
 
     def set(self, member: Member, new: Sample) -> None:
-        """Change a member.
+        """Change a member's value.
 
         Raises:
             ValueError: The member cannot be written.
@@ -369,7 +373,7 @@ class ChangedValue:
 
     @property
     def sample(self) -> Sample:
-        """The value with all changes."""
+        """The value with all changes applied."""
         given: list[Extension] = self._sample.value if self._sample.dims is not None else [self._sample.value]
         made = []
         for one, reading in zip(given, self._readings, strict=True):
@@ -423,7 +427,7 @@ def _encode(one: Field, sample: Sample) -> bytes:
 
 
 class Listed(NamedTuple):
-    """A member of a structure, as a candidate for a register. If it has no value, ``sample`` has only its type."""
+    """A member of a structure, as a candidate for a register. ``sample`` has only a type if the member has no value."""
 
     member: Member
     sample: Sample

@@ -39,7 +39,7 @@ _DEFAULTS: Final = {
     "LINT": ua.INT64, "REAL": ua.FLOAT, "LREAL": ua.DOUBLE, "TIME": ua.INT32, "LTIME": ua.INT64,
     "TIME_OF_DAY": ua.UINT32, "LTOD": ua.UINT64, "STRING": ua.STRING, "WSTRING": ua.STRING, "LDT": ua.DATE_TIME,
 }  # fmt: skip
-"""Assumed type of a node without a value, by the register's type. Types for which servers differ are missing."""
+"""The type that a node without a value is assumed to have, by the register's type, unless servers differ in it."""
 
 
 class MismatchError(ValueError):

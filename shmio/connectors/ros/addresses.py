@@ -110,7 +110,7 @@ def _steps(field: str) -> tuple[Step, ...]:
 
 
 def leaf_type(address: Address) -> str:
-    """Return the type of an address's field; ``[]`` at its end means a whole sequence.
+    """Return the type of the field at an address, with ``[]`` at its end for a whole sequence.
 
     Raises:
         KeyError: The message type is unknown.
@@ -172,7 +172,7 @@ def extract(message: Any, address: Address) -> Any:
 
 
 def getter(address: Address) -> Callable[[Any], Any]:
-    """Return a function that does the same as :func:`extract` with one address, in less time for most messages."""
+    """Return a function that extracts an address's field from a message, in most cases faster than :func:`extract`."""
     *outer, last = address.steps
     name, place, key = last
     if any(not step.whole for step in outer):

@@ -31,7 +31,7 @@ class Seen:
     """A topic, as the domain or the server describes it.
 
     Attributes:
-        type: The type of its messages.
+        type: The type of the topic's messages.
         published: Whether a node publishes on it.
         stored: Whether a publisher stores its last messages for late subscribers.
         message: A message; None if none has arrived.
@@ -50,7 +50,7 @@ class Seen:
 
     @property
     def awaited(self) -> bool:
-        """Whether a message may come that says how long the sequences of the type are."""
+        """Whether to wait for a message of this topic, because only a message shows the lengths of sequences."""
         return self.published and self.known and _has_sequence(plain(self.type))
 
 
@@ -66,7 +66,7 @@ def levels(topic: str) -> tuple[str, ...]:
 
 
 def browsed(topics: Mapping[str, Seen], wanted: Wanted, incomplete: str) -> Browsed:
-    """Return the fields of topics."""
+    """Return those fields of topics that the user wants. ``incomplete`` says why there may be more."""
     offers = (offer for name in sorted(topics) for offer in _offers(name, topics))
     return Browsed([offer for offer in offers if wanted.takes(offer.names)], incomplete)
 

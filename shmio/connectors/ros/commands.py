@@ -1,8 +1,8 @@
 """Turns writes of registers into ROS messages.
 
 A ROS message always has all its fields. shmio copies the fields that a command does not write from the
-last message of the topic. If there was none, the command must write all registers of the topic, so that
-shmio need not invent a value.
+last message of the topic. If no message has arrived, the command must write all registers of the topic,
+so that shmio need not invent values.
 """
 
 from __future__ import annotations
@@ -98,13 +98,13 @@ class Sending:
         return self._publications[self._place] if self._place < len(self._publications) else None
 
     def end(self, refusal: str) -> None:
-        """Store the outcome of :attr:`publication` ("" if confirmed, else why refused); go to the next message."""
+        """Store the outcome of :attr:`publication`: "", or why it was refused. Go to the next message."""
         for number in self._publications[self._place].writes:
             self.outcomes[number] = self.outcomes[number] or refusal
         self._place += 1
 
     def lost(self, reason: str) -> WriteLostError:
-        """Return the error for a lost connection, with what is known of the outcome of each write."""
+        """Return the error for a lost connection, with what is known about the outcome of each write."""
         done = {number for one in self._publications[: self._place] for number in one.writes}
         for one in self._publications[self._place :]:
             for number in one.writes:

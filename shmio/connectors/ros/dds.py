@@ -31,22 +31,22 @@ if TYPE_CHECKING:
     from shmio.connectors.ros.participant import Participant
 
 POLL_S: Final = 0.005
-"""Period in s at which the connector looks for a first publisher while it connects."""
+"""Interval in s at which the connector looks for the first publisher or subscriber while it connects."""
 
 DISCOVERIES: Final = 4
-"""Largest number of discovered publishers and subscribers to examine in a cycle; each takes about 0.2 ms."""
+"""Maximum number of discovered publishers and subscribers to examine in a cycle; each takes about 0.2 ms."""
 DISCOVERIES_AT_END: Final = 1000
-"""The same, where no cycle waits: in ``browse``, and before an error."""
+"""Maximum number to examine where no cycle waits: in ``browse``, and before an error."""
 MAX_REASONS: Final = 3
-"""Largest number of reasons in a message to the user."""
+"""Maximum number of reasons in a message to the user."""
 DISCOVERY_S: Final = 1.0
-"""Time in s, from the creation of readers and writers, for which a write waits until a subscriber is discovered."""
+"""Time in s after the creation of readers and writers during which a write waits for a first subscriber."""
 
 log = logging.getLogger("shmio.source")
 
 
 class Ros2Options(TopicOptions, frozen=True, kw_only=True):
-    """Domain and network interface, how topics are read, and their QoS.
+    """The DDS domain and the network interface, and how topics are read, with their QoS.
 
     Raises:
         ValueError: Some keys contradict each other.
@@ -64,9 +64,9 @@ class Ros2Options(TopicOptions, frozen=True, kw_only=True):
     qos: QosKeys = QosKeys()
     """The QoS of all topics."""
     topic_qos: Annotated[dict[str, QosKeys], msgspec.Meta(max_length=10_000)] = msgspec.field(default_factory=dict)
-    """The QoS of single topics, which precedes ``qos``."""
+    """The QoS of single topics, which takes precedence over ``qos``."""
     max_message_bytes: Annotated[int, msgspec.Meta(ge=1000, le=1 << 26)] = 1 << 20
-    """The largest message that is received, in bytes; larger ones are dropped."""
+    """Size in bytes of the largest message that is received; larger messages are dropped."""
 
     def __post_init__(self) -> None:
         if self.interface == "lo" and self.peers:
@@ -97,7 +97,7 @@ class Ros2Connector(Connector):
 
     @classmethod
     def browse_options(cls, url: str) -> dict[str, Any]:
-        """Return the domain of a URL such as ``ros2://0``."""
+        """Return the options for a URL such as ``ros2://0``, which contains the domain."""
         domain = url.removeprefix("ros2://").rstrip("/")
         if not re.fullmatch(r"[0-9]{1,3}", domain):
             raise ConfigError(f"{url}: expected ros2://DOMAIN with the robot's ROS_DOMAIN_ID, such as ros2://0")
@@ -148,7 +148,7 @@ class Ros2Connector(Connector):
         return f"to DDS {self._where}, {len(self._topics.by_name)} topics"
 
     def cycle_requests(self) -> CycleRequests:
-        """Return the number of topics. A cycle needs no requests."""
+        """Return a description with the number of topics. A cycle sends no requests."""
         return CycleRequests(counted(len(self._topics.by_name), "topic"), note="their publishers send messages")
 
     def connect(self) -> None:
@@ -166,7 +166,7 @@ class Ros2Connector(Connector):
         self._meet(joined, end_s)
 
     def take_over(self, other: Ros2Connector) -> bool:
-        """Take over the participant, and the last messages of the topics that both connectors have."""
+        """Take over the participant of ``other``, and the last messages of the topics that both connectors have."""
         joined = other._participant
         if joined is None:
             return False
@@ -251,13 +251,13 @@ class Ros2Connector(Connector):
             self._topics.take(name, message, time.monotonic_ns(), time.time_ns())
 
     def close(self) -> None:
-        """Leave the domain. It may be called at any time and more than once."""
+        """Leave the domain. You may call this at any time and more than once."""
         if self._participant is not None:
             self._participant.close()
             self._participant = None
 
     def send(self, writes: Sequence[Write]) -> None:
-        """Plan the messages for these writes; :meth:`confirm` publishes one after the other."""
+        """Prepare the messages for these writes; :meth:`confirm` publishes them one after the other."""
         joined = self._participant
         if joined is None:
             raise WriteLostError(f"this process has not joined DDS {self._where}", [Lost.UNSENT] * len(writes))

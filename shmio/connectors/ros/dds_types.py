@@ -19,23 +19,23 @@ _PRIMITIVES: Final[dict[str, Any]] = {
 
 
 def dds_topic(topic: str) -> str:
-    """Return the name that a ROS topic has in DDS."""
+    """Return the DDS name of a ROS topic."""
     return f"rt{topic}"
 
 
 def ros_topic(name: str) -> str:
-    """Return the ROS topic that has a name in DDS; "" if it is none, but a service or a topic of other programs."""
+    """Return the ROS topic with a DDS name; "" if the name is that of a service or of a topic of another program."""
     return name.removeprefix("rt") if name.startswith("rt/") else ""
 
 
 def dds_type(kind: str) -> str:
-    """Return the name that a type ``package/Name`` has in DDS."""
+    """Return the DDS name of a type ``package/Name``."""
     package, _, name = kind.partition("/")
     return f"{package}::msg::dds_::{name}_"
 
 
 def ros_type(name: str) -> str:
-    """Return a type of DDS as ``package/Name`` if ROS has given it its name, else as it is."""
+    """Convert the DDS name of a type to ``package/Name``; return a name that ROS does not use unchanged."""
     package, middle, last = name.partition("::msg::dds_::")
     return f"{package}/{last.removesuffix('_')}" if middle else name
 
@@ -59,7 +59,7 @@ def _annotation(kind: str) -> Any:
 
 
 def to_message(sample: Any, kind: str) -> Any:
-    """Return a sample, or the value of one of its fields, as dictionaries and lists."""
+    """Convert a sample, or the value of one of its fields, to dictionaries and lists."""
     if kind.endswith("[]"):
         inner = kind[:-2]
         return list(sample) if inner in _PRIMITIVES else [to_message(one, inner) for one in sample]
@@ -69,7 +69,7 @@ def to_message(sample: Any, kind: str) -> Any:
 
 
 def to_sample(message: Any, kind: str) -> Any:
-    """Return a message as a sample. The message must conform to its type."""
+    """Convert a message to a sample. The message must conform to its type."""
     if kind.endswith("[]"):
         return [to_sample(one, kind[:-2]) for one in message]
     if kind in _PRIMITIVES:

@@ -28,9 +28,9 @@ class Endpoint(NamedTuple):
     """A publisher or subscriber of another participant."""
 
     topic: str
-    """The name of the topic in DDS."""
+    """The DDS name of the topic."""
     type: str
-    """The name of the type in DDS."""
+    """The DDS name of the type."""
     qos: Qos
 
 
@@ -46,11 +46,11 @@ class Discovery:
         """True if there are more publishers or subscribers than the limit."""
 
     def begin(self, participant: Any, topics: Collection[str] | None, limit: int) -> None:
-        """Begin to discover, for the first time or anew.
+        """Start the discovery, or start it anew.
 
         Args:
             participant: The participant of the library.
-            topics: The names in DDS of the topics that matter; None if all do.
+            topics: The DDS names of the topics that matter; None: all topics.
             limit: Maximum number of publishers, and of subscribers, to remember.
 
         """
@@ -61,16 +61,16 @@ class Discovery:
         ]
 
     def close(self) -> None:
-        """Forget everything."""
+        """End the discovery, and forget everything."""
         for reader in self._readers:
             reader.__del__()
         self._readers, self._found, self.full = [], [{}, {}], False
 
     def update(self, most: int) -> list[str]:
-        """Take note of at most ``most`` changes of each kind. A change takes about 0.2 ms.
+        """Process changes of publishers and of subscribers, at most ``most`` of each. A change takes about 0.2 ms.
 
         Returns:
-            The names of the topics with changes.
+            The DDS names of the topics with changes.
 
         """
         topics: list[str] = []
@@ -98,16 +98,19 @@ class Discovery:
         return str(one.topic_name)
 
     def publishers(self, topic: str | None = None) -> list[Endpoint]:
-        """Return the publishers of a topic that are known so far; without an argument, those of all topics."""
+        """Return the publishers of a topic (None: of all topics) that are known so far."""
         return [one for one in self._found[0].values() if topic in (None, one.topic)]
 
     def subscribers(self, topic: str | None = None) -> list[Endpoint]:
-        """Return the subscribers of a topic that are known so far; without an argument, those of all topics."""
+        """Return the subscribers of a topic (None: of all topics) that are known so far."""
         return [one for one in self._found[1].values() if topic in (None, one.topic)]
 
 
 def reader_qos(qos: TopicQos) -> Qos:
-    """Return what a reader of a topic requests. It keeps only the newest message, since a register shows no other."""
+    """Return what a topic's reader requests.
+
+    The reader keeps only the newest message, because a register shows no other.
+    """
     return Qos(
         Policy.Reliability.Reliable(0) if qos.reliability == "reliable" else Policy.Reliability.BestEffort,
         _durability(qos), Policy.History.KeepLast(1), Policy.IgnoreLocal.Participant, _liveliness(qos),
@@ -116,7 +119,11 @@ def reader_qos(qos: TopicQos) -> Qos:
 
 
 def writer_qos(qos: TopicQos, blocking_ns: int) -> Qos:
-    """Return what a writer of a topic offers; ``blocking_ns`` is how long a write may wait for room in its queue."""
+    """Return what a topic's writer offers.
+
+    ``blocking_ns`` is the maximum time in ns for which a write waits for room in the writer's
+    queue.
+    """
     history = Policy.History.KeepAll if qos.history == "keep_all" else Policy.History.KeepLast(qos.depth)
     return Qos(
         Policy.Reliability.Reliable(blocking_ns), _durability(qos), Policy.IgnoreLocal.Participant, _liveliness(qos),
@@ -145,7 +152,7 @@ def stores(qos: Qos) -> bool:
 
 
 def unmet(offered: Qos, requested: Qos) -> Iterator[tuple[str, str, str]]:
-    """Yield each policy that a publisher offers and that does not satisfy a subscriber.
+    """Yield each policy in which a publisher's offer does not satisfy a subscriber's request.
 
     Yields:
         The policy's name, what is offered, and what is requested.

@@ -70,7 +70,7 @@ DEFINITIONS: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType({
 
 
 def plain(name: str) -> str:
-    """Return a type as ``package/Name``; the argument may also be ``package/msg/Name``."""
+    """Convert a type to ``package/Name``; the argument may also have the form ``package/msg/Name``."""
     return name.replace("/msg/", "/")
 
 
@@ -84,7 +84,7 @@ def default(kind: str) -> Any:
 
 
 def from_json(message: Any, kind: str) -> Any:
-    """Return a message of a known type with lists of numbers for sequences of uint8, which JSON has as base64."""
+    """Return a JSON message of a known type, with lists of numbers instead of base64 for sequences of uint8."""
     if not _has_bytes(kind):
         return message
     if kind == "uint8[]" and isinstance(message, str):

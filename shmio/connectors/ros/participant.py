@@ -35,11 +35,11 @@ from shmio.connectors.ros.topics import Topic
 from shmio.errors import ConnectorError
 
 MAX_PARTICIPANTS: Final = 60
-"""Largest number of participants on a host that are found without multicast."""
+"""Maximum number of participants on a host that can be found without multicast."""
 MAX_ENDPOINTS: Final = 10_000
-"""Largest number of publishers, and of subscribers, of the topics that are remembered for messages to the user."""
+"""Maximum number of publishers, and of subscribers, that are remembered for messages to the user."""
 _KEYS: Final = {"deadline": "deadline_ms", "lease": "lease_ms"}
-"""The keys of policies, if they have other names."""
+"""The configuration keys of those policies whose keys have other names."""
 _COMPARED: Final = frozenset({2, 4, 8, 11})
 """The numbers of the policies that ``unmet`` compares."""
 _HEARTBEAT: Final = '<HeartbeatInterval min="2 ms" minsched="2 ms" max="1 s">5 ms</HeartbeatInterval>'
@@ -177,7 +177,7 @@ class Participant:
             ) from None
 
     def add(self, topics: Iterable[Topic]) -> None:
-        """Read more topics, and write those of them that are writable.
+        """Start to read more topics, and prepare to write to those that are writable.
 
         Raises:
             ConnectorError: The library reports an error.
@@ -198,7 +198,7 @@ class Participant:
         self.discovery.begin(self._participant, None, limit)
 
     def change(self, topics: Collection[Topic]) -> None:
-        """Read and write these topics, and no others. Topics that stay the same keep their readers and writers.
+        """From now on, read and write these topics only. Unchanged topics keep their readers and writers.
 
         Raises:
             ConnectorError: The library reports an error.
@@ -236,18 +236,18 @@ class Participant:
         return 0 if writer is None else len(writer.get_matched_subscriptions())
 
     def alive(self, topic: str) -> bool:
-        """Return whether a topic has a publisher that has shown within its lease that it lives."""
+        """Return whether a topic has a publisher that has shown, within its lease, that it is alive."""
         endpoint = self._endpoints[topic]
         if not endpoint.qos.lease_ms:
             return bool(self.publishers(topic))
         return bool(endpoint.reader.get_liveliness_changed_status().alive_count)
 
     def discover(self, most: int) -> set[str]:
-        """Take note of what DDS has discovered, at most ``most`` changes; return the topics that have changed."""
+        """Process at most ``most`` discovered changes of each kind; return the names of the topics with changes."""
         return {ros_topic(name) for name in self.discovery.update(most)} & self._endpoints.keys()
 
     def obstacles(self, topic: str) -> list[str]:
-        """Return why publishers and subscribers of a topic do not fit this participant's reader and writer."""
+        """Return why publishers and subscribers of a topic do not match this participant's reader and writer."""
         endpoint, name = self._endpoints[topic], dds_topic(topic)
         found: dict[str, None] = {}
         for one in self.discovery.publishers(name):
@@ -268,7 +268,7 @@ class Participant:
         return list(found) or _other_policies(endpoint)
 
     def take(self) -> Iterator[tuple[str, Any]]:
-        """Yield the topics with new messages, each with its newest message, or None if that is malformed.
+        """Yield each topic with a new message, and its newest message, which is None if it is malformed.
 
         Raises:
             ConnectorError: The library reports an error.
@@ -303,7 +303,7 @@ class Participant:
         """Wait until all reliable subscribers have received what was published on a topic.
 
         Returns:
-            Whether all have received it by ``until_s``, a time of CLOCK_MONOTONIC.
+            False if some have not received everything by ``until_s``, a time of CLOCK_MONOTONIC.
 
         """
         endpoint = self._endpoints[topic]

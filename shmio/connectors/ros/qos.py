@@ -14,7 +14,7 @@ Durability = Literal["volatile", "transient_local"]
 
 
 class QosKeys(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
-    """Keys for the QoS of all topics of a source, or of one topic. A key that is None was not given.
+    """Keys for the QoS of all topics of a source, or of one topic. None means that a key was not given.
 
     Raises:
         ValueError: Some keys contradict each other.
@@ -22,7 +22,7 @@ class QosKeys(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=T
     """
 
     profile: Literal["default", "sensor_data", "system_default", "services", "parameters"] | None = None
-    """A profile of ROS 2. The other keys change single policies of it."""
+    """A profile of ROS 2. The other keys replace single policies of the profile."""
     reliability: Reliability | None = None
     """The reliability that readers request from publishers. Commands are always published reliably."""
     durability: Durability | None = None
@@ -30,13 +30,13 @@ class QosKeys(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=T
     history: Literal["keep_last", "keep_all"] | None = None
     """Whether a publisher of commands may replace messages that subscribers have not received yet."""
     depth: Annotated[int, msgspec.Meta(ge=1, le=10_000)] | None = None
-    """The number of messages that a publisher of commands keeps. A register always has the newest message."""
+    """The number of messages that a publisher of commands keeps. A register always shows the newest message."""
     deadline_ms: Milliseconds | None = None
     """The longest time between two messages that readers accept."""
     liveliness: Literal["automatic", "manual_by_topic"] | None = None
-    """How publishers must show that they live."""
+    """How publishers must show that they are alive."""
     lease_ms: Milliseconds | None = None
-    """The time after which a publisher that does not show that it lives is lost."""
+    """A publisher that has not shown for this time that it is alive counts as lost."""
     lifespan_ms: Milliseconds | None = None
     """The age at which subscribers drop a command."""
 
@@ -45,7 +45,7 @@ class QosKeys(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=T
             raise ValueError("depth: history keep_all keeps all messages; remove depth, or use keep_last")
 
     def given(self) -> dict[str, Any]:
-        """Return the keys that were given, with their values; ``profile`` is replaced by its own."""
+        """Return the keys that were given, with their values, and the keys of ``profile`` in its place."""
         keys = {name: getattr(self, name) for name in QosKeys.__struct_fields__}
         own = {name: value for name, value in keys.items() if value is not None and name != "profile"}
         if self.profile is None:
@@ -63,11 +63,11 @@ PROFILES: Final[Mapping[str, Mapping[str, object]]] = MappingProxyType({
     "services": {"reliability": "reliable", "durability": "volatile", "history": "keep_last", "depth": 10},
     "parameters": {"reliability": "reliable", "durability": "volatile", "history": "keep_last", "depth": 1000},
 })  # fmt: skip
-"""The profiles of rmw. ``system_default`` is what DDS itself has: a reader requests best_effort."""
+"""The QoS profiles of rmw. ``system_default`` has the defaults of DDS, so readers request best_effort."""
 
 
 class TopicQos(NamedTuple):
-    """The QoS of one topic. Times are in ms, and 0 if they are infinite."""
+    """The QoS of one topic. Times are in ms; 0 stands for infinite."""
 
     reliability: Reliability = "best_effort"
     durability: Durability = "volatile"
@@ -84,8 +84,9 @@ def qos_of(source: QosKeys, topic: QosKeys | None, *, latched: bool, writable: b
 
     Args:
         source: The keys for all topics of the source.
-        topic: The keys for this topic; None if there are none. They precede those of the source.
-        latched: Whether ``latched`` has the topic.
+        topic: The keys for this topic; None if there are none. They take precedence over those of
+            the source.
+        latched: Whether the option ``latched`` contains the topic.
         writable: Whether the source publishes on the topic.
 
     Raises:

@@ -28,11 +28,11 @@ from shmio.wording import counted
 
 DEFAULT_PORT: Final = 9090
 FIRST_S: Final = 0.1
-"""Maximum time for which a new connection waits for the first messages, in s."""
+"""Maximum time in s for which a new connection waits for the first messages."""
 
 
 class RosbridgeOptions(TopicOptions, frozen=True, kw_only=True):
-    """Address of the server, and how topics are read.
+    """The server's address, and how topics are read.
 
     Raises:
         ValueError: The URL is wrong.
@@ -41,9 +41,9 @@ class RosbridgeOptions(TopicOptions, frozen=True, kw_only=True):
 
     url: Annotated[str, msgspec.Meta(min_length=1, max_length=1000)]
     max_message_bytes: Annotated[int, msgspec.Meta(ge=1000, le=1 << 26)] = 1 << 20
-    """The largest message that is accepted, in bytes."""
+    """Size in bytes of the largest message that is accepted."""
     throttle_ms: Annotated[int, msgspec.Meta(ge=0, le=3_600_000)] = 0
-    """The shortest time in ms between two messages of a topic that the server may send."""
+    """Minimum time in ms that the server must keep between two messages of a topic."""
 
     def __post_init__(self) -> None:
         parts = urlsplit(self.url)
@@ -121,7 +121,7 @@ class RosbridgeConnector(Connector):
         return f"to {self._options.address}, {len(self._topics.by_name)} topics by rosbridge"
 
     def cycle_requests(self) -> CycleRequests:
-        """Return the number of topics. A cycle needs no requests."""
+        """Return a description with the number of topics. A cycle sends no requests."""
         return CycleRequests(counted(len(self._topics.by_name), "topic"), note="the server sends their messages")
 
     def connect(self) -> None:
@@ -149,7 +149,7 @@ class RosbridgeConnector(Connector):
             raise
 
     def take_over(self, other: RosbridgeConnector) -> bool:
-        """Take over the connection, and the last messages of the topics that both connectors have."""
+        """Take over the connection of ``other``, and the last messages of the topics that both connectors have."""
         link = other._link
         if link is None:
             return False
@@ -195,13 +195,13 @@ class RosbridgeConnector(Connector):
             self._topics.take(name, message, received.monotonic_ns, received.utc_ns)
 
     def close(self) -> None:
-        """Close the connection. It may be called at any time and more than once."""
+        """Close the connection. You may call this at any time and more than once."""
         if self._link is not None:
             self._link.close()
             self._link = None
 
     def send(self, writes: Sequence[Write]) -> None:
-        """Plan the messages for these writes; :meth:`confirm` publishes one after the other."""
+        """Prepare the messages for these writes; :meth:`confirm` publishes them one after the other."""
         link = self._link
         if link is None:
             raise WriteLostError(f"not connected to {self._options.address}", [Lost.UNSENT] * len(writes))

@@ -23,14 +23,14 @@ from shmio.model.statuses import (
 )
 
 MAX_REPORTED: Final = 20
-"""Largest number of faults logged with their registers in each connection."""
+"""Maximum number of faults that the log names, with their registers, in each connection."""
 MAX_SEC: Final = 1 << 33
 
 log = logging.getLogger("shmio.source")
 
 
 class Topic:
-    """A topic, the indices of the registers that have values of its fields, and its last message."""
+    """A topic, with the indices of the registers whose values are its fields, and its last message."""
 
     def __init__(self, name: str, kind: str) -> None:
         self.name, self.type = name, kind
@@ -56,7 +56,7 @@ class Topic:
         self.changed, self.shown = False, GOOD
 
     def inherit(self, other: Topic) -> None:
-        """Take the last message from the same topic of an earlier layout."""
+        """Take over the last message of ``other``, the same topic in the layout before a reload."""
         self.message, self.received_ns, self.utc_ns = other.message, other.received_ns, other.utc_ns
         self.changed = bool(other.received_ns)
 
@@ -127,7 +127,10 @@ class Topics:
             self._fail(topic, BAD_WAITING_FOR_INITIAL_DATA)
 
     def inherit(self, other: Topics) -> None:
-        """Take the last messages of the topics that an earlier layout also has; the others wait for a value."""
+        """Take over the last messages of the topics that the layout before a reload had, too.
+
+        All other topics wait for a value.
+        """
         self.reset()
         for name, topic in self.by_name.items():
             if (before := other.by_name.get(name)) is not None and plain(before.type) == plain(topic.type):
@@ -196,7 +199,7 @@ class Topics:
         return (stamp_ns(topic.message) if self._stamps else 0) or topic.utc_ns
 
     def report(self, index: int, what: str) -> None:
-        """Log a fault of a register, once per connection. After ``MAX_REPORTED`` faults, log no more of them."""
+        """Log the fault of a register, but only once per connection, and at most ``MAX_REPORTED`` faults."""
         if len(self._reported) > MAX_REPORTED or (index, what) in self._reported:
             return
         self._reported.add((index, what))

@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 CLOSE_S: Final = 0.2
 MAX_REPORTED: Final = 20
 MAX_FRAGMENTS: Final = 10_000
-"""Largest number of fragments of a message."""
+"""Maximum number of fragments in a message."""
 _SEND_TIMEOUT: Final = struct.Struct("@ll")
 
 log = logging.getLogger("shmio.source")
 
 
 class Received(NamedTuple):
-    """The newest message of a topic as JSON, and when it was received."""
+    """The newest message of a topic as JSON, with the time of its receipt."""
 
     json: msgspec.Raw
     monotonic_ns: int
@@ -140,13 +140,13 @@ class Link:
             raise ConnectorError(self._failure or f"the connection to {self._peer} was lost: {_why(error)}") from None
 
     def newest(self) -> Mapping[str, Received]:
-        """Return the newest message of each topic that has had one since the last call."""
+        """Return the newest message of each topic on which a message has come since the last call."""
         with self._condition:
             found, self._newest = self._newest, {}
         return found
 
     def keep(self, topics: Collection[str]) -> None:
-        """From now on, keep the messages of these topics, and of no others."""
+        """From now on, keep only the messages of these topics."""
         with self._condition:
             self._topics = topics
             self._newest = {name: one for name, one in self._newest.items() if name in topics}
@@ -187,7 +187,7 @@ class Link:
     # -- confirmation --------------------------------------------------------------------------------------------------
 
     def publish(self, topic: str, message: Any, number: str) -> None:
-        """Publish a message. The server sends it back, since this client also subscribes to the topic.
+        """Publish a message. The server sends it back, because this client also subscribes to the topic.
 
         Args:
             topic: The topic.

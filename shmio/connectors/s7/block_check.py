@@ -20,7 +20,7 @@ from shmio.connectors.s7.userdata import BLOCK_INFO, BlockInfo, block_data, pars
 
 INTERVAL_NS: Final = 60_000_000_000
 MAX_BLOCKS: Final = 200
-"""Largest number of a tag table's blocks that are watched."""
+"""Maximum number of blocks of a tag table that are watched for changes."""
 _MOST_CHANGES: Final = 5  # largest number of reports about changes of checksum or time only
 
 log = logging.getLogger("shmio.source")
@@ -31,11 +31,11 @@ class ExpectedBlock(NamedTuple):
 
     db_number: int
     name: str
-    """The name of the layout; empty for a block of a tag table, which gives only the number."""
+    """The name of the layout; empty for a block of a tag table, which is known only by its number."""
     size: int
-    """Number of bytes of the layout, or up to the last register of a tag table."""
+    """Number of bytes of the layout; for a tag table, number of bytes up to the end of the last register."""
     ends: Sequence[tuple[int, str]]
-    """Of each register, in the order of addresses, the offset after its last byte, and its name."""
+    """For each register, in the order of addresses, the offset after its last byte, and its name."""
     whole: bool
     """True if the layout describes the whole block, and not only some addresses."""
 
@@ -62,7 +62,7 @@ class BlockChangeMonitor(Query):
 
     @property
     def doubts(self) -> Mapping[int, str]:
-        """The change in each block that no longer fits its layout, as text by block number."""
+        """A text about the change of each block that may no longer fit its layout, by block number."""
         return self._doubts
 
     def data(self) -> bytes:
@@ -72,13 +72,13 @@ class BlockChangeMonitor(Query):
         return block_data(self._round[-1].db_number)
 
     def answered(self, data: bytes) -> None:
-        """Compare the information about a block with the previous one, and go on to the next block."""
+        """Compare the information about a block with what was known before, and go on to the next block."""
         block = self._round[-1]
         self._compare(block, parse_block(data, block.db_number))
         self._continue()
 
     def refused(self, refusal: RefusedError) -> None:  # noqa: ARG002 - that it is refused says enough
-        """Go on to the next block; if all are refused, ask again only in the next session."""
+        """Go on to the next block; once all blocks are refused, ask again only in the next session."""
         self._refused.add(self._round[-1].db_number)
         self._continue()
 
@@ -87,7 +87,7 @@ class BlockChangeMonitor(Query):
         log.debug("shmio will not notice a change of a block, because the controller %s", why)
 
     def lost(self, *, alive: bool = True) -> None:
-        """Forget an open question; the next session begins with the first block."""
+        """Forget the open question. The next session begins with the first block."""
         self._round.clear()
         self._refused.clear()
         super().lost(alive=alive)

@@ -1,8 +1,8 @@
-"""Reads and writes data of a controller with several requests in flight; finds a block's length.
+"""Reads and writes data of a controller with several requests in flight, and finds a block's length.
 
 Nothing here does I/O. Each operation builds its requests (``take``) and checks the answers
-(``accept``). ``transport`` sends and receives them. Round trips take nearly all the time of a
-cycle, so ``transport`` keeps as many requests in flight as the controller granted.
+(``accept``). ``transport`` sends and receives them. Round trips take nearly all the time of a cycle, so
+``transport`` keeps as many requests in flight as the controller granted.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class BlockRead:
         return bytes(self._block)
 
     def take(self, count: int, first: int) -> memoryview:
-        """Return the next ``count`` requests; references begin at ``first`` (16 bits, wrapping)."""
+        """Return the next ``count`` requests. Their references are 16-bit numbers from ``first`` on, which wrap."""
         size = pdu.READ_REQUEST_SIZE
         begin, self.sent = self.sent, self.sent + count
         for place in range(count):
@@ -105,12 +105,12 @@ class BlockRead:
 
 
 def byte_item(db_number: int, start: int, data: bytes, area: int = pdu.DATA_BLOCK) -> tuple[bytes, bytes]:
-    """Return the encoded address and value of an item that writes bytes."""
+    """Return an item that writes bytes: its encoded address, and its encoded value."""
     return pdu.address(db_number, 8 * start, len(data), area=area), _ITEM_HEAD.pack(0, _SIZE_BITS, 8 * len(data)) + data
 
 
 def bit_item(db_number: int, start: int, bit: int, value: bool, area: int = pdu.DATA_BLOCK) -> tuple[bytes, bytes]:
-    """Return the encoded address and value of an item that writes one bit.
+    """Return an item that writes one bit: its encoded address, and its encoded value.
 
     The controller does not change the other bits of the byte.
     """
@@ -174,7 +174,7 @@ class BlockWrite:
         return len(self._answered) == self.count
 
     def take(self, count: int, first: int) -> bytes:
-        """Return the next ``count`` requests; references begin at ``first`` (16 bits, wrapping)."""
+        """Return the next ``count`` requests. Their references are 16-bit numbers from ``first`` on, which wrap."""
         begin, self.sent = self.sent, self.sent + count
         return b"".join(
             write_request((first + place) & 0xFFFF, [item.encoded for item in job])
@@ -201,7 +201,7 @@ class BlockWrite:
         self._answered.add(index)
 
     def unanswered(self) -> Iterator[tuple[int, Lost | None]]:
-        """Yield, for each item, the index of its write and the item's state.
+        """Yield, for each item, the index of its write, and the item's state if the session is lost now.
 
         The state is None if the controller has answered the item.
         """
@@ -219,7 +219,7 @@ class BlockWrite:
 
 
 def waves(db_number: int, pdu_size: int, writes: Sequence[Write], outcomes: list[str]) -> Iterator[BlockWrite]:
-    """Divide a batch into waves, in order. Each wave must be complete before the next one is sent.
+    """Divide writes into waves, in order. Each wave must be complete before the next one is sent.
 
     The controller may execute jobs in flight in any order, so writes to the same bits must be in
     different waves. If the controller refuses a write, its wave stores the reason in ``outcomes``.

@@ -84,7 +84,7 @@ class S7Connector(S7Client, Connector):
 
     @classmethod
     def for_layout(cls, layout: Layout) -> type[Connector]:
-        """Return this class, or the connector for tag tables if registers have addresses."""
+        """Return this class, or the class of connectors for tag tables if registers have addresses."""
         if not any(register.address for register in layout.registers):
             return cls
         return S7TableConnector
@@ -110,7 +110,7 @@ class S7Connector(S7Client, Connector):
 
     @property
     def doubt(self) -> str:
-        """Why values may be frozen, or may not fit the layout; empty if there is no reason for doubt."""
+        """Why values may be frozen or may not fit the layout; empty if there is no reason for doubt."""
         return "; ".join(filter(None, (*self._watch.doubts.values(), super().doubt)))
 
     def _explain_size(self, found: int) -> str:
@@ -118,7 +118,7 @@ class S7Connector(S7Client, Connector):
         return explain_size(self.db_number, self.size, found, self._described.name, gone)
 
     def describe(self) -> str:
-        """Return the peer and the parameters of the session, for the log."""
+        """Return, for the log, the peer and the parameters of the session."""
         return f"to {self.options.peer} DB{self.db_number} pdu={self.pdu_size} jobs={self.jobs} depth={self.depth}"
 
     def cycle_requests(self) -> CycleRequests:

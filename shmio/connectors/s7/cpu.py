@@ -1,10 +1,10 @@
-"""Registers of a tag table that have values of the CPU itself, such as its mode, clock and identity.
+"""Registers of a tag table whose values come from the CPU itself, such as its mode, clock and identity.
 
-Their addresses are ``cpu.state``, ``cpu.clock``, ``cpu.order_code`` and the like. The session asks
-for these values between reads. If the CPU refuses a question, only the registers that need its
-answer turn bad. Siemens describes the lists and their records in System Software for S7-300/400,
-A5E00739858, 33.3, 33.5 and 33.21. Users of python-snap7 have found that record 7 of list 0x0011
-contains the firmware on S7-1200 and S7-1500, too (its ``szl.py``).
+Their addresses are ``cpu.state``, ``cpu.clock``, ``cpu.order_code`` and the like. The session asks for
+these values between reads. If the CPU refuses a question, only the registers that need its answer turn
+bad. Siemens describes the lists and their records in System Software for S7-300/400, A5E00739858, 33.3,
+33.5 and 33.21. Users of python-snap7 have found that record 7 of list 0x0011 contains the firmware on
+S7-1200 and S7-1500, too (its ``szl.py``).
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ log = logging.getLogger("shmio.source")
 
 
 class CpuTag(NamedTuple):
-    """A register that has a value of the CPU."""
+    """A register of a tag table with a value of the CPU."""
 
     place: int
     """The register's index in the layout."""
@@ -73,7 +73,7 @@ class CpuTag(NamedTuple):
 
 
 def parse(place: int, register: Register) -> CpuTag:
-    """Return the tag of a register that has a value of the CPU.
+    """Return the tag of a register that has an address such as ``cpu.clock``.
 
     Raises:
         ValueError: The CPU has no such value, or the value does not fit the register.
@@ -138,7 +138,7 @@ class CpuValues:
                 self._changes[tag.place] = None, BAD_WAITING_FOR_INITIAL_DATA, 0
 
     def store(self, image: RegisterImage) -> None:
-        """Store all values that are new since the last call in the image."""
+        """Store in the image all values that are new since the last call."""
         if self._states:
             self._look_at_mode()
         for index, (value, status, source_ns) in self._changes.items():

@@ -22,7 +22,7 @@ ACCESS_DENIED, OUT_OF_RANGE, NO_SUCH_TYPE, OTHER_SIZE, NO_SUCH_OBJECT = 0x03, 0x
 KNOWN_CODES: Final = frozenset(
     {ITEM_OK, *range(0x02), 0x03, *range(0x05, 0x08), 0x0A, *range(0x10, 0x15), *range(0x19, 0x1F), 0x20, 0x21}
 )
-"""The codes for which python-snap7 has texts. It is imported only when a text is needed, because that is slow."""
+"""The codes for which python-snap7 has texts. The library is imported only for a text, because that is slow."""
 
 _NO_OPTIMIZED = "if the block is optimized, clear 'Optimized block access', compile and load it, or read it by OPC UA"
 _ACCESS_DENIED = (
@@ -72,7 +72,7 @@ def explain_read(code: int, db_number: int, size: int) -> str:
 
 
 def explain_size(db_number: int, size: int, found: int, name: str = "", gone: Sequence[str] = ()) -> str:
-    """Return a message for a block that has ``found`` bytes instead of ``size`` as in its layout.
+    """Return a message for a block that has ``found`` bytes, while its layout has ``size``.
 
     ``name`` is the name of the layout. ``gone`` are the names of registers beyond the block's end.
     """
@@ -93,12 +93,12 @@ def explain_size(db_number: int, size: int, found: int, name: str = "", gone: Se
 
 
 def block_name(db_number: int, name: str) -> str:
-    """Return a text with a block's number, and with its name unless this only repeats the number."""
+    """Return a text with a block's number, and with its name unless the name only repeats the number."""
     return f"DB{db_number}" if name.upper() in {"", f"DB{db_number}"} else f'DB{db_number} "{shorten(name, 40)}"'
 
 
 def names_of(paths: Sequence[str]) -> str:
-    """Return the first few names as text, with the number of those left out."""
+    """Return a text with the first few names, and with the number of the others."""
     text = ", ".join(shorten(path, 40) for path in paths[:_MOST_NAMES])
     return text if len(paths) <= _MOST_NAMES else f"{text} and {len(paths) - _MOST_NAMES} more"
 
@@ -143,7 +143,7 @@ def _item_texts() -> Mapping[int, str]:
 
 
 def explain_item(code: int) -> str:
-    """Return a message for the return code of an item, without saying which item."""
+    """Return a message for the return code of an item, without naming the item."""
     where = f"(item code 0x{code:02X})"
     if code == ACCESS_DENIED:
         return _ACCESS_DENIED.format(where=where)

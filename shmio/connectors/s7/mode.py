@@ -1,9 +1,9 @@
-"""The query for the controller's operating mode, made about once a second to notice a PLC in STOP. No I/O.
+"""The query for the controller's operating mode, sent about once a second to notice a PLC in STOP. No I/O.
 
-The mode is the low half of the fourth byte of a record of the system status list (SZL) W#16#0424;
-the high half is the previous mode. The numbers are from Siemens, System Software for S7-300/400,
-A5E00739858, 33.21. If a controller refuses this list, shmio does not query it again in the session, and does not notice
-STOP.
+The mode is the low half of the fourth byte of a record of the system status list (SZL) W#16#0424; the
+high half is the previous mode. The numbers are from Siemens, System Software for S7-300/400,
+A5E00739858, 33.21. If a controller refuses this list, shmio does not ask for it again in the session,
+and does not notice STOP.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class ModeQuery(Query):
 
     @property
     def runs(self) -> bool:
-        """True if the mode is known to be one in which the program runs."""
+        """True if the mode is known, and the program runs in this mode."""
         return self.mode in MODES and self.mode not in _DOUBTS
 
     def data(self) -> bytes:
@@ -74,7 +74,7 @@ class ModeQuery(Query):
         return szl_data(_SZL)
 
     def answered(self, data: bytes) -> None:
-        """Store the mode. If the answer has none, stop asking in this session."""
+        """Store the mode. If the answer contains no mode, stop asking in this session."""
         records = szl_records(data, _SZL)
         if not records or len(records[0]) < 4:
             self._stop()

@@ -103,7 +103,7 @@ def request(reference: int, parameters: bytes, data: bytes = b"", rosctr: int = 
 def address(db_number: int, place: int, count: int, kind: int = TYPE_BYTE, area: int = DATA_BLOCK) -> bytes:
     """Return the encoded address of ``count`` bytes, or of one bit, in a data block or other area.
 
-    ``place`` is the offset in bits, or the number of a timer or counter.
+    ``place`` is the offset in bits; for a timer or counter, its number.
     """
     return _ADDRESS.pack(0x12, 10, 0x10, kind, count, db_number, area << 24 | place)
 
@@ -113,7 +113,7 @@ def _frame(payload: bytes) -> bytes:
 
 
 def reference_of(frame: memoryview) -> int:
-    """Return the reference of the request to which an answer belongs; do not check the answer."""
+    """Return the reference of the request to which an answer belongs, without checking the answer."""
     if len(frame) < USERDATA_END:
         _check_cotp(frame)
         raise ConnectorError(f"the controller's answer of {len(frame)} bytes is too short")
@@ -210,12 +210,12 @@ def parse_connect_confirm(frame: memoryview) -> int:
 
 
 def setup_request(reference: int, jobs: int, pdu_size: int) -> bytes:
-    """Return the request "setup communication", for this number of parallel jobs and PDU size in bytes."""
+    """Return the request "setup communication", which proposes a number of parallel jobs and a PDU size in bytes."""
     return request(reference, struct.pack(">BBHHH", _SETUP, 0, jobs, jobs, pdu_size))
 
 
 def parse_setup_answer(frame: memoryview, reference: int, asked: Session) -> Session:
-    """Return the session that the controller grants, with no parameter above that of ``asked``."""
+    """Return the session that the controller grants. No parameter is above that of ``asked``."""
     data_length = check_answer(frame)
     if (answered := reference_of(frame)) != reference:
         raise ConnectorError(f"the controller answered a request that was not sent (reference {answered})")

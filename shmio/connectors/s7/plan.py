@@ -9,9 +9,9 @@ from shmio.connectors.s7 import pdu
 from shmio.layout.s7.address import Area
 
 MAX_ITEMS: Final = 20
-"""Largest number of items in a job that all known controllers accept."""
+"""Maximum number of items in a job; all known controllers accept as many."""
 MAX_GAP: Final = 16
-"""Largest number of unused bytes between two fields of a range; about the cost of another item."""
+"""Maximum number of unused bytes between two fields of a range; reading them costs about as much as another item."""
 _REQUEST_HEAD, _REQUEST_ITEM = 12, 12
 _ANSWER_HEAD, _ANSWER_ITEM = 14, 4
 _OPEN_JOBS: Final = 8  # largest number of jobs in which to look for room, so that planning takes linear time
@@ -28,7 +28,7 @@ class Field(NamedTuple):
     """Offset of the first byte. For a timer or counter, twice its number."""
     stop: int
     every: int = 1
-    """Number of cycles in which the field is read once."""
+    """The field is read once in this number of cycles."""
 
 
 class Range:
@@ -46,7 +46,7 @@ class Range:
         """The last bytes of the range that were stored in the image."""
 
     def halves(self) -> list[Range]:
-        """Return two ranges with half of the fields each; for a range of one field, return the range."""
+        """Return two ranges with half of the fields each; for a range with one field, only this range."""
         middle = len(self.fields) // 2
         if not middle:
             return [self]
@@ -79,7 +79,7 @@ def merge(fields: Iterable[Field], most: int, max_gap: int = MAX_GAP) -> list[Ra
     """Return ranges that cover the fields.
 
     Fields that are read at different rates do not share a range. A range has at most ``most``
-    bytes, unless it has only one, longer field.
+    bytes, unless its only field is longer.
     """
     ranges: list[Range] = []
     run: list[Field] = []
@@ -100,7 +100,7 @@ def merge(fields: Iterable[Field], most: int, max_gap: int = MAX_GAP) -> list[Ra
 
 
 def most_bytes(pdu_size: int) -> int:
-    """Return the largest number of bytes in an item.
+    """Return the maximum number of bytes that an item can read with a PDU of ``pdu_size`` bytes.
 
     The result is even, because timers and counters have two bytes each.
     """

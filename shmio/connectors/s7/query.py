@@ -1,9 +1,9 @@
 """A question about the controller itself, which the session asks between reads of data. No I/O.
 
 Only one question is open at a time, and its request is sent after those of a read. A controller may
-refuse a question, or close the connection without an answer. After ``PATIENCE`` connections that
-were lost while a question was open that was never answered, or ``PATIENCE`` malformed answers in a
-row, no session asks it again.
+refuse a question, or close the connection without an answer. No session asks a question again after
+``PATIENCE`` malformed answers in a row, or if the controller has never answered the question and
+``PATIENCE`` connections were lost while it was open.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Query(ABC):
     """A question that the session asks periodically, or once in each session."""
 
     optional: ClassVar[bool] = False
-    """True if the session skips this question once the controller has failed to answer the one for its mode."""
+    """True if the session skips this question once the controller has failed to answer the query for its mode."""
 
     def __init__(self, service: Service, interval_ns: int | None) -> None:
         """Create a question; if ``interval_ns`` is None, it is asked once in each session."""
@@ -68,7 +68,7 @@ class Query(ABC):
         self._answer.clear()
 
     def take(self, count: int, first: int) -> bytes:
-        """Return the question's request at first, and then requests for the next parts of the answer."""
+        """Return the request of the question or, after a first part of the answer, the request for the next part."""
         begin, self.sent = self.sent, self.sent + count
         if begin:
             return next_request(first & 0xFFFF, self.service, self._sequence)
@@ -109,8 +109,9 @@ class Query(ABC):
     def lost(self, *, alive: bool = True) -> None:
         """Close an open question, because the connection was lost.
 
-        Never ask it again if this happens on several connections. A connection counts only if the
-        controller was ``alive``, which means that it answered other requests in the meantime.
+        If this happens on ``PATIENCE`` connections, and the controller has never answered the
+        question, the question is never asked again. A connection counts only if the controller was
+        ``alive``, which means that it answered other requests in the meantime.
         """
         self._due_ns = 0
         if self.complete:
@@ -152,7 +153,7 @@ class Query(ABC):
 
     @abstractmethod
     def given_up(self, why: str) -> None:
-        """Handle that the question is never asked again.
+        """Handle the decision never to ask the question again.
 
         ``why`` is the reason; it continues the words "the controller …".
         """

@@ -17,7 +17,7 @@ NOTE: Final = (
 
 
 def by_pdu_size(count: Callable[[int], int]) -> tuple[Requests, ...]:
-    """Return the requests of a cycle for each PDU size. Sizes with the same count share an entry.
+    """Return the number of requests in a cycle for each usual PDU size. Sizes with equal numbers share an entry.
 
     Args:
         count: Returns the number of requests for a PDU size.

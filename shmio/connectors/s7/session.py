@@ -32,7 +32,7 @@ from shmio.wording import unknown
 
 MAX_DEPTH = 4  # largest number of reads in flight; with more, images would only be older
 REGISTER_OPTIONS = frozenset({"dbNumber", "every", "packetSize"})
-"""The keys that determine what is read, and not how to connect."""
+"""The keys that determine what is read, but not how to connect."""
 LONGEST_WRITE_S = 20  # time limit for a whole batch, or ``timeout`` if that is longer
 
 # The usual slot of the CPU in its rack, by family.
@@ -40,7 +40,7 @@ _CPU_SLOT = {"S7_300": 2, "S7_400": 3, "S7_1200": 1, "S7_1500": 1}
 
 
 class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
-    """Address of the controller and parameters of the session, with the keys of ``plc.ini``.
+    """The address of the controller and the parameters of the session, with the keys of ``plc.ini``.
 
     Raises:
         ValueError: The host or the model is invalid.
@@ -62,13 +62,13 @@ class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only
     timeout: Annotated[int, msgspec.Meta(ge=1, le=600_000)] = 5000
     """Time-out in ms for connecting, for reading the block, and for each answer to a write."""
     packetSize: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None  # noqa: N815 - a key of plc.ini
-    """Largest number of data bytes in one read, unless the PDU size that the controller grants is too small for it."""
+    """Maximum number of data bytes in one read; the PDU size that the controller grants may allow fewer."""
     dbNumber: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None  # noqa: N815 - a key of plc.ini
     """Number of the data block; None: the number in the layout's name."""
     every: Annotated[dict[str, Annotated[int, msgspec.Meta(ge=2, le=10_000)]], msgspec.Meta(max_length=8)] = {}
-    """For a tag table, by pattern: the number n for registers that are read only in every n-th cycle."""
+    """For a tag table: patterns of registers to read only in every n-th cycle, each with its n."""
     maxJobs: Annotated[int, msgspec.Meta(ge=1, le=255)] | None = None  # noqa: N815 - named like the other keys
-    """Largest number of requests in flight, unless the controller grants fewer."""
+    """Maximum number of requests in flight; the controller may grant fewer."""
 
     def __post_init__(self) -> None:
         if not _is_host(self.host):
@@ -120,7 +120,7 @@ def _is_name(text: str) -> bool:
 
 
 class Read(Operation, Protocol):
-    """A read of all values of a cycle. It can be used again for other cycles."""
+    """A read of all values of a cycle. The same object can read further cycles."""
 
     deadline_ns: int
     """Time by which the read must be complete, in ns of CLOCK_MONOTONIC."""
@@ -161,24 +161,24 @@ class S7Session(ABC):
 
     @property
     def timeout_s(self) -> float:
-        """The longest time that a method may take, in s: the longer of ``timeout`` and LONGEST_WRITE_S."""
+        """The longest time that any method may block, in s: the longer of ``timeout`` and LONGEST_WRITE_S."""
         return max(self.options.timeout / 1000, LONGEST_WRITE_S)
 
     @property
     def connected(self) -> bool:
-        """True if a session is open as far as shmio knows; the controller may have closed it."""
+        """True if a session is open, as far as shmio knows; the controller may have closed it."""
         return self._transport is not None
 
     @property
     def pdu_size(self) -> int:
-        """Largest PDU size that the controller granted, in bytes; 0 before the first session."""
+        """The largest PDU size that the controller has granted, in bytes; 0 before the first session."""
         return self._session.pdu_size
 
     @property
     def jobs(self) -> int:
-        """Largest number of requests in flight; 0 before the first session.
+        """Maximum number of requests in flight; 0 before the first session.
 
-        The controller grants it, and ``maxJobs`` may limit it.
+        The controller grants this number; ``maxJobs`` may lower it.
         """
         return self._session.jobs
 
@@ -189,13 +189,13 @@ class S7Session(ABC):
 
     @property
     def doubt(self) -> str:
-        """Why values may not change, such as a PLC in STOP; empty if there is no reason."""
+        """Why values may not change, for example because the PLC is in STOP; empty if there is no reason."""
         return self._mode.doubt
 
     def connect(self) -> None:
         """Open a session and ask for the operating mode.
 
-        This takes at most ``timeout``, and the time to look up the host name.
+        This takes at most ``timeout``, plus the time to look up the host name.
 
         Raises:
             ConnectorError: No controller answers, it does not speak S7, or it refuses the session.
@@ -218,7 +218,7 @@ class S7Session(ABC):
         self._begin(deadline_ns)
 
     def take_over(self, other: S7Session) -> bool:
-        """Take over the open session of another object that has the same options for the session.
+        """Take over the open session of another object with the same options for the session.
 
         First wait until the controller has answered all questions of that object.
 

@@ -56,7 +56,7 @@ from shmio.wording import counted
 RETRY_NS: Final = 10_000_000_000
 """Time in ns after which a refused register is tried again."""
 MAX_RETRIED: Final = 20
-"""Largest number of refused registers that one read tries again."""
+"""Maximum number of refused registers that one read tries again."""
 _STATUS: Final = {
     ACCESS_DENIED: BAD_USER_ACCESS_DENIED,
     OUT_OF_RANGE: BAD_OUT_OF_RANGE,
@@ -69,7 +69,7 @@ _AREA_NAMES: Final = {
     Area.COUNTER: "counters", Area.TIMER: "timers",
 }  # fmt: skip
 MAX_PLACES: Final = 200
-"""Largest length, in characters, of a text that lists blocks and areas."""
+"""Maximum length, in characters, of a text that lists blocks and areas."""
 _MOST_LOGGED: Final = 20  # largest number of refused registers that the log names one by one
 
 log = logging.getLogger("shmio.source")
@@ -92,7 +92,7 @@ class Planner:
         """Statuses of refused registers that are not in the image yet, by index in the layout."""
 
     def use(self, pdu_size: int) -> None:
-        """Plan for the PDU size of a new session, whose first read includes all registers.
+        """Plan for the PDU size of a new session. The session's first read includes all registers.
 
         The planner keeps what it knows about refused registers.
         """
@@ -102,7 +102,7 @@ class Planner:
             self._merge()
 
     def jobs(self, now_ns: int) -> list[Job]:
-        """Return the jobs of the next read, including refused registers that are due for an attempt."""
+        """Return the jobs of the next read. They include refused registers that it is time to try again."""
         jobs = self._due(self._cycle)
         self._cycle += 1
         if not self.refused:
@@ -116,7 +116,7 @@ class Planner:
 
     @property
     def count(self) -> int:
-        """Largest number of jobs in a cycle, without those that try refused registers."""
+        """Maximum number of jobs in a cycle, without those that try refused registers again."""
         return len(self._due(0))
 
     def _due(self, cycle: int) -> list[Job]:
@@ -128,14 +128,14 @@ class Planner:
         return jobs
 
     def split(self, whole: Range, parts: Sequence[Range]) -> None:
-        """From now on, read ``parts`` instead of the range ``whole``, if this range is still in use."""
+        """From now on, read ``parts`` instead of the range ``whole``, provided that ``whole`` is still being read."""
         if whole in self._ranges:
             del self._ranges[whole]
             self._ranges |= dict.fromkeys(parts)
             self._jobs = {}
 
     def replan(self) -> None:
-        """Divide the ranges among jobs anew, because some now need their own job."""
+        """Divide the ranges into jobs anew, because some ranges now need a job of their own."""
         self._jobs = {}
 
     def together(self, ranges: Iterable[Range]) -> None:
@@ -162,7 +162,7 @@ class Planner:
         return explain_place(code, tag.address.text, tag.address.db, part.stop - 1)
 
     def accept(self, part: Range) -> None:
-        """If the fields of a range had been refused, read them together with other fields again."""
+        """Treat the fields of a range as no longer refused, and read them together with other fields again."""
         if self.refused and any(field in self.refused for field in part.fields):
             for field in part.fields:
                 if self.refused.pop(field, None):
@@ -227,7 +227,7 @@ class TableRead:
 
     @property
     def count(self) -> int:
-        """Number of jobs so far."""
+        """Number of jobs so far. Refused ranges lead to more jobs."""
         return len(self._jobs)
 
     @property
@@ -241,7 +241,7 @@ class TableRead:
         return self._store(self)
 
     def take(self, count: int, first: int) -> bytes:
-        """Return the next ``count`` requests; references begin at ``first`` (16 bits, wrapping)."""
+        """Return the next ``count`` requests. Their references are 16-bit numbers from ``first`` on, which wrap."""
         begin, self.sent = self.sent, self.sent + count
         return b"".join(
             pdu.read_request((first + place) & 0xFFFF, [piece.address for piece in job])
@@ -397,7 +397,7 @@ class S7TableConnector(S7Session, Connector):
         self._image = RegisterImage(layout) if layout.status_offset is not None else None
 
     def describe(self) -> str:
-        """Return the peer, the session's parameters and the number of requests in a cycle, as text for the log."""
+        """Return, for the log, the peer, the session's parameters and the number of requests in a cycle."""
         requests = self._planner.count
         return (
             f"to {self.options.peer} {len(self._layout.registers)} registers pdu={self.pdu_size} jobs={self.jobs} "

@@ -1,4 +1,4 @@
-"""A register of a tag table, with its field, which is the bytes to read for the register."""
+"""A register of a tag table, with the bytes in the controller's memory to read for it."""
 
 from __future__ import annotations
 

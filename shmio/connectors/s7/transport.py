@@ -21,7 +21,7 @@ from shmio.errors import ConnectorError
 class Transport:
     """One TCP connection.
 
-    Deadlines are CLOCK_MONOTONIC in ns. Methods meet them with an accuracy of about 0.1 ms.
+    Deadlines are times of CLOCK_MONOTONIC in ns. Methods meet them to within about 0.1 ms.
     """
 
     def __init__(self, host: str, port: int, timeout_ns: int) -> None:
@@ -57,7 +57,7 @@ class Transport:
     def send(self, data: bytes | memoryview, deadline_ns: int) -> None:
         """Send all of ``data``.
 
-        Answers that arrive meanwhile fit into the buffer of the kernel.
+        Answers that arrive in the meantime wait in the kernel's buffer.
 
         Raises:
             TimeoutError: The peer has not accepted the data by ``deadline_ns``.
@@ -73,7 +73,7 @@ class Transport:
             self.taken += self._socket.send(data[self.taken :])
 
     def receive(self, until_ns: int) -> bool:
-        """Wait for data until ``until_ns``, and receive them. Return False if nothing came.
+        """Wait for data, and receive them. Return False if no data have come by ``until_ns``.
 
         Take all complete frames before the next call, so that there is room in the buffer.
 
@@ -95,7 +95,7 @@ class Transport:
         return True
 
     def frame(self) -> memoryview | None:
-        """Return the next complete frame, valid until the next ``receive``; None if there is none."""
+        """Return the next complete frame, which is valid until the next ``receive``; None if there is none."""
         if self._end - self._start < 4:
             return None
         length = pdu.frame_length(self._inbox, self._start, self._longest)
@@ -141,9 +141,9 @@ class Operation(Protocol):
         """True if the operation expects no more answers."""
 
     def take(self, count: int, first: int) -> bytes | memoryview:
-        """Return the next ``count`` requests as frames, with references from ``first`` on.
+        """Return the next ``count`` requests as frames.
 
-        References have 16 bits and wrap.
+        Their references are 16-bit numbers from ``first`` on, which wrap.
         """
 
     def accept(self, index: int, frame: memoryview) -> None:
@@ -179,14 +179,14 @@ class Window:
         return bool(self._queue)
 
     def add(self, operation: Operation, *, urgent: bool = False) -> None:
-        """Queue the requests of an operation; if ``urgent``, before all others."""
+        """Queue the requests of an operation, before all others if ``urgent`` is true."""
         if urgent:
             self._queue.appendleft(operation)
         else:
             self._queue.append(operation)
 
     def due(self) -> bytes | memoryview:
-        """Return the requests that may be sent now, as one sequence of bytes; empty if there are none."""
+        """Return the requests that may be sent now, joined to one sequence of bytes; empty if there are none."""
         parts: list[bytes | memoryview] = []
         self._given.clear()
         while self._queue and (free := self.jobs - len(self._in_flight)) > 0:
@@ -202,7 +202,7 @@ class Window:
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
     def take_back(self) -> None:
-        """Mark the requests that ``due`` returned last as not sent, because the connection was lost."""
+        """Mark the requests that the last :meth:`due` returned as not sent, because the connection was lost."""
         for operation, begin in self._given:
             operation.sent = begin
 

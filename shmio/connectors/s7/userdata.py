@@ -50,7 +50,7 @@ _ACTIVE = b"A"  # asks for the block in the work memory
 
 
 class Part(NamedTuple):
-    """An answer, or a part of an answer."""
+    """An answer, or one of its parts."""
 
     data: bytes
     sequence: int
@@ -67,7 +67,7 @@ def request(reference: int, service: Service, data: bytes = b"") -> bytes:
 
 
 def next_request(reference: int, service: Service, sequence: int) -> bytes:
-    """Return a request for the next part of an answer, whose last part had the number ``sequence``."""
+    """Return a request for the part of an answer that follows the part with the number ``sequence``."""
     parameters = _PARAMETERS.pack(
         _PARAMETERS_HEAD, 8, _ANSWER, 0x40 | service.group, service.function, sequence, 0, 0, 0
     )
@@ -113,12 +113,12 @@ def _refused(service: Service, number: str, code: int = 0) -> RefusedError:
 
 
 def szl_data(szl: int) -> bytes:
-    """Return the data of a request for all records of a list."""
+    """Return the data of a request for all records of a system status list."""
     return struct.pack(">HH", szl, 0)
 
 
 def szl_records(data: bytes, szl: int) -> list[bytes]:
-    """Return the complete records in the data of an answer.
+    """Return the complete records of a system status list in the data of an answer.
 
     Raises:
         ConnectorError: The answer is about another list, or its head is missing.
@@ -155,7 +155,7 @@ def parse_clock(data: bytes) -> datetime | None:
 
 
 class BlockInfo(NamedTuple):
-    """The CPU's description of a data block, which differs after a changed block was loaded."""
+    """The CPU's description of a data block. Loading a changed block changes this description."""
 
     load_size: int
     """The block's size in load memory, in bytes."""
