@@ -1,4 +1,4 @@
-"""Derives, from a recording, declared injections that repeat the recorded injections."""
+"""Derives declared injections from a recording: they repeat the recorded injections."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ class Derived:
 
     @property
     def begin_s(self) -> float:
-        """The earliest start of a declaration, in s.
+        """The earliest start of all declarations, in s.
 
-        The value is 0 if there are no declarations, or if a declaration has no start.
+        It is 0 if there are no declarations, or if a declaration has no start.
         """
         return min((one.start_s or 0.0 for one in self.declarations), default=0.0)
 
@@ -72,9 +72,9 @@ def derive(dump: Dump) -> Derived:
     """Derive declarations that repeat a recording's injections at the same instance times.
 
     A declared injection keeps its declaration and its seed, but lasts no longer than it did in the
-    recording. Each value that a client gave over ``/out`` becomes a ``set``, which lasts until the
-    client's next value. A client's injection over ``/in`` cannot be declared, because its values
-    depend on the writes of other clients.
+    recording. Each value that a client gave to its injection over ``/out`` becomes an injection with
+    the operation ``set``, which lasts until the client's next value. A client's injection over
+    ``/in`` cannot be repeated, because its values depend on the writes of other clients.
     """
     found = Derived()
     for source in dump.sources:

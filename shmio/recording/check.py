@@ -16,7 +16,7 @@ from shmio.recording.reading.survey import MAX_BLOCKS, Count, read_index
 from shmio.recording.times import lost
 
 MAX_TOLD: Final = 1000
-"""A result lists at most this many damaged places and this many problems. It counts all of them."""
+"""A result lists at most this many damaged places, and this many problems, but it counts all of them."""
 
 
 @dataclass(slots=True)
@@ -29,7 +29,7 @@ class Findings:
     damage: list[Damage] = field(default_factory=list)
     """The first damaged places, which are parts of the file that cannot be read."""
     problems: list[str] = field(default_factory=list)
-    """Messages about the first places that can be read, but are inconsistent."""
+    """Messages about the first places that can be read but are inconsistent."""
     count: int = 0
     """Total number of damaged places and problems."""
 
@@ -39,14 +39,14 @@ class Findings:
         return self.count == 0
 
     def texts(self) -> list[str]:
-        """Return a message for each listed place, and one with the number of unlisted places."""
+        """Return a message for each damage and problem in the lists, and one with the number of all others."""
         found = [lost(damage) for damage in self.damage] + self.problems
         more = self.count - len(found)
         return [*found, f"and {more} more such places"] if more else found
 
 
 def check(reader: Reader, at: Callable[[int], object] = lambda _: None) -> Findings:
-    """Verify all CRCs and messages, and that a gap is recorded for each missing frame or event.
+    """Verify all CRCs and messages, and that the file has a gap for each missing frame or event.
 
     If the file was not closed, check the part that exists.
 
@@ -67,9 +67,10 @@ def check(reader: Reader, at: Callable[[int], object] = lambda _: None) -> Findi
 
 
 def check_by_record(reader: Reader) -> Generator[int, None, Findings]:
-    """Check a file like :func:`check`, and yield the byte offset of each record before its check.
+    """Check a file as :func:`check` does, but yield the byte offset of each record before its check.
 
-    Between two records, the caller may do other work, or give up.
+    Between two records, the caller may do other work, or give up. The generator returns the
+    findings.
     """
     work = _Check(reader)
     for record in reader.records.walk():

@@ -47,11 +47,11 @@ class Columns(Mapping[str, Array]):
     Attributes:
         source: Name of the source.
         registers: The registers.
-        time_ns: Log times, UTC, in ns, shape (n,).
+        time_ns: Log times, UTC in ns, shape (n,).
         number: Numbers of the frames, shape (n,).
         cycle: Cycles of the source's schedule, shape (n,).
-        source_ns: Times at which the source had the values, in ns, shape (n,). In frames before the
-            source had any value, the time and all values are 0.
+        source_ns: Time stamps of the source, UTC in ns, shape (n,). In frames before the source had
+            any value, the time stamp and all values are 0.
         quality: 0 bad, 1 uncertain, 2 good; shape (n,).
         provenance: 0 live, 1 simulated, 2 replayed, 3 injected; shape (n,).
         values_by_path: The values, by path without the source.
@@ -80,10 +80,11 @@ class Columns(Mapping[str, Array]):
     def to_arrow(self) -> pyarrow.Table:
         """Return a pyarrow table with a row for each frame.
 
-        The columns are time (UTC, ns), source time, number, cycle, quality, provenance, and the
-        registers with native types: arrays are lists of fixed size, POINTER and ANY are bytes. A
-        value is null if the bytes are not valid for the type, or if the source had no value yet. A
-        register whose path equals the name of another column gets the name ``source/path``.
+        The columns are the time (UTC in ns), source time, number, cycle, quality, provenance, and
+        the registers, with native types: arrays are lists of fixed size, POINTER and ANY are bytes.
+        A value is null if the bytes are not valid for the type, or if the source had no value yet.
+        If the path of a register equals the name of another column, the register's column is named
+        ``source/path``.
 
         Raises:
             MissingLibraryError: pyarrow is not installed.
@@ -106,7 +107,7 @@ class Columns(Mapping[str, Array]):
     def to_pandas(self) -> pandas.DataFrame:
         """Return a pandas data frame with a row for each frame.
 
-        The index is the time (UTC). The columns are number, cycle, quality, and one for each
+        The index is the time (UTC). The columns are number, cycle, quality, and one column for each
         register or array element.
 
         Raises:
@@ -136,12 +137,12 @@ class Columns(Mapping[str, Array]):
 
 
 def heading(source: str, path: str, taken: Collection[str] = OF_FRAMES) -> str:
-    """Return a register's column name: its path, or source/path if the path is in ``taken``."""
+    """Return the name of a register's column: its path, or ``source/path`` if ``taken`` contains the path."""
     return f"{source}/{path}" if path in taken else path
 
 
 def flat(register: Register, values: Array) -> Iterator[tuple[str, Array]]:
-    """Yield a column (path, values) for a register, or for each element of an array.
+    """Yield (path, values) for the column of a register or, for an array, of each element.
 
     Values of POINTER and ANY become hexadecimal digits.
     """
@@ -218,11 +219,11 @@ class Collector:
 
     @property
     def bytes(self) -> int:
-        """Approximate number of bytes of the frames added since :meth:`columns` was called."""
+        """Approximate number of bytes of the frames that were added since the last call of :meth:`columns`."""
         return self._waiting_bytes + sum(some.nbytes for some in self._decoded)
 
     def columns(self) -> Columns:
-        """Return the columns of the frames added since the last call."""
+        """Return the columns of the frames that were added since the last call."""
         self._flush()
         assert self._codec is not None  # noqa: S101  begin() was called before
         decoded = np.concatenate([np.empty(0, self._codec.dtype), *self._decoded])

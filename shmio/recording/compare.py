@@ -22,14 +22,14 @@ from shmio.segment.playhead import OWN_WORDS
 from shmio.wording import unknown
 
 EVENT_FIELDS: Final = ("kind", "quality", "text", "offset", "size", "mask", "data")
-"""The fields of an event that are equal if the same happens in two runs."""
+"""The fields of an event to compare: they are equal if the same happens in two runs."""
 MAX_EVENTS: Final = 4096
-"""Largest number of events of one cycle that are in memory at once, to match them.
+"""Maximum number of events of one cycle to hold in memory at once, in order to match them.
 
 While time is paused, one cycle may have any number of events.
 """
 MAX_SHIFT: Final = 64
-"""Number of frames of the first common group to compare in order to align two recordings."""
+"""Number of frames to compare in order to align two recordings, from the first group that both have."""
 
 T = TypeVar("T", Frame, Event)
 _Pair = tuple[Entry[T] | None, Entry[T] | None]
@@ -40,8 +40,8 @@ _Groups = Iterator[tuple[int, Iterable[Entry[T]]]]
 class RegisterDifference:
     """A register whose values differ in ``count`` frames.
 
-    ``first`` and ``values`` have the log times and the values of both frames in the first pair that
-    differs. ``largest`` is the largest difference, if the values are numbers.
+    For the first pair of frames that differ, ``first`` has both log times, and ``values`` both
+    values. ``largest`` is the largest difference in any pair; 0 if the values are not numbers.
     """
 
     count: int
@@ -54,8 +54,8 @@ class RegisterDifference:
 class Difference:
     """The first pair of frames or events that differ.
 
-    ``times_ns`` and ``numbers`` have the log time and the number in each recording. They are None
-    for a recording that lacks the frame or event.
+    ``times_ns`` and ``numbers`` have the log time and the number of the frame or event in each
+    recording; None for a recording that lacks it. ``what`` says what differs.
     """
 
     times_ns: tuple[int | None, int | None]
@@ -65,7 +65,7 @@ class Difference:
 
 @dataclass(slots=True)
 class Side:
-    """The result of a comparison of the frames, or of the events, of one source."""
+    """The result of comparing all frames, or all events, of one source."""
 
     compared: int = 0
     differing: int = 0
@@ -80,10 +80,10 @@ class Side:
 
 
 class Timing:
-    """Statistics of the time differences between matching frames.
+    """Statistics of the time differences between matching frames of two recordings.
 
-    Times are relative to the first frame of each recording. Percentiles are accurate to 5 %. The
-    memory use does not grow with the number of frames.
+    Times are relative to the first matching frame of each recording. Percentiles are accurate to
+    5 %. The memory use does not grow with the number of frames.
     """
 
     def __init__(self) -> None:
@@ -103,7 +103,7 @@ class Timing:
         self._count += 1
 
     def percentile_ns(self, percent: float) -> int:
-        """Return a percentile of the differences in ns; 0 if there are no frames."""
+        """Return the percentile ``percent`` (0 to 100) of the differences, in ns; 0 if there are no frames."""
         rest = self._count * percent / 100
         for place in sorted(self._bins):
             rest -= self._bins[place]
@@ -114,7 +114,7 @@ class Timing:
 
 @dataclass(slots=True)
 class SourceDifference:
-    """The differences between two recordings in one source."""
+    """The differences between two recordings of one source."""
 
     source: str
     frames: Side = field(default_factory=Side)
@@ -133,10 +133,10 @@ class SourceDifference:
 
 
 IGNORABLE: Final = ("times", "cycle", "reason", "events", "ends")
-"""The items that a comparison can ignore.
+"""The kinds of differences that a comparison can ignore.
 
-``ends`` stands for frames and events that only one recording has, before the first or after the
-last frame or event that both have.
+``ends`` stands for the frames and events that only one recording has, before the first or after the
+last frame or event that both recordings have.
 """
 _OF_PROCESSES: Final = frozenset({EventKind.STARTED, EventKind.STOPPED})
 
@@ -149,10 +149,11 @@ class Comparison:
     """The options of a comparison.
 
     Attributes:
-        ignore: The items of :data:`IGNORABLE` to ignore.
+        ignore: The differences to ignore, from :data:`IGNORABLE`.
         only: Paths of the registers to compare, as for :meth:`Dump.select`; empty for all.
         tolerance: Absolute difference up to which REAL and LREAL values count as equal.
-        relative: The same tolerance as a fraction of the larger absolute value.
+        relative: Difference up to which they count as equal, as a fraction of the larger absolute
+            value.
     """
 
     ignore: Collection[str] = ()
@@ -170,21 +171,22 @@ def compare(
 ) -> Iterator[SourceDifference]:
     """Compare two recordings source by source.
 
-    Frames with the same cycle match. If cycles are ignored, frames with the same source time match.
-    If times are also ignored, the frames match in their order.
+    A frame of the first recording is compared with the frame of the second that has the same cycle.
+    If cycles are ignored, it is compared with the frame that has the same source time; if times are
+    also ignored, with the next frame.
 
     Args:
         first: The first recording.
         second: The second recording.
         how: The options.
         sources: Names of the sources to compare; None for all.
-        progress: Called with the present log time in the first recording.
+        progress: Called with the log time that the comparison has reached in the first recording.
 
     Yields:
         The differences of each source.
 
     Raises:
-        PathError: A source or register is not in any of the recordings.
+        PathError: A source or register is in neither recording.
     """
     names = list(dict.fromkeys((*first.sources, *second.sources)))
     chosen = _chosen(first, how), _chosen(second, how)

@@ -14,7 +14,7 @@ class Samples(NamedTuple):
     Attributes:
         time_ns: Times in ns, int64.
         values: Values, float64; NaN where there is no good value.
-        injected: True where the value is injected, bool.
+        injected: True where a value is injected, bool.
     """
 
     time_ns: npt.NDArray[np.int64]
@@ -38,8 +38,9 @@ class Decimator:
     """Reduces samples that are added in parts, in the order of time.
 
     Time is divided into columns, such as the pixels of a plot. From each column, the decimator
-    keeps the first and the last sample, the least and the greatest, the first without a good value,
-    and the first injected one. A plot of these looks like a plot of all samples.
+    keeps the first and the last sample, those with the least and the greatest value, the first
+    sample without a good value, and the first injected sample. A plot of these samples looks like a
+    plot of all samples.
     """
 
     def __init__(self, begin_ns: int, end_ns: int, columns: int) -> None:
@@ -51,7 +52,7 @@ class Decimator:
         """True if any sample was left out so far."""
 
     def add(self, samples: Samples) -> Samples:
-        """Add later samples. Return the kept samples of all columns that are now complete."""
+        """Add the next samples. Return the kept samples of all columns that are now complete."""
         whole = joined(self._rest, samples)
         if not len(whole.time_ns):
             return NO_SAMPLES

@@ -15,11 +15,11 @@ from shmio.recording.times import iso
 
 
 def describe(file: Path, **options: Any) -> dict[str, Any]:
-    """Describe a file as ``shmio-dump info --json`` does, without reading all of it.
+    """Return what ``shmio-dump info --json`` prints about a file, without reading all of the file.
 
     Args:
         file: The path.
-        options: Keywords of :class:`Reader`.
+        options: Keyword arguments for :class:`Reader`.
 
     Raises:
         OSError: The file cannot be read.

@@ -1,4 +1,4 @@
-"""The digest of what a recording contains, which is the same for equal runs in virtual time."""
+"""Computes a digest of what a recording contains, which is the same for equal runs in virtual time."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from shmio.recording.format.encoding import encode_event, encode_frame
 def digest_of_contents(dump: Dump) -> str:
     """Return the SHA-256 of all frames and events of a recording, source by source.
 
-    It leaves out what differs between two equal runs: the host's clocks, and the numbers of
-    commands and injections, which begin with them.
+    It leaves out what differs between two equal runs: times of the host's clocks, and the numbers of
+    commands and injections.
     """
     found = hashlib.sha256()
     for source in sorted(dump.sources):

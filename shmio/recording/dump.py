@@ -38,7 +38,7 @@ from shmio.wording import name_one, unknown
 
 MAX_FILES: Final = 512
 OVERLAP_NS: Final = 1_000_000_000
-"""A file of a recorder begins at most this time before the end of the previous file."""
+"""Maximum time in ns by which two consecutive files of a recorder overlap."""
 
 Chosen = dict[DumpBlock, list[Register]]
 
@@ -46,13 +46,13 @@ Chosen = dict[DumpBlock, list[Register]]
 def open_dump(files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], damaged: Damaged | None = None) -> Dump:
     """Open a recording that consists of one file, or of several files of one run in any order.
 
-    Opening reads only the index of each file. If a file was not closed, it reads the headers of the
-    file's chunks instead.
+    Opening reads only the index of each file, or the headers of the chunks if the file was not
+    closed.
 
     Args:
         files: The path of a file, or the paths of several files.
-        damaged: Called with the file and the damage for each place that cannot be read. Reading
-            continues after this place. If None, reading such a place raises RecordingError.
+        damaged: Called with the file and the damage for each place that cannot be read; reading then
+            continues after this place. None: reading such a place raises RecordingError.
 
     Returns:
         The recording, a context manager.
@@ -77,7 +77,7 @@ def open_dump(files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], 
 class Dump:
     """An open recording of one file, or of several files of one run.
 
-    All times are log times: UTC, in ns. A range of time includes both ``from_ns`` and ``to_ns``.
+    All times are log times (UTC in ns). A range of time includes both ``from_ns`` and ``to_ns``.
     Use the recording as a context manager, or call :meth:`close`. Iterators read one chunk at a
     time, on demand. You may use several iterators at once, in one thread.
     """
@@ -150,7 +150,7 @@ class Dump:
     def gaps(self) -> list[Gap]:
         """The gaps in the files, at most 1000 of each file.
 
-        The field ``block`` of a gap is the number that the block has in the gap's file.
+        The field ``block`` of a gap is the number of the block in the file that has the gap.
         """
         return [gap for part in self._parts for gap in part.found.gaps]
 
@@ -214,7 +214,7 @@ class Dump:
     def events(
         self, sources: str | Collection[str] | None = None, from_ns: int = 0, to_ns: int = MAX_NS
     ) -> Iterator[Entry[Event]]:
-        """Iterate over the events of some sources. This reads only the chunks that have events.
+        """Iterate over the events of some sources, reading only the chunks that have events.
 
         Args:
             sources: Names of the sources; None for all.
@@ -234,7 +234,7 @@ class Dump:
 
         Args:
             source: Name of the source; None if there is only one.
-            time_ns: The time.
+            time_ns: The time; the end of the recording if not given.
 
         Returns:
             The frame; None if the source has no frame at or before this time.
@@ -257,7 +257,7 @@ class Dump:
 
         Args:
             source: Name of the source; None for any source.
-            after_ns: The time.
+            after_ns: The time; the start of the recording if not given.
 
         Raises:
             PathError: There is no such source.
@@ -265,7 +265,7 @@ class Dump:
         return next(self.events(source, after_ns + 1), None)
 
     def next_change(self, path: str, after_ns: int = -1, to_ns: int = MAX_NS) -> Entry[Frame] | None:
-        """Return the first frame after ``after_ns`` in which readers saw a change of registers.
+        """Return the first frame after ``after_ns`` in which readers saw one of some registers change.
 
         Args:
             path: A register, a structure or a pattern of one source.
@@ -302,8 +302,8 @@ class Dump:
             source: Name of the source; None if there is only one.
             from_ns: Start of the range.
             to_ns: End of the range.
-            raw: True for the images that the source delivered, without injections; False for those
-                that readers saw.
+            raw: True for the images that the source delivered, without injections; False for the
+                images that readers saw.
 
         Raises:
             PathError: There is no such source.
@@ -325,21 +325,21 @@ class Dump:
     ) -> Columns:
         """Read registers of one source as numpy arrays, with one value for each frame.
 
-        The arrays have the types of the registers. The result has no frames of blocks that have
-        none of these registers. All of it is in memory.
+        The arrays have the types of the registers, and are all in memory. Frames of blocks without
+        any of these registers are left out.
 
         Args:
             paths: Registers, elements, structures or patterns.
             from_ns: Start of the range.
             to_ns: End of the range.
-            raw: True for the values that the source delivered, without injections; False for those
-                that readers saw.
+            raw: True for the values that the source delivered, without injections; False for the
+                values that readers saw.
 
         Returns:
             Arrays of shape (n, …) by path, for n frames, with their times and qualities.
 
         Raises:
-            PathError: There is no such register, or the registers are of several sources.
+            PathError: There is no such register, or the registers belong to several sources.
             RecordingError: A reload changed the registers within the range.
         """
         chosen = self._names.of_one_source(paths)
@@ -353,7 +353,7 @@ class Dump:
         return collector.columns()
 
     def select(self, paths: Iterable[str]) -> dict[DumpBlock, list[Register]]:
-        """Return the registers that paths name, by block. The paths are as for :meth:`columns`.
+        """Return the registers that paths name, by block. Give paths as for :meth:`columns`.
 
         Raises:
             PathError: There is no such register.
@@ -461,7 +461,7 @@ class _Names:
         """Return the registers of one source that the paths name, by block.
 
         Raises:
-            PathError: There is no such register, or the registers are of several sources.
+            PathError: There is no such register, or the registers belong to several sources.
         """
         chosen = self.select([paths] if isinstance(paths, str) else paths)
         sources = sorted({block.source for block in chosen})

@@ -31,7 +31,7 @@ from shmio.version import __version__
 PIECE_BYTES: Final = 8 << 20
 """Approximate size in bytes, in memory, of the pieces that :func:`pieces` yields."""
 GROUP_BYTES: Final = 16 << 20
-"""Approximate size of a row group of a Parquet file, in bytes.
+"""Approximate size in bytes of a row group of a Parquet file.
 
 Each row group takes some hundred bytes of memory per column until the file is closed.
 """
@@ -44,9 +44,9 @@ _EVENT_COLUMNS: Final = (
 _EVENT_BATCH: Final = 4096
 _FRAME: Final = "frame"
 _FRAME_FIELDS: Final = {"number": "integer", "cycle": "integer", "quality": "integer", "provenance": "integer"}
-"""The header fields of a frame, with their JSON types.
+"""The header fields of a frame that a JSON message has, with their JSON types.
 
-In a message, they are below the key ``frame``.
+In the message, they are in the object ``frame``.
 """
 _JSON_TYPES: Final = {"b": "boolean", "i": "integer", "u": "integer", "f": "number", "m": "integer"}
 _EVENT_TYPES: Final = {
@@ -86,7 +86,7 @@ def pieces(
 
 
 class CsvTable:
-    """A CSV file with a column for each register and each element of an array.
+    """A CSV file with a column for each register or, for an array, for each element.
 
     Times are in UTC. Durations are numbers in the unit of their type. A cell is empty if the
     register's bytes are not a valid value, or if the source had no value yet.
@@ -184,7 +184,7 @@ class ParquetTable:
 
 
 class Table(Protocol):
-    """The protocol of a file with a row for each frame of a block."""
+    """A file that gets a row for each frame of a block."""
 
     rows: int
 
@@ -213,9 +213,10 @@ def _new_folder(path: Path) -> Iterator[None]:
 
 
 class BlockTables:
-    """Writes a table file for each block.
+    """Writes a file with a table for each block.
 
-    A file is named after its source; the files of the source's later blocks also have a number.
+    A file has the name of its source. If a source has several blocks, the names of all files but the
+    first also have a number.
     """
 
     def __init__(self, stack: ExitStack, output: Path, form: str, chosen: Chosen, *, named: bool) -> None:
@@ -270,9 +271,10 @@ def export_events(
         sources: Names of the sources.
         stream: The new file.
         form: ``csv`` or ``parquet``.
-        from_ns: Start of the range.
-        to_ns: End of the range.
-        progress: Called with the length in ns of the part that is done.
+        from_ns: Start of the range of log times.
+        to_ns: End of the range of log times.
+        progress: Called with the time in ns, from the start of the recording, up to which it is
+            done.
 
     Returns:
         The number of rows.
@@ -354,10 +356,12 @@ def export_mcap(
         dump: The recording.
         chosen: The registers to export, by block.
         stream: The new file.
-        from_ns: Start of the range.
-        to_ns: End of the range.
-        raw: True to export the values that the source delivered, without injections.
-        progress: Called with the length in ns of the part that is done.
+        from_ns: Start of the range of log times.
+        to_ns: End of the range of log times.
+        raw: True to export the values that the source delivered, without injections; False to export
+            the values that readers saw.
+        progress: Called with the time in ns, from the start of the recording, up to which it is
+            done.
 
     Returns:
         The number of messages.

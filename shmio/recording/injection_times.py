@@ -1,4 +1,4 @@
-"""Finds out from events when injections were active."""
+"""Finds the periods in which injections were active, from events."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from shmio.judging.report import Span
 from shmio.segment.events import Event, EventKind
 
 MAX_SPANS: Final = 10_000
-"""Largest number of finished periods that are stored; later ones are left out."""
+"""Maximum number of finished periods to store; later periods are left out."""
 
 
 class InjectionTimes:
     """The periods in which injections were active, according to the events of their sources.
 
-    A declared injection is active from its activation on; a client's injection, from its first
-    value on.
+    A declared injection is active from its activation on; a client's injection is active from its
+    first value on.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Judges expectations over a recording."""
+"""Judges whether a recording meets expectations."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from shmio.recording.reading.batch import Batch
 from shmio.recording.reading.part import MAX_NS, DumpBlock
 
 MAX_GOLDEN: Final = 20_000_000
-"""Largest number of values to read from a recording that expectations name in ``like``."""
+"""Maximum number of values to read from a recording that expectations name with the key ``like``."""
 
 
 def recording_judge(dump: Dump, expectations: Sequence[Expectation], golden: Golden | None = None) -> Judge:
-    """Return a judge of the sources of a recording. ``golden`` is as for :class:`Judge`.
+    """Return a judge of expectations for the sources of a recording. ``golden`` is as for :class:`Judge`.
 
     Raises:
         ConfigError: An expectation is invalid; the message starts like ``expect[0].formula: …``.
@@ -46,10 +46,10 @@ def judge_recording(
 
     Args:
         dump: The recording.
-        judge: A new judge of this recording.
+        judge: A new judge for this recording, from :func:`recording_judge`.
         from_ns: Start of the range, log time.
         to_ns: End of the range, log time.
-        seen: Called with the values of the signals, by source, in order.
+        seen: Called with the values of the signals in each chunk, by source, in the order of time.
 
     """
     blocks: dict[str, DumpBlock] = _first_blocks(dump)
@@ -64,7 +64,7 @@ def judge_recording(
 
 
 class GoldenRecordings:
-    """Reads signals of the recordings that expectations name in ``like``."""
+    """Reads signals from the recordings that expectations name with the key ``like``."""
 
     def __init__(self, folder: Path) -> None:
         """Create the reader. Names of files are relative to ``folder``."""

@@ -1,4 +1,4 @@
-"""Makes new recordings: a part of one, several joined, or the intact entries of a damaged one."""
+"""Makes new recordings: a part of a recording, several files joined, or the intact entries of a damaged file."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Rewriter:
         """Number of frames and events that could not be read; the new file has gaps for them."""
 
     def attach(self) -> None:
-        """Copy the intact attachments, except layouts: these are written with their blocks."""
+        """Copy all intact attachments except layouts, which are written with their blocks."""
         seen: set[str] = set()
         for reader in self._dump.readers:
             for name in reader.attachments:
@@ -69,7 +69,7 @@ class Rewriter:
                     seen.add(name)
 
     def add(self, entry: Entry[Item]) -> None:
-        """Add the next entry, in order."""
+        """Add an entry. Call this for all entries in their order."""
         if isinstance(entry.item, StepMark):
             self._writer.step(entry.item, entry.time_ns)
         elif isinstance(entry.item, ProcessChange):
@@ -146,7 +146,7 @@ class Rewriter:
 
 @contextmanager
 def new_file(path: Path) -> Iterator[IO[bytes]]:
-    """Create a file that only this user may read. After an error, remove it again.
+    """Create a file that only this user may read, open during a ``with`` block; after an error, remove it.
 
     Raises:
         RecordingError: The file exists already.
@@ -185,9 +185,10 @@ def rewrite(
         path: The new file.
         made: Name of the command that makes the file, for its metadata.
         entries: The entries in order: from ``dump.items()``, or from :func:`part`.
-        whole: True to write a gap if entries are missing at the beginning of a block; False if they
-            were left out on purpose.
-        progress: Called with the length in ns of the part that is done.
+        whole: True to write a gap for entries that are missing at the beginning of a block; False if
+            they were left out on purpose.
+        progress: Called with the time in ns, from the start of the recording, up to which it is
+            done.
 
     Returns:
         The writer of the file, with its statistics.
@@ -222,8 +223,8 @@ def part(
         from_ns: Start of the range of time.
         to_ns: End of the range of time.
         sources: Names of the sources; None for all.
-        registers: Paths of the registers; empty for all. An element selects its whole array. The
-            bytes of all other registers become zero.
+        registers: Paths of the registers; empty for all. The path of an element selects its whole
+            array. The bytes of all other registers become zero.
 
     Returns:
         The entries in order.

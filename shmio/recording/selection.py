@@ -19,10 +19,10 @@ from shmio.wording import did_you_mean, unknown
 
 
 class RecordedRegisters:
-    """The registers of a block to record. ``layout`` has only these, at their original offsets.
+    """The registers of a block to record. ``layout`` has only these registers, at their original offsets.
 
-    If the block has a status area, the recorded area is shorter: it has the statuses of only these
-    registers.
+    If the block has a status area, the recorded status area is shorter: it has the statuses of only
+    these registers.
     """
 
     def __init__(self, layout: Layout, registers: Sequence[Register] | None = None) -> None:
@@ -41,7 +41,7 @@ class RecordedRegisters:
         self._mask, self._taken = _with_statuses(layout, self.layout, mask[: layout.status_offset])
 
     def keep(self, frame: Frame) -> Frame:
-        """Return the frame, reduced to these registers: all other bits are zero."""
+        """Return the frame with images that have only these registers; all other bits are zero."""
         if self._mask is None:
             return frame
         effective = None if frame.effective is None else self._kept(frame.effective, self._mask)

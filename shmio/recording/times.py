@@ -18,7 +18,7 @@ def local(time_ns: int) -> str:
 
 
 def span(first_ns: int, last_ns: int) -> str:
-    """Format a range of time as local date and time, for people."""
+    """Format a range of time, given by its first and last time in ns, in local date and time, for people."""
     return f"from {local(first_ns)} to {local(last_ns)}"
 
 

@@ -1,6 +1,7 @@
-"""Writes a recording as MCAP.
+"""Writes a recording as an MCAP file.
 
-The file has channels for the frames and events of each block, for gaps, steps and process changes.
+The file has channels for the frames and the events of each block, and for gaps, steps and process
+changes.
 """
 
 from __future__ import annotations
@@ -50,9 +51,8 @@ TEXT: Final = "text/plain"
 def layout_files(layout: Layout) -> Iterator[tuple[str, bytes]]:
     """Yield the name and the data of each attachment that describes a layout.
 
-    If the layout has tag tables over the block, a second attachment is the layout without them.
-    Readers before version 0.2 refuse a layout whose registers overlap, and use the second
-    attachment.
+    If the layout has tag tables over the block, a second attachment is the layout without them. It
+    is for readers before version 0.2, which refuse a layout whose registers overlap.
     """
     for one in dict.fromkeys((layout.base.hash, layout.hash)):
         data = (layout if one == layout.hash else layout.base).to_json()
@@ -60,7 +60,7 @@ def layout_files(layout: Layout) -> Iterator[tuple[str, bytes]]:
 
 
 class Output(Protocol):
-    """What a recording is written to, such as a binary file."""
+    """An object to which a recording is written, such as a binary file."""
 
     def write(self, data: bytes, /) -> object:
         """Append data."""
@@ -94,12 +94,20 @@ class Writer:
         self.flush()
 
     def places(self, places: Mapping[int, BlockPosition]) -> None:
-        """Write the position in each block at which the previous recording ended, by section."""
+        """Write the position at which the previous recording ended, for each block, by its section."""
         if places:
             self._mcap.add_metadata(PLACES, {str(section): encode_position(place) for section, place in places.items()})
 
     def attach(self, name: str, media_type: str, data: bytes, now_ns: int, changed_ns: int = 0) -> None:
-        """Attach a file. ``changed_ns`` is the UTC time of the file's last change; 0 if unknown."""
+        """Attach a file with the content ``data``.
+
+        Args:
+            name: Name of the attachment.
+            media_type: Media type of the file.
+            data: Content of the file.
+            now_ns: The present log time, in ns.
+            changed_ns: UTC of the file's last change, in ns; 0 if unknown.
+        """
         self._mcap.add_attachment(changed_ns, now_ns, name, media_type, data)
 
     def attach_layout(self, layout: Layout, now_ns: int) -> None:
@@ -121,10 +129,10 @@ class Writer:
         Args:
             block: The block.
             number: Number of the block in this recording.
-            after_frame: Number of the frame before the first recorded one.
-            after_event: Number of the event before the first recorded one.
+            after_frame: Number of the frame before the first recorded frame.
+            after_event: Number of the event before the first recorded event.
             layout: Layout of the recorded registers; None for the layout of the block.
-            of: Hash of the source's whole layout, if it is not the layout of ``block``.
+            of: Hash of the source's whole layout, if ``block`` has only a part of it; else empty.
         """
         layout = layout or block.layout
         self.flush()  # readers without an index need a channel's record in the chunk of its first message

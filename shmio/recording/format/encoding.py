@@ -36,13 +36,13 @@ PROCESSES_TOPIC: Final = "processes"
 
 FRAME: Final = "shmio.frame.v1"
 FRAME_V2: Final = "shmio.frame.v2"
-"""Like FRAME, but five fields are differences from the message's header: see :func:`differ`."""
+"""Like FRAME, but five fields are differences from the message's header: see :func:`encode_frame_v2`."""
 EVENT: Final = "shmio.event.v1"
 PLAIN: Final = "json"
 GAP: Final = "gap"
 STEP: Final = "step"
 PROCESS: Final = "process"
-"""GAP, STEP and PROCESS stand for the encodings of gaps, steps and process changes in the code.
+"""In this program, GAP, STEP and PROCESS are the encodings of gaps, steps and process changes.
 
 In the file, all three have the encoding PLAIN; only their topics differ.
 """
@@ -98,9 +98,9 @@ class Reason(StrEnum):
     NOT_RUNNING = "not running"
     """The entries were overwritten while no recorder ran."""
     ELSEWHERE = "elsewhere"
-    """The entries are in the file of the previous recorder, but this file is not in the folder.
+    """The entries are in the file of the previous recorder, but the folder does not have this file.
 
-    It was moved, or ``recorder.directory`` has changed.
+    The file was moved, or ``recorder.directory`` has changed.
     """
     NO_ROOM = "no room"
     """The disk was full or too slow, so the recorder's buffer overflowed."""
@@ -131,7 +131,7 @@ class Gap(msgspec.Struct, frozen=True):
 class StepMark(msgspec.Struct, frozen=True):
     """The end of a step of virtual time, recorded after all frames of the step.
 
-    ``time_ns`` is the instance's clock after the step, and ``dt_ns`` is the length of the step.
+    ``time_ns`` is the instance's clock after the step; ``dt_ns`` is the length of the step, in ns.
     """
 
     step: int
@@ -147,7 +147,7 @@ class ProcessEvent(StrEnum):
     STARTED = "started"
     """The process was started or restarted. In a restart, ENDED or DIED was recorded before."""
     ENDED = "ended"
-    """The process ended, or was restarted, on request."""
+    """The process ended on request, for example to be restarted."""
     DIED = "died"
     """The process ended unexpectedly; the supervisor restarts it."""
     GAVE_UP = "gave up"
@@ -168,7 +168,7 @@ class ProcessChange(msgspec.Struct, frozen=True):
 
 
 class BlockPosition(NamedTuple):
-    """A position in a block: the last frame and the last event before it, and their log time."""
+    """A position in a block: the last frame and the last event before it, and the log time of the later one."""
 
     frame: int = 0
     event: int = 0
@@ -208,9 +208,9 @@ def decode_frame(data: bytes) -> Frame:
 def encode_frame_v2(frame: Frame, sequence: int, log_ns: int, publish_ns: int) -> bytes:
     """Encode a frame as FRAME_V2.
 
-    This replaces the numbers and times of the frame by their differences, modulo 2^64, from those
-    in the message's header. The differences hardly change from frame to frame, so they compress
-    well.
+    FRAME_V2 has, instead of the frame's numbers and times, their differences, modulo 2^64, from the
+    numbers and times in the message's header: ``sequence``, ``log_ns`` and ``publish_ns``. The
+    differences hardly change from frame to frame, so they compress well.
     """
     (number, cycle, published_ns, clock_ns, source_ns, incarnation, quality, provenance, event, delay_us, text, raw,
      effective) = frame  # fmt: skip
@@ -226,7 +226,7 @@ def encode_frame_v2(frame: Frame, sequence: int, log_ns: int, publish_ns: int) -
 def restore(data: bytes, sequence: int, log_ns: int, publish_ns: int) -> bytes:
     """Convert a frame from FRAME_V2 to FRAME; the opposite of :func:`encode_frame_v2`.
 
-    Return bytes that are too short for a frame unchanged.
+    If the bytes are too short for a frame, return them unchanged.
     """
     if len(data) < _FRAME.size:
         return data
@@ -322,7 +322,7 @@ class Channel:
     """A channel with a block's frames or events, or with gaps, steps or process changes.
 
     ``layout`` is the hash of the block's layout, including its tag tables, in hexadecimal digits.
-    ``encoding`` is FRAME for both versions of frames, and empty if another program wrote the
+    ``encoding`` is FRAME for both versions of frames; it is empty if another program wrote the
     channel's messages.
     """
 
@@ -333,7 +333,7 @@ class Channel:
     block: int = 0
     section: int = 0
     after: int = 0
-    """Number of the last frame or event before the first recorded one."""
+    """Number of the last frame or event before the first frame or event in the channel."""
     layout: str = ""
     period_ns: int = 0
     stale_ns: int = 0

@@ -1,9 +1,9 @@
 """Reads the records of an MCAP file from front to back, without an index.
 
-Therefore, it can read a file that ends anywhere. The reader does not trust the content: it compares
-lengths with the size of the file, with each other and with limits, and checks the CRC of each
-chunk. At most one chunk is in memory at a time. After a damaged place, reading continues with the
-next intact chunk or attachment.
+Therefore, it can also read a file whose end is missing. It does not trust the content: it compares
+lengths with the size of the file, with each other and with limits, and checks the CRC of each chunk.
+At most one chunk is in memory at a time. After a damaged place, reading continues with the next
+intact chunk or attachment.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ from shmio.errors import RecordingError
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 MAX_RECORD_BYTES: Final = 1 << 20
-"""Largest size of a record that is read as a whole. Chunks have their own limit."""
+"""Largest size in bytes of a record that is read as a whole. Chunks have their own limit."""
 
 BROKEN: Final = 0
 """Opcode that stands for bytes that are not a valid record. MCAP does not use this opcode."""
 ONLY_BEGUN: Final = "has no content: its recorder was killed before it wrote anything, or has just started"
 LOOK_BYTES: Final = 4096
-"""Number of bytes at the beginning of a record that are read to check the lengths in it.
+"""Number of bytes at the beginning of a record that are read to check the lengths in the record.
 
-They include the name of an attachment or of metadata.
+These bytes include the name of an attachment or of metadata.
 """
 BEAT_BYTES: Final = 1 << 20
-"""Number of bytes that are read or decompressed between two calls of ``beat``."""
+"""Number of bytes that are read or decompressed between two calls of ``beat``, the caller's function."""
 MAX_CHUNK_BYTES: Final = 32 << 20
-"""Largest size of a chunk.
+"""Largest size of a chunk in bytes.
 
-A recorder ends a chunk when it has 1 MiB; a message has at most 2 MiB.
+A recorder ends a chunk as soon as it has 1 MiB; a message has at most 2 MiB.
 """
 
 HEAD: Final = struct.Struct("<BQ")  # of any record: opcode, size of its content
@@ -59,7 +59,7 @@ _MARK: Final = re.compile(  # beginning of each chunk and attachment that shmio 
 _MARK_BYTES: Final = 64
 _SEARCH_BYTES: Final = 1 << 20
 _MAX_SEARCHED: Final = 100
-"""A search ends after this number of places that only look like a chunk or an attachment."""
+"""A search for the next chunk or attachment ends after this number of places that only look like one."""
 _SIZES: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: FOOTER.size}
 
 
@@ -79,7 +79,7 @@ class Record(NamedTuple):
 class Records:
     """Reads the records of a file.
 
-    :attr:`closed` and :attr:`damage` are valid after :meth:`walk`.
+    :attr:`closed` and :attr:`damage` are valid when :meth:`walk` has reached its end.
     """
 
     def __init__(self, file: Path, *, own: bool, beat: Callable[[], object]) -> None:
@@ -128,7 +128,7 @@ class Records:
         """Yield all records up to the footer, or to the end of the file.
 
         Damaged bytes, up to the next intact chunk, attachment or footer, become one record with
-        opcode BROKEN. If ``to`` is given, reading stops at this byte, and does not set
+        opcode BROKEN. If ``to`` is not None, the walk stops at this byte offset, and does not set
         :attr:`closed` and :attr:`damage`.
         """
         self.closed, self.damage, self._searched = False, "", 0
@@ -159,7 +159,7 @@ class Records:
     def summary(self) -> Iterator[Record]:
         """Yield the records in the summary of a closed file.
 
-        They include the description of each channel.
+        These records include the description of each channel.
         """
         footer = self._footer(len(MAGIC))
         if not footer:
@@ -170,7 +170,7 @@ class Records:
             at = record.at + record.size
 
     def summary_damage(self) -> str:
-        """Check the CRC of a closed file's summary. Return a message if it is wrong, else ""."""
+        """Check the CRC of a closed file's summary. Return a message if the CRC is wrong, else ""."""
         footer = self._footer(len(MAGIC))
         start, _, crc = FOOTER.unpack(self.read(footer + HEAD.size, FOOTER.size))
         end = footer + HEAD.size + FOOTER.size - U32.size
@@ -178,7 +178,7 @@ class Records:
         return "" if whole else f"the index between byte {start} and byte {footer} is damaged: its checksum is wrong"
 
     def crc(self, at: int, end: int) -> int:
-        """Return the CRC-32 of the bytes from ``at`` to ``end``.
+        """Return the CRC-32 of the bytes from offset ``at`` up to, but not including, ``end``.
 
         Raises:
             RecordingError: The file became shorter.
@@ -326,7 +326,7 @@ class Records:
 
 
 class Damage(NamedTuple):
-    """A damaged place in a file: bytes ``first`` to ``last`` cannot be read, or only in part.
+    """A damaged place in a file: the bytes ``first`` to ``last`` cannot be read, or only in part.
 
     ``after_ns`` is the log time of the last readable entry before this place. ``before_ns`` is the
     log time of the first readable entry after it. Each is 0 if there is no such entry.
@@ -352,7 +352,7 @@ class DamageLog:
         self._found: Damage | None = None
 
     def add(self, record: Record, why: object) -> None:
-        """Add a record that cannot be read completely."""
+        """Add a record that cannot be read completely, and the reason."""
         first, last = record.at, record.at + record.size - 1
         if self._found is None:
             self._found = Damage(first, last, str(why), self._after_ns, 0)
@@ -360,13 +360,13 @@ class DamageLog:
             self._found = self._found._replace(last=last)
 
     def after(self, last_ns: int) -> None:
-        """Remember that a chunk was read. ``last_ns`` is the log time of its last entry."""
+        """Remember that a chunk was read; ``last_ns`` is the log time of the chunk's last entry."""
         self._after_ns = last_ns
 
     def end(self, before_ns: int = 0) -> None:
         """Report the damage since the last chunk.
 
-        ``before_ns`` is the log time of the next entry; 0 if no entry follows.
+        ``before_ns`` is the log time of the first entry after the damage; 0 if no entry follows.
         """
         if self._found is not None:
             self._report(self._found._replace(before_ns=before_ns))

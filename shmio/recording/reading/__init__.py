@@ -1,1 +1,1 @@
-"""Reads recordings that are closed, were left by a killed recorder, or are being written."""
+"""Reads recordings, whether they are closed, are still being written, or were left by a killed recorder."""

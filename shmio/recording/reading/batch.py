@@ -52,7 +52,7 @@ _MESSAGE_HEAD: Final = np.dtype(
 _HEAD_SIZE: Final = 9
 _LOG_AT: Final = 15
 _WORTH: Final = 4
-"""If runs have fewer messages than this, reading by runs is not faster.
+"""Number of consecutive messages of a channel (a run) from which on it is faster to read them at once.
 
 After ``_MAX_TRIES`` shorter runs, the rest of the chunk is read message by message.
 """
@@ -67,9 +67,10 @@ class Batch:
 
     Attributes:
         time_ns: Log times in ns, int64, shape (n,).
-        records: Headers (:data:`HEAD`) and images, uint8, shape (n, header + image size). The
-            images are those that readers saw; with ``raw``, those that the source delivered.
-        reasons: The reasons of the frames; None if all are empty.
+        records: For each frame, its header (:data:`HEAD`) and image, uint8, shape (n, header + image
+            size). The images are those that readers saw; with ``raw``, those that the source
+            delivered.
+        reasons: The reason of each frame; None if all reasons are empty.
     """
 
     time_ns: npt.NDArray[np.int64]
@@ -103,7 +104,7 @@ def batch(data: bytes, channel: Channel, size: int, from_ns: int, to_ns: int, *,
         size: Size of an image in bytes.
         from_ns: First log time.
         to_ns: Last log time.
-        raw: True for the images that the source delivered; False for those that readers saw.
+        raw: True for the images that the source delivered; False for the images that readers saw.
 
     Raises:
         RecordingError: The frames cannot be decoded.

@@ -26,7 +26,7 @@ from shmio.segment import Frame
 MAX_NS: Final = (1 << 63) - 1
 """The largest log time, used as the end of a range that has no end."""
 BATCH_FRAMES: Final = 256
-"""Number of frames in a batch that :func:`batches_of` makes from single frames."""
+"""Number of frames that :func:`batches_of` joins to a batch."""
 
 Damaged = Callable[[Path, Damage], object]
 T = TypeVar("T")
@@ -35,7 +35,7 @@ ItemT_co = TypeVar("ItemT_co", bound=Item, covariant=True)
 
 @dataclass(slots=True, eq=False)
 class DumpBlock:
-    """A source with one layout in a recording. A reload that changes the layout begins a new block.
+    """A part of a recording in which a source has one layout. A reload that changes it begins a new block.
 
     No two blocks of a run have the same ``section``, even in different files. ``layout_hash`` is a
     SHA-256 in hexadecimal digits.
@@ -53,7 +53,7 @@ class DumpBlock:
     """Number of recorded frames; a frame that is in two files counts twice."""
     events: int = 0
     after: dict[str, int] = field(default_factory=dict)
-    """Number of the last frame (key ``frames``) and event (key ``events``) before the recording."""
+    """The numbers of the last frame (key ``frames``) and the last event (key ``events``) before the recording."""
     begin_ns: int = 0
     end_ns: int = 0
     """Log times of the first (``begin_ns``) and the last (``end_ns``) frame or event."""
@@ -62,7 +62,7 @@ class DumpBlock:
     """Log times of the first (``first_ns``) and the last (``last_ns``) frame."""
 
     def add(self, kind: str, track: Track) -> None:
-        """Add the counts and times of the frames or events in a file."""
+        """Add the count and the times of the block's frames or events in a file, according to ``kind``."""
         if kind == FRAME:
             self.frames += track.count
             self.first_ns = min(self.first_ns or track.first_ns, track.first_ns)
@@ -81,7 +81,7 @@ class DumpBlock:
         return find(self.layout, parse_topic(path, (self.source,), self.source).path)
 
     def named(self, topic: Topic) -> list[Register]:
-        """Return the registers that a topic names.
+        """Return the registers of the block that a topic names.
 
         Raises:
             PathError: There is no such register.
@@ -89,7 +89,7 @@ class DumpBlock:
         return named(self.layout, topic)
 
     def value(self, frame: Frame, path: str) -> Value:
-        """Return the value of a register that readers saw in a frame of this block.
+        """Return the value of a register, as readers saw it, in a frame of this block.
 
         Raises:
             PathError: There is no such register.
@@ -105,17 +105,17 @@ class Contents:
     """The block of each channel with frames or events, by the channel's number."""
     kinds: dict[int, str] = field(default_factory=dict)
     instance: set[int] = field(default_factory=set)
-    """The numbers of the channels with gaps, steps and process changes."""
+    """The numbers of the channels with gaps, steps and process changes of the instance."""
     numbered: dict[tuple[str, int], DumpBlock] = field(default_factory=dict)
-    """The blocks by source and their number in this file."""
+    """Each block, by its source and its number in this file."""
     number: dict[DumpBlock, int] = field(default_factory=dict)
 
     def frames(self, source: str) -> list[int]:
-        """Return the channels with frames of a source, in the order in which the blocks began."""
+        """Return the numbers of the channels with frames of a source, in the order in which the blocks began."""
         return [number for number, kind in self.kinds.items() if kind == FRAME and self.blocks[number].source == source]
 
     def events(self, sources: Collection[str]) -> list[int]:
-        """Return the channels with events of these sources."""
+        """Return the numbers of the channels with events of these sources."""
         return [
             number for number, kind in self.kinds.items() if kind == EVENT and self.blocks[number].source in sources
         ]
@@ -124,7 +124,8 @@ class Contents:
 def contents(part: Part, blocks: dict[tuple[str, int, str], DumpBlock]) -> Contents:
     """Return the contents of a file, and add its new blocks to ``blocks``.
 
-    Leave out a block with a damaged layout, and add a message to the survey's damage.
+    Leave out each block with a damaged layout, and add a message about it to the damage in the
+    file's survey.
     """
     found = Contents()
     for channel in sorted(part.reader.channels.values(), key=lambda channel: (channel.block, channel.number)):
@@ -288,7 +289,7 @@ class Entry(NamedTuple, Generic[ItemT_co]):
 def messages_of(
     part: Part, within: Contents, channels: Collection[int], from_ns: int, to_ns: int
 ) -> Iterator[tuple[Contents, Entry[Item]]]:
-    """Yield the messages of some channels in a range of log times, with the file's contents."""
+    """Yield the messages of some channels in a range of log times, each with the contents of its file."""
     for channel, log_ns, item in part.messages(channels, from_ns, to_ns):
         block = (
             within.numbered.get((item.source, item.block))
@@ -299,7 +300,7 @@ def messages_of(
 
 
 def batches_of(frames: Iterable[Entry[Frame]], *, raw: bool) -> Iterator[tuple[DumpBlock, Batch]]:
-    """Yield frames as batches of arrays. ``raw`` selects the images without injections."""
+    """Yield frames as batches of arrays; with ``raw``, the images are those without injections."""
     for block, of_block in groupby(frames, key=lambda entry: entry.block):
         while block is not None and (some := list(islice(of_block, BATCH_FRAMES))):
             items = [entry.item for entry in some]
@@ -310,7 +311,7 @@ def batches_of(frames: Iterable[Entry[Frame]], *, raw: bool) -> Iterator[tuple[D
 
 
 def latest_of(part: Part, within: Contents, source: str, time_ns: int) -> Entry[Frame] | None:
-    """Return the last frame of a source at or before a time in a file; None if there is none."""
+    """Return a source's last frame at or before a time, from one file; None if the file has none."""
     for messages in part.messages_before(within.frames(source), time_ns):
         for message in reversed(messages):
             if isinstance(message.item, Frame):

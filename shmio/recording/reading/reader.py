@@ -55,7 +55,7 @@ from shmio.recording.format.records import (
 from shmio.segment import Event, Frame
 
 MAX_LAYOUT_BYTES: Final = 64 << 20
-"""Largest total size of all layouts in a file."""
+"""Largest total size of all layouts in a file, in bytes."""
 MAX_ATTACHMENTS: Final = 10_000
 
 _MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
@@ -92,8 +92,8 @@ class AttachmentEntry(NamedTuple):
 class Reader:
     """Reads one file of a recording. Use it as a context manager.
 
-    The file may be closed, left by a killed recorder, or being written. :meth:`messages` adds the
-    channels that it finds to ``channels``.
+    The file may be closed, still being written, or left by a killed recorder. :meth:`messages` adds
+    the channels that it finds to ``channels``.
 
     Raises:
         OSError: The file cannot be opened.
@@ -136,14 +136,14 @@ class Reader:
         """Yield the messages of some channels in a range of log times, in file order.
 
         After the last message, :attr:`Records.closed` and :attr:`Records.damage` say how the file
-        ends. When all channels are known, the reader skips chunks outside the range.
+        ends. As soon as all channels are known, the reader skips chunks outside the range.
 
         Args:
-            wanted: Selects the channels.
+            wanted: Returns whether to read a channel.
             from_ns: Start of the range.
             to_ns: End of the range.
-            damaged: Called for each damaged place in the range. Reading continues with the next
-                intact chunk. If None, damage raises RecordingError.
+            damaged: Called for each damaged place in the range; reading then continues with the next
+                intact chunk. None: damage raises RecordingError.
             records: The records to read; None for the whole file.
         """
 
@@ -195,15 +195,14 @@ class Reader:
             raise problem
 
     def raw(self, record: Record) -> Iterator[tuple[Channel, int, memoryview]]:
-        """Yield channel, log time and data of each message in a chunk.
+        """Yield (channel, log time, data) of each message in a chunk.
 
-        Add the channels that the chunk describes to ``channels``.
-
-        This skips messages of other programs, and converts frames of both versions to FRAME.
+        Messages of other programs are skipped. Frames of both versions are converted to FRAME. The
+        channels that the chunk describes are added to ``channels``.
 
         Raises:
-            RecordingError: The chunk is damaged. If only the channel of a message is unknown, the
-                error comes after the last message.
+            RecordingError: The chunk is damaged; or the channel of a message is unknown, and all
+                other messages of the chunk were yielded before.
         """
         return self._raw(self.records.chunk(record))
 
@@ -231,9 +230,9 @@ class Reader:
     def channel(self, number: int) -> Channel | None:
         """Return a channel by its number; None if it is unknown.
 
-        If the chunk that describes the channel is damaged, this uses the description in the summary
-        of a closed file. If that is also damaged, :attr:`summary_damage` says so; other channels
-        are not affected.
+        If the chunk that describes the channel is damaged, the description comes from the summary of
+        the closed file. If the summary is damaged, too, :attr:`summary_damage` says so; other
+        channels are not affected.
         """
         if number not in self.channels and not self._summarized:
             self._summarized = True
@@ -286,14 +285,14 @@ class Reader:
         """Return the data of an attachment, and check its CRC.
 
         Raises:
-            RecordingError: The attachment is damaged, or larger than the limit.
+            RecordingError: The attachment is damaged, or larger than ``limit`` bytes.
         """
         entry = self.attachments[name]
         self.records.check_crc(entry.record)
         return self.records.read(entry.at, entry.size, limit)
 
     def note(self, record: Record) -> None:
-        """Read a record outside the chunks: metadata, a header or an attachment.
+        """Take the content of a record outside the chunks: metadata, a header or an attachment's entry.
 
         Raises:
             RecordingError: The record is damaged.

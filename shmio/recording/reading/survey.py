@@ -1,4 +1,4 @@
-"""Surveys a recording without reading all of it: by its index, or by the indexes of its chunks."""
+"""Surveys a recording without reading all of it, by the file's index or by the indexes of its chunks."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from shmio.recording.reading.reader import Reader
 
 MAX_CHUNKS: Final = 1 << 22
 MAX_SETS: Final = 1 << 16
-"""Largest number of different sets of channels that the chunks of a file may have."""
+"""Maximum number of different sets of channels in the chunks of a file."""
 MAX_GAPS: Final = 1000
-"""Largest number of gaps that a survey lists; it counts all gaps."""
+"""Maximum number of gaps that a survey lists. It counts all gaps."""
 MAX_DAMAGE: Final = 20
 """Largest number of damaged places that a survey lists."""
 MAX_BLOCKS: Final = 10_000
 MAX_SUMMARY_BYTES: Final = 64 << 20
-"""Largest size of the summary. It has about 90 bytes per chunk, so this is enough for a week."""
+"""Largest size of a file's summary, in bytes. It has about 90 bytes per chunk, so this suffices for a week."""
 
 _MAX_U64: Final = (1 << 64) - 1
 _ENTRY: Final = struct.Struct("<QQ")  # log time, offset
@@ -89,16 +89,16 @@ class Chunks:
     ) -> Iterator[tuple[Record, int, int]]:
         """Yield the chunks that may have messages in a range of log times.
 
-        Each item is a chunk, and the log times of its first and last message. ``channels`` selects
-        the chunks with messages of any of these channels.
+        Each item is a chunk, and the log times of its first and last message. If ``channels`` is not
+        None, only chunks with messages of any of these channels are yielded.
         """
         begin, end = self._bounds(from_ns, to_ns)
         yield from self._rows(range(begin, end), from_ns, to_ns, channels)
 
     def before(self, time_ns: int, channels: Collection[int] | None = None) -> Iterator[tuple[Record, int, int]]:
-        """Yield the chunks that begin at or before a time, the last one first.
+        """Yield the chunks that begin at or before a time, the last chunk first.
 
-        Each item is as for :meth:`between`.
+        The items and ``channels`` are as for :meth:`between`.
         """
         _, end = self._bounds(0, time_ns)
         yield from self._rows(range(end - 1, -1, -1), 0, time_ns, channels)
@@ -145,7 +145,7 @@ class Count(NamedTuple):
 
 @dataclass(slots=True)
 class Track:
-    """The number of a channel's messages in a file; the times and chunks of the first and last."""
+    """The number of a channel's messages in a file, and the time and chunk of the first and the last message."""
 
     channel: Channel
     count: int
@@ -158,7 +158,7 @@ class Track:
         """Return the numbers of the first and the last frame or event.
 
         Raises:
-            RecordingError: A chunk with one of these cannot be read.
+            RecordingError: The chunk with the first or the last one cannot be read.
         """
         return self._in(reader, self.first_in)[0], self.last(reader)
 
@@ -166,7 +166,7 @@ class Track:
         """Return the number of the last frame or event.
 
         Raises:
-            RecordingError: Its chunk cannot be read.
+            RecordingError: The chunk with this frame or event cannot be read.
         """
         return self._in(reader, self.last_in)[-1]
 
@@ -199,10 +199,10 @@ class Survey:
     missed: dict[tuple[str, int, str], int] = field(default_factory=dict)
     """Number of missing frames or events, by source, block and kind."""
     missed_to: dict[tuple[str, int, str], int] = field(default_factory=dict)
-    """Highest number of a missing frame or event, by source, block and kind."""
+    """Highest number of all missing frames or events, by source, block and kind."""
     gap_count: int = 0
     damage: list[str] = field(default_factory=list)
-    """Messages about what could not be read."""
+    """Messages about the parts of the file that could not be read."""
     chunks: Chunks = field(default_factory=Chunks)
     """All chunks of the file."""
 
@@ -233,7 +233,7 @@ class Survey:
 
 
 def survey(reader: Reader) -> Survey:
-    """Survey a recording by reading through the file. List damage, and continue after it.
+    """Survey a recording by reading the headers and chunk indexes of the file; continue after damage.
 
     Raises:
         RecordingError: The file is not a recording of shmio.
@@ -325,7 +325,7 @@ def _read(reader: Reader, found: Survey, chunk: Record) -> list[Count]:
 def survey_by_index(reader: Reader) -> Survey | None:
     """Survey a recording by its index; return None if the index is missing, damaged or wrong.
 
-    The result is the same as that of :func:`survey`, but this takes less time.
+    The result is the same as that of :func:`survey`, in less time.
     """
     try:
         data = _summary(reader)
