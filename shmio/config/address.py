@@ -11,11 +11,11 @@ from shmio.errors import ConfigError
 
 UNIX: Final = "unix:"
 MAX_PATH_BYTES: Final = 107
-"""Maximum length in bytes of a UNIX socket's path: ``sun_path`` holds 108, including the final zero (unix(7))."""
+"""Maximum length in bytes of a UNIX socket's path: ``sun_path`` holds 108, including a final zero (unix(7))."""
 
 
 class Address(msgspec.Struct, frozen=True):
-    """A host name or IP address, and a TCP port (0: any free port)."""
+    """A host name or IP address, and a TCP port; port 0 stands for any free port."""
 
     host: str
     port: int
@@ -85,7 +85,7 @@ class UnixAddress(msgspec.Struct, frozen=True):
 
     @property
     def loopback(self) -> bool:
-        """True, because only this host can reach a UNIX socket."""
+        """Always True, because only this host can reach a UNIX socket."""
         return True
 
 

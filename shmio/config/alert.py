@@ -23,11 +23,11 @@ _DEPENDENT: Final = {
     "webhook_ca": "webhook",
     "insecure": "webhook",
 }
-"""Keys that are allowed only beside another key, with that key."""
+"""For each key that needs another key in the same section: the other key."""
 
 
 def alert_faults(config: Config) -> Iterator[str]:
-    """Yield each fault of the alerts that the configuration alone shows, without layouts and the host's files."""
+    """Yield each fault of the alerts that can be found without layouts and without files of the host."""
     if len(config.alert) > MAX_ALERTS:
         yield f"alert: there are {len(config.alert)} alerts, but at most {MAX_ALERTS} are allowed"
         return
@@ -58,7 +58,7 @@ def alert_faults(config: Config) -> Iterator[str]:
 
 
 def resolve_alert(alert: Alert, config: Config) -> None:
-    """Make the paths of an alert absolute. The name of a program without a slash is not changed."""
+    """Make the paths of an alert absolute, except the name of a program that has no slash."""
     if alert.command and "/" in alert.command[0]:
         alert.command = [str(config.path(alert.command[0])), *alert.command[1:]]
     for field in ("webhook_header_file", "webhook_ca"):
@@ -67,7 +67,7 @@ def resolve_alert(alert: Alert, config: Config) -> None:
 
 
 def parse_webhook(url: str) -> SplitResult:
-    """Split the URL of a webhook.
+    """Check the URL of a webhook, and return its parts.
 
     Raises:
         ConfigError: The URL cannot be used for a webhook.

@@ -1,4 +1,4 @@
-"""Reads campaign files: injections, parameters of models, and what is expected of signals."""
+"""Reads campaign files, which have injections, parameters of models, and expectations of signals."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from shmio.config.read import check_text, convert, read_tables
 from shmio.errors import ConfigError
 
 SAMPLES: Final = 20
-"""Number of random points at which a campaign with ranges is checked, besides the corners and the middle."""
+"""Number of random points at which a campaign with ranges is checked, besides the lowest, middle and highest."""
 _BARE: Final = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -31,9 +31,9 @@ class Campaign(Section, omit_defaults=True):
 
     Attributes:
         config: The ``supervisor.toml`` of the instance, relative to the campaign file.
-        start: Name of a snapshot in which the run begins.
-        duration_s: Duration on the instance's clock.
-        step_ms: Length of a step of virtual time.
+        start: Name of a snapshot from which the run starts; None: it starts without a snapshot.
+        duration_s: Duration of the run on the instance's clock, in s.
+        step_ms: Length of a step of virtual time, in ms.
         parameters: Parameters of models, by source and name. Only laboratories can set them.
         injection: The injections.
         expect: The expectations.
@@ -50,7 +50,7 @@ class Campaign(Section, omit_defaults=True):
 
 
 class CampaignFile:
-    """A campaign file that may have ranges: a campaign for each point of its space."""
+    """A campaign file that may have ranges. It has a campaign for each point in the space of its ranges."""
 
     def __init__(self, file: Path) -> None:
         """Read a file with expectations.
@@ -74,10 +74,10 @@ class CampaignFile:
         """Return the campaign at a point.
 
         Args:
-            point: A value for each dimension.
+            point: A value for each range, by the name of the range.
 
         Raises:
-            ConfigError: A name is unknown, a range has no value yet, or the values contradict each
+            ConfigError: A name is unknown, a range has no value, or the values contradict each
                 other. The message names the file, the key and the remedy.
 
         """
@@ -95,7 +95,7 @@ class CampaignFile:
 
     @property
     def expect(self) -> list[Expectation]:
-        """The expectations, which have no ranges."""
+        """The expectations, which never have ranges."""
         return _parse({"expect": self.tables["expect"]}, "expect").expect
 
     def _check(self) -> None:
@@ -130,7 +130,7 @@ def load_campaign(file: Path, settings: Sequence[str] = ()) -> Campaign:
 
     Args:
         file: The file.
-        settings: Values for ranges, as ``NAME=VALUE`` in TOML.
+        settings: Values for ranges, each as ``NAME=VALUE`` with the value in TOML.
 
     Raises:
         ConfigError: The file is invalid, has no expectation, or has a range without a value; the
@@ -141,7 +141,7 @@ def load_campaign(file: Path, settings: Sequence[str] = ()) -> Campaign:
 
 
 def read_settings(settings: Sequence[str]) -> dict[str, Any]:
-    """Return the point that texts such as ``late.start_s=3`` describe.
+    """Return the point that settings such as ``late.start_s=3`` describe.
 
     Raises:
         ConfigError: A text has no ``=``, or its value is not TOML.
@@ -192,7 +192,7 @@ def parse_campaign(tables: dict[str, Any]) -> list[Declaration]:
 
 
 def campaign_of(tables: dict[str, Any]) -> Campaign:
-    """Return the campaign of tables without ranges.
+    """Return the campaign that tables without ranges describe.
 
     Raises:
         ConfigError: A table is invalid; the message begins with its key.
@@ -205,7 +205,7 @@ def campaign_text(campaign: Mapping[str, Any], comment: Sequence[str] = ()) -> s
     """Return the tables of a campaign as TOML.
 
     Args:
-        campaign: The tables, as of :func:`msgspec.to_builtins`.
+        campaign: The tables, as :func:`msgspec.to_builtins` returns them.
         comment: Lines for a comment at the top.
 
     """

@@ -1,6 +1,7 @@
 """Reads credentials from files: bearer tokens, passwords, and HTTP headers of webhooks.
 
-Only its owner may have access to a file with credentials. Messages never quote a secret.
+A file with credentials is refused if anyone but its owner has access to it. Messages never quote a
+secret.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ MIN_TOKEN_BYTES: Final = 20
 MAX_TOKEN_BYTES: Final = 1024
 MAX_PASSWORDS_BYTES: Final = 1 << 20
 ROUNDS: Final = 101
-"""Number of PBKDF2 rounds, the same as in mosquitto up to 2.0.
+"""Number of PBKDF2 rounds for hashes of passwords, the same as in mosquitto up to 2.0.
 
 The broker checks a password once per connection.
 """
 _KEY: Final = "mqtt.password_file"
 _HASH: Final = re.compile(r"\$[0-9a-z-]{1,16}\$")
-"""Matches the beginning of a hash of any kind."""
+"""Matches the beginning of a password's hash of any kind."""
 _HEADER: Final = re.compile(r"[A-Za-z0-9!#$%&'*+.^_`|~-]{1,100}")
 _OWN_HEADERS: Final = ("connection", "content-length", "content-type", "host", "transfer-encoding")
 _OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
@@ -37,8 +38,8 @@ _OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
 class Secret(NamedTuple):
     """A bearer token's name, roles and SHA-256 digest; the token itself is not stored.
 
-    The digest has no salt, because tokens are random. It has only one round, because checks must be
-    fast.
+    The digest needs no salt, because tokens are random. It is made in only one round, because each
+    check must be fast.
     """
 
     name: str
@@ -130,12 +131,12 @@ def read_headers(name: str, key: str) -> dict[str, str]:
 
 
 def read_accounts(name: str, roles: Sequence[MqttAccount] = ()) -> dict[str, str]:
-    """Return the password hashes of the accounts of shmio's own broker, by account name.
+    """Return the hashes of the passwords of all accounts of shmio's own broker, by account name.
 
     Args:
         name: Path of the file. Each line is ``name:password``, or ``name:hash`` as mosquitto_passwd
             writes it.
-        roles: Accounts that must have a line.
+        roles: The accounts in the configuration, each of which must have a line in the file.
 
     Raises:
         ConfigError: The file cannot be used, or a line is invalid or missing. The message has the
@@ -213,7 +214,7 @@ def read_secret(key: str, name: str, most_bytes: int, *, instead: str) -> bytes:
         key: The beginning of messages: the configuration key and the path.
         name: Path of the file.
         most_bytes: Maximum number of bytes to read.
-        instead: How to replace a secret that others could have read, for the message.
+        instead: Advice on how to replace a secret that others could have read, for the message.
 
     Raises:
         ConfigError: The file cannot be read, or other users have access to it; the message never

@@ -1,4 +1,4 @@
-"""Checks declared injections of any file, as far as possible without a layout."""
+"""Checks injections that any file declares, as far as possible without a layout."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ MAX_DIMENSIONS: Final = 6  # of an array; the same as in layout/model.py, which 
 
 
 class Keys(msgspec.Struct, frozen=True):
-    """The keys that an operation takes, besides those of every injection.
+    """The keys that an operation takes, besides the keys that every injection has.
 
     Attributes:
         needed: Required keys.
-        choice: Alternative sets of keys; exactly one set must be given, and completely.
+        choice: Alternative sets of keys: exactly one of these sets must be given, completely.
         free: Optional keys.
 
     """
@@ -34,7 +34,7 @@ class Keys(msgspec.Struct, frozen=True):
 
     @property
     def known(self) -> set[str]:
-        """All keys of the operation."""
+        """All keys that the operation takes, required or optional."""
         return {*self.needed, *self.free, *(key for keys in self.choice for key in keys)}
 
 
@@ -54,12 +54,12 @@ _OPERANDS: Final = tuple(dict.fromkeys(key for keys in KEYS.values() for key in 
 
 
 def with_seed(declaration: Declaration, seed: int) -> Declaration:
-    """Return a declaration with the given seed, unless the declaration has its own."""
+    """Return the declaration with this seed, or unchanged if it has a seed of its own."""
     return msgspec.structs.replace(declaration, seed=seed) if declaration.seed is None else declaration
 
 
 def shifted(declaration: Declaration, by_s: float) -> Declaration:
-    """Return a declaration whose times are ``by_s`` seconds later."""
+    """Return the declaration with its start and end ``by_s`` seconds later."""
     end_s = None if declaration.end_s is None else declaration.end_s + by_s
     return msgspec.structs.replace(declaration, start_s=(declaration.start_s or 0) + by_s, end_s=end_s)
 
@@ -69,7 +69,7 @@ def check_declarations(declarations: Sequence[Declaration]) -> None:
 
     Raises:
         ConfigError: A declaration is faulty; the message describes the first fault, and begins
-            with its key.
+            with the faulty key.
 
     """
     for fault in declaration_faults(declarations):
@@ -77,21 +77,24 @@ def check_declarations(declarations: Sequence[Declaration]) -> None:
 
 
 def declaration_faults(declarations: Sequence[Declaration]) -> Iterator[str]:
-    """Yield each fault that can be found without a layout; each begins with its key."""
+    """Yield a message for each fault that can be found without a layout; each begins with the faulty key."""
     return faults_of_tables("injection", "injections", declarations, MAX_DECLARATIONS, contradictions)
 
 
 def faults_of_tables(
     key: str, what: str, tables: Sequence[_Table], most: int, contradictions_of: Callable[[_Table], Iterable[str]]
 ) -> Iterator[str]:
-    """Yield each fault of the tables of one kind, such as ``[[injection]]``; each begins with its key.
+    """Yield a message for each fault in tables of one kind, such as ``[[injection]]``.
+
+    Each message begins with the faulty key.
 
     Args:
-        key: The key of the tables.
-        what: What the tables are, in the plural.
-        tables: The tables. Each needs a name of its own.
+        key: The key of the tables, such as ``injection``.
+        what: The noun for the tables in the plural, such as ``injections``.
+        tables: The tables. No two may have the same name.
         most: Maximum number of tables.
-        contradictions_of: Returns the contradictions within a table; each begins with its key.
+        contradictions_of: Returns a message for each contradiction within a table; each begins
+            with the key within the table.
 
     """
     if len(tables) > most:
@@ -107,7 +110,7 @@ def faults_of_tables(
 
 
 def contradictions(declaration: Declaration) -> Iterator[str]:
-    """Yield a message about each contradiction within a declaration; each begins with the key."""
+    """Yield a message for each contradiction within a declaration; each begins with the faulty key."""
     operation = declaration.operation
     keys = KEYS[operation]
     given = {key for key in _OPERANDS if getattr(declaration, key) is not None}

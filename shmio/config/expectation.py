@@ -13,7 +13,7 @@ MAX_EXPECTATIONS: Final = 256
 
 
 class Form(NamedTuple):
-    """The keys of a form of expectation, besides the key that marks the form."""
+    """The required and the optional keys of a form of expectation, besides the key that determines the form."""
 
     needed: tuple[str, ...] = ()
     free: tuple[str, ...] = ()
@@ -28,17 +28,17 @@ FORMS: Final[Mapping[str, Form]] = {
     "max_rate": Form(("signal",)),
     "like": Form(("signal",), ("tolerance", "tolerance_s")),
 }
-"""The forms that an expectation can have, by the key that marks each form."""
+"""The forms that an expectation can have, by the key that determines the form."""
 _KEYS: Final = tuple(dict.fromkeys(key for name, form in FORMS.items() for key in (name, *form.needed, *form.free)))
 
 
 def form_of(expectation: Expectation) -> str:
-    """Return the name of an expectation's form. The expectation must have no faults."""
+    """Return the key that determines the form of an expectation, which must have no faults."""
     return next(name for name in FORMS if getattr(expectation, name) is not None)
 
 
 def expectation_faults(expectations: Sequence[Expectation]) -> Iterator[str]:
-    """Yield each fault that can be found without a layout; each begins with its key."""
+    """Yield a message for each fault that can be found without a layout; each begins with the faulty key."""
     return faults_of_tables("expect", "expectations", expectations, MAX_EXPECTATIONS, _contradictions)
 
 

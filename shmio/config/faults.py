@@ -1,4 +1,4 @@
-"""Collects the faults of a configuration, up to a limit, as messages with line numbers."""
+"""Collects the faults of a configuration file, up to a limit, as messages with line numbers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ MAX_SHOWN: Final = 1_000
 MAX_CHARACTERS: Final = 500
 """Maximum number of characters of a message.
 
-Without this limit, a message could quote text that is as long as the file.
+Without this limit, a message could quote a text as long as the whole file.
 """
 _KEY: Final = re.compile(r"[A-Za-z0-9_-]+(?:\[[0-9]+\]|\.[A-Za-z0-9_-]+)*(?=[:\s])")
 _PLACE: Final = re.compile(r"\b(source|emulator|injection|expect|alert)\[([0-9]+)\]")
@@ -61,7 +61,7 @@ def too_long(text: str, most: int = MAX_KEY) -> int:
 
 
 class Lines:
-    """The line of each key in a TOML text, by the key's name in messages, such as ``source[0].host``."""
+    """The line of each key in a TOML text. Keys have the names that messages use, such as ``source[0].host``."""
 
     def __init__(self, text: str, most: int = MAX_KEY) -> None:
         self._most = most
@@ -74,9 +74,10 @@ class Lines:
         self._read(text)
 
     def of(self, key: str) -> int:
-        """Return the line of a key; if it is unknown, the line of the innermost known table around it.
+        """Return the line of a key.
 
-        0 if no table around it is known either.
+        If the text does not have the key, return the line of the innermost table around it that the
+        text has; 0 if there is none.
         """
         while key:
             if key in self._lines:
@@ -166,12 +167,12 @@ def _bare(token: str) -> str:
 
 
 def explain(error: ValidationError, key: str, kind: Any) -> str:
-    """Return msgspec's error as ``key: what is wrong``.
+    """Return an error of msgspec as a message ``key: what is wrong``.
 
     Args:
         error: The error.
-        key: The key of the converted value; empty for a whole file or table.
-        kind: The type to which it was converted.
+        key: The key of the value that msgspec could not convert; empty for a whole file or table.
+        kind: The type to which the value should have been converted.
 
     """
     text, _, at = str(error).partition(" - at `$")
@@ -217,10 +218,10 @@ def _types(match: re.Match[str]) -> str:
 
 
 def decode(data: bytes, place: str) -> str:
-    """Return the text of the file with the name ``place``.
+    """Decode the contents of a file, whose name in messages is ``place``.
 
     Raises:
-        ConfigError: The file is not UTF-8, or has zero bytes.
+        ConfigError: The contents are not UTF-8, or have zero bytes.
 
     """
     try:
@@ -234,7 +235,7 @@ def decode(data: bytes, place: str) -> str:
 
 
 def explain_toml(error: Exception, text: str) -> str:
-    """Return the TOML parser's message with the text of the faulty line, and the remedy for frequent mistakes."""
+    """Return the TOML parser's message, the text of the faulty line and, for frequent mistakes, the remedy."""
     if isinstance(error, ValueError) and not isinstance(error, TOMLDecodeError):  # int() refuses so many digits
         return "a number has too many digits"
     place = _POSITION.search(str(error))
@@ -268,7 +269,7 @@ def _slip(message: str, line: str, column: int) -> str:
 
 
 def named(message: str, tables: Mapping[str, Any]) -> str:
-    """Add the name of a source, emulator, injection, expectation or alert to a message that has only its number."""
+    """Add to a message the name of the source, emulator, injection, expectation or alert whose number it has."""
     key = re.match(r"(source|emulator|injection|expect|alert)\[(\d+)\](?!\.name:)", message)
     if key is None:
         return message
@@ -280,10 +281,10 @@ def named(message: str, tables: Mapping[str, Any]) -> str:
 
 
 def locate(message: str, file: str, lines: Lines) -> tuple[int, str]:
-    """Return the line of ``file`` that a message is about, and the message without the file's name.
+    """Return the number of the line of ``file`` that a message is about, and the message without the file's name.
 
-    The line is 0 if the message is about the whole file. For a message about another file, return 0
-    and the unchanged message.
+    The number is 0 if the message is about the whole file. If the message is about another file,
+    return 0 and the unchanged message.
 
     Args:
         message: A message of :class:`Faults`.
@@ -303,7 +304,7 @@ def locate(message: str, file: str, lines: Lines) -> tuple[int, str]:
 
 
 class Faults:
-    """Collects the faults of one file; each message begins with its key."""
+    """Collects the faults of one file as messages with the file, the line and the faulty key."""
 
     def __init__(self, file: Path, tables: Mapping[str, Any], text: str = "") -> None:
         self._file = file
@@ -329,11 +330,11 @@ class Faults:
 
     @property
     def full(self) -> bool:
-        """True if further faults are only counted. Callers can then skip expensive checks."""
+        """True if further faults will only be counted; callers can then skip expensive checks."""
         return self.count >= MAX_SHOWN
 
     def add(self, message: str) -> None:
-        """Add a fault, ``key: what is wrong``."""
+        """Add a fault with the message ``key: what is wrong``."""
         if self.full:
             self.count += 1
             return
@@ -348,7 +349,7 @@ class Faults:
             self._note(f"{self._file}{f':{line}' if line else ''}: {text}", line)
 
     def lies_in(self, file: str, table: str, lines: Mapping[str, int]) -> None:
-        """Record that some keys of a table come from another file, so that faults name that file.
+        """Remember that some keys of a table come from another file, so that messages name that file.
 
         Args:
             file: The other file, relative to the folder of the configuration.
@@ -366,13 +367,13 @@ class Faults:
             self.count += 1
 
     def include(self, other: Faults) -> None:
-        """Add the faults and warnings of another file, to show them after those of this file."""
+        """Add the faults and warnings of another file; they are shown after those of this file."""
         for message in sorted(other._found, key=other._found.__getitem__):
             self._note(message, math.inf)
         self._warnings += other._warnings
 
     def warn(self, message: str) -> None:
-        """Add a warning, ``key: what is unusual``, which is shown after the faults."""
+        """Add a warning with the message ``key: what is unusual``; it is shown after the faults."""
         self._warnings.append(f"{self._file}: warning: {_shortened(_PLACE.sub(self._place, message))}")
 
     def _place(self, match: re.Match[str]) -> str:
@@ -381,7 +382,7 @@ class Faults:
 
     @contextmanager
     def catching(self) -> Iterator[None]:
-        """Collect a ConfigError or LayoutError raised in the ``with`` block, instead of raising it."""
+        """Return a context manager that adds a ConfigError or LayoutError from its ``with`` block as a fault."""
         try:
             yield
         except ConfigError as error:
@@ -396,7 +397,7 @@ class Faults:
 
         Raises:
             ConfigError: There are faults; the message has a line for each fault and warning.
-            LayoutError: All faults are those of one layout.
+            LayoutError: All faults come from one layout.
 
         """
         if not self.count:

@@ -1,6 +1,6 @@
 """Checks whether a folder is writable, by writing to it.
 
-Permissions alone do not show whether a disk is full or read-only.
+Permissions do not show whether a disk is full or read-only.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _MEANING: Final = {
 class Obstacle:
     """Why a folder is not writable, with the remedy.
 
-    ``full`` is True if the disk is full, which may change at any time.
+    ``full`` is True if the reason is a full disk, which may change at any time.
     """
 
     reason: str
@@ -40,8 +40,8 @@ class Obstacle:
 def unwritable(folder: Path) -> Obstacle | None:
     """Return why files cannot be created in a folder; None if they can.
 
-    If the folder does not exist yet, its nearest existing parent is checked. No file is left
-    behind. The call may take long on a slow file system.
+    If the folder does not exist yet, check its nearest existing parent. The check leaves no file
+    behind, and may take long on a slow file system.
     """
     try:
         place = next(path for path in (folder, *folder.parents) if path.exists())

@@ -1,4 +1,4 @@
-"""Checks the addresses to listen on, tokens and roles, and makes the paths of ``[grpc]`` absolute."""
+"""Checks addresses to listen on, tokens and roles; makes the paths in ``[grpc]`` absolute."""
 
 from __future__ import annotations
 
@@ -49,15 +49,15 @@ def resolve(grpc: Grpc, config: Config) -> None:
 def encrypted(grpc: Grpc, address: Listening) -> bool:
     """Return whether an address uses TLS.
 
-    A UNIX socket never does, because it needs no encryption.
+    A UNIX socket never uses TLS, because only this host can reach it.
     """
     return grpc.tls is not None and not address.insecure and not address.listen.startswith(UNIX)
 
 
 def takes_tokens(grpc: Grpc, address: Listening) -> bool:
-    """Return whether an address accepts tokens.
+    """Return whether the endpoint accepts tokens at an address.
 
-    It does if nobody can read the tokens on the network, or if the configuration allows tokens in
+    It accepts them if nobody can read them on the network, or if the configuration allows tokens in
     plain text.
     """
     return encrypted(grpc, address) or parse_address(address.listen).loopback or address.tokens_in_plain_text

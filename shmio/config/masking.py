@@ -1,10 +1,10 @@
 """Masks secrets in the text of a configuration, so that it can be shown to others.
 
-shmio's own keys name files with secrets, or have hashes of secrets. A key of another package's
-connector may have the secret itself. Therefore the name of a key decides whether its value is masked.
-Secrets are also masked in the values of other keys: in URLs, after options of commands such as
-``--password``, after ``Bearer``, and where a text has the form of a well-known kind of token. In
-doubt, a value is masked.
+The values of shmio's own keys are paths of files with secrets, or hashes of secrets. The value of a
+key of another package's connector may be the secret itself. Therefore, whether a value is masked
+depends on the name of its key. Secrets are also masked in the values of other keys: in URLs, after
+options of commands such as ``--password``, after ``Bearer``, and in texts that look like a well-known
+kind of token. In doubt, a value is masked.
 """
 
 from __future__ import annotations
@@ -22,18 +22,21 @@ _PARTS: Final = re.compile(
     r"password|passwd|passphrase|passcode|pwd|secret|token|credential|authorization|bearer|sha256|psk"
 )
 _WHOLE: Final = frozenset({"webhook"})
-"""Keys that may have a secret only if this is their whole name. The URL of a webhook often contains a secret."""
+"""Keys whose values may be secret, but not those of longer keys with the same word.
+
+The URL of a webhook often contains a secret.
+"""
 _NO_SECRETS: Final = frozenset({"tokens_in_plain_text"})
 _PATH_SUFFIXES: Final = ("_file", "_path", "_dir")
 _KEY_FILES: Final = re.compile(r"""["']?[^"']*\.(?:pem|key|der|crt|p8)["']?""", re.IGNORECASE)
-"""Matches a path. It is not masked if its key has the name ``key``, as in shmio's own sections."""
+"""Matches the path of a key file, which is not masked if it is the value of the key ``key``."""
 _WORD: Final = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 _USER: Final = re.compile(r"(?<=://)[^\s/\"']*(?=@)")
 _SHAPES: Final = re.compile(
     r"(?<![A-Za-z0-9_-])(?:gh[oprsu]_[A-Za-z0-9]{16,}|github_pat_\w{16,}|glpat-[\w-]{16,}|xox[a-z]-[\w-]{10,}"
     r"|sk-[\w-]{16,}|A[KS]IA[0-9A-Z]{16}|eyJ[\w-]{8,}\.[\w-]{8,}(?:\.[\w-]*)?)"
 )
-"""Matches tokens of GitHub, GitLab, Slack and others, and JSON web tokens."""
+"""Matches tokens of GitHub, GitLab, Slack and other services, and JSON web tokens."""
 _WEB_URL: Final = re.compile(r"(?<![A-Za-z])(?:https?|wss?)://[^\s\"']+", re.IGNORECASE)
 _URL_PARTS: Final = re.compile(r"(?<=/)[^/?#]+")
 _UUID: Final = re.compile(r"[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}", re.IGNORECASE)
@@ -44,17 +47,17 @@ _SCHEME: Final = re.compile(r"(?<![\w-])(?:Bearer|Basic)\s+(?=[\w.~+/=-]{8})", r
 _ASSIGNED: Final = re.compile(r"(?<![A-Za-z0-9_-])([A-Za-z0-9_-]++)[\"']?\s*+(?:=(?!=)|:(?!//))\s*(?=\S)")
 _EQUATED: Final = re.compile(r"(?<![A-Za-z0-9_-])([A-Za-z0-9_-]++)[\"']?\s*+=(?!=)\s*(?=\S)")
 _MIN_QUOTED: Final = 4
-"""Minimum number of characters of a secret that is masked wherever a message quotes it."""
+"""Minimum number of characters that a secret must have to be masked wherever a message quotes it."""
 _BEFORE_EQUALS: Final = re.compile(r"[ \t]*=")
 _OWN_TABLES: Final = frozenset({("grpc", "token")})
-"""Tables that are not masked as a whole, although their names suggest a secret: the names of their keys decide."""
+"""Tables that are masked key by key, and not as a whole although their names suggest a secret."""
 
 
 def is_secret(key: str) -> bool:
-    """Return whether a key of this name, without its table, may have a secret as its value.
+    """Return whether the value of a key with this name may be a secret.
 
-    It returns True for the name ``key``, although the value may be the path of a key file. The caller
-    may then check the value.
+    The name does not include the table. The result is True for the name ``key``, although the value
+    may be the path of a key file; the caller may then check the value.
     """
     folded = key.lower()
     if folded in _NO_SECRETS or folded.replace("-", "_").endswith(_PATH_SUFFIXES):
@@ -69,7 +72,7 @@ def mask_value(key: str, value: Any) -> Any:
 
     Args:
         key: Name of the value's key.
-        value: Text, a number, a list or a table.
+        value: The value: a text, a number, a list or a table.
 
     """
     if value is None or isinstance(value, bool):
@@ -90,7 +93,7 @@ def mask_value(key: str, value: Any) -> Any:
 
 
 def mask_line(line: str, assigned: re.Pattern[str] = _ASSIGNED) -> str:
-    """Return a line in which secrets are masked: parts of URLs, tokens, and all that follows a secret key or option.
+    """Return a line with its secrets masked: parts of URLs, tokens, and what follows a secret key or option.
 
     Args:
         line: The line.
@@ -118,7 +121,7 @@ def _mask_url_part(part: re.Match[str]) -> str:
 
 
 def is_secret_option(item: Any) -> bool:
-    """Return whether an item of a list is an option of a command, such as ``--password``, which the secret follows."""
+    """Return whether an item of a list is an option, such as ``--password``, so that the next item is a secret."""
     match = _WHOLE_OPTION.fullmatch(item) if isinstance(item, str) else None
     return match is not None and is_secret(match[1])
 
@@ -132,7 +135,7 @@ class Masked:
     _secrets: list[str] = field(default_factory=list)
 
     def hide(self, message: str) -> str:
-        """Return a message without the secrets that it may quote from the original text."""
+        """Return a message in which secrets of the original text are masked."""
         for secret in self._secrets:
             message = message.replace(secret, MASK)
         return mask_line(message, _EQUATED)  # in messages, a colon follows the faulty key
@@ -141,7 +144,7 @@ class Masked:
 def mask(text: str) -> Masked:
     """Mask the secrets in the text of a TOML file, which may have faults.
 
-    Comments are masked after a secret key and ``=`` or ``:``, such as ``# password = …``.
+    In comments, what follows a secret key and ``=`` or ``:`` is masked, as in ``# password = …``.
     """
     masker = _Masker(text)
     parts: list[str] = []

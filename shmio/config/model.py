@@ -44,7 +44,7 @@ ROLES = ("read", "write", "inject", "control")
 
 
 class Section(Struct, forbid_unknown_fields=True, kw_only=True):
-    """Base class of the file's tables; unknown keys are refused."""
+    """Base class of the tables of a configuration file; a table refuses unknown keys."""
 
 
 class Instance(Section):
@@ -65,9 +65,9 @@ class Instance(Section):
 class Source(Section):
     """``[[source]]``: a producer of registers.
 
-    ``options`` are the connector's own keys in the table. ``texts`` are the keys of the
-    ``properties`` file that the table does not override; their values are still text. The types of
-    both are checked with the connector's options.
+    ``options`` has the values of the connector's own keys in the table. ``texts`` has those of the
+    keys in the ``properties`` file that the table does not override, still as text. Both are checked
+    later, against the types of the connector's options.
     """
 
     name: Name
@@ -93,7 +93,7 @@ class Source(Section):
 
     @property
     def stale_ns(self) -> int:
-        """Age in ns at which a frame becomes bad: as configured, else 5 periods, at least 500 ms."""
+        """Age in ns above which a frame is bad: as configured; by default, 5 periods, but at least 500 ms."""
         return round(1_000_000 * (self.stale_ms or max(5 * self.period_ms, 500.0)))
 
 
@@ -117,9 +117,9 @@ class Emulator(Section):
 
 
 class Tls(Section):
-    """``[grpc.tls]``: PEM files.
+    """``[grpc.tls]``: PEM files of the gRPC endpoint.
 
-    With ``client_ca``, clients must present a certificate issued by it.
+    With ``client_ca``, clients must present a certificate that this authority has issued.
     """
 
     certificate: Text
@@ -128,7 +128,7 @@ class Tls(Section):
 
 
 class Token(Section):
-    """``[[grpc.token]]``: a bearer token and its roles. A file or a hash defines the token."""
+    """``[[grpc.token]]``: a bearer token, given by a file or a hash, and the roles of its bearer."""
 
     name: Name
     roles: Texts
@@ -137,19 +137,19 @@ class Token(Section):
 
 
 class Client(Section):
-    """``[[grpc.client]]``: the roles of clients whose certificate's name matches a pattern."""
+    """``[[grpc.client]]``: the roles of clients with a certificate whose name matches a pattern."""
 
     subject: Text | Texts
     roles: Texts
 
     @property
     def patterns(self) -> list[str]:
-        """Globs; one of them must match the certificate's common name or one of its alternative names."""
+        """Globs, one of which must match the common name or an alternative name of the certificate."""
         return [self.subject] if isinstance(self.subject, str) else self.subject
 
 
 class Listening(Section):
-    """``[[grpc.address]]``: an address, and the roles of clients without token or certificate."""
+    """``[[grpc.address]]``: an address to listen on, and the roles of its clients without token or certificate."""
 
     listen: Text
     roles: Texts = field(default_factory=lambda: ["read"])
@@ -178,7 +178,8 @@ class Grpc(Section):
     def listening(self) -> dict[str, Listening]:
         """All addresses to listen on, by configuration key, with the roles of unauthenticated clients.
 
-        On addresses of ``listen``, such clients have all roles, or none if the endpoint is guarded.
+        At the addresses of ``listen``, such clients have all roles; none if the endpoint is
+        ``guarded``.
         """
         roles = [] if self.guarded else list(ROLES)
         found = {
@@ -194,7 +195,7 @@ class Grpc(Section):
 
 
 class Trigger(Section):
-    """``[recorder.trigger]``: limits recording to the time around moments at which a condition is true."""
+    """``[recorder.trigger]``: records only the time around the moments at which a condition is true."""
 
     when: Text
     before_s: Annotated[float, Meta(ge=0, le=3600)] = 10.0
@@ -291,11 +292,11 @@ class Expectation(Section, omit_defaults=True):
 
 
 class MqttTls(Section):
-    """``[mqtt.tls]``: PEM files.
+    """``[mqtt.tls]``: PEM files for MQTT.
 
-    ``ca`` has the authority that issues the peer's certificates. Without it, the host's authorities
-    check the certificate of an external broker. ``certificate`` and ``key`` identify shmio to an
-    external broker, or shmio's own broker to its clients.
+    ``ca`` has the authority that issues the peer's certificates. Without it, an authority that the
+    host trusts must have issued the certificate of an external broker. ``certificate`` and ``key``
+    identify shmio to an external broker, or shmio's own broker to its clients.
     """
 
     ca: Text | None = None
@@ -304,9 +305,9 @@ class MqttTls(Section):
 
 
 class MqttTopic(Section):
-    """``[[mqtt.topic]]``: how matching registers are published.
+    """``[[mqtt.topic]]``: a rule for how the registers that match it are published.
 
-    The first rule that matches applies.
+    The first rule that matches a register applies to it.
     """
 
     match: Text | Texts
@@ -327,7 +328,7 @@ class MqttTopic(Section):
 class Sparkplug(Section):
     """``[mqtt.sparkplug]``: publishes the instance as a Sparkplug B edge node.
 
-    The node has the instance's name, unless ``node`` gives another.
+    ``node`` is the name of the edge node; None: the name of the instance.
     """
 
     group: Text
@@ -347,8 +348,8 @@ class Sparkplug(Section):
 class MqttAccount(Section):
     """``[[mqtt.account]]``: the roles of an account of shmio's own broker.
 
-    Without ``name``, the section applies to clients without an account. ``publish`` lists topic
-    filters on which an account with the role ``write`` may publish, in addition to commands.
+    Without ``name``, the section applies to clients without an account. ``publish`` has filters of
+    topics on which an account with the role ``write`` may publish, in addition to commands.
     """
 
     roles: Texts
@@ -391,7 +392,7 @@ class OpcUa(Section):
 
 
 class Metrics(Section):
-    """``[metrics]``: the address at which Prometheus finds the figures of the instance."""
+    """``[metrics]``: the address at which Prometheus can read the figures of the instance."""
 
     listen: Text
     insecure: bool = False
@@ -404,7 +405,7 @@ class Metrics(Section):
 class Web(Metrics):
     """``[web]``: the address of the web page, which also serves the figures of ``[metrics]``.
 
-    ``roles`` are the roles of users without a token; the page accepts the tokens of
+    ``roles`` has the roles of users without a token. Users with a token have the roles in
     ``[[grpc.token]]``. ``scene`` is the file that describes the cell in 3D (``scene.py``).
     """
 
@@ -442,33 +443,33 @@ class Alert(Section):
 
     @property
     def title(self) -> str:
-        """The name of the alert; if it has no name, what it watches."""
+        """The name of the alert; if it has no name, a text that says what it watches."""
         return self.watches if self.name is None else self.name
 
     @property
     def watches(self) -> str:
-        """The watched condition, sources or processes, as text."""
+        """The condition, the processes or the sources that the alert watches, as text."""
         what = f"process {', '.join(self.processes)}" if self.processes else f"source {', '.join(self.sources)}"
         return self.when or what
 
     @property
     def processes(self) -> list[str]:
-        """Patterns of the processes whose state is watched."""
+        """Patterns for the names of the processes whose state the alert watches."""
         return _listed(self.process)
 
     @property
     def states(self) -> list[str]:
-        """The states of processes in which the alert is active."""
+        """The states of a watched process in which the alert is active."""
         return _listed(self.state) or ["backoff", "fatal"]
 
     @property
     def sources(self) -> list[str]:
-        """Patterns of the sources whose quality is watched."""
+        """Patterns for the names of the sources whose quality the alert watches."""
         return _listed(self.source)
 
     @property
     def qualities(self) -> list[str]:
-        """The qualities of sources with which the alert is active."""
+        """The qualities of a watched source with which the alert is active."""
         return _listed(self.quality) or ["bad"]
 
 

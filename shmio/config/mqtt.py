@@ -1,4 +1,4 @@
-"""Checks the section ``[mqtt]``: the broker's address, its accounts' roles, and topic names."""
+"""Checks the section ``[mqtt]``: the broker's address, the roles of its accounts, and the names of topics."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ PORT: Final = 1883
 TLS_PORT: Final = 8883
 MAX_PREFIX: Final = 256
 ROLES: Final = ("read", "write")
-"""Roles of accounts of shmio's own broker: ``read`` may subscribe, ``write`` may publish commands."""
+"""Roles of accounts of shmio's own broker: with ``read``, they may subscribe; with ``write``, publish commands."""
 _ELSEWHERE: Final = ("host", "port", "username")
-"""Keys for an external broker: its address, and shmio's user name there."""
+"""Keys that are only for an external broker: its address, and shmio's user name there."""
 
 
 def check_mqtt(config: Config) -> None:
-    """Check addresses, plain-text access and combinations of keys.
+    """Check the addresses, plain-text access and combinations of keys in ``[mqtt]``.
 
     Raises:
-        ConfigError: A rule is broken.
+        ConfigError: A key breaks a rule, or contradicts another key.
 
     """
     mqtt = config.mqtt
@@ -47,7 +47,7 @@ def check_mqtt(config: Config) -> None:
 
 
 def own_topics(mqtt: Mqtt, instance: str) -> list[str]:
-    """Return topic filters for everything that the instance publishes, and for its commands."""
+    """Return topic filters that match everything that the instance publishes, and its commands."""
     found = [f"{mqtt.prefix or f'shmio/{instance}'}/#"]
     if mqtt.sparkplug is not None:
         found.append(f"spBv1.0/{mqtt.sparkplug.group}/+/{mqtt.sparkplug.node or instance}/#")
@@ -55,7 +55,7 @@ def own_topics(mqtt: Mqtt, instance: str) -> list[str]:
 
 
 def resolve_mqtt(mqtt: Mqtt, config: Config) -> None:
-    """Make the paths in the section absolute, and set the default prefix."""
+    """Make the paths in ``[mqtt]`` absolute, and set the prefix if it is not given."""
     mqtt.prefix = mqtt.prefix or f"shmio/{config.instance.name}"
     if mqtt.password_file is not None:
         mqtt.password_file = str(config.path(mqtt.password_file))

@@ -14,10 +14,10 @@ EXTRA: Final = "opcua: the OPC UA endpoint needs another library; run pip instal
 
 
 def check_opcua(config: Config) -> None:
-    """Check the address, plain-text access and combinations of keys.
+    """Check the address, plain-text access and combinations of keys in ``[opcua]``.
 
     Raises:
-        ConfigError: A rule is broken.
+        ConfigError: A key breaks a rule, or contradicts another key.
 
     """
     opcua = config.opcua

@@ -1,4 +1,4 @@
-"""The parameter space of a campaign: the values that it leaves open, as ranges or choices."""
+"""The parameter space of a campaign, whose dimensions are the ranges and choices of the campaign's file."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _WHOLE: Final = frozenset({"times", "priority", "delay_cycles", "seed", "bits"})
 _LOW: Final = frozenset(
     {"start_s", "end_s", "for_s", "times", "delay_ms", "delay_cycles", "amplitude", "probability", "seed"}
 )
-"""Keys of an injection whose lowest value is the simplest."""
+"""Keys of an injection for which the lowest value is the simplest."""
 
 Point = Mapping[str, Any]
 """A value for each dimension of a space, by the dimension's name."""
@@ -37,8 +37,8 @@ class Range:
         place: Keys and indices from the campaign's tables to the value.
         low: The lowest value.
         high: The highest value, which is above ``low``.
-        step: If not None, only ``low``, ``low + step``, … are in the range.
-        log: Whether to search the logarithm, because the order of magnitude matters.
+        step: Only ``low``, ``low + step``, … are in the range; None: all numbers are.
+        log: Whether the search uses a logarithmic scale.
         whole: Whether values are whole numbers.
 
     """
@@ -57,7 +57,7 @@ class Range:
         return None if self.step is None else math.floor((self.high - self.low) / self.step + 1e-9) + 1
 
     def at(self, share: float) -> float:
-        """Return the value at a share of the range, from 0 to 1."""
+        """Return the value at a fraction ``share`` of the range: the lowest at 0, the highest at 1."""
         if self.count is not None:
             return self._stepped(min(int(share * self.count), self.count - 1))
         if self.log:
@@ -68,7 +68,7 @@ class Range:
         return round(value) if self.whole else float(value)
 
     def nearest(self, value: float) -> float:
-        """Return the value of the range that is nearest to a number."""
+        """Return the value in the range that is nearest to a number."""
         value = min(max(value, self.low), self.high)
         if self.step is None or self.count is None:
             return round(value) if self.whole else float(value)
@@ -80,7 +80,7 @@ class Range:
 
     @property
     def simplest(self) -> float:
-        """The value that needs the least explanation: the lowest time, duration, amplitude or probability.
+        """The value to prefer in a failing case: the lowest time, duration, amplitude or probability.
 
         For other keys, it is the middle of the range.
         """
@@ -94,7 +94,7 @@ class Choice:
     Attributes:
         name: Name for users.
         place: Keys and indices from the campaign's tables to the value.
-        options: The values. The first one is the usual one.
+        options: The values. The first value is the usual value.
 
     """
 
@@ -108,12 +108,12 @@ class Choice:
         return len(self.options)
 
     def at(self, share: float) -> Any:
-        """Return the value at a share of the list, from 0 to 1."""
+        """Return the value at a fraction ``share`` of the list: the first at 0, the last at 1."""
         return self.options[min(int(share * len(self.options)), len(self.options) - 1)]
 
     @property
     def simplest(self) -> Any:
-        """The first value."""
+        """The value to prefer in a failing case: the first value."""
         return self.options[0]
 
 
@@ -121,7 +121,7 @@ Dimension = Range | Choice
 
 
 class Space:
-    """The dimensions of a campaign's tables, and the campaign at each point."""
+    """The dimensions of a campaign's tables. For each point, it returns tables with that point's values."""
 
     def __init__(self, tables: Mapping[str, Any]) -> None:
         """Find the ranges and choices in the tables of a campaign file.
@@ -145,7 +145,7 @@ class Space:
             seen.add(one.name)
 
     def at(self, point: Point) -> dict[str, Any]:
-        """Return a copy of the tables with a value in place of each range that ``point`` names."""
+        """Return a copy of the tables, in which each dimension that ``point`` names has the value from ``point``."""
         tables = copy.deepcopy(dict(self._tables))
         for one in self.dimensions:
             if one.name in point:
@@ -156,11 +156,11 @@ class Space:
         return tables
 
     def shares(self, share: float) -> dict[str, Any]:
-        """Return the point at the same share of each dimension, from 0 to 1."""
+        """Return the point at the same fraction ``share``, from 0 to 1, of each dimension."""
         return {one.name: one.at(share) for one in self.dimensions}
 
     def check_names(self, names: Iterable[str]) -> None:
-        """Check that each name is that of a dimension.
+        """Check that each name is the name of a dimension.
 
         Raises:
             ConfigError: A name is unknown.
@@ -173,7 +173,7 @@ class Space:
 
 
 def key_of(place: Sequence[str | int]) -> str:
-    """Return a place as a key in messages, such as ``injection[0].value``."""
+    """Return the key for messages, such as ``injection[0].value``, from the keys and indices that lead to a value."""
     return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in place).lstrip(".")
 
 

@@ -1,4 +1,4 @@
-"""Reads ``supervisor.toml`` into a checked :class:`Config`. Messages name file, key and remedy."""
+"""Reads ``supervisor.toml`` into a checked :class:`Config`. Messages name the file, the key and the remedy."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ MAX_FILE_BYTES = 1 << 20
 MAX_PROPERTIES_BYTES = 64 << 10
 MAX_DEPTH = 64
 MAX_SECTIONS = 1_000
-"""Maximum number of sections of the same name that are checked."""
+"""Maximum number of sections of the same name to check."""
 MAX_SOURCES = 200
 """Maximum number of sources of an instance."""
 
@@ -96,7 +96,7 @@ _SEVERAL = {
 }
 _SLIPPED = re.compile(r"[A-Za-z]:[\x00-\x1f\\]")  # a Windows path in double quotes, \t being a tab
 DERIVED: Final[Mapping[type[Section], tuple[str, ...]]] = {Config: ("folder",), Source: ("options", "texts")}
-"""Fields that are not keys of the file."""
+"""For each type of section, the fields that are not keys of the file."""
 _Table = TypeVar("_Table", bound=Section)
 
 
@@ -114,12 +114,12 @@ def load(file: Path) -> Config:
 
 
 class Examined(NamedTuple):
-    """A configuration without its faulty sections, and the faults."""
+    """A configuration, from which faulty sections are left out, and its faults."""
 
     config: Config
     faults: Faults
     broken: dict[int, tuple[str, dict[str, Any], dict[str, str]]]
-    """The connector, the connector's keys and the keys of the properties file of each faulty source, by index."""
+    """For each faulty source, by index: connector, its keys in the section, and its keys in the properties file."""
 
 
 def examine(file: Path) -> Examined:
@@ -207,7 +207,7 @@ def _depth(value: Any) -> int:
 
 
 def read_properties(file: Path, key: str) -> dict[str, tuple[str, int]]:
-    """Read the text and line of each key of a properties file, such as ``plc.ini``.
+    """Return the text and the line number of each key in a properties file, such as ``plc.ini``.
 
     The file has lines ``key=value``. Blank lines, ``[section]`` lines and lines that begin with
     ``#``, ``;`` or ``!`` are skipped. ``key`` is the configuration key that names the file, for
@@ -297,7 +297,7 @@ def _fields(kind: type[Section]) -> tuple[msgspec.structs.FieldInfo, ...]:
 
 
 class Structure:
-    """Checks of each key whether it is known, is present where needed, and has the right type."""
+    """Checks the keys of a file: that each is known, present where needed, and of the right type."""
 
     def __init__(
         self, faults: Faults, whole: type[Section], kinds: Mapping[str, type[Section]], several: Collection[str]
@@ -315,7 +315,10 @@ class Structure:
         self._whole, self._kinds, self._several = whole, kinds, several
 
     def sections(self, tables: dict[str, Any]) -> tuple[dict[str, Any], dict[str, list[int]]]:
-        """Return the sections without faults and, for those that may repeat, their indices in the file."""
+        """Return the sections without faults, and the indices that they have in the file if they may repeat.
+
+        Add the faults of the other sections to the faults of the file.
+        """
         sound: dict[str, Any] = {}
         places: dict[str, list[int]] = {}
         hinted = self._unknown(tables, "", "")
@@ -348,7 +351,13 @@ class Structure:
             self._faults.add(f"{key}: expected tables, each with the header [[{key}]]")
 
     def table(self, value: Any, key: str, name: str) -> tuple[bool, dict[str, Any]]:
-        """Return whether a table has no faults, and its faultless keys with their values."""
+        """Return whether a table has no faults, and its keys without faults, with their values.
+
+        Args:
+            value: The table.
+            key: The key of the table in messages, such as ``source[0]``.
+            name: The dotted name of the table without indices.
+        """
         if not isinstance(value, dict):
             self._faults.add(f"{key}: expected a table with the header [{name}]")
             return False, {}
@@ -499,9 +508,9 @@ def unknown_option(index: int, key: str, known: list[str]) -> str:
 
 
 def check_text(value: Any, key: str) -> None:
-    """Check that texts contain no control characters, which harm file names and terminals.
+    """Check that no text in a value contains control characters, which harm file names and terminals.
 
-    A type with a pattern would be simpler, but makes msgspec 0.22 crash when Python exits.
+    (A type with a pattern would be simpler, but makes msgspec 0.22 crash when Python exits.)
 
     Raises:
         ConfigError: A text contains a control character.
@@ -512,7 +521,7 @@ def check_text(value: Any, key: str) -> None:
 
 
 def text_faults(value: Any, key: str) -> Iterator[str]:
-    """Yield a fault for each text with control characters, however deeply it is nested."""
+    """Yield a fault for each text with control characters in a value, however deeply the text is nested."""
     if isinstance(value, str) and any(char < " " or char == "\x7f" for char in value):
         path = "; write a path with backslashes in single quotes" if _SLIPPED.search(value) else ""
         yield f"{key}: must not contain control characters{path}"

@@ -1,4 +1,4 @@
-"""Reads the file that describes a cell in 3D, which ``[web]`` names; docs/reference/scene.md explains its keys."""
+"""Reads the scene, a file that describes a cell in 3D (key ``scene`` of ``[web]``, docs/reference/scene.md)."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Template(Section):
 
 
 class Copy(Section):
-    """``[[copy]]``: the bodies of a template at another place, with registers of their own."""
+    """``[[copy]]``: a copy of the bodies of a template, at another place and moved by other registers."""
 
     name: Name
     template: Text
@@ -105,7 +105,7 @@ class Camera(Section):
 
 
 class Scene(Section):
-    """The contents of the whole file."""
+    """The contents of a scene file."""
 
     body: list[Body] = []
     template: list[Template] = []
@@ -144,14 +144,14 @@ _KEYS: Final[Mapping[str, _Keys]] = {
 }
 _MEASURES: Final = ("size_mm", "radius_mm", "top_radius_mm", "length_mm", "along", "round_mm")
 _UNITS: Final[Mapping[str, tuple[UnitName, ...]]] = {"revolute": ("deg", "rad"), "prismatic": ("mm", "m")}
-"""The units of a register by the type of its joint; the first is the default."""
+"""The units that a register may have, by the type of its joint; the first unit is the default."""
 
 
 def examine_scene(file: Path) -> tuple[Scene, Faults]:
-    """Read the description of a cell, and collect the faults that can be found without knowing the registers.
+    """Read a scene file, and collect the faults that can be found without knowing the registers.
 
     Returns:
-        The scene, which is complete only if there are no faults, and the faults.
+        The scene, which is complete only if there are no faults; and the faults.
 
     Raises:
         ConfigError: The file cannot be read or is not TOML.
@@ -174,7 +174,7 @@ def examine_scene(file: Path) -> tuple[Scene, Faults]:
 
 
 def bodies(scene: Scene) -> Iterator[tuple[str, Body]]:
-    """Yield all bodies in the file, including those of templates, each with its key."""
+    """Yield (key, body) of each body in the file, including the bodies of templates."""
     for index, body in enumerate(scene.body):
         yield f"body[{index}]", body
     for place, template in enumerate(scene.template):
@@ -188,7 +188,7 @@ def unit(joint: Joint) -> UnitName:
 
 
 def filled(text: str, values: Mapping[str, str]) -> str:
-    """Return a text of a template with the values of a copy in place of ``{name}``.
+    """Return a text of a template in which each ``{name}`` is replaced by the copy's value of this name.
 
     Raises:
         KeyError: The copy has no value of this name.

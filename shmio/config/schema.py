@@ -1,4 +1,4 @@
-"""JSON schemas of the configuration files, for editors: from the types by which the files are read."""
+"""Makes JSON schemas of the configuration files, for editors, from the types by which shmio reads the files."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from shmio.config.read import DERIVED
 from shmio.config.scene import Scene
 
 _DRAFT: Final = "http://json-schema.org/draft-07/schema#"
-"""The newest draft that all editors' plugins for TOML know."""
+"""The version of JSON schema: the newest that the TOML plugins of all editors know."""
 _NO_CONTROL: Final = "^[^\\u0000-\\u001f\\u007f]*$"
-"""The pattern of a text in which :func:`shmio.config.read.text_faults` finds no fault."""
+"""Matches each text in which :func:`shmio.config.read.text_faults` finds no fault."""
 _DEFINITIONS: Final = "definitions"
 
 Schema = dict[str, Any]

@@ -1,4 +1,4 @@
-"""Reads and tests the PEM files of the TLS tables, and makes TLS contexts from them."""
+"""Reads and tests the PEM files that sections for TLS name, and makes TLS contexts from them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class TlsFiles(NamedTuple):
 
 
 def read_tls(tls: Tls) -> TlsFiles:
-    """Read and test the gRPC endpoint's PEM files: gRPC would report a bad file as a busy port.
+    """Read and test the gRPC endpoint's PEM files, because gRPC would report a bad file as a busy port.
 
     Raises:
         ConfigError: A file cannot be used; the message names its key.
@@ -50,8 +50,8 @@ def read_tls(tls: Tls) -> TlsFiles:
 def client_context(tls: MqttTls, where: str = "mqtt.tls.") -> ssl.SSLContext:
     """Return the TLS context for an external broker.
 
-    ``ca`` must have issued the broker's certificate. Without ``ca``, one of the host's authorities
-    must have issued it. ``where`` is the beginning of the keys' names, for messages.
+    The authority ``ca`` must have issued the broker's certificate; without ``ca``, an authority that
+    the host trusts. ``where`` is the beginning of the names of keys, for messages.
 
     Raises:
         ConfigError: A file cannot be used.
@@ -70,8 +70,8 @@ def client_context(tls: MqttTls, where: str = "mqtt.tls.") -> ssl.SSLContext:
 def server_context(tls: MqttTls, where: str = "mqtt.tls.") -> ssl.SSLContext:
     """Return the TLS context of one of shmio's own servers.
 
-    With ``ca``, clients must present a certificate issued by it. ``where`` is the beginning of the
-    keys' names, for messages.
+    With ``ca``, clients must present a certificate that this authority has issued. ``where`` is the
+    beginning of the names of keys, for messages.
 
     Raises:
         ConfigError: A file cannot be used.

@@ -10,4 +10,4 @@ TOKEN: Final = re.compile(
     r"""|\[\[|\]\]|[\[\]{}=.,\n]|[^\s"'\#\[\]{}=.,]+""",
     re.DOTALL,
 )
-"""Matches a comment, a string, a bracket, a sign, a newline, or a bare word. Strings need not be terminated."""
+"""Matches a comment, a string, a bracket, a sign, a newline, or a bare word; also a string without its end."""

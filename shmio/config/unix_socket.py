@@ -1,4 +1,4 @@
-"""Creates and removes the files of UNIX sockets to listen on."""
+"""Creates and removes the files of UNIX sockets at which shmio listens."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def clear(path: str) -> None:
     """Remove a socket file that a killed process has left.
 
     Raises:
-        EndpointError: Another process listens there, the file is not a socket, or it cannot be
-            removed.
+        EndpointError: Another process listens at the path, the file is not a socket, or the file
+            cannot be removed.
 
     """
     if (reason := obstacle(path)) is not None:
@@ -76,10 +76,10 @@ class SocketFile:
 
     @contextmanager
     def binding(self) -> Iterator[str]:
-        """Yield a temporary path to which to bind the socket, then move the socket to its own path.
+        """Yield a temporary path to which to bind the socket; at the end, move the socket to its own path.
 
-        Other users cannot enter the temporary folder, so nobody can connect before the socket has
-        its mode. (Setting the umask is no solution, because all threads of the process share it.)
+        Other users cannot enter the temporary folder, so they cannot connect before the socket has
+        its final mode. (Setting the umask instead would affect all threads of the process.)
 
         Raises:
             EndpointError: The socket cannot be created, or a file with its path exists.

@@ -15,10 +15,10 @@ _LIBRARIES: Final = ("uvicorn", "starlette", "websockets", "prometheus_client")
 
 
 def check_web(config: Config) -> None:
-    """Check addresses, plain-text access and roles.
+    """Check the addresses, plain-text access and roles in ``[web]`` and ``[metrics]``.
 
     Raises:
-        ConfigError: A rule is broken.
+        ConfigError: A key breaks a rule, or contradicts another key.
 
     """
     for key, section in http_sections(config):
@@ -35,7 +35,7 @@ def check_web(config: Config) -> None:
 
 
 def http_sections(config: Config) -> list[tuple[str, Metrics]]:
-    """Return those of the sections ``[metrics]`` and ``[web]`` that the configuration has, each with its name."""
+    """Return (name, section) of each of the sections ``[metrics]`` and ``[web]`` that the configuration has."""
     return [(key, section) for key, section in (("metrics", config.metrics), ("web", config.web)) if section]
 
 
