@@ -32,7 +32,7 @@ class Lost(Enum):
 
 
 class WriteLostError(ConnectorError):
-    """The connection was lost before the device answered all writes."""
+    """The connection was lost before the device had answered all writes."""
 
     def __init__(self, message: str, outcomes: Sequence[str | Lost]) -> None:
         """Create the error.
@@ -100,7 +100,7 @@ class Connector(ABC):
     """
 
     cannot_browse: ClassVar[str] = "this connector cannot list what a device offers"
-    """Why :meth:`browse` is not possible, and what the user can do instead."""
+    """Why this connector cannot browse, and what the user can do instead."""
 
     @classmethod
     def for_layout(cls, layout: Layout) -> type[Connector]:  # noqa: ARG003  most read all layouts
@@ -276,7 +276,7 @@ class Connector(ABC):
     def send(self, writes: Sequence[Write]) -> None:
         """Send writes without waiting until the device confirms them.
 
-        A connector implements this and :meth:`confirm` if a device in good order may take longer
+        A connector implements this and :meth:`confirm` if even a healthy device may take longer
         than a cycle to confirm a write. The loop sends no further writes before it has the outcomes
         of these. By default, this method calls :meth:`write`, which waits.
 

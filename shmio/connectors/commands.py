@@ -197,7 +197,7 @@ def ends(
         writes: The writes from :func:`coalesce`.
         superseded: The indices of superseded items from :func:`coalesce`.
         outcomes: The outcome of each write.
-        error: Why the outcomes of some writes are not known.
+        error: Why the outcomes of some writes are unknown; empty if all are known.
 
     """
     lost = any(isinstance(outcome, Lost) for outcome in outcomes)
@@ -472,7 +472,7 @@ class CommandProcessor:
                 queues.wait(seen, self._patience_ns())
 
     def stop(self) -> None:
-        """Make :meth:`run` return. Any thread may call it."""
+        """Make :meth:`run` return. Any thread may call this."""
         self._stopped = True
         self._writer.block.commands.wake()
 

@@ -132,7 +132,7 @@ class Output:
         return max(0, self._next_ns - self._now_ns()) if self._changed else -1
 
     def publish(self, image: Image) -> None:
-        """Publish the next image."""
+        """Publish the next image, after applying the injections to it."""
         with self.lock:
             self._last = image
             if self.advance is not None:

@@ -191,7 +191,7 @@ class WallClock:
         return self._stopped.wait(max(0, duration_ns) / 1e9)
 
     def stop(self) -> None:
-        """Stop the loop. Any thread may call it."""
+        """Stop the loop. Any thread may call this."""
         self._stopped.set()
 
 
@@ -273,7 +273,7 @@ class SourceLoop:
 
     @property
     def note(self) -> str:
-        """Why quality is not good; empty if it is."""
+        """Why quality is not good; empty if it is good."""
         return self._quality_log.note
 
     def keep(self) -> None:

@@ -29,11 +29,12 @@ class Device(Protocol):
         """Listen, and run the program. Raise EndpointError if the address is not available."""
 
     def save(self) -> bytes:
-        """Return the state of the memory and the program, for a snapshot. Call it between two cycles.
+        """Return the state of the memory and the program, for a snapshot. Call this between two cycles.
 
         Raises:
             SnapshotError: The state cannot be saved.
             ModelError: The program's code failed.
+
         """
 
     def prepare_restore(self, data: bytes) -> Callable[[], None]:
@@ -44,7 +45,7 @@ class Device(Protocol):
         """
 
     def change(self, served: Sequence[Served]) -> None:
-        """Serve other layouts from now on, and keep the connections of clients. Call it between two cycles.
+        """Serve other layouts from now on, and keep the connections of clients. Call this between two cycles.
 
         Memory that the old and the new layouts share keeps its values. The program starts again, on
         the first layout.

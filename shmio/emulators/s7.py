@@ -370,7 +370,7 @@ class _Parts:
 class S7Server(Server):
     """Serves data blocks to S7 clients on one address. Start and stop it once, or use ``with``.
 
-    Each job holds ``lock``. Hold this lock to change a block between two jobs.
+    The server holds ``lock`` during each job. To change a block between two jobs, hold this lock.
     """
 
     def __init__(self, address: Address, *, max_clients: int = 16, options: ServerOptions | None = None) -> None:
@@ -384,7 +384,7 @@ class S7Server(Server):
         self._checksums: dict[int, int] = {}
 
     def add_block(self, number: int, data: bytearray) -> None:
-        """Serve ``data``, in place, as data block ``number``.
+        """Serve ``data`` itself, not a copy, as data block ``number``.
 
         Raises:
             ConfigError: The number is in use or invalid.
@@ -399,7 +399,7 @@ class S7Server(Server):
         self.area_locks[(S7Area.DB, number)] = self.lock  # for python-snap7's own code
 
     def add_area(self, area: SrvArea, data: bytearray) -> None:
-        """Serve ``data``, in place, as the inputs, outputs, markers, timers or counters."""
+        """Serve ``data`` itself, not a copy, as the inputs, outputs, markers, timers or counters."""
         self.register_area(area, 0, data)
         for kind, number in self.memory_areas:
             if number == 0:

@@ -68,7 +68,7 @@ class DeviceKeeper:
         self._prepare(data)
 
     def restore(self, data: bytes, name: str) -> None:  # noqa: ARG002
-        """Restore a state.
+        """Restore a state that :meth:`save` has returned.
 
         Raises:
             SnapshotError: The state is damaged, or does not fit the device.

@@ -1,8 +1,8 @@
-"""Compile data-block sources to layouts: decode, parse, place, emit.
+"""Compile the sources of data blocks to layouts, in the steps decode, parse, place and emit.
 
-No I/O: the caller reads the files. Sources are exports of TIA Portal (``.db``, ``.udt``, ``.scl``)
-and of STEP 7 classic (``.awl``). Files that use each other's types, function blocks or constants
-must be compiled together.
+No I/O: the caller reads the files. Sources are exports of TIA Portal (``.db``, ``.udt``, ``.scl``) and
+of STEP 7 classic (``.awl``). Files that use each other's types, function blocks or constants must be
+compiled together.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Source:
 class Compiled:
     """Result of a compilation: the layouts in source order, and the warnings.
 
-    ``unused`` are the types whose size the caller gave although no member has the type.
+    ``unused`` are the types whose size the caller gave although no member has such a type.
     """
 
     layouts: tuple[Layout, ...]

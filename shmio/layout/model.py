@@ -43,7 +43,7 @@ class ElementType(msgspec.Struct, frozen=True):
     """An elementary type; a string type includes its length.
 
     Attributes:
-        name: The canonical name: ``DATE_AND_TIME``, never ``DT``; ``STRING[20]``.
+        name: The canonical name, such as ``STRING[20]``; ``DATE_AND_TIME``, not its alias ``DT``.
         base: The name without the length.
         size: Size in bytes; 1 for BOOL, which takes one bit of it.
         align: Alignment in bytes, 1 or 2.
@@ -59,7 +59,7 @@ class ElementType(msgspec.Struct, frozen=True):
 
     @property
     def stride(self) -> int:
-        """Distance from one array element to the next, in bytes. Not for BOOL, whose elements are bits."""
+        """Distance from one array element to the next, in bytes. Not valid for BOOL, whose elements are bits."""
         return -(-self.size // self.align) * self.align
 
 
@@ -153,7 +153,8 @@ class Register(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True
     Attributes:
         path: Names of the members and indices, percent-encoded and joined by ``/``, without source
             and direction.
-        type: S7 name of the element type in upper case; strings with length: ``STRING[20]``.
+        type: S7 name of the element type in upper case; for strings, with the length:
+            ``STRING[20]``.
         dims: (low, high) of each dimension; ``()`` for a scalar.
         offset: First byte in the block.
         bit: 0-7 for BOOL, else None.
@@ -166,12 +167,12 @@ class Register(msgspec.Struct, frozen=True, gc=False, forbid_unknown_fields=True
         unit: Unit of the value, such as ``mm/s``; "" if unknown.
         address: Address in the device, in the notation of the source's connector; "" if the
             position in the block is the address.
-        scale: (factor, offset) with which the connector computes the value from the device's number:
-            value = number * factor + offset. None: the value is the number.
+        scale: (factor, offset) with which the connector computes the value from the device's
+            number: value = number * factor + offset. None: the value is the number.
         deadband: Largest change of the value that the connector may ignore.
         writable: Whether the tag table lets commands write the register.
-        over: For a register of a tag table over a data block, the path of the part of the block that
-            it names; "" for a register that has bytes of its own.
+        over: For a register of a tag table over a data block, the path of the part of the block
+            that it names; "" for a register that has bytes of its own.
 
     """
 

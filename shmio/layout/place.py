@@ -50,7 +50,7 @@ _SIZE = 'type_bytes = {{ "{name}" = … }} in the configuration, or --type-bytes
 
 @dataclass(frozen=True, slots=True)
 class Leaf:
-    """The type of a register: elementary, or an array; ``size`` in bytes, without padding."""
+    """The type of a register: an elementary type, or an array of one. ``size`` is in bytes, without padding."""
 
     element: ElementType
     dims: Dims
@@ -64,7 +64,7 @@ class Leaf:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """A placed structure; ``size`` in bytes, always even. ``opaque``: True if its members are unknown."""
+    """A placed structure. ``size`` is in bytes and always even. ``opaque`` is true if the members are unknown."""
 
     fields: dict[str, Field]  # by name in lower case: S7 names are case-insensitive
     size: int
@@ -83,7 +83,7 @@ class Repeat:
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """A member of a structure, and its ``offset`` there in bytes; ``bit`` is None except for a single BOOL."""
+    """A member of a structure. ``offset`` is in bytes from the structure's start. Only a single BOOL has a ``bit``."""
 
     segment: str
     member: Member
@@ -172,8 +172,8 @@ class Placer:
     def struct(self, struct: Struct, depth: int = 0) -> Group | None:
         """Place a structure; report errors, and return None if there are any.
 
-        Only the body of a block may have no members. For any other structure the parser has
-        already reported that.
+        Only the body of a block may be without members. For any other structure without members,
+        the parser has already reported an error.
         """
         if depth and not struct.members:
             return None

@@ -24,9 +24,9 @@ class Report:
         self.warnings: list[Diagnostic] = []
 
     def add(self, diagnostic: Diagnostic) -> None:
-        """Keep a diagnostic, unless it is a duplicate or a consequence of the last error.
+        """Keep a diagnostic, unless it is a duplicate or a consequence of the error before it.
 
-        An error counts as a consequence if it is at the same place as the error before it.
+        An error at the same place as the error before it counts as a consequence.
 
         Raises:
             TooManyErrors: The report has reached ``MAX_ERRORS``.

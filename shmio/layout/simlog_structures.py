@@ -27,7 +27,7 @@ class Member(NamedTuple):
     name: str
     type: str
     many: Literal["", "joints", "points"] = ""
-    """"joints" or "points": the member is an array with an element for each of them; "": no array."""
+    """"joints" or "points" if the member is an array with an element for each joint or point; else ""."""
     needed: bool = True
     """True if a structure must have this member to be recognised."""
 

@@ -152,7 +152,8 @@ def parse_topic(text: str, sources: Collection[str], default: str | None) -> Top
     """Split a topic into source, path and direction.
 
     Args:
-        text: The topic. Its first segment is the source if it is a source's name or reserved.
+        text: The topic. The first segment is the source if it is the name of a source or a reserved
+            name.
         sources: Names of the sources.
         default: The source of a topic that names none; None if a topic must name one.
 

@@ -145,14 +145,14 @@ class Declaration:
 class Input(Declaration):
     """A register that the model reads.
 
-    Clients write it, or a register of another source sets it.
+    Clients write the register, or it is connected to a register of another source.
     """
 
     kind = "an input"
 
 
 class Parameter(Declaration):
-    """A constant of the model, not a register. The configuration may set it by its name."""
+    """A constant of the model, not a register. The configuration can set the constant by its name."""
 
     kind = "a parameter"
 
@@ -171,7 +171,7 @@ class Parameter(Declaration):
 class Output(Declaration):
     """A register that only the model writes.
 
-    It keeps its value until the model sets another value.
+    The register keeps its value until the model sets another value.
     """
 
     kind = "an output"
@@ -183,7 +183,7 @@ class Output(Declaration):
 class InOut(Declaration):
     """A register that clients write and the model computes.
 
-    The value of the attribute is an :class:`Ends`.
+    In a model object, the attribute is an :class:`Ends`, which has both values.
     """
 
     kind = "an in-out register"

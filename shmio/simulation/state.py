@@ -1,9 +1,9 @@
 """Encodes the state of models for snapshots, as data that runs no code when it is read.
 
 The data may contain numbers, texts, bytes, lists, tuples, dicts, sets, deques, numpy arrays, random
-generators, and objects and enumerations of classes that the model's own modules define. An object
-is created without calling its class, and only its attributes are set. Objects that are reachable by
-several ways stay one object.
+generators, and objects and enumerations of classes that the model's own modules define. An object is
+created without calling its class, and only its attributes are set. An object that is referenced from
+several places stays one object.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def encode_state(value: object, model: object, modules: Collection[str]) -> byte
 
     Args:
         value: The value.
-        model: The model; a reference to it stays a reference to the model.
+        model: The model. A reference to this object is encoded as a reference to the model.
         modules: The names of the modules whose classes the objects may have.
 
     Raises:

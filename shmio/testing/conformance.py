@@ -1,9 +1,8 @@
 """Test suite for connectors of shmio and of other packages. It needs pytest.
 
-A subclass provides a :class:`Rig`: a real device behind a fault proxy. The suite breaks the
-connection in all ways that occur in cells. It checks that the quality becomes bad with a reason,
-that the source recovers without a restart, and that it never shows a value that the device did not
-have.
+A subclass provides a :class:`Rig`: a real device behind a fault proxy. The suite breaks the connection
+in all ways that occur in cells. It checks that the quality becomes bad with a reason, that the source
+recovers without a restart, and that the source never shows a value that the device did not have.
 """
 
 from __future__ import annotations
@@ -89,15 +88,15 @@ class Run:
         raise AssertionError(f"no frame met the condition in time; last frame: {self.frames[-1:]}")
 
     def good(self) -> Frame:
-        """Wait for the next good frame."""
+        """Wait for the next good frame, and return it."""
         return self.until(lambda frame: frame.quality is Quality.GOOD)
 
     def bad(self) -> Frame:
-        """Wait for the next bad frame."""
+        """Wait for the next bad frame, and return it."""
         return self.until(lambda frame: frame.quality is Quality.BAD)
 
     def newer(self, generation: int) -> Frame:
-        """Wait for a frame whose image has a higher number than ``generation``."""
+        """Wait for a frame whose image has a higher number than ``generation``, and return it."""
         return self.until(lambda frame: self._rig.generation(frame.raw) > generation)
 
     def wait_busy(self) -> None:
@@ -166,7 +165,7 @@ class ConnectorConformance:
 
     @pytest.fixture
     def run(self, rig: Rig, instance: str) -> Iterator[Run]:
-        """Provide a running loop. Stop and check it after the test."""
+        """Provide a running loop; stop and check the loop after the test."""
         with Segment.create(instance, [block_of(rig)], [ProcessSpec("device", "source")]) as segment:
             run = Run(segment, rig, self.writable)
             try:
@@ -277,9 +276,9 @@ class ConnectorConformance:
 
     @pytest.fixture
     def others(self, rig: Rig) -> Iterator[Rig]:
-        """Return an endless iterator over rigs for reloads, which alternates between two layouts.
+        """Provide an endless iterator over rigs for reloads, which alternates between two layouts.
 
-        Skip the test if a reload cannot change the registers of the connector.
+        The test is skipped if a reload cannot change the registers of the connector.
         """
         if type(rig.connector()).register_options is None:
             pytest.skip("a reload restarts the sources of this connector")

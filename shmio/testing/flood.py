@@ -1,6 +1,6 @@
 """A flood of gRPC calls to unknown methods.
 
-It sends raw HTTP/2, because client libraries refuse to send some of these calls.
+This module sends raw HTTP/2, because client libraries refuse to send some of these calls.
 """
 
 from __future__ import annotations

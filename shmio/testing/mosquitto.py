@@ -13,16 +13,16 @@ from shmio.endpoints.mqtt.broker.program import find_mosquitto
 
 PATIENCE_S = 20.0
 KILL_WITH_PARENT = ("setpriv", "--pdeathsig", "KILL") if shutil.which("setpriv") else ()
-"""Prefix of the broker's command: it kills the broker when the thread that started it ends."""
+"""Prefix of the broker's command, by which the broker ends with the thread that started it."""
 
 
 def missing() -> str:
-    """Return the reason why mosquitto cannot run here; empty if it can."""
+    """Return why mosquitto cannot run here; empty if it can."""
     return "" if find_mosquitto() else "mosquitto is not installed: apt-get install mosquitto"
 
 
 class Mosquitto:
-    """A broker that keeps its port over restarts. Its log is ``mosquitto.log`` in its folder."""
+    """A broker that keeps its port across restarts. Its log is ``mosquitto.log`` in its folder."""
 
     def __init__(self, folder: Path, address: Address, *lines: str) -> None:
         """Write the configuration: the port, then ``lines``.

@@ -66,7 +66,7 @@ class Writer:
         return self._sender.submit(writes, time.monotonic_ns() + round(FAR_S * 1e9))
 
     def accepted(self, number: int) -> None:
-        """Wait until the source has accepted a command. Call it before :meth:`end`."""
+        """Wait until the source has accepted a command. Call this before :meth:`end`."""
         deadline_s = time.monotonic() + PATIENCE_S
         while True:
             event = self._events.next(max(0.0, deadline_s - time.monotonic()))
@@ -75,7 +75,7 @@ class Writer:
                 return
 
     def end(self, number: int, items: int = 1) -> Event:
-        """Wait for the outcomes of all items of a command; return that of the first."""
+        """Wait for the outcomes of all items of a command; return the outcome of the first item."""
         ends: list[Event] = []
         deadline_s = time.monotonic() + PATIENCE_S
         while sum(event.items for event in ends) < items:
@@ -122,7 +122,7 @@ class WriteConformance(ConnectorConformance):
 
     @pytest.fixture
     def writer(self, run: Run) -> Writer:
-        """Wait until the running source is connected, and provide a writer of commands."""
+        """Wait until the running source is connected, and provide a :class:`Writer` for it."""
         run.good()
         return Writer(run)
 

@@ -1,1 +1,1 @@
-"""Sources without a device: a model computes their registers, in the source or in a client."""
+"""Sources without a device: memory, and models that run in the source's process or in a client."""

@@ -81,7 +81,7 @@ def save_source(
 
 
 class PreparedSource:
-    """The checked state of a source, which :meth:`restore` restores."""
+    """The state of a source, after a check. :meth:`restore` restores it."""
 
     def __init__(self, source: Computed, output: Output, commands: CommandProcessor, data: bytes) -> None:
         """Check the state.
@@ -101,7 +101,7 @@ class PreparedSource:
         )
 
     def restore(self, writer: BlockWriter, name: str) -> None:
-        """Restore the state, and publish an event and a frame. Set the writer's cycle and time before.
+        """Restore the state, and publish an event and a frame. First set the writer's cycle and time.
 
         Raises:
             ShmioError: The source's own code failed.

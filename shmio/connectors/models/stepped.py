@@ -343,7 +343,7 @@ class SteppedLoop:
         return self._clock.wait_ns(wait_ns)
 
     def step(self, state: Clock) -> str:
-        """Compute a step that was requested; return why it failed, or ""."""
+        """Compute a requested step; return "", or why the step failed."""
         self._handled = state.step
         self._writer.at_ns = self._page.monotonic_ns(state.time_ns)
         return self._compute(state.step, state.time_ns, state.dt_ns)

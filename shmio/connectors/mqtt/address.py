@@ -71,7 +71,7 @@ def parse(text: str) -> Address:
     """Parse the address of a register.
 
     Raises:
-        ValueError: The address is wrong; the message says how.
+        ValueError: The address is wrong; the message says what is wrong.
 
     """
     text = text.strip()
@@ -89,7 +89,7 @@ def place(text: str) -> Place:
     """Parse a topic, with a path in its JSON if the text has one.
 
     Raises:
-        ValueError: The text is wrong; the message says how.
+        ValueError: The text is wrong; the message says what is wrong.
 
     """
     text = text.strip()

@@ -100,7 +100,7 @@ class MqttConnector(Connector):
         return TIMEOUTS * self._options.timeout / 1000
 
     def describe(self) -> str:
-        """Return the broker's address and how the connection reaches it, for the log."""
+        """Return, for the log, the broker's address and how the connection reaches it."""
         version = "5" if self._version == MQTTv5 else "3.1.1"
         secured = "TLS" if self._options.tls else "plain text"
         return f"to {self._options.address} as {self._client_id}, MQTT {version}, {secured}, {self._store.describe()}"

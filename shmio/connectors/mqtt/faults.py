@@ -1,4 +1,4 @@
-"""The error about a single value. It makes only the value's own register bad."""
+"""The error about a single value, which makes only the value's own register bad."""
 
 from __future__ import annotations
 

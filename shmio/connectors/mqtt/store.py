@@ -162,7 +162,7 @@ class Store:
         return topic
 
     def describe(self) -> str:
-        """Return how many topics and Sparkplug nodes are read, for the log."""
+        """Return, for the log, how many topics and Sparkplug nodes are read."""
         found = [counted(len(self._topics), "topic")] if self._topics else []
         return ", ".join([*found, *([counted(len(self.host), "Sparkplug node")] if self.host else [])])
 

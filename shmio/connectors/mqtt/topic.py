@@ -137,7 +137,7 @@ class Topic(Origin):
         return 0
 
     def reset(self) -> None:
-        """Forget the message."""
+        """Forget the newest message."""
         self.message = self._document = self._decoded = None
         self.refused = False
 

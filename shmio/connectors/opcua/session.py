@@ -84,7 +84,7 @@ class Item:
     """A node that the source reads, and its state."""
 
     index: int
-    """Index of the node in the source's layout, which a reload may change."""
+    """Index of the node among the nodes that the layout's registers need. A reload may change the index."""
     handle: int
     """The client's number of the monitored item. No other item gets this number during the connection."""
     address: Address

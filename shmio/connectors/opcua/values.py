@@ -60,7 +60,7 @@ class ValueConverter:
         """Return the register's value for a sample.
 
         Raises:
-            MismatchError: The type does not fit.
+            MismatchError: The sample's type does not fit the register.
             ValueRangeError: The register cannot hold the value.
 
         """

@@ -144,7 +144,7 @@ class Ros2Connector(Connector):
         return f"domain {self._options.domain} on {self._options.interface}"
 
     def describe(self) -> str:
-        """Return the domain and the number of topics, for the log."""
+        """Return, for the log, the domain and the number of topics."""
         return f"to DDS {self._where}, {len(self._topics.by_name)} topics"
 
     def cycle_requests(self) -> CycleRequests:
@@ -152,7 +152,7 @@ class Ros2Connector(Connector):
         return CycleRequests(counted(len(self._topics.by_name), "topic"), note="their publishers send messages")
 
     def connect(self) -> None:
-        """Join the domain, and wait until another participant publishes or subscribes to a topic.
+        """Join the domain, and wait until another participant publishes on or subscribes to a topic of this source.
 
         Raises:
             ConnectorError: No participant has done so within the time-out.
@@ -215,8 +215,8 @@ class Ros2Connector(Connector):
         """Return the image of the newest messages.
 
         Raises:
-            ConnectorError: No other participant publishes or subscribes to one of the topics any
-                more.
+            ConnectorError: All other participants that published on or subscribed to a topic of
+                this source have left.
 
         """
         joined = self._participant
@@ -266,7 +266,7 @@ class Ros2Connector(Connector):
         self._sending = Sending(publications, [*refusals], time.monotonic() + self._options.timeout / 1000)
 
     def confirm(self, until_ns: int) -> list[str] | None:
-        """Publish the messages. A message is confirmed once all reliable subscribers have received it.
+        """Publish the messages, one after the other. All reliable subscribers must confirm each message.
 
         Raises:
             UnconfirmedError: A subscriber did not acknowledge a message in time.

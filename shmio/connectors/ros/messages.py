@@ -122,7 +122,7 @@ def conforms(message: Any, kind: str) -> bool:
 
 
 def finite(message: Any) -> bool:
-    """Return whether no number in a message is NaN or infinite."""
+    """Return whether all numbers in a message are finite: neither NaN nor infinite."""
     if isinstance(message, dict):
         return all(map(finite, message.values()))
     if isinstance(message, list):

@@ -117,7 +117,7 @@ class RosbridgeConnector(Connector):
         return 3 * self._options.timeout / 1000
 
     def describe(self) -> str:
-        """Return the server's address and the number of topics, for the log."""
+        """Return, for the log, the server's address and the number of topics."""
         return f"to {self._options.address}, {len(self._topics.by_name)} topics by rosbridge"
 
     def cycle_requests(self) -> CycleRequests:
@@ -210,10 +210,11 @@ class RosbridgeConnector(Connector):
         self._sending = Sending(publications, [*refusals], time.monotonic() + self._options.timeout / 1000)
 
     def confirm(self, until_ns: int) -> list[str] | None:
-        """Publish the messages. A message is confirmed once the server has sent it back.
+        """Publish the messages, one after the other. The server confirms a message by sending it back.
 
         Raises:
-            WriteLostError: The server did not send a message back in time, or the connection was lost.
+            WriteLostError: The server did not send a message back in time, or the connection was
+                lost.
 
         """
         link, sending = self._link, self._sending

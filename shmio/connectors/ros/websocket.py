@@ -128,7 +128,7 @@ class Link:
         self._thread.join(CLOSE_S)
 
     def send(self, **message: Any) -> None:
-        """Send an operation.
+        """Send an operation of the protocol, given by its fields.
 
         Raises:
             ConnectorError: The connection is lost.
@@ -227,7 +227,7 @@ class Link:
         """Call a service; return its answer.
 
         Raises:
-            ConnectorError: The server does not answer in time, or says that it cannot.
+            ConnectorError: The server does not answer in time, or reports that the call failed.
 
         """
         number = f"call:{service}:{next(self._calls)}"

@@ -66,7 +66,7 @@ class BlockChangeMonitor(Query):
         return self._doubts
 
     def data(self) -> bytes:
-        """Return the data of the request."""
+        """Return the data of the request for the next block."""
         if not self._round:
             self._round = [block for block in reversed(self._blocks) if block.db_number not in self._refused]
         return block_data(self._round[-1].db_number)

@@ -240,7 +240,10 @@ def waves(db_number: int, pdu_size: int, writes: Sequence[Write], outcomes: list
 def ends(outcomes: Sequence[str], begun: Iterable[BlockWrite]) -> list[str | Lost]:
     """Return the outcome of each write after the session was lost.
 
-    ``begun`` are the waves of which at least a part was sent.
+    Args:
+        outcomes: For each write, why the controller refused it, or "".
+        begun: The waves of which at least a part was sent.
+
     """
     parts: list[set[Lost | None]] = [set() for _ in outcomes]
     for wave in begun:

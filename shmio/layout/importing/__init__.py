@@ -1,1 +1,1 @@
-"""Convert tag lists of other vendors' tools to tag tables; one module for each format."""
+"""Convert tag lists of other vendors' tools to tag tables. Each format has a module."""

@@ -32,7 +32,7 @@ class Area(IntEnum):
 
     @property
     def numbered(self) -> bool:
-        """True for timers and counters: an address is a number, and not the offset of a byte."""
+        """True for timers and counters, whose addresses are numbers and not offsets of bytes."""
         return self in (Area.COUNTER, Area.TIMER)
 
     @property
@@ -91,7 +91,7 @@ class Address(NamedTuple):
 
 
 def is_of_cpu(text: str) -> bool:
-    """Return whether an address names a value of the CPU itself, and not one in its memory."""
+    """Return whether an address names a value of the CPU itself, and not a value in its memory."""
     return text.strip().lower().startswith(CPU)
 
 
@@ -104,7 +104,7 @@ def parse(register: Register) -> Address:
     """Return the address of a register.
 
     Raises:
-        ValueError: The register has no address, or one that does not fit its type.
+        ValueError: The register has no address, or an address that does not fit its type.
 
     """
     text = register.address.strip()

@@ -1,1 +1,1 @@
-"""Read source text into declarations: lexer, parser, constants."""
+"""Read the text of sources into declarations, with a lexer and a parser."""

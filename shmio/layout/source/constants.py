@@ -58,7 +58,7 @@ def string_length(at: Cursor, base: str) -> Bound:
 
 
 def bound(at: Cursor, what: str) -> Bound:
-    """Read a whole number within 32 bits, or an expression of constants."""
+    """Read a whole number within 32 bits, or an expression of constants; ``what`` names it in messages."""
     position = at.position
     terms: list[tuple[int, tuple[int | Constant, ...]]] = []
     sign = 1
@@ -81,7 +81,7 @@ def bound(at: Cursor, what: str) -> Bound:
 
 
 def integer(at: Cursor, what: str) -> int:
-    """Read a whole number that is a literal, and not a constant or an expression."""
+    """Read a literal whole number, not a constant or an expression; ``what`` names it in messages."""
     token = at.token
     value = bound(at, what)
     if not isinstance(value, int):

@@ -72,7 +72,7 @@ class FrameCodec:
         self._others = [(r, _decoder(r, order)) for r in registers if r.path not in done]
 
     def decode(self, frames: bytes | bytearray | memoryview | Bytes) -> Array:
-        """Decode n frames.
+        """Decode any number of frames at once.
 
         Args:
             frames: The bytes of n frames, or a uint8 array of shape (n, size).
@@ -82,6 +82,7 @@ class FrameCodec:
 
         Raises:
             ValueError: The bytes are not whole frames of the layout.
+
         """
         raw = np.asarray(frames, np.uint8) if isinstance(frames, np.ndarray) else np.frombuffer(frames, np.uint8)
         if raw.ndim == 1 and self.size and raw.size % self.size == 0:

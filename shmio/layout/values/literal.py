@@ -1,8 +1,8 @@
 """Convert S7 literals, from sources and from users, to values, and values to literals.
 
-``16#FF``, ``INT#-5``, ``1.5e3``, ``TRUE``, ``T#1h30m``, ``S5T#10s``, ``D#2024-02-29``, ``TOD#12:00:00``,
-``DT#2024-02-29-12:00:00``, ``'text$N'``, ``WSTRING#'…'``, and arrays ``[1, 2, 5(0)]`` of any of these.
-``codec.py`` lists the Python type of each value.
+Examples are ``16#FF``, ``INT#-5``, ``1.5e3``, ``TRUE``, ``T#1h30m``, ``S5T#10s``, ``D#2024-02-29``,
+``TOD#12:00:00``, ``DT#2024-02-29-12:00:00``, ``'text$N'``, ``WSTRING#'…'``, and arrays ``[1, 2, 5(0)]``
+of any of these. ``codec.py`` lists the Python type of each value.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ _DAMAGED: Final = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError
 
 
 class Archive:
-    """The archive of one FMU. It is open only while it is read."""
+    """The archive of one FMU. The file is open only during a read."""
 
     def __init__(self, path: Path) -> None:
         """Check the archive, and read its description.

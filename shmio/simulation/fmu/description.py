@@ -34,7 +34,7 @@ TYPES: Final = {
     "Boolean": "BOOL",
     "String": f"STRING[{MAX_STRING}]",
 }
-"""The type of the register, by the type of the variable. Variables of other types are left out."""
+"""The register's type for each type of variable. Variables of other types are left out."""
 _KINDS: Final[dict[str, type[Input] | type[Output] | type[Parameter]]] = {
     "input": Input,
     "output": Output,
