@@ -98,8 +98,8 @@ class ConditionValues:
             own: The name of the source to which the image belongs.
             image: The source's next image.
             blocks: The blocks of all sources.
-            before: The number of the present step; None outside steps. Of a source that has already
-                completed this step, the values from before the step count.
+            before: The number of the present step; None outside steps. If a source has already
+                completed this step, its values from before the step count.
 
         """
         self._blocks = blocks

@@ -229,17 +229,17 @@ class SourceLoop:
         """Create the loop.
 
         Args:
-            connector: The protocol of the device.
+            connector: The connector to the device.
             writer: Writes the source's block.
-            schedule: When cycles are due.
+            schedule: The times at which cycles are due.
             clock: The loop's clock.
             writable: Patterns of the registers that commands may write.
             allow_nonfinite: Patterns of the registers to which NaN and infinities may be written.
             armed: Whether injections may change what is written to the device.
             owner_of: Returns the process that uses a command queue.
             blocks: Returns the blocks of all sources.
-            predecessor: A loop that has ended. This loop continues its counters, and takes over its
-                connection if it has kept that.
+            predecessor: A loop that has ended. This loop continues the counters of that loop, and
+                takes over its connection if it was kept.
 
         """
         self._connector = connector

@@ -62,11 +62,11 @@ class Emulator:
             layout: The layout of the program's block, or a tag table with addresses.
             program_name: The program to run.
             listen: The address to listen on.
-            db_number: The block's number; default: the layout's own.
+            db_number: The block's number; None: the number in the layout.
             others: Blocks without a program, served under their own numbers, and tag tables.
             max_clients: Maximum number of clients at a time.
             options: Limits and faults of the server.
-            code: What the program needs if it is a class of the user.
+            code: Folder and parameters of the program if it is a class of the user.
 
         Raises:
             ConfigError: There is no such program, the layout does not suit it, a number is missing

@@ -173,10 +173,11 @@ class ModbusEmulator:
             served: The tag tables; the program runs on the first.
             program_name: The program to run.
             listen: The address to listen on.
-            code: What the program needs if it is a class of the user.
+            code: Folder and parameters of the program if it is a class of the user.
 
         Raises:
-            ConfigError: There is no such program, the table does not suit it, or an address is wrong.
+            ConfigError: There is no such program, the table does not suit it, or an address is
+                wrong.
 
         """
         self.address = listen

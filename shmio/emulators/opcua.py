@@ -119,7 +119,7 @@ class OpcUaEmulator:
                 first.
             program_name: The program to run.
             listen: The address to listen on.
-            code: What the program needs if it is a class of the user.
+            code: Folder and parameters of the program if it is a class of the user.
 
         Raises:
             ConfigError: There is no such program, the layout does not suit it, or an address is

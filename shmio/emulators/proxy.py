@@ -146,7 +146,7 @@ class Tampering:
     """
 
     def __init__(self, framing: Framing | None) -> None:
-        """Start without an edit. ``framing`` measures a frame; if None, the result of each ``recv`` is a frame."""
+        """Start without an edit. ``framing`` measures frames; if it is None, the result of each ``recv`` is a frame."""
         self._framing = framing
         self._edit: Edit | None = None
         self._held: list[bytes] = []
@@ -219,10 +219,10 @@ class FaultProxy:
         Args:
             target: Address of the server.
             listen: Address to listen on; None for a free loopback port.
-            up_s: Delay of each byte to the server, in s. It does not limit the throughput.
+            up_s: Delay of each byte to the server, in s. The delay does not limit the throughput.
             down_s: Delay of each byte from the server, in s.
-            framing: Function that returns the length of a frame. If None, the result of each ``recv``
-                is a frame.
+            framing: Function that returns the length of a frame. If None, the result of each
+                ``recv`` is a frame.
 
         Raises:
             EndpointError: ``listen`` is not available.

@@ -35,7 +35,7 @@ class DeviceKeeper:
 
         Args:
             device: The device.
-            time: Runs its scans.
+            time: Lets the device follow the instance's clock.
             kind: The kind of the emulator.
             program: The program's name.
             disturbed: Returns whether a command disturbs the device's answers.

@@ -25,7 +25,7 @@ class Mosquitto:
     """A broker that keeps its port across restarts. Its log is ``mosquitto.log`` in its folder."""
 
     def __init__(self, folder: Path, address: Address, *lines: str) -> None:
-        """Write the configuration: the port, then ``lines``.
+        """Write a configuration with the port and ``lines``.
 
         Without ``lines``, anybody may connect.
         """

@@ -62,7 +62,7 @@ class OwnConfiguration:
         for source in tables.get("source", ()):
             _redirect(source, ports)
         self.file = folder / FILE
-        """The copy."""
+        """The file of the copy."""
         self.file.write_text("".join(f"{_key(key)} = {_toml(value)}\n" for key, value in tables.items()))
 
 

@@ -24,7 +24,7 @@ class Command:
         self.publication, self.writes = publication, writes
         self.number: int | None = None
         self.outcome: str | None = None
-        """Empty if the broker has accepted the message, else why it was refused; None if that is not known."""
+        """"" if the broker has accepted the message, or why it was refused; None if that is not known yet."""
 
 
 class _Draft:

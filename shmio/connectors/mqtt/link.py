@@ -61,7 +61,7 @@ class Deliver(Protocol):
     """Function that receives the messages of a connection."""
 
     def __call__(self, topic: str, payload: bytes, *, retained: bool) -> None:
-        """Receive a message. ``retained`` is true if the broker had stored it."""
+        """Receive a message. ``retained`` is true if the broker had stored the message."""
 
 
 class UnsupportedVersionError(ConnectorError):

@@ -64,13 +64,13 @@ class Device(Origin):
     def __init__(self, node: Node, name: str) -> None:
         self.node, self.name = node, name
         self.wanted: dict[str, list[int]] = {}
-        """By the name of a metric, the indices of the registers that have its value."""
+        """For each metric, by name, the indices of the registers that have the metric's value."""
         self.metrics: dict[str, _Known] = {}
-        """The definitions in the device's birth, by name, of the metrics that registers have."""
+        """The birth's definitions of the metrics that registers have, by name."""
         self.born = False
         self.died = False
         self.missed = False
-        """True if the last birth had metrics, or was of a device, that no register had then."""
+        """True if a register was added after the last birth, whose definition of the register's metric was not kept."""
         self._birth_order = 0
         self._found: dict[int, tuple[Found | ValueFaultError, int]] = {}
 

@@ -89,7 +89,7 @@ class Topic(Origin):
         """
         self.name = name
         self.places: dict[int, Steps | None] = {}
-        """By register index, the path of its value in JSON; None if the payload is the value as text."""
+        """For each register, by index, the path of its value in JSON; None if the payload is the value as text."""
         self.refused = False
         """True if the broker refuses the subscription."""
         self._time, self._max_bytes = time, max_bytes

@@ -44,7 +44,8 @@ class ValueConverter:
 
         Args:
             register: The register.
-            texts: Further texts that mean false and true in a BOOL register; these are published.
+            texts: Texts for false and true of a BOOL register. They are published, and are
+                understood besides the usual texts.
 
         Raises:
             ValueError: MQTT messages cannot carry values of the register's type.

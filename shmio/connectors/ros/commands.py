@@ -86,7 +86,7 @@ class Sending:
         Args:
             publications: The messages.
             outcomes: For each write, "" or why it is refused.
-            until_s: When to stop waiting for confirmations, s of CLOCK_MONOTONIC.
+            until_s: Time at which to stop waiting for confirmations, in s of CLOCK_MONOTONIC.
 
         """
         self.outcomes, self.until_s = outcomes, until_s

@@ -148,7 +148,7 @@ class Participant:
             domain: The domain's id.
             configured: The configuration of Cyclone DDS, from :func:`configuration`.
             topics: The topics to read. Those that are writable are also written.
-            timeout_s: How long a write may wait for room in the queue.
+            timeout_s: Maximum time in s for which a write waits for room in the queue.
             loopback: Whether to receive from this host only.
 
         Raises:

@@ -38,9 +38,9 @@ class Topic:
         self.writable = False
         self.latched = False
         self.qos = TopicQos()
-        """The QoS of the topic; only ``ros2`` has any other than this."""
+        """The QoS of the topic; always the default with ``rosbridge``."""
         self.message: Any = None
-        """The last message; None before the first one, and if the last one cannot be read."""
+        """The last message; None if no message has arrived, or if the last one cannot be read."""
         self.received_ns = 0
         """When the last message was received, ns of CLOCK_MONOTONIC; 0 if there was none."""
         self.utc_ns = 0

@@ -24,7 +24,7 @@ class S7Client(S7Session):
     """Reads and writes one data block of one controller."""
 
     def __init__(self, options: S7Options, db_number: int, size: int) -> None:
-        """Create a client for ``size`` bytes of DB ``db_number``. It does not connect yet.
+        """Create a client, without connecting, for ``size`` bytes of data block ``db_number``.
 
         Raises:
             ConfigError: S7 cannot address such a block.

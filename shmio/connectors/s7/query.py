@@ -29,7 +29,7 @@ class Query(ABC):
     """True if the session skips this question once the controller has failed to answer the query for its mode."""
 
     def __init__(self, service: Service, interval_ns: int | None) -> None:
-        """Create a question; if ``interval_ns`` is None, it is asked once in each session."""
+        """Create a question to ask every ``interval_ns``; if that is None, to ask once in each session."""
         self.service = service
         self._interval_ns = interval_ns
         self._due_ns: int | None = 0

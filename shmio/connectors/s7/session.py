@@ -144,7 +144,7 @@ class S7Session(ABC):
     """
 
     def __init__(self, options: S7Options) -> None:
-        """Create a session. It does not connect yet."""
+        """Create a session without connecting."""
         self.options = options
         self._timeout_ns = options.timeout * 1_000_000
         self._transport: Transport | None = None

@@ -361,7 +361,7 @@ class S7TableConnector(S7Session, Connector):
         """Create the connector without connecting it.
 
         Raises:
-            ConfigError: A register has no address, or one that does not fit its type.
+            ConfigError: A register has no address, or an address that does not fit its type.
 
         """
         super().__init__(options)

@@ -25,7 +25,7 @@ class Conversion:
 
         Args:
             register: The register in the image.
-            address: Its place in the controller.
+            address: The register's place in the controller.
             byte_order: The byte order of the image.
 
         """
@@ -41,9 +41,9 @@ class Conversion:
         ) and element.base != "BOOL"
         plain = element.base == "BOOL" or element.size == 1 or bool(scalar_codec(element, byte_order).plain)
         self.swapped = 0 if self._converted or not plain else 1 if byte_order == "big" else element.size
-        """Size of an element in bytes if the image has its bytes in reverse order; 1: in the same order.
+        """If the image has the bytes of each element in reverse order, the size of an element in bytes.
 
-        0: the value must be decoded and encoded again.
+        1 if the order is the same; 0 if values must be decoded and encoded again.
         """
         self._in = replace(
             register, type=address.kind.name, offset=0, bit=address.bit if not register.dims else register.bit,
