@@ -53,8 +53,8 @@ class Images:
         """Write bytes and bits into the commanded image.
 
         Returns:
-            For each write, "" or why it is refused: it would change an output, it lies outside the
-            block, or its value is outside the register's limits.
+            For each write, "" or why it is refused. A write is refused if it would change an
+            output, lies outside the block, or has a value outside the register's limits.
 
         """
         return [self._write(write) for write in writes]

@@ -119,8 +119,8 @@ class ModelRunner:
             writes: The writes, in order.
 
         Returns:
-            For each write "", or the reason if it is refused: it would change an output, or lies
-            outside the block, or the value is outside the register's limits.
+            For each write, "" or why it is refused. A write is refused if it would change an
+            output, lies outside the block, or has a value outside the register's limits.
 
         """
         return self._images.write(writes)
@@ -374,8 +374,8 @@ class ServedModel:
     """Runs a model in a client, for a source with ``connector = "remote"``.
 
     Pass its ``step`` and ``start`` to :meth:`shmio.client.Client.simulate`. The model behaves as
-    with ``connector = "simulation"``. It continues from the values that the source has when the
-    client first connects.
+    with ``connector = "simulation"``. Before its first step, the model continues from the values
+    that an earlier model has computed.
     """
 
     def __init__(self, model: type[Model], parameters: Mapping[str, object] = NOTHING, seed: int = 0) -> None:
@@ -402,6 +402,9 @@ class ServedModel:
 
     def start(self, joined: Source) -> None:
         """Check that the source has the model's registers. Call this after each connect.
+
+        Before its first step, the model continues from the source's values, if a model has computed
+        them.
 
         Args:
             joined: The source.
