@@ -158,7 +158,8 @@ def parse_topic(text: str, sources: Collection[str], default: str | None) -> Top
         default: The source of a topic that names none; None if a topic must name one.
 
     Returns:
-        The topic. Its path is empty if the text names only the source: the whole block.
+        The topic. Its path is empty if the text names only the source, which stands for the whole
+        block.
 
     Raises:
         PathError: The source is unknown or missing, or the path is malformed.

@@ -35,7 +35,7 @@ _NODES_AT_ONCE: Final = 20
 """Maximum number of nodes in a browse request. More would block the event loop for too long."""
 _VALUES_AT_ONCE: Final = 100
 REFERENCES_PER_NODE: Final = 30
-"""Maximum number of references per node of the limit: some lead to properties or to known nodes."""
+"""Maximum number of references, as a multiple of the limit of nodes; some lead to properties or known nodes."""
 MAX_CHARACTERS: Final = 1 << 26
 """Maximum number of characters of all names, identifiers and comments together."""
 MAX_MEMBERS: Final = 1000

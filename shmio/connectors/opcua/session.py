@@ -89,7 +89,7 @@ class Item:
     """The client's number of the monitored item. No other item gets this number during the connection."""
     address: Address
     deadband: float
-    """Dead-band of the node's own numbers, to which no scale is applied; 0 if there is none."""
+    """Dead-band in the node's own numbers, without the register's scale; 0 if there is none."""
     session: int = 0
     """Index of the session that reads the node."""
     node: Any = None

@@ -47,7 +47,7 @@ def read_identity(certificate: Path, key: Path) -> tuple[x509.Certificate, rsa.R
 
 
 def read_user(certificate: Path, key: Path) -> tuple[x509.Certificate, rsa.RSAPrivateKey]:
-    """Return the user's certificate and key. Nobody but its owner may have access to the file of the key.
+    """Return the user's certificate and key. Only its owner may have access to the key's file.
 
     Raises:
         ConfigError: A file cannot be used, or the key does not belong to the certificate.

@@ -26,7 +26,7 @@ MAX_REPEATS: Final = 1000
 
 
 def is_fmu(text: str) -> bool:
-    """Return whether a model's name is the path of an FMU: whether it ends in ``.fmu``, in any case."""
+    """Return whether a model's name is the path of an FMU, which ends in ``.fmu`` in upper or lower case."""
     return text.lower().endswith(SUFFIX)
 
 
