@@ -1,1 +1,1 @@
-"""Plans an instance: turns a checked configuration into the processes to start."""
+"""Plans an instance: determines the blocks and processes for a configuration, and checks the configuration."""

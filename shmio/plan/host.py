@@ -1,4 +1,4 @@
-"""Checks what a configuration needs from the host, and finds what it lets other users of the host do."""
+"""Checks what a configuration needs from the host, and finds what it allows other users of the host to do."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ MAX_NAMES: Final = 3
 
 
 def check_host(config: Config, catching: Callable[[], AbstractContextManager[None]]) -> list[str]:
-    """Check group, priorities, folders, libraries and other files; return warnings. Nothing is created.
+    """Check group, priorities, folders, libraries and other files, without creating any; return warnings.
 
     ``catching`` returns a context manager that collects a ConfigError instead of raising it.
     """
@@ -169,7 +169,7 @@ def _check_folder(key: str, folder: Path) -> list[str]:
 
 
 def exposure(config: Config) -> str | None:
-    """Return a line that says what other users of this host may do without logging in; None if nothing."""
+    """Return a line that says what other users of this host may do without credentials; None if nothing."""
     ways = [*_open_grpc(config), *_open_mqtt(config), *_open_opcua(config), *_open_web(config)]
     users = other_users() if ways else []
     if not users:
@@ -183,9 +183,9 @@ def exposure(config: Config) -> str | None:
 
 
 def other_users() -> list[str]:
-    """Return the names of other users who can log in. The user root is not included.
+    """Return the names of other users who can log in to this host, without root.
 
-    Users that are only known to a directory service are missing.
+    Users whom only a directory service knows are missing.
     """
     return [user.pw_name for user in pwd.getpwall() if _may_log_in(user) and user.pw_uid not in (0, os.geteuid())]
 

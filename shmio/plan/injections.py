@@ -22,7 +22,7 @@ from shmio.segment.injection_list import InjectionEntry, declared_document, enco
 
 
 def check_injections(config: Config, layouts: Mapping[str, Layout]) -> tuple[dict[str, bytes], tuple[str, ...]]:
-    """Return the encoded injections for each source's process, and a line about each injection.
+    """Return the encoded injections for each source's process, by source name, and a line about each injection.
 
     Raises:
         ConfigError: An injection is invalid; the message begins with the full key.

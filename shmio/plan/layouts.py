@@ -33,8 +33,14 @@ class LayoutFiles:
         """Return the layout of a section's data block.
 
         If the files declare several blocks, the key ``block`` or ``number`` chooses one. Errors in
-        the other blocks are then ignored. With ``optimized``, the section can use a block with
-        optimized access, so do not warn about it.
+        the other blocks are then ignored.
+
+        Args:
+            key: The key of the section, for messages.
+            section: The section that names the files.
+            number: Number of the block; None if the section has no such key.
+            optimized: True if the section can use a block with optimized access, so that no warning
+                about such access is needed.
 
         Raises:
             ConfigError: A file or block is missing, or the section does not say which block it means.
@@ -123,7 +129,7 @@ def _choose(
 
 
 def read_program(paths: Iterable[Path], key: str = "") -> compiler.Program:
-    """Read source files, which may use types of each other, as one program.
+    """Read source files as one program, so that each file may use the types of the others.
 
     Raises:
         ConfigError: A file cannot be read; the message begins with ``key``.

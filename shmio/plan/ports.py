@@ -25,9 +25,9 @@ _LISTEN: Final = "0A"
 
 
 def check_listening(config: Config) -> None:
-    """Check that host names can be resolved, and that no two addresses share a port.
+    """Check that host names can be resolved, and that no two addresses have the same port.
 
-    Port 0, which stands for any free port, is never shared.
+    Addresses with port 0 never conflict, because port 0 stands for any free port.
 
     Raises:
         ConfigError: A host name cannot be resolved, or two addresses share a port.
@@ -77,7 +77,7 @@ def check_ports(plan: Plan) -> None:
 def taken(plan: Plan) -> Iterator[str]:
     """Yield a message for each address of the plan that is in use, with the program that uses it, if known.
 
-    Other faults of an address are reported by the process that listens there.
+    Other faults of an address are not checked: the process that will listen there reports them.
     """
     for job in plan.jobs:
         for text in job.listening:
@@ -90,7 +90,7 @@ def taken(plan: Plan) -> Iterator[str]:
 
 
 def in_use(address: Address) -> bool:
-    """Return whether the address is in use. For a host name, all of its addresses must be in use.
+    """Return whether the address is in use; a host name is in use if all of its addresses are.
 
     Raises:
         ConfigError: The host name cannot be resolved.
@@ -102,7 +102,7 @@ def in_use(address: Address) -> bool:
 
 
 def served(address: Address) -> bool:
-    """Return whether a process of this host listens at the address, or at one of a host name's addresses."""
+    """Return whether a process of this host listens at the address; for a host name, at any of its addresses."""
     return any(True for _ in _listening(address))
 
 

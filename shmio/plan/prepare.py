@@ -1,4 +1,4 @@
-"""Prepares a plan from a configuration file: compiles layouts, checks connectors and emulators."""
+"""Makes a plan from a configuration file: compiles layouts, and checks connectors and emulators."""
 
 from __future__ import annotations
 
@@ -55,9 +55,9 @@ class Prepared:
     layouts: dict[str, Layout]
     """The layout of each source, by source name."""
     emulated: dict[str, tuple[Served, ...]]
-    """All blocks and tag tables of each emulator, by emulator name."""
+    """All blocks and tag tables that each emulator serves, by emulator name."""
     injections: tuple[str, ...]
-    """Lines about the declared injections."""
+    """A line about each declared injection."""
     notes: tuple[str, ...] = ()
     """Remarks for the user that are not about faults."""
 
@@ -68,7 +68,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
     Args:
         file: The configuration file.
         mode: ``live``, ``log`` or ``replay``.
-        keys: Keys that override those of the section ``[replay]``.
+        keys: Values by key that override those in the section ``[replay]``; None for none.
 
     Raises:
         ConfigError: The configuration has faults.
@@ -202,7 +202,7 @@ def _warn_besides(config: Config, layouts: dict[str, Layout], faults: Faults) ->
 
 
 def peer(source: Source) -> str:
-    """Return the address of a checked source's device: a URL, host:port, or the host; "" if it has no device."""
+    """Return the address of a checked source's device: a URL, host:port, or a host; "" if the source has no device."""
     if url := source.options.get("url"):
         return str(url)
     host, port = source.options.get("host"), source.options.get("port")

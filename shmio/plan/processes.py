@@ -25,15 +25,15 @@ RANKS: Final[Mapping[str, int]] = {
     "web": 2,
     "alerts": 3,
 }
-"""Order of start by kind: emulators first, then sources, then endpoints, then the alerts.
+"""Order in which kinds of processes start: emulators and recorder, sources, endpoints, alerts.
 
-The alerts stop first, so that stopping the others raises no alert.
+They stop in the opposite order. The alerts stop first, so that stopping the others raises no alert.
 The recorder starts before the sources and stops after them, so that it records all their frames and
 events.
 """
 
 BROKER: Final = "broker"
-"""Name of the process of shmio's own MQTT broker; its kind is mqtt.
+"""Name of the process of shmio's own MQTT broker, whose kind is ``mqtt`` as that of the bridge.
 
 The broker starts before the bridge and stops after it, so that the bridge can disconnect properly.
 """
@@ -44,9 +44,9 @@ ALERTS: Final = "alerts"
 
 
 def rank(name: str, kind: str) -> int:
-    """Return a process's place in the order of start.
+    """Return a process's place in the order of start; processes with higher places stop first.
 
-    A process of a kind that this version does not know stops last.
+    A process of a kind that this version of shmio does not know stops last.
     """
     return 0 if (name, kind) == (BROKER, "mqtt") else RANKS.get(kind, 0)
 
@@ -64,19 +64,19 @@ MODULES: Final[Mapping[str, str]] = {
 """The module that each kind of process runs."""
 
 EMULATED: Final = ("layouts", "options")
-"""The keys that say what an emulator serves. The emulator can change what it serves while clients are connected."""
+"""The keys that say what an emulator serves. Their values can change while clients are connected."""
 
 RULES: Final[Mapping[str, tuple[str, ...]]] = {"grpc": ("token", "client")}
-"""By kind of process, the keys of its section that the process can read again while it runs."""
+"""For each kind of process, the keys of its section that the process can read again while it runs."""
 
 AUDIT_FILE: Final = "audit.jsonl"
-"""Name of the newest file of the audit log, in the folder of the log files."""
+"""Name of the audit log's newest file, which is in the folder of the log files."""
 MAX_PROCESSES = 200
 MODES = ("live", "log", "replay")
 """Modes of an instance.
 
-``log`` starts no endpoints; ``replay`` replaces sources by a recording. Only ``live`` starts the
-alerts.
+In the mode ``log``, no endpoints are started. In the mode ``replay``, a recording replaces the
+sources. The alerts are started only in the mode ``live``.
 """
 
 
@@ -97,14 +97,14 @@ class Job:
     audit: AuditSettings | None = None
     """The audit log, to which the process writes who did what; None if there is none."""
     connection: dict[str, Any] | None = None
-    """The part of a section that says how a source connects to its device, or how an emulator listens.
+    """The part of the section that says how a source connects to its device, or how an emulator listens.
 
-    While this part stays the same, the process can follow other changes without a new connection.
-    None if the process must be restarted for each change.
+    If this part stays the same, the process can adapt to other changes without a new connection.
+    None if each change requires a restart of the process.
     """
 
     def connects_like(self, other: Job) -> bool:
-        """Return whether a process with the other job can take over this job, and keep its connection."""
+        """Return whether a process that has the job ``other`` can change to this job and keep its connection."""
         same = (self.log_file, self.log_format, self.audit) == (other.log_file, other.log_format, other.audit)
         return same and self.connection is not None and self.connection == other.connection
 
@@ -121,22 +121,22 @@ class Job:
         return [*texts, *(address["listen"] for address in self.config.get("address", ()))]
 
     def describe(self, instance: str, epoch: int) -> bytes:
-        """Return the JSON object that the process reads from its standard input."""
+        """Return the description of this job, a JSON object that the process reads from its standard input."""
         return self._json(instance, epoch, self.config | (self.rules or {}))
 
     def describe_again(self, instance: str, epoch: int, revision: int) -> bytes:
-        """Return the JSON object that replaces that of :meth:`describe` while the process runs.
+        """Return the description of this job that replaces the one from :meth:`describe` while the process runs.
 
         Args:
             instance: Name of the instance.
             epoch: Epoch of the segment.
-            revision: A number that no earlier description of the process had; not 0.
+            revision: A number other than 0, which no earlier description of the process had.
 
         """
         return self._json(instance, epoch, self.config | (self.rules or {}), revision=revision)
 
     def identify(self, instance: str, epoch: int) -> bytes:
-        """Return the part of the description that cannot change without starting a new process."""
+        """Return the part of the description that can change only if the process is started again."""
         return self._json(instance, epoch, self.config)
 
     def _json(self, instance: str, epoch: int, config: dict[str, Any], **more: int) -> bytes:
@@ -170,9 +170,9 @@ class Plan:
     warnings: tuple[str, ...] = ()
     """Warnings about the configuration, one line each."""
     stepped: bool = False
-    """True if the instance's clock stands still from the start, and moves only by steps."""
+    """True if time is virtual from the start: only steps move the instance's clock."""
     origin: Origin | None = None
-    """The instance time at which the clock starts, if a recording is replayed; else None."""
+    """The time at which the instance's clock starts, if a recording is replayed; else None."""
     log_format: str = "text"
     audit: AuditSettings | None = None
     """The audit log, to which the processes write who did what; None if there is none."""
@@ -212,22 +212,22 @@ def make_plan(
     Args:
         config: The checked configuration.
         layouts: The layout of each source, by source name.
-        emulated: All blocks and tag tables of each emulator, with the keys of the sources that read
-            them, by emulator name.
+        emulated: All blocks and tag tables of each emulator, each with the keys of the sources that
+            read it, by emulator name.
         config_file: Path of the configuration file.
         mode: ``live``, ``log`` or ``replay``.
         declared: The encoded injections for each source's process, by source name.
         warnings: Warnings about the configuration.
-        computed: Sources that follow the instance's clock.
-        replayed: Those of the computed sources that play a recording.
-        remote: For sources that a remote program computes, by source name: patterns of their
-            outputs and in-outs.
-        register_options: For sources that can change without a new connection, by source name: the name
-            of the connector's class, and the keys of ``options`` that may then change.
-        origin: The instance time at which the clock starts, if a recording is replayed; else None.
-        recordings: The directory of the configured recorder, even if it does not run in this mode; None if there is
-            no recorder.
-        scene: The cell in 3D, which the web page draws; None if the configuration has none.
+        computed: Names of the sources that follow the instance's clock.
+        replayed: Names of those computed sources that play a recording.
+        remote: For each source that a remote program computes, by source name: patterns of its
+            outputs, and of the registers that are both inputs and outputs.
+        register_options: For each source that can change without a new connection, by source name:
+            the name of the connector's class, and the keys of ``options`` that may then change.
+        origin: The time at which the instance's clock starts, if a recording is replayed; else None.
+        recordings: The directory of the configured recorder, even if the recorder does not run in
+            this mode; None if there is no recorder.
+        scene: The description of the cell in 3D for the web page; None if there is none.
 
     Raises:
         ConfigError: The instance has too many processes.

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from shmio.connectors.replay.recording import Recording
 
 LEAD_NS: Final = 2_000_000_000
-"""How long before the start of the recording the clock starts, in ns, if possible.
+"""Time in ns by which the instance's clock starts before the start of the recording, if possible.
 
 In this time, the processes start.
 """
@@ -35,8 +35,8 @@ class Replayed(NamedTuple):
 class Recordings:
     """Opens the recordings that a configuration plays.
 
-    The last recording stays open, so that consecutive sources of the same recording share it. Use an
-    object as a context manager.
+    The last recording stays open until another is needed, so that consecutive sources with the same
+    recording share it. Use an object as a context manager.
     """
 
     def __init__(self) -> None:

@@ -11,9 +11,9 @@ from shmio.layout.values.write import bits_of, cover
 
 
 def source_requests(source: Source, layout: Layout) -> CycleRequests | None:
-    """Return what a source requests from its device in a cycle.
+    """Return what a source requests from its device in each cycle.
 
-    None if the source has no device, or its connector does not count its requests.
+    Return None if the source has no device, or if its connector does not count requests.
 
     Args:
         source: A checked source.
@@ -31,7 +31,7 @@ def source_requests(source: Source, layout: Layout) -> CycleRequests | None:
 
 
 def writable_registers(source: Source, layout: Layout) -> int:
-    """Return how many registers of a checked source can be written by commands, at least in part."""
+    """Return the number of a checked source's registers that commands can write, at least in part."""
     connector = registry.load(source.connector)
     if not source.writable or (issubclass(connector, Connector) and not connector.for_layout(layout).can_write):
         return 0

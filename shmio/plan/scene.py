@@ -1,4 +1,4 @@
-"""Makes the scene that the web page draws from its description: copies templates, sorts bodies, checks registers."""
+"""Makes the scene for the web page from a scene file: copies templates, sorts bodies, checks registers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from shmio.layout.topic import look_up, parse_topic
 from shmio.wording import already_named, unknown
 
 MAX_REGISTERS: Final = 200
-"""Maximum number of registers that move bodies: as many as one page follows."""
+"""Maximum number of registers that move bodies: the number that one web page can follow."""
 _TYPES: Final = NUMBERS | {"BOOL"}
 
 
@@ -46,14 +46,14 @@ class _Placed(msgspec.Struct):
 
 
 def check_scene(config: Config, layouts: Mapping[str, Layout], faults: Faults, *, replayed: bool) -> Any:
-    """Return the scene of ``[web]`` as the page draws it, as JSON values; None if there is none.
+    """Return the scene of ``[web]`` for the web page, as JSON values; None if the configuration has none.
 
     Args:
         config: The checked configuration.
         layouts: The layout of each source, by source name.
-        faults: Where to add the faults.
-        replayed: Whether a recording replaces the sources. The recording need not have all registers: a body
-            without its register stands still.
+        faults: The faults of the configuration, to which those of the scene are added.
+        replayed: Whether a recording replaces the sources. The recording need not have all registers:
+            a body whose register is missing stands still.
 
     """
     if config.web is None or config.web.scene is None:

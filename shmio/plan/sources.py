@@ -31,15 +31,15 @@ PATIENCE_S: Final = 60.0
 
 
 class Sources(NamedTuple):
-    """What :func:`check_sources` finds, by source name."""
+    """What :func:`check_sources` finds out about the sources, by source name."""
 
     layouts: dict[str, Layout]
     computed: list[str]
-    """Sources that follow the instance's clock."""
+    """Names of the sources that follow the instance's clock."""
     replayed: list[str]
-    """Sources that play a recording."""
+    """Names of the sources that play a recording."""
     remote: dict[str, tuple[list[str], list[str]]]
-    """For each source that a remote program computes: patterns of its outputs and in-outs."""
+    """For each source that a remote program computes: patterns of its outputs, and of its in-out registers."""
     register_options: dict[str, tuple[str, frozenset[str]]]
     """For each source that can change without a new connection: its connector's class and ``register_options``."""
 
@@ -47,7 +47,7 @@ class Sources(NamedTuple):
 def check_sources(config: Config, files: LayoutFiles, recordings: Recordings, faults: Faults) -> Sources:
     """Check each source with its connector, and add the problems to ``faults``.
 
-    The function also completes the ``options`` of each source. They then contain all keys, with values
+    The function also completes the ``options`` of each source: they then have all keys, with values
     of the right types.
     """
     found = Sources({}, [], [], {}, {})
@@ -122,7 +122,15 @@ def _check_source(
 
 
 def note_options(index: int, connector: str, options: dict[str, Any], texts: dict[str, str], faults: Faults) -> None:
-    """Add the faults in a source's connector and the keys for it; ``index`` is the source's index in the file."""
+    """Add faults to ``faults`` if a source's connector is unknown, or the keys for the connector are wrong.
+
+    Args:
+        index: Index of the source in the file.
+        connector: Name of the connector.
+        options: The connector's keys in the section.
+        texts: The connector's keys in the properties file, as text.
+        faults: The faults of the configuration.
+    """
     key = f"source[{index}]"
     if what := registry.clash(connector):
         faults.add(f"{key}.connector: {what}")
@@ -212,8 +220,8 @@ def describe(
     Args:
         key: The section in the configuration, for messages.
         options: The model, its parameters and its folder.
-        layout: The layout of the block; None if the model's declarations define it.
-        name: The key in the section that names the model.
+        layout: The layout of the block; None if the model's declarations define the layout.
+        name: The key in the section whose value is the model.
 
     Raises:
         ConfigError: The model cannot be imported or described; the message begins with ``key``.

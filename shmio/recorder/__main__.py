@@ -20,7 +20,7 @@ from shmio.segment import Report
 from shmio.worker import BEAT_S, Worker
 
 NOTE = "to "
-"""Start of the recorder's status note if it has no problem. The name of its file follows."""
+"""Start of the recorder's status note while it has no problem; the name of its file follows."""
 WAITS = f"{NOTE}a file as soon as its trigger fires"
 
 

@@ -18,7 +18,7 @@ from shmio.errors import RecordingError
 RETRY_S: Final = 0.5
 """Time in s between attempts after a failed write."""
 WAIT_S: Final = 0.02
-"""Interval in s at which to check whether the previous file is complete."""
+"""Interval in s at which the output of a file checks whether the previous file is complete."""
 SLOW_S: Final = 2.0
 """A write that takes longer than this time in s is reported as a problem."""
 SUFFIX: Final = ".mem"
@@ -26,9 +26,14 @@ _NAMES: Final = 1000
 
 
 def create(directory: Path, instance: str, now: datetime | None = None) -> tuple[Path, int]:
-    """Create a file whose name has the instance and the time (UTC), and its directory if needed.
+    """Create a file that is named after the instance and the time (UTC), and its directory if needed.
 
     The function never changes an existing file. Only this user may read the new file.
+
+    Args:
+        directory: Directory of the file.
+        instance: Name of the instance.
+        now: The time for the name; None: the present time.
 
     Returns:
         The path and the file descriptor.
@@ -49,10 +54,10 @@ def create(directory: Path, instance: str, now: datetime | None = None) -> tuple
 
 
 class Output:
-    """Queues bytes from one thread, and writes them to a file in another.
+    """Queues bytes from one thread, and writes them to a file in another thread.
 
-    The bytes between two calls of :meth:`flush` are a piece. The file contains only whole pieces.
-    If the disk is full, the thread removes an incomplete piece from the file, and writes the piece
+    The bytes between two calls of :meth:`flush` are a piece. The file contains only whole pieces:
+    if the disk is full, the thread removes an incomplete piece from the file, and writes the piece
     again later. The file is locked (flock) while it is being written, so that no process takes it
     for the file of a dead recorder.
     """
@@ -106,7 +111,7 @@ class Output:
     # ---- called by the recorder's thread -----------------------------------------------------------------------------
 
     def write(self, data: bytes | memoryview) -> int:
-        """Append to the present piece. This does not wait for the disk."""
+        """Append data to the present piece, without waiting for the disk; return their number of bytes."""
         self._piece += data
         return len(data)
 
@@ -130,9 +135,9 @@ class Output:
 
     @property
     def full(self) -> bool:
-        """True if too many bytes wait for the disk.
+        """True if more than ``limit_bytes`` bytes wait for the disk.
 
-        It stays True until at most half of ``limit_bytes`` wait.
+        It then stays True until at most half of ``limit_bytes`` wait.
         """
         self._full = self.waiting > (self._limit // 2 if self._full else self._limit)
         return self._full
@@ -150,7 +155,7 @@ class Output:
         return ""
 
     def check(self) -> None:
-        """Raise RecordingError if the file was removed, because new data would be lost."""
+        """Raise RecordingError if the file was removed, so that further data would be lost."""
         if os.fstat(self._fd).st_nlink == 0:
             raise RecordingError(f"{self.path} was removed while it was being written")
 
@@ -170,7 +175,7 @@ class Output:
         return not self._thread.is_alive()
 
     def close(self, patience_s: float) -> bool:
-        """Write the waiting bytes, for at most ``patience_s`` seconds.
+        """End the file, and wait at most ``patience_s`` seconds until all waiting bytes are written.
 
         Return whether all bytes of the file are safely on the disk.
         """

@@ -1,4 +1,4 @@
-"""Closes a recording that a dead recorder left open: repairs its end, adds an index and footer."""
+"""Closes a recording that a dead recorder has left unclosed: repairs its end, adds an index and a footer."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from shmio.recording.format.records import (
 from shmio.recording.reading.reader import Reader
 
 CHECKED: Final = 128
-"""Number of chunks at the end of a file to verify. After a power cut, they may contain zeros."""
+"""Number of chunks at the end of a file to verify, because they may contain zeros after a power cut."""
 ZEROS_BYTES: Final = 1 << 20
 
 _MESSAGE: Final = struct.Struct("<HIQ")  # channel, sequence, log time

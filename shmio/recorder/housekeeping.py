@@ -1,6 +1,6 @@
-"""Closes recordings that earlier recorders left unclosed, and deletes old ones.
+"""Closes recordings that earlier recorders have left unclosed, and deletes old recordings.
 
-This runs in a separate thread, so that many files or a slow disk do not delay the recording.
+A separate thread does this, so that many files or a slow disk do not delay the recording.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from shmio.recorder.previous_recordings import about_of, is_own, own_files
 from shmio.recording.reading.reader import Reader
 
 LOOK_S: Final = 60.0
-"""Interval in s at which the folder is checked."""
+"""Interval in s at which the folder of the recordings is checked."""
 DAY_S: Final = 86_400
 log = logging.getLogger("shmio.recorder")
 
@@ -38,8 +38,8 @@ class _File(NamedTuple):
 class Housekeeper:
     """Thread that closes and deletes recordings.
 
-    It changes only recordings of this user and this instance that the same kind of recorder
-    (``by``) has written. It never changes a file that another process is writing.
+    The thread changes only recordings of this user and this instance that the same kind of recorder
+    (``by``) has written, and never a file that another process is writing.
     """
 
     def __init__(self, instance: str, settings: Settings, by: str, present: Callable[[], set[Path]]) -> None:
@@ -56,7 +56,7 @@ class Housekeeper:
         self._thread = threading.Thread(target=self._run, name="keeper", daemon=True)
 
     def start(self) -> None:
-        """Start the thread, which checks the folder at once."""
+        """Start the thread, which first checks the folder at once."""
         self._thread.start()
 
     def stop(self, patience_s: float = 0.5) -> None:
@@ -76,7 +76,7 @@ class Housekeeper:
             self._stop.wait(LOOK_S)
 
     def check_folder(self) -> None:
-        """Check the folder once: close recordings that were left unclosed, and delete old ones."""
+        """Check the folder once: close recordings that were left unclosed, and delete old recordings."""
         present = self._present()
         files = [_file(path) for path in own_files(Path(self._settings.directory), self._instance)]
         found = [file for file in files if file is not None]

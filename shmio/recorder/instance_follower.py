@@ -21,10 +21,10 @@ In a turn, the recorder reads the entries that are new since the last turn.
 LIVELY: Final = 256
 """If one block has more entries than this in a turn, the next turn comes sooner.
 
-Many commands fill an event ring fast.
+The reason is that many commands fill an event ring fast.
 """
 BATCH_BYTES: Final = 2 << 20
-"""Approximate number of bytes to read from one block in a turn. The next turn continues there."""
+"""Approximate number of bytes to read from one block in a turn; the next turn reads the rest."""
 
 _DOWN: Final[Mapping[Phase, ProcessEvent]] = {Phase.BACKOFF: ProcessEvent.DIED, Phase.FATAL: ProcessEvent.GAVE_UP}
 
@@ -108,11 +108,11 @@ class BlockFollower:
         return self._frames.cursor.last
 
     def restart_time(self) -> None:
-        """Give new entries their own times again, which may be before those of earlier entries."""
+        """Let the log time go back: give the next entries their own times, even if earlier ones have later times."""
         self._log_ns = 0
 
     def take(self, limit: int) -> Iterator[BlockEntry]:
-        """Yield the entries that were published so far, at most about ``limit`` entries."""
+        """Yield unread entries that were published so far: about ``limit`` at most."""
         retired = self.block.retired  # before the read, so that the last entries are read, too
         for _ in range(limit):
             side = self._next()
@@ -123,7 +123,7 @@ class BlockFollower:
             yield from self._entries(side)
 
     def remaining(self) -> Iterator[BlockEntry]:
-        """Yield gaps for the frames and events that are missing after the last entry."""
+        """Yield gaps for the frames and events that were overwritten after the last entry that was read."""
         for side in (self._frames, self._events):
             if side.cursor.last > side.last and side.held is None:
                 yield BlockEntry(self._log_ns, self, self._gap(side, side.cursor.last, 0))
@@ -174,14 +174,14 @@ class _ProcessState(NamedTuple):
 
 
 class ProcessWatch:
-    """Finds changes in the process table, even if a process was restarted between two checks."""
+    """Finds changes in the process table, including restarts of processes between two checks."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._known = self._now()
 
     def check(self) -> list[ProcessChange]:
-        """Return the changes since the last check, or since the watch was created."""
+        """Return the changes since the last check; at the first check, since this object was created."""
         before, self._known = self._known, self._now()
         changes = []
         for name, old in before.items():
@@ -192,7 +192,7 @@ class ProcessWatch:
         return changes
 
     def present(self) -> list[ProcessChange]:
-        """Return a process change for each process that ran or had failed at the last check."""
+        """Return a process change for each process that was running, or had failed, at the last check."""
         found = []
         for name, state in self._known.items():
             what = ProcessEvent.IS if state.phase is Phase.RUNNING else _DOWN.get(state.phase)
@@ -228,16 +228,16 @@ def _between(name: str, old: _ProcessState | None, now: _ProcessState) -> Iterat
 
 
 class StartPositions(NamedTuple):
-    """The positions after which to start reading, by the section of each block.
+    """The positions in the blocks after which to start reading: ``places``, by the section of each block.
 
-    For a block without a position, reading starts at the oldest frame if ``first`` is True, else
+    For a block without a position, reading starts with the oldest frame if ``first`` is True, else
     with the next new frame.
     """
 
     places: Mapping[int, BlockPosition] = {}
     first: bool = True
     reason: Reason = Reason.NOT_RUNNING
-    """Reason for a gap at the start."""
+    """Reason of a gap at the start."""
 
 
 FROM_THE_FIRST: Final = StartPositions()
@@ -246,8 +246,8 @@ FROM_THE_FIRST: Final = StartPositions()
 class InstanceFollower:
     """Reads each entry of an instance once, in order. Use it from one thread only.
 
-    It also follows blocks that a reload adds or replaces. Several files may be written from one
-    follower, one after another. No entry is lost between them.
+    The follower also reads blocks that a reload adds or replaces. A recorder may write several files
+    from one follower, one after another; no entry is lost between the files.
     """
 
     def __init__(
@@ -277,13 +277,13 @@ class InstanceFollower:
         self._follow(start)
 
     def restart_time(self) -> None:
-        """Give new entries their own times again, which may be before those of earlier entries."""
+        """Let the log time go back: give the next entries their own times, even if earlier ones have later times."""
         self.went_back = False
         for follower in (*self.followers, *self._watching):
             follower.restart_time()
 
     def again(self, start: StartPositions) -> InstanceFollower:
-        """Return a follower of the same instance and selection that starts at other positions."""
+        """Return a new follower of the same instance and selection, which starts at other positions."""
         tap = InstanceFollower(self.segment, start, self._selection)
         tap.done = self.done
         return tap
@@ -316,7 +316,7 @@ class InstanceFollower:
         return self.log_time(time.monotonic_ns())
 
     def take(self) -> tuple[list[BlockEntry | InstanceEntry], bool]:
-        """Return new entries in order, and whether there are more."""
+        """Return (entries, more): new entries in order, and whether further entries are unread."""
         state = self.segment.clock.read()  # before the blocks, so that all frames of a finished step are read
         self.segment.refresh()
         if self.segment.blocks is not self._known:
@@ -352,12 +352,12 @@ class InstanceFollower:
         return [InstanceEntry(now_ns, change) for change in changes]
 
     def remaining(self) -> list[BlockEntry]:
-        """Return gaps for the frames and events that are missing after the last entries."""
+        """Return gaps for the frames and events that were overwritten after the last entries that were read."""
         return [entry for follower in self.followers for entry in follower.remaining()]
 
     @property
     def pause_s(self) -> float:
-        """Time to wait before the next turn, in s. The rings keep entries much longer."""
+        """Time in s to wait before the next turn, which is much shorter than the rings keep entries."""
         rings = [follower.block.ring for follower in (*self.followers, *self._watching)]
         return min(
             [TURN_S / 10 if self._lively else TURN_S, *(ring.slot_count * ring.period_ns / 8e9 for ring in rings)]

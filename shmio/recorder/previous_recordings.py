@@ -21,17 +21,17 @@ from shmio.recording.reading.survey import survey
 from shmio.segment import Block, Segment
 
 ABOUT_BYTES: Final = 1 << 20
-"""Number of bytes to read at the start of a file, for the metadata about the instance."""
+"""Number of bytes to read at the start of a file, to find the metadata about the instance."""
 MAX_FILES: Final = 256
-"""Largest number of recordings to check: those with the newest names."""
+"""Maximum number of recordings to check; those with the newest names are checked."""
 
 log = logging.getLogger("shmio.recorder")
 
 
 def own_files(directory: Path, instance: str) -> list[Path]:
-    """Return the files that have the name of a recording of this instance.
+    """Return the files whose names are those of recordings of this instance.
 
-    Ignore files that are not regular files of this user, and log a warning.
+    Leave out files that are not regular files of this user, and log a warning about them.
     """
     name = re.compile(rf"{re.escape(instance)}-\d{{8}}T\d{{6}}Z(_\d+)?{re.escape(SUFFIX)}")  # does not match a50-test
     found: list[Path] = []
@@ -91,7 +91,7 @@ def last_positions(
         beat: Called at intervals, so that the process can write its heartbeat.
 
     Returns:
-        The positions, by the section of each block. A block that was not recorded has none.
+        The positions, by the section of each block. A block that was not recorded is missing.
     """
     found: dict[int, BlockPosition] = {}
     blocks = {block.section: block for block in (*segment.ended, *segment.blocks.values())}

@@ -1,4 +1,4 @@
-"""Records an instance to one file, or to a sequence of files that are rotated by size and age."""
+"""Records an instance to one file, or to a sequence of files that each have a limited size and duration."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ from shmio.segment import Event, Frame
 from shmio.version import __version__
 
 MAX_FILE_BYTES: Final = 16 << 20
-"""Largest size of a file that is attached to a recording."""
+"""Largest size in bytes of a file that is attached to a recording."""
 CHUNK_S: Final = 0.8
-"""Longest duration of a chunk, in s, so that a killed recorder loses less than a second."""
+"""Longest duration of a chunk in s: a killed recorder loses less than a second."""
 CLOSE_S: Final = 3.0
 CHECK_S: Final = 1.0
 """Interval in s at which to check whether the file was removed."""
 CONFIG_S: Final = 5.0
 """Interval in s at which to check whether the configuration has changed."""
 RENEWAL: Final = Backoff(1.0, 600.0)
-"""Back-off between attempts to start a new file, while fsync fails again and again."""
+"""Waits between attempts to start a new file, while fsync fails again and again."""
 
 log = logging.getLogger("shmio.recorder")
 
@@ -56,9 +56,9 @@ class AttachedFile(NamedTuple):
 
 
 AttachedFiles = Callable[[str | None, int], list[AttachedFile]]
-"""A function from a source's name and block number to the files to attach for the source.
+"""A function that returns the files to attach for a source, given by its name and the number of its block.
 
-If the name is None, the function returns the files of the instance.
+If the name is None, the function returns the files to attach for the instance.
 """
 
 
@@ -70,7 +70,7 @@ def no_attachments(_source: str | None, _block: int) -> list[AttachedFile]:
 class ConfigFiles:
     """Reads the files that a configuration names.
 
-    It skips files that cannot be read, and logs why.
+    Files that cannot be read are skipped, and the reason is logged.
     """
 
     def __init__(self, file: Path) -> None:
@@ -137,7 +137,7 @@ class _LostRange:
 
 @dataclass(slots=True)
 class RecordedBlock:
-    """A block in one file, with its start position and its last recorded frame and event.
+    """A block in one file, with the position at which it starts, and its last recorded frame and event.
 
     Frames and events in a recorded gap count as recorded.
     """
@@ -170,7 +170,7 @@ class RecordedBlock:
             self.event = number
 
     def lose(self, item: Frame | Event | Gap) -> int:
-        """Count an item as lost, and return the number of its frames or events."""
+        """Count an item as lost, and return how many frames or events it has: 1 if it is not a gap."""
         if isinstance(item, Gap):
             what, first, last = item.what, item.first, item.last
         else:
@@ -180,7 +180,10 @@ class RecordedBlock:
         return last - first + 1
 
     def found(self, before_ns: int) -> list[Gap]:
-        """Return gaps for the lost entries, and clear :attr:`lost`."""
+        """Return gaps for the lost frames and events, and clear :attr:`lost`.
+
+        ``before_ns`` is the log time of the entry after the gaps; 0 if no entry follows.
+        """
         block = self.follower.block
         lost, self.lost = self.lost, {}
         return [
@@ -194,7 +197,7 @@ class RecordedBlock:
 
 @dataclass(slots=True)
 class Counters:
-    """Numbers of recorded frames, of recorded events, and of missed frames and events."""
+    """The numbers of recorded frames, of recorded events, and of missed frames and events together."""
 
     frames: int = 0
     events: int = 0
@@ -202,7 +205,7 @@ class Counters:
 
 
 class Recorder:
-    """Records to one file. Call :meth:`run_once` repeatedly, then :meth:`close`, from one thread."""
+    """Records to one file. Call :meth:`run_once` again and again, then :meth:`close`, from one thread."""
 
     def __init__(
         self,
@@ -273,7 +276,7 @@ class Recorder:
         }
 
     def run_once(self) -> bool:
-        """Record new entries, and return whether there are more.
+        """Record new entries, and return whether further entries are unread.
 
         Raises:
             RecordingError: The file was removed.
@@ -283,7 +286,7 @@ class Recorder:
         return more
 
     def put(self, entries: Iterable[BlockEntry | InstanceEntry]) -> None:
-        """Record entries, and end the chunk if it is due.
+        """Record entries, and end the chunk if it has lasted long enough.
 
         Raises:
             RecordingError: The file was removed.
@@ -327,7 +330,7 @@ class Recorder:
             self._to_confirm = self.output.tell(), dict(self.places)
 
     def settle(self) -> None:
-        """Set :attr:`places` to the positions of the last recorded entries."""
+        """Update :attr:`places` to the positions after the last recorded entries."""
         self.places |= {section: followed.place for section, followed in self._followed.items()}
 
     @property
@@ -359,7 +362,7 @@ class Recorder:
     def close(self, patience_s: float = CLOSE_S) -> bool:
         """Record the remaining entries, and close the file.
 
-        Return False if it is not safely on the disk.
+        Return whether the file is safely on the disk.
         """
         while self.run_once():
             pass
@@ -460,13 +463,12 @@ def is_process_change(entry: BlockEntry | InstanceEntry) -> bool:
 class RotatingRecorder:
     """Records to a sequence of files.
 
-    It starts a new file when the present one is too large or old, and when a snapshot has set time
-    back.
+    The recorder starts a new file when the present file is too large or too old, and when a snapshot
+    has set time back. No entry is lost between two files.
 
-    No entry is lost between two files. It also starts a new file after a failed fsync, because part
-    of the old file may be lost. The new file begins at the last position that an fsync has
-    confirmed. It has the entries after this position that are still in the rings, and gaps for all
-    other entries.
+    It also starts a new file after a failed fsync, because a part of the old file may be lost. The
+    new file begins at the last position that an fsync has confirmed. It has the entries after this
+    position that are still in the rings, and gaps for those that are not.
     """
 
     def __init__(
@@ -524,7 +526,7 @@ class RotatingRecorder:
         )  # fmt: skip
 
     def run_once(self) -> bool:
-        """Record new entries, and return whether there are more.
+        """Record new entries, and return whether further entries are unread.
 
         Raises:
             RecordingError: The file was removed.
@@ -545,7 +547,10 @@ class RotatingRecorder:
         self.recorder.put(entries)
 
     def end(self) -> Mapping[int, BlockPosition]:
-        """End the recording without waiting for the disk. Return the last positions, by section."""
+        """End the recording without waiting for the disk.
+
+        Return the position after the last recorded entry of each block, by section.
+        """
         self.recorder.end()
         return self.recorder.places
 
@@ -556,7 +561,7 @@ class RotatingRecorder:
 
     @property
     def tap(self) -> InstanceFollower:
-        """The follower of the instance. After a failed fsync, a new follower replaces it."""
+        """The follower from which this recorder reads; after a failed fsync, a new one replaces it."""
         return self.recorder.tap
 
     @property
@@ -571,7 +576,7 @@ class RotatingRecorder:
 
     @property
     def waiting(self) -> int:
-        """Number of bytes that wait for the disk."""
+        """Number of bytes, of all files, that wait for the disk."""
         return sum(recorder.output.waiting for recorder in (*self._ending, self.recorder))
 
     @property
@@ -580,7 +585,7 @@ class RotatingRecorder:
         return next(filter(None, (recorder.problem for recorder in (*self._ending, self.recorder))), "")
 
     def tend(self) -> bool:
-        """Start a new file if one is due. Return True if it replaces a file whose fsync failed."""
+        """Start a new file if one is due. Return True if the new file replaces a file whose fsync failed."""
         for old in [old for old in self._ending if old.output.ended and not old.output.doubt]:
             old.output.close(0)
             self._ending.remove(old)

@@ -1,4 +1,4 @@
-"""Records to a file when a trigger fires. The file includes the seconds before the trigger."""
+"""Records a file when a trigger fires. The file also has the seconds before that."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from shmio.segment import Block, Frame, Quality
 from shmio.segment.block import Layouts
 
 ENTRY_BYTES: Final = 800
-"""Approximate memory that an entry takes besides its images, in bytes."""
+"""Approximate memory in bytes that an entry takes in addition to its images."""
 
 log = logging.getLogger("shmio.recorder")
 
@@ -31,7 +31,7 @@ log = logging.getLogger("shmio.recorder")
 class Trigger:
     """Evaluates the trigger's condition at each frame of the sources that the condition reads.
 
-    It uses the values that readers see. The values of a bad frame count as unknown.
+    The trigger uses the values that readers see. The values of a bad frame count as unknown.
     """
 
     def __init__(self, when: str, blocks: Mapping[str, Block]) -> None:
@@ -45,9 +45,9 @@ class Trigger:
         self._bind(blocks)
 
     def follow(self, blocks: Mapping[str, Block]) -> None:
-        """Find the registers again after a reload.
+        """Find the condition's registers in the instance's blocks, for example after a reload.
 
-        If a register is missing, the trigger does not fire.
+        While a register is missing, the trigger does not fire.
         """
         if blocks is not self._blocks:
             try:
@@ -66,7 +66,7 @@ class Trigger:
         self._memory = Memory()
 
     def sees(self, entry: BlockEntry | InstanceEntry) -> bool:
-        """Return whether the entry is a frame at which the condition is true."""
+        """Take the next entry; return whether it is a frame at which the condition is true."""
         if isinstance(entry, InstanceEntry) or not isinstance(entry.item, Frame):
             return False
         source = self._sections.get(entry.follower.block.section, "")
@@ -84,7 +84,7 @@ class Trigger:
 
 
 class PreTriggerBuffer:
-    """Stores the entries of the last seconds before a trigger, within a limit of memory."""
+    """Stores the entries of the last seconds, for a trigger that may fire; the memory is limited."""
 
     def __init__(self, before_s: float, limit_bytes: int, places: Mapping[int, BlockPosition]) -> None:
         """Create the buffer. ``places`` are the positions after which to start, by section."""
@@ -97,7 +97,7 @@ class PreTriggerBuffer:
         """Positions after which the buffer starts now, by section of the block."""
 
     def add(self, entry: BlockEntry | InstanceEntry) -> None:
-        """Add an entry. Do not store a gap that arose before this recorder was started."""
+        """Add an entry, unless it is a gap from the time before this recorder was started."""
         item = entry.item
         if isinstance(item, Gap) and item.reason is not Reason.OVERTAKEN:
             self._pass(entry)
@@ -116,7 +116,7 @@ class PreTriggerBuffer:
             self._drop()
 
     def before(self, log_ns: int) -> list[BlockEntry | InstanceEntry]:
-        """Return the stored entries of the last seconds before a time, the oldest first."""
+        """Return the stored entries of the last seconds before the log time ``log_ns``, the oldest first."""
         self._trim(log_ns)
         return list(self._entries)
 
@@ -149,9 +149,9 @@ def _size(entry: BlockEntry | InstanceEntry) -> int:
 
 
 class TriggeredRecorder:
-    """Records a file each time the trigger fires, with some seconds before and after.
+    """Records a file each time the trigger fires, from some seconds before until some seconds after.
 
-    If the trigger fires again while a file is being written, that file becomes longer.
+    If the trigger fires again while a file is being written, this file becomes longer.
     """
 
     def __init__(
@@ -187,7 +187,7 @@ class TriggeredRecorder:
     def run_once(self) -> bool:
         """Read new entries, and record them if the trigger has fired.
 
-        Return whether there are more.
+        Return whether further entries are unread.
 
         Raises:
             RecordingError: The file was removed.

@@ -1,4 +1,4 @@
-"""Compares an instance with a plan: finds what has to change and why, and what cannot change while it runs."""
+"""Compares an instance with a plan: finds what must change and why, and what cannot change during a run."""
 
 from __future__ import annotations
 
@@ -17,10 +17,12 @@ from shmio.supervisor.fleet import Fleet, digest
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """The differences between an instance and a plan, as names.
+    """The differences between an instance and a plan.
 
-    The processes in ``replaced`` are restarted. The sources and emulators in ``changed`` keep their
-    process and its connections. ``add`` has the blocks to create, and ``retire`` those to remove.
+    ``kept``, ``started``, ``stopped``, ``replaced`` and ``changed`` have names of processes. Those in
+    ``replaced`` are restarted. Those in ``changed``, which are sources and emulators, keep running,
+    with their connections. ``add`` has the blocks to create, and ``retire`` the sources whose present
+    blocks are retired.
     """
 
     kept: tuple[str, ...]
@@ -35,9 +37,9 @@ class Changes:
 def reconcile(plan: Plan, epoch: int, fleet: Fleet, blocks: Iterable[Block]) -> Changes:
     """Compare a plan with the present processes and blocks.
 
-    A source is replaced together with its block, because the process of a source writes to one
-    block only. If the new source connects as before, the process keeps its connection, and continues
-    with the new block.
+    If a source's block is replaced, the source's process is restarted, because it writes to one block
+    only. If the source connects to its device as before, the process instead keeps its connection,
+    and continues with the new block.
     """
     present = {block.source: block for block in blocks}
     add = tuple(spec for spec in plan.blocks if spec.source not in present or not _same(spec, present[spec.source]))
@@ -122,7 +124,7 @@ MAX_VALUE: Final = 60
 
 
 def preview(plan: Plan, running: Plan, epoch: int, fleet: Fleet, segment: Segment) -> dict[str, list[str]]:
-    """Return what applying the plan to the running instance would do, as lines by kind of change. Change nothing.
+    """Return what applying a plan to a running instance would change, as lines by kind of change.
 
     Raises:
         SegmentError: There is no room for new processes or blocks.
@@ -207,7 +209,7 @@ def _changed_injections(plan: Plan, running: Plan) -> Iterator[str]:
 
 
 def injections_by_name(document: bytes) -> dict[str, Declaration]:
-    """Return the declared injections in a block's document."""
+    """Return the declared injections in a block's document, by name."""
     return {one.name: one for one in msgspec.json.decode(document or b"[]", type=tuple[Declaration, ...])}
 
 

@@ -27,13 +27,13 @@ TICK_S: Final = 0.1
 LATE_S: Final = 0.4
 """Time in s after which a heartbeat is late: two of its intervals."""
 _LOST: Final = {"mqtt": ("dropped", "changes"), "alerts": ("failed", "notices")}
-"""For each kind of process, the counter of what it loses while it has a problem, and what messages call that."""
+"""For each kind of process, the counter of what it loses during a problem, and the noun for that in messages."""
 
 log = logging.getLogger("shmio.supervisor")
 
 
 class ManagedProcess:
-    """A process slot with its job, its state (``life``), and the process while there is one."""
+    """A process slot with its job, its state (``life``), and its process (``child``; None if there is none)."""
 
     def __init__(self, slot: ProcessSlot) -> None:
         self.slot = slot
@@ -58,7 +58,7 @@ class ManagedProcess:
 
     @property
     def rank(self) -> int:
-        """Place in the order of start; a process of an unknown kind stops last."""
+        """The process's place in the order of start; a process of an unknown kind stops last."""
         return rank(self.slot.name, self.slot.kind)
 
     @property
@@ -74,17 +74,18 @@ class ManagedProcess:
         return self._job
 
     def renew(self, job: Job) -> None:
-        """Assign another job, and reset the state."""
+        """Assign another job to the slot, and reset the state."""
         self._job = job
         self.life = Life()
 
     def keep(self, job: Job) -> bool:
-        """Continue the process with a job from a new plan, and signal it to read its rules again.
+        """Continue the process with its job from a new plan. If the job has rules, signal it to reread them.
 
-        An adopted process is always signalled, because its former rules are unknown.
+        Rules are the part of the configuration that a process can read again while it runs.
 
         Returns:
-            True if the process was signalled, and has rules or had some.
+            True if the process was signalled, and its rules are not empty or, as far as known, were
+            not empty before.
 
         """
         reported = self.rereads(job)
@@ -95,7 +96,7 @@ class ManagedProcess:
         return reported
 
     def rereads(self, job: Job) -> bool:
-        """Return whether :meth:`keep` would signal the process, and it has rules or had some."""
+        """Return what :meth:`keep` would return, without any change."""
         known = job.rules or (self._job and self._job.rules)
         return bool(self.child is not None and job.rules is not None and known)
 
@@ -105,13 +106,13 @@ class ManagedProcess:
         return known and self.ready and self.life.state is State.RUNNING
 
     def follow(self, job: Job) -> None:
-        """Continue the process with a job that it has received, and wake it."""
+        """Continue the process with a job whose description it has received, and wake it."""
         self._job = job
         if self.child is not None:
             self.child.reread()
 
     def reports(self, activity: Activity) -> bool:
-        """Return whether the latest report of the present process has this activity."""
+        """Return whether the present process has reported this activity last."""
         report = self.slot.report
         return self.child is not None and report.pid == self.child.pid and report.activity is activity
 
@@ -136,12 +137,12 @@ class ManagedProcess:
 
     @property
     def advice(self) -> str:
-        """Advice to append to a message about a start that timed out; "" for other failures."""
+        """Advice for the message about a failed start if the start timed out; "" for other failures."""
         late = self.life.hang and self.life.hang in self.life.note
         return f"; see its log, {self.job.log_file}; the host may be overloaded" if late else ""
 
     def listen(self) -> None:
-        """Read the problem that the process reports; when a problem has ended, log how much was lost."""
+        """Read the problem that the process reports; if a problem has ended, log how much was lost during it."""
         running = self.life.state is State.RUNNING
         complaint = complaint_of(self.slot.kind, self.slot.report.note) if running else ""
         lost = _LOST.get(self.slot.kind, ("missed", "frames and events"))
@@ -153,7 +154,10 @@ class ManagedProcess:
         self.complaint = complaint
 
     def quiet_ns(self, elapsed_ns: int) -> int:
-        """Return the time in ns since the last heartbeat, without pauses of the supervisor itself."""
+        """Return the time in ns since the last heartbeat, not counting pauses of the supervisor itself.
+
+        ``elapsed_ns`` is the time since the last call, without such pauses.
+        """
         beat_ns = self.slot.heartbeat_ns
         # The first check of a running process also starts the count.
         fresh = beat_ns != self._beat_ns or self.life.state is not State.RUNNING
@@ -166,11 +170,17 @@ class ManagedProcess:
         return self._quiet_ns
 
     def waited_ns(self) -> int:
-        """Return how long the process has waited for a processor, in ns: since its start, or since it is late."""
+        """Return the time in ns for which the process has waited for a processor.
+
+        It is counted from the start of the process; if its heartbeat is late, from when that began.
+        """
         return 0 if self.child is None else self.child.waited_ns() - (self._waited_ns or 0)
 
     def end_note(self, pid: int, code: int | None) -> str:
-        """Return why the process ended, with its last message if it left one."""
+        """Return why the process ``pid`` ended, with its last message if there is one.
+
+        ``code`` is the exit code; None if it is unknown.
+        """
         end = describe_end(code)
         if code is not None and code <= 0:
             return end
@@ -224,7 +234,7 @@ def brief(error: Exception) -> str:
 
 
 class Fleet:
-    """All processes of a segment. Each pidfd in the selector has, as its data, the function to call."""
+    """All processes of a segment. When a process ends, the selector returns the function to call as data."""
 
     def __init__(
         self, segment: Segment, selector: selectors.BaseSelector, limits: Limits, modules: Mapping[str, str]
@@ -257,11 +267,11 @@ class Fleet:
 
     @property
     def ranked(self) -> list[tuple[int, Life]]:
-        """Rank and state of each process, in the order of iteration."""
+        """(rank, state) of each process, in the order of iteration over this object."""
         return [(managed.rank, managed.life) for managed in self]
 
     def assign(self, job: Job) -> None:
-        """Assign a job to a process that does not run; if the name is new, add a slot."""
+        """Assign a job to the process of this name, which does not run; if the name is new, add a slot for it."""
         managed = self._managed.get(job.name)
         if managed is None:
             slot = self._segment.processes.add(ProcessSpec(job.name, job.kind))
@@ -269,7 +279,7 @@ class Fleet:
         managed.renew(job)
 
     def offer(self, managed: ManagedProcess, job: Job) -> None:
-        """Give a running process the description of another job.
+        """Give a running process the description of another job, and signal it.
 
         Raises:
             OSError: The process has ended, or its description cannot be replaced.
@@ -291,7 +301,7 @@ class Fleet:
         self._segment.processes.remove(managed.slot)
 
     def adopt(self, managed: ManagedProcess, child: AdoptedProcess) -> None:
-        """Supervise a running process that another supervisor has started."""
+        """Supervise, as ``managed``, a running process that another supervisor has started."""
         managed.adopt(child)
         self._watch(managed, child)
 
@@ -300,7 +310,7 @@ class Fleet:
         self._apply_all(policy.to_start(self.ranked), Event.START)
 
     def stop_due(self) -> None:
-        """Stop the processes that are next in the order of stopping. Call this until all have stopped."""
+        """Stop the processes that are next in the order of stopping. Call this again until all have stopped."""
         self._apply_all(policy.to_stop(self.ranked), Event.STOP)
 
     def _apply_all(self, indices: list[int], event: Event) -> None:
@@ -309,7 +319,7 @@ class Fleet:
             self.apply(managed[index], event)
 
     def check(self, now_ns: int) -> None:
-        """Check all heartbeats and time limits."""
+        """Check the heartbeats and time limits of all processes, and act on the results."""
         # If the supervisor was paused (host suspended, container paused), so were all processes: this time
         # does not count.
         elapsed_ns = min(now_ns - self._ticked_ns, round(2 * TICK_S * 1e9))
@@ -359,7 +369,10 @@ class Fleet:
         os.close(worker.pidfd)
 
     def apply(self, managed: ManagedProcess, event: Event, note: str = "") -> None:
-        """Apply an event to the state of a process, and carry out the action that follows."""
+        """Apply an event to the state of a process, and carry out the resulting action.
+
+        ``note`` says how a process ended.
+        """
         before = managed.life
         managed.life, action = policy.step(before, event, time.monotonic_ns(), self._limits, note)
         if managed.life == before:

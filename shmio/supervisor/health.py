@@ -22,7 +22,7 @@ from shmio.supervisor.policy import State
 from shmio.supervisor.process import NOTIFY_VARIABLES
 
 QUALITY_S: Final = 0.5
-"""Interval in s at which the sources' quality is checked after the start."""
+"""Interval in s at which the quality of the sources is checked when the instance has started."""
 LOOK_S: Final = 5.0
 """Interval in s at which the folder of the log files is checked."""
 SILENT_S: Final = 15.0
@@ -32,7 +32,7 @@ _SOCKET, _WATCHDOG_USEC, _WATCHDOG_PID = NOTIFY_VARIABLES
 
 
 class LogFolder:
-    """Checks whether the log folder is writable, in a thread because a disk may hang."""
+    """Checks whether the log folder is writable, in a thread, because a disk may not answer."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -41,7 +41,7 @@ class LogFolder:
         self._found = ""
 
     def problem(self, now_ns: int) -> str:
-        """Return the problem that the last check found, or "". Start a new check if one is due."""
+        """Return the problem that the last check found; "" if none. Start another check if it is due."""
         waited_s = 0.0 if self._begun_ns is None else (now_ns - self._begun_ns) / 1e9
         if self._looking is not None and self._looking.is_alive():
             return f"log_dir: {self._folder}: the disk does not answer" if waited_s > SILENT_S else self._found
@@ -58,7 +58,7 @@ class LogFolder:
 
 
 class Notifier:
-    """Sends notifications to the service manager if ``$NOTIFY_SOCKET`` names one; see sd_notify(3).
+    """Sends notifications to the service manager, if ``$NOTIFY_SOCKET`` is set; see sd_notify(3).
 
     No method fails or blocks, with or without a service manager.
     """
@@ -69,7 +69,7 @@ class Notifier:
         self._beat_ns = 0
 
     def ready(self) -> None:
-        """Report that the start or a reload is complete."""
+        """Report that the start of the instance, or a reload, is complete."""
         self._send("READY=1")
 
     def reloading(self) -> None:
@@ -77,7 +77,7 @@ class Notifier:
         self._send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
     def stopping(self) -> None:
-        """Report that the stop has begun."""
+        """Report that the instance is stopping."""
         self._send("STOPPING=1")
 
     def status(self, text: str) -> None:
@@ -147,7 +147,13 @@ class Health:
         return qualities
 
     def publish(self, now_ns: int, *, started: bool, stopping: bool) -> None:
-        """Publish the state of the instance. This also serves as the supervisor's heartbeat."""
+        """Publish the state of the instance, and the supervisor's heartbeat.
+
+        Args:
+            now_ns: The present time, CLOCK_MONOTONIC.
+            started: Whether the start of the instance is complete.
+            stopping: Whether the instance is stopping.
+        """
         note = self._logs.problem(now_ns) or trail.problem()
         state = self._assess(now_ns, note) if started and not stopping else InstanceState.STARTING
         if stopping:

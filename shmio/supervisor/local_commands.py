@@ -1,10 +1,10 @@
 """Writes to the audit log what programs on this host do to the instance through its shared memory.
 
-No endpoint serves these programs. Only the sources receive their commands, and a source must not
-wait for a disk. Therefore a thread of the supervisor reads the sources' events. They have the number
-of each command, which contains the pid of the program. The instance's own processes write their
-entries themselves. If one of them was killed before it knew the outcome of a command, this module
-writes the entry.
+These programs use no endpoint that could write the entries. Only the sources receive their commands,
+and a source must not wait for a disk. Therefore, a thread of the supervisor reads the sources'
+events. An event about a command has the command's number, which contains the pid of the program. The
+instance's own processes write entries about their commands themselves. If such a process was killed
+before it knew the outcome of a command, this module writes the entry.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ if TYPE_CHECKING:
     from shmio.segment.explain import Explained, Explainer
 
 TURN_S: Final = 0.05
-"""Pause in s between two turns; it is shorter than the time in which an event ring fills."""
+"""Pause in s between two turns of the thread, which is shorter than the time in which an event ring fills."""
 LIVELY_S: Final = 0.005
-"""Pause after a turn in which a block had many events."""
+"""Pause in s after a turn in which a block had many events."""
 LIVELY: Final = 256
-"""Number of a block's events in one turn above which they count as many."""
+"""Number of events of a block in one turn above which they count as many."""
 MAX_READ: Final = 1024
-"""Maximum number of a block's events to read in one turn, so that the other blocks have theirs."""
+"""Maximum number of events of a block to read in one turn, so that the other blocks do not wait."""
 MAX_OPEN: Final = 4096
-"""Maximum number of commands of a block whose outcome is awaited."""
+"""Maximum number of commands of a block for whose outcomes to wait."""
 CLOSE_S: Final = 2.0
 """Longest time in s to wait for the end of the thread."""
 RESTARTED: Final = "the source was restarted before it reported the outcome"
@@ -61,7 +61,7 @@ class Programs:
         self._ended: dict[int, bool] = {}
 
     def look(self) -> None:
-        """Read the process table. Call this often: a program may have ended before its events are read."""
+        """Read the process table. Call this often, because a program may end before its events are read."""
         self._ended.clear()
         self._own |= {slot.report.pid for slot in self._segment.processes}
         for slot in self._segment.processes.external:
@@ -73,7 +73,12 @@ class Programs:
             self._others.clear()
 
     def is_own(self, pid: int, writer: int | None = None) -> bool:
-        """Return whether a process belongs to the instance; such processes write their entries themselves."""
+        """Return whether a process belongs to the instance, and therefore writes its entries itself.
+
+        Args:
+            pid: The process.
+            writer: The queue from which its command came; None if it is unknown.
+        """
         return pid in self._own or writer in _KINDS
 
     def has_ended(self, pid: int) -> bool:
@@ -83,7 +88,10 @@ class Programs:
         return self._ended[pid]
 
     def actor(self, pid: int, writer: int | None = None) -> Acting:
-        """Return who acts as the process with this pid."""
+        """Return who acts through the process with this pid, for an entry.
+
+        ``writer`` is the queue from which its command came; None if it is unknown.
+        """
         if self.is_own(pid, writer):
             kind = "web" if writer is None else _KINDS.get(writer, "web")
             return Acting(Actor("process", kind, f"pid {pid}, which ended before shmio could find its user"), kind)
@@ -277,7 +285,10 @@ _SNAPSHOTS: Final = {StateAction.SAVE: "save snapshot", StateAction.RESTORE: "re
 
 
 class TimeChanges:
-    """Writes to the audit log which programs move the instance's time. Use it from one thread."""
+    """Writes to the audit log which programs move the instance's time, and save or restore snapshots.
+
+    Use it from one thread.
+    """
 
     def __init__(self, segment: Segment, programs: Programs) -> None:
         self._clock = segment.clock
@@ -288,8 +299,8 @@ class TimeChanges:
     def turn(self) -> None:
         """Write entries for all changes since the last turn.
 
-        All steps of a turn share one entry. If several snapshots are saved or restored in a turn,
-        the last has an entry.
+        All steps since the last turn share one entry. If several snapshots were saved or restored,
+        only the last has an entry.
         """
         asked, before, now = self._clock.state_request(), self._before, self._clock.last_written()
         snapshot, self._asked = asked.number != self._asked and asked.action in _SNAPSHOTS, asked.number

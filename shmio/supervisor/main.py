@@ -35,11 +35,11 @@ from shmio.supervisor.takeover import take_over
 from shmio.wording import unknown
 
 START_TICK_S: Final = 0.01
-"""Interval in s of checks while a process starts: the process's report cannot wake the supervisor."""
+"""Interval in s of checks while a process starts, because the process's report does not wake the supervisor."""
 MAX_ADDRESSES: Final = 16
-"""Maximum number of a process's listening addresses in an answer."""
+"""Maximum number of listening addresses of one process in an answer."""
 ACTIONS: Final = {Stop: "down", Restart: "restart", Reload: "reload"}
-"""What the audit log calls each request."""
+"""The name of each request in the audit log."""
 NAME_S: Final = 1.0
 """Interval in s at which to check that the segment still exists under its name."""
 
@@ -84,15 +84,15 @@ class Supervisor:
         """Lines that say what an earlier supervisor left behind, and what was done with it."""
 
     def run(self) -> None:
-        """Start the instance, or take over what a dead supervisor left behind; return after a stop.
+        """Start the instance, or take over what a dead supervisor has left; return when it has stopped.
 
         Raises:
             AlreadyRunningError: Another supervisor runs the instance.
             SegmentError: There is not enough memory for the segment.
             ControlError: The control socket cannot be created.
-            ShmioError: A process could not be started, or the segment was removed; all processes
-                are stopped. Or the supervisor itself failed; its processes continue, and the next
-                supervisor can take them over.
+            ShmioError: A process could not be started, or the segment was removed, and all processes
+                were stopped; or the supervisor itself failed, and its processes continue, so that
+                the next supervisor can take them over.
 
         """
         with ExitStack() as stack:

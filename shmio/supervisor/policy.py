@@ -1,6 +1,7 @@
 """States of a supervised process, and all decisions about it, as functions of state and time.
 
-No I/O, no clock. The graph of states is in docs/reference/process-states.md.
+This module does no I/O, and reads no clock. The graph of states is in
+docs/reference/process-states.md.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class State(Enum):
 
 
 class Event(Enum):
-    """Events that can change a process's state. ELAPSED: the time limit of the state has passed."""
+    """Events that can change the state of a process. ELAPSED: the time limit of its state has passed."""
 
     START = "start"
     READY = "ready"
@@ -42,7 +43,7 @@ class Event(Enum):
 
 
 class Action(Enum):
-    """Action of the supervisor after a change of state."""
+    """What the supervisor must do after a change of a process's state."""
 
     SPAWN = "spawn"
     TERMINATE = "terminate"
@@ -118,7 +119,7 @@ PHASES: Final[Mapping[State, Phase]] = {
     State.BACKOFF: Phase.BACKOFF,
     State.FATAL: Phase.FATAL,
 }
-"""The published phase of each state. A process in transition has the phase that it will reach."""
+"""The published phase for each state. For a state of transition, it is the phase that the process will reach."""
 
 LIVING: Final = frozenset({State.STARTING, State.RUNNING, State.STOPPING, State.RESTARTING, State.HUNG})
 """States in which an operating-system process exists."""
@@ -127,7 +128,7 @@ LIVING: Final = frozenset({State.STARTING, State.RUNNING, State.STOPPING, State.
 REFUSED_STATUS = 2
 """Exit status of a process that can never work as configured."""
 RESTART: Final = Backoff(0.5, 10.0)
-"""The waiting times before starts of a process, from its second crash on."""
+"""The waiting times before restarts of a process, from its second crash on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,24 +138,24 @@ class Limits:
     start_s: float = 20.0
     """Time-out from the start of a process until it reports that it runs."""
     start_most_s: float = 60.0
-    """The same time-out for a process that has waited for a processor at least half of the time."""
+    """Time-out of a start during which the process has waited for a processor for at least half of the time."""
     hang_s: float = 5.0
-    """Longest time without a heartbeat, while the process runs."""
+    """Longest time without a heartbeat while a process runs; after that, it counts as hung."""
     hang_most_s: float = 20.0
-    """The same for a process that has waited for a processor at least half of this time."""
+    """The longest time for a process that has waited for a processor for at least half of the time."""
     grace_s: float = 5.0
     """Time from SIGTERM to SIGKILL."""
     kill_s: float = 5.0
     """Time from SIGKILL until a process that still exists counts as stuck."""
     stable_s: float = 5.0
-    """Time after which a running process counts as stable: its earlier crashes no longer count."""
+    """Time after which a running process counts as stable, so that its earlier crashes no longer count."""
     backoff: Backoff = RESTART
     start_attempts: int = 3
-    """Number of crashes of a process that has never run, at which the instance's start fails."""
+    """Number of crashes after which a process that has never run makes the instance's start fail."""
     settle_s: float = 3.0
     """Longest time to wait for the sources' first frames before the instance counts as started."""
     plan_s: float = 60.0
-    """Longest time for a reload to read the configuration and all files that it names."""
+    """Longest time that a reload may take to read the configuration and all files that it names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,34 +164,34 @@ class Life:
 
     state: State = State.STOPPED
     due_ns: int | None = None
-    """When the time limit of the state ends; None if the state has none."""
+    """When the time limit of the present state ends; None if the state has no limit."""
     spawned_ns: int = 0
     ready_ns: int | None = None
     """When the process reported that it runs; None from its start until then."""
     starts: int = 0
     crashes: int = 0
-    """Number of consecutive crashes. It is reset when the process has run stably."""
+    """Number of consecutive crashes, which is reset when the process counts as stable."""
     ran: bool = False
     """True if the process has ever run."""
     note: str = ""
-    """Why the process is not running."""
+    """Why the process is not running; empty while it runs."""
     hang: str = ""
-    """Why the process was last killed as hung. The note about its end includes this text."""
+    """Why the supervisor last killed the process as hung. The note about its end includes this text."""
     killed: bool = False
-    """True if the process was sent SIGKILL and has not ended yet."""
+    """True if the supervisor has sent SIGKILL to the process, which has not ended yet."""
     stuck: bool = False
     """True if the process has not ended in time after SIGKILL, because it waits in the kernel."""
 
     @property
     def restarts(self) -> int:
-        """Number of starts of the process after the first, for any reason."""
+        """Number of starts of the process, for any reason, without the first start."""
         return max(0, self.starts - 1)
 
 
 def step(life: Life, event: Event, now_ns: int, limits: Limits, note: str = "") -> tuple[Life, Action | None]:
-    """Return the state after an event, and the action to take.
+    """Return the state of a process after an event, and the action to take; None if there is no action.
 
-    ``note`` says how a process ended.
+    ``note`` says how the process ended, if that is the event.
     """
     edge = GRAPH[life.state].get(event)
     if edge is None:
@@ -252,7 +253,7 @@ def backoff_s(crashes: int, limits: Limits) -> float:
 
 
 def due(life: Life, now_ns: int, *, ready: bool, quiet_ns: int, limits: Limits, waited_ns: int = 0) -> Event | None:
-    """Return the event that the time or the process's report causes; None if there is none.
+    """Return the event that the present time or the process's report causes; None if there is no event.
 
     Args:
         life: The state of the process.
@@ -260,8 +261,8 @@ def due(life: Life, now_ns: int, *, ready: bool, quiet_ns: int, limits: Limits, 
         ready: True if the process has reported that it runs.
         quiet_ns: Time since the last heartbeat, in ns.
         limits: The limits that apply.
-        waited_ns: How long the process has waited for a processor, in ns: since its start or, if it runs,
-            while it gave no heartbeat.
+        waited_ns: How long the process has waited for a processor, in ns: since its start or, if it
+            runs, during the time without a heartbeat.
 
     """
     if life.state is State.STARTING:
@@ -279,12 +280,12 @@ def due(life: Life, now_ns: int, *, ready: bool, quiet_ns: int, limits: Limits, 
 
 
 def adopted(spawned_ns: int, restarts: int) -> Life:
-    """Return the state of an adopted process, from the records of its former supervisor."""
+    """Return the state of an adopted process, from its former supervisor's entry in the process table."""
     return Life(State.RUNNING, spawned_ns=spawned_ns, ready_ns=spawned_ns, starts=restarts + 1, ran=True)
 
 
 def ended(returncode: int | None) -> Event:
-    """Return the event for the end of a process; ``returncode`` is None if the exit status is unknown."""
+    """Return the event for the end of a process; ``returncode`` is the exit code, or None if it is unknown."""
     return Event.REFUSAL if returncode == REFUSED_STATUS else Event.EXIT
 
 
@@ -293,9 +294,9 @@ Ranked = Sequence[tuple[int, Life]]
 
 
 def to_start(processes: Ranked) -> list[int]:
-    """Return the indices of the processes to start: those of the lowest rank not started yet.
+    """Return the indices of the processes to start: those of the lowest rank that has not been started yet.
 
-    Higher ranks wait until processes of lower ranks run for the first time, or have failed.
+    Higher ranks wait until all processes of lower ranks have run for the first time, or have failed.
     """
     ranks = {rank for rank, life in processes if not life.starts}
     if not ranks or any(life.starts == 1 and life.state is State.STARTING for _, life in processes):
@@ -305,7 +306,7 @@ def to_start(processes: Ranked) -> list[int]:
 
 
 def to_stop(processes: Ranked) -> list[int]:
-    """Return the indices of the processes to stop: those of the highest rank not stopped yet.
+    """Return the indices of the processes to stop: those of the highest rank that has not stopped yet.
 
     Stuck processes do not delay the stop of others.
     """
@@ -325,7 +326,7 @@ def all_gone(processes: Ranked) -> bool:
 
 
 def start_failure(life: Life, limits: Limits) -> str | None:
-    """Return why this process makes the instance's start fail; None if it does not."""
+    """Return why a process makes the start of the instance fail; None if it does not."""
     if life.ran:
         return None
     if life.state is State.FATAL or life.stuck:
@@ -338,7 +339,7 @@ def start_failure(life: Life, limits: Limits) -> str | None:
 def start_over(
     processes: Ranked, qualities: Sequence[Quality | None], since_ns: int, now_ns: int, limits: Limits
 ) -> bool:
-    """Return whether the instance has started: all processes ran, and all sources have frames or are late.
+    """Return whether the start is over: all processes have run, and all sources have a frame or are late.
 
     Args:
         processes: Rank and state of each process.

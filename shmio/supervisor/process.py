@@ -1,4 +1,4 @@
-"""Starts or adopts one process, signals it, watches it by its pidfd, and describes its end."""
+"""Starts or adopts one process, signals it, holds the pidfd that reports its end, and describes its end."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pathlib import Path
 import shmio
 
 NOTIFY_VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
-"""Variables of the service manager: sd_notify(3), sd_watchdog_enabled(3)."""
+"""Environment variables of the service manager, see sd_notify(3) and sd_watchdog_enabled(3)."""
 _DESCRIPTION = "description"
 _PACKAGED = ("site-packages", "dist-packages")
 _TAIL_BYTES = 4096
@@ -39,7 +39,7 @@ class ChildProcess:
     def spawn(cls, module: str, description: bytes, log_file: Path) -> ChildProcess:
         """Start ``python -m module`` with ``description`` on its standard input.
 
-        Its output, such as the traceback of a crash, is appended to its log file.
+        The output of the process, such as the traceback of a crash, is appended to ``log_file``.
 
         Raises:
             OSError: The process cannot be started.
@@ -76,10 +76,10 @@ class ChildProcess:
         self._popen.send_signal(signal.SIGHUP)
 
     def describe_again(self, description: bytes) -> None:
-        """Replace the process's description, and signal it.
+        """Replace the process's description, and send SIGHUP, so that the process reads it.
 
         Raises:
-            OSError: The process cannot be given a new description.
+            OSError: The description cannot be replaced.
 
         """
         _write_description(self.pid, self.pidfd, description)
@@ -90,13 +90,13 @@ class ChildProcess:
         self._popen.kill()
 
     def reap(self) -> int:
-        """Close the pidfd of the ended process, and return the exit code (-n if signal n killed the process)."""
+        """Return the exit code of the ended process (-n if signal n has killed it), and close its pidfd."""
         code = self._popen.wait()
         os.close(self.pidfd)
         return code
 
     def waited_ns(self) -> int:
-        """Return how long the process's threads have waited for a processor, in ns; 0 if unknown."""
+        """Return how long the threads of the process have waited for a processor, in ns; 0 if unknown."""
         return _waited_ns(self.pid)
 
     def last_words(self) -> str:
@@ -129,10 +129,10 @@ class AdoptedProcess:
         self._send(signal.SIGHUP)
 
     def describe_again(self, description: bytes) -> None:
-        """Replace the process's description, and signal it.
+        """Replace the process's description, and send SIGHUP, so that the process reads it.
 
         Raises:
-            OSError: The process cannot be given a new description.
+            OSError: The description cannot be replaced.
 
         """
         _write_description(self.pid, self.pidfd, description)
@@ -152,7 +152,7 @@ class AdoptedProcess:
         os.close(self.pidfd)
 
     def waited_ns(self) -> int:
-        """Return how long the process's threads have waited for a processor, in ns; 0 if unknown."""
+        """Return how long the threads of the process have waited for a processor, in ns; 0 if unknown."""
         return _waited_ns(self.pid)
 
     def last_words(self) -> str:
@@ -202,7 +202,7 @@ def _open_log(file: Path) -> int:
 
 
 def describe_end(code: int | None) -> str:
-    """Return an exit code in words; ``code`` is None if the exit code is unknown."""
+    """Return in words how a process ended, from its exit code; None if the code is unknown."""
     if code is None:
         return "ended; its exit status is unknown, because an earlier supervisor started it"
     if code >= 0:
@@ -217,8 +217,8 @@ def child_environment() -> dict[str, str]:
     """Return the environment of a child, in which it imports the same shmio as the supervisor.
 
     Children run with ``-P``, so Python does not import from the current folder. If shmio is not in
-    site-packages, the folder that contains it is added to PYTHONPATH. (site-packages itself must not
-    be there: it would come before the standard library, and could hide its modules.)
+    site-packages, the folder that contains shmio is added to PYTHONPATH. (The folder site-packages
+    must not be added: it would come before the standard library, and could hide modules of it.)
     """
     environment = dict(os.environ, PYTHONFAULTHANDLER="1")
     # Otherwise gRPC prints a line for each bad handshake of any client, and the log would not rotate.

@@ -1,7 +1,7 @@
-"""Changes an instance to match its plan, after a reload or a take-over. ``changes`` compares the two.
+"""Changes an instance to match a plan, after a reload or a take-over. ``changes`` compares the two.
 
-Processes and blocks that already match are not touched. For a reload, a thread makes the plan, so
-that supervision continues meanwhile. The supervisor's loop then applies the plan.
+Processes and blocks that already match the plan are not touched. For a reload, a thread makes the
+plan, so that supervision continues meanwhile. The supervisor's loop then applies the plan.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from shmio.supervisor.health import Notifier
 from shmio.supervisor.policy import Event, Limits, State
 
 PAUSE_S: Final = 6.0
-"""Time in s within which a process whose registers change must pause. Otherwise the supervisor restarts it."""
+"""Time in s within which a process whose registers change must pause; otherwise, the supervisor restarts it."""
 FOLLOW_S: Final = 20.0
-"""Time in s within which such a process must run with its new registers. Otherwise the supervisor restarts it."""
+"""Time in s within which such a process must then run with its new registers; otherwise, it is restarted."""
 _SETTLED = (State.RUNNING, State.BACKOFF, State.FATAL, State.STOPPED)
 
 
@@ -171,7 +171,10 @@ class InstanceChange:
         return [job for job in self.plan.jobs if job.name in names]
 
     def step(self) -> bool:
-        """Continue as far as possible now; return True when each new process runs or has failed once."""
+        """Do what is possible now; return True if the change is complete.
+
+        It is complete when each process that the change starts runs, or has failed once.
+        """
         if not self._stopped:
             self._stopped = self._stop()
             if self._stopped:
@@ -186,7 +189,7 @@ class InstanceChange:
 
     @property
     def stuck(self) -> str:
-        """A text about the processes that do not end although the change waits for them; "" if none."""
+        """Text about the processes that do not end although the change waits for their end; "" if none."""
         leaving = [] if self._stopped else [self._fleet.named(name) for name in self._leaving]
         return "; ".join(f"{managed.name}: {managed.life.note}" for managed in leaving if managed.life.stuck)
 
@@ -224,7 +227,7 @@ class InstanceChange:
         self._injections += injection_changes(block.source, before, after)
 
     def outcome(self) -> tuple[list[str], list[str]]:
-        """Return two lists of lines: what was done, and which problems there are."""
+        """Return (done, problems): a line for each thing that was done, and one for each problem."""
         done = [*(f"{name}: stopped" for name in self.changes.stopped), *self._injections]
         done += [f"{name}: the supervisor asked it to reload its tokens and roles" for name in self._signalled]
         done += self._followers.outcome()
@@ -284,7 +287,7 @@ class _PendingPlan:
 
 
 class Reloader:
-    """Holds the plan in force, and carries out one change of the instance at a time."""
+    """Holds the present plan of the instance, and carries out one change of the instance at a time."""
 
     def __init__(
         self,
@@ -316,7 +319,7 @@ class Reloader:
         return self._change is not None
 
     def busy(self) -> str | None:
-        """Return why another change cannot begin at present; None if it can."""
+        """Return why another change cannot begin now; None if it can."""
         if self._change is None:
             return None
         if stuck := self._change.stuck:
@@ -333,7 +336,10 @@ class Reloader:
         self._change = InstanceChange(self._fleet, self._segment, self.plan)
 
     def reload(self, answer: Answer) -> None:
-        """Make a new plan and apply it. Refuse this if another reload is in progress."""
+        """Begin to make a new plan, to be applied later. If another reload is in progress, refuse.
+
+        ``answer`` gets the outcome of the reload.
+        """
         reason = self.busy() or (self._planning and "another reload is being prepared; try again when it is done")
         if reason:
             answer.error(reason)
@@ -342,7 +348,7 @@ class Reloader:
         self._planning, self._answer = _PendingPlan(self._replan, self._limits.plan_s), answer
 
     def preview(self, answer: Answer) -> None:
-        """Make a new plan, and answer what a reload would do with it. This never delays a reload.
+        """Begin to make a new plan, and answer later what a reload would do. This never delays a reload.
 
         Requests that arrive while a plan is being made share the next plan, because the files may
         have changed in the meantime.
@@ -357,7 +363,7 @@ class Reloader:
             answer.error("a file of the configuration still cannot be read; check whether a file system hangs")
 
     def drop(self) -> None:
-        """Cancel the change, because the instance stops."""
+        """Cancel the reload and all previews, because the instance stops."""
         waiting = [*self._previewers, *self._next_previewers]
         for answer in [self._answer, *waiting] if self._answer else waiting:
             answer.error("the instance is stopping")
@@ -365,7 +371,7 @@ class Reloader:
         self._previewers, self._next_previewers = [], []
 
     def step(self) -> None:
-        """Continue the reload as far as possible now."""
+        """Do what is possible now of the reload, the change and the previews."""
         if self._planning is not None and (self._planning.over or self._planning.late):
             planning, self._planning = self._planning, None
             self._begin(planning)

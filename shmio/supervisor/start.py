@@ -1,4 +1,4 @@
-"""Checks before a start that the instance does not run, and that its ports and its log folder are free."""
+"""Checks, before an instance starts, that it does not run, and that its ports and log folder are free."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LOCK_NAME: Final = ".instance"
 
 
 def check_startable(plan: Plan) -> None:
-    """Check that an instance can start. Ports used by processes of a dead supervisor count as free.
+    """Check that an instance can start. Ports that processes of its dead supervisor use count as free.
 
     Raises:
         AlreadyRunningError: The instance is running; the message says how to stop it.
@@ -53,9 +53,10 @@ def _whose(plan: Plan) -> str:
 
 @contextmanager
 def hold_log_folder(folder: Path, instance: str) -> Iterator[None]:
-    """Create an instance's folder for log files, and lock it for the duration of a ``with`` block.
+    """Create an instance's folder for log files, and lock it during a ``with`` block.
 
-    Only one instance may use a folder, because the log files of two would have the same names.
+    Only one instance may use a folder, because the log files of two instances would have the same
+    names.
 
     Raises:
         ConfigError: Another instance uses the folder, or the folder cannot be written.

@@ -29,7 +29,9 @@ class TakenOver:
 
 
 def take_over(plan: Plan, control: str, limits: Limits) -> tuple[TakenOver | None, list[str]]:
-    """Take over the segment and the processes that match the plan; stop and remove all others.
+    """Take over a dead supervisor's segment, and its processes that run properly; end all other processes.
+
+    If the plan cannot use the segment, remove it, and end all of its processes.
 
     Args:
         plan: The plan of the instance.
@@ -37,7 +39,8 @@ def take_over(plan: Plan, control: str, limits: Limits) -> tuple[TakenOver | Non
         limits: Time-outs for the processes.
 
     Returns:
-        What was taken over, or None; and a line about each thing that was done.
+        What was taken over, or None if there was no segment that the plan can use; and a line about
+        each thing that was done.
 
     Raises:
         AlreadyRunningError: A supervisor is alive.
