@@ -116,8 +116,8 @@ def measure(period_ms: float, round_trip_ms: float, count: int) -> None:
                     times[name].append(taken_ms)
     link = f", link +{round_trip_ms:g} ms" if round_trip_ms else ""
     title = f"poll each {period_ms:g} ms{link}"
-    report_spread(f"{title}: until confirmed, ms", confirmed, OURS, digits=2)
-    report_spread(f"{title}: until seen in the block, ms", seen, OURS, digits=2)
+    report_spread(f"{title}, until confirmed", "ms", confirmed, OURS, digits=2)
+    report_spread(f"{title}, until seen in the block", "ms", seen, OURS, digits=2)
     rows = [[name, *(f"{cut:.2f}" for cut in quantiles(times))] for name, times in writer.stages.items()]
     table([f"{title}: shmio's stages, ms", "median", "p90", "p99"], rows)
 

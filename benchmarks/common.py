@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import csv
 import gc
 import itertools
 import json
@@ -27,6 +28,10 @@ ROOT = HERE.parent
 DB201 = ROOT / "shmio/cli/a50/db201.db"
 """The reference load: a block of 2,180 bytes with 20 REALs that change."""
 
+HISTORY = ROOT / "docs/reference/benchmark-history.csv"
+"""Figures of earlier runs, which the documentation site plots."""
+
+Better = Literal["less", "more"]
 Samples = Mapping[str, Sequence[float]]
 PATIENCE_S = 20.0
 """The longest time for which a client waits for a value."""
@@ -36,17 +41,46 @@ PATIENCE_S = 20.0
 
 
 def begin(description: str) -> bool:
-    """Parse the option that all benchmarks have, and print the title and the machine.
+    """Parse the options that all benchmarks have, and print the title and the machine.
 
     Return whether ``--quick`` was given.
     """
     parser = argparse.ArgumentParser(description=description)
-    parser.add_argument(
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument(
         "--quick", action="store_true", help="fewer and shorter rounds, which check only that the benchmark works"
     )
-    quick: bool = parser.parse_args().quick
+    length.add_argument(
+        "--store", action="store_true", help=f"append the most important figures to {HISTORY.relative_to(ROOT)}"
+    )
+    options = parser.parse_args()
+    if options.store:
+        _stored_as.extend([time.strftime("%Y-%m-%d"), _commit(parser), Path(sys.argv[0]).stem])
+    quick: bool = options.quick
     print(f"# {description}\n{machine()}")
     return quick
+
+
+_stored_as: list[str] = []
+"""With ``--store``: the first columns of the run's figures, which are date, commit and benchmark."""
+
+
+def _commit(parser: argparse.ArgumentParser) -> str:
+    """Return the commit that is measured. It has all changes but those of the history."""
+    status = ["git", "status", "--porcelain", "--", ".", f":!{HISTORY.relative_to(ROOT)}"]
+    if subprocess.run(status, cwd=ROOT, check=True, capture_output=True).stdout:
+        parser.error("--store: commit your changes first, so that the figures have a commit")
+    commit = ["git", "rev-parse", "--short=8", "HEAD"]
+    return subprocess.run(commit, cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
+
+
+def keep(figure: str, value: float, unit: str, better: Better) -> None:
+    """Append a figure to the history, with the load of the machine by now, if ``--store`` was given."""
+    if _stored_as:
+        number = f"{value:.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+        row = [*_stored_as, figure, number, unit, better, f"{os.getloadavg()[0]:.1f}"]
+        with HISTORY.open("a", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerow(row)
 
 
 def machine() -> str:
@@ -126,6 +160,8 @@ Connect = Callable[[ExitStack], Callable[[], object]]
 def compare_clients(title: str, clients: Mapping[str, Connect], count: int, rounds: int, round_s: float) -> None:
     """Print the values a second and the CPU time a value of clients in this process, which take turns.
 
+    The history keeps shmio's figures relative to the second client's.
+
     Args:
         title: The title of the table.
         clients: The clients by name. The first one is shmio's.
@@ -138,7 +174,9 @@ def compare_clients(title: str, clients: Mapping[str, Connect], count: int, roun
     samplers = {name: _turn(connect, count, round_s, used[name]) for name, connect in clients.items()}
     rates = {name: statistics.median(found) for name, found in interleave(samplers, rounds).items()}
     costs = {name: statistics.median(found) for name, found in used.items()}
-    ours = next(iter(clients))
+    ours, peer = list(clients)[:2]
+    keep(f"{title}: rate relative to {peer}", rates[ours] / rates[peer], "ratio", "more")
+    keep(f"{title}: CPU time relative to {peer}", costs[ours] / costs[peer], "ratio", "less")
     rows = [
         [name, f"{rates[name]:.0f}", f"{costs[name]:.2f}"]
         + (["", ""] if name == ours else [f"{rates[ours] / rates[name]:.2f}", f"{costs[ours] / costs[name]:.2f}"])
@@ -201,26 +239,36 @@ def follow(device: Child, newest: Callable[[], object], period_s: float) -> Call
 # -- printing ----------------------------------------------------------------------------------------------------------
 
 
-def report(title: str, samples: Samples, ours: str, better: Literal["less", "more"]) -> None:
-    """Print best and median of each contender, and the ratio of its median to the median of ours."""
+def report(title: str, unit: str, samples: Samples, ours: str, better: Better, peer: str | None = None) -> None:
+    """Print best and median of each contender, and the ratio of its median to the median of ours.
+
+    The history keeps our median, and how many times as fast as ``peer`` we are.
+    """
     own = statistics.median(samples[ours])
+    keep(f"{title}: {ours}", own, unit, better)
     rows = []
     for name, values in samples.items():
         median = statistics.median(values)
         best, ratio = (min(values), median / own) if better == "less" else (max(values), own / median)
         rows.append([name, f"{best:.0f}", f"{median:.0f}", "" if name == ours else f"{ratio:.2f} times as fast"])
-    table([title, "best", "median", "shmio is"], rows)
+        if name == peer:
+            keep(f"{title}: {ours}, times as fast as {peer}", ratio, "ratio", "more")
+    table([f"{title}, {unit}", "best", "median", "shmio is"], rows)
 
 
-def report_spread(title: str, samples: Samples, ours: str, digits: int = 1) -> None:
-    """Print median, p90 and p99 of each contender's times, and the ratio of its median to the median of ours."""
+def report_spread(title: str, unit: str, samples: Samples, ours: str, digits: int = 1) -> None:
+    """Print median, p90 and p99 of each contender's times, and the ratio of its median to the median of ours.
+
+    The history keeps our median.
+    """
     own = statistics.median(samples[ours])
+    keep(f"{title}: {ours}", own, unit, "less")
     rows = []
     for name, values in samples.items():
         cuts = quantiles(values)
         ratio = "" if name == ours else f"{cuts[0] / own:.2f} times as fast"
         rows.append([name, *(f"{cut:.{digits}f}" for cut in cuts), ratio])
-    table([title, "median", "p90", "p99", "shmio is"], rows)
+    table([f"{title}, {unit}", "median", "p90", "p99", "shmio is"], rows)
 
 
 def table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 
-from common import Child, CpuTime, begin, table
+from common import Child, CpuTime, begin, keep, table
 from instance import Instance, instance
 
 PERIOD_MS = 20
@@ -39,6 +39,7 @@ def measure(running: Instance, subscribers: Child | None, duration_s: float) -> 
     rows.append(["instance", *percent(*ours)])
     rows += [[name, *percent(name)] for name in used if name not in ours]
     count = len(REGISTERS) if subscribers else 0
+    keep(f"an instance with {count} subscribers", float(percent(*ours)[-1]), "% of a core", "less")
     table([f"{count} subscribers, % of a core", "user", "system", "sum"], rows)
     print(f"in {taken_s:.1f} s: {frames} frames, {messages} changes encoded")
 

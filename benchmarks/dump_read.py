@@ -131,7 +131,8 @@ def scans(file: Path, path: str, rounds: int) -> None:
     expected = ways[OURS]()
     assert all(np.array_equal(way(), expected) for way in ways.values())
     samples = {name: (lambda way=way: len(expected) / timed(way)) for name, way in ways.items()}
-    report(f"scan of one register, {len(expected)} frames: frames/s", interleave(samples, rounds), OURS, "more")
+    title = f"scan of one register, {len(expected)} frames"
+    report(title, "frames/s", interleave(samples, rounds), OURS, "more", "mcap library and struct")
 
 
 def seeks(file: Path, count: int) -> None:
@@ -149,7 +150,7 @@ def seeks(file: Path, count: int) -> None:
             other = seek_by_library(reader, time_ns)
             others.append((time.perf_counter() - begun_s) * 1e3)
             assert found == other >= time_ns
-    report_spread("seek, ms", {"shmio": ours, "mcap library, its summary read": others}, "shmio", digits=2)
+    report_spread("seek", "ms", {"shmio": ours, "mcap library, its summary read": others}, "shmio", digits=2)
 
     def opened() -> None:
         with shmio.open_dump(file):
@@ -163,7 +164,7 @@ def seeks(file: Path, count: int) -> None:
         "shmio": lambda: timed(opened) * 1e3,
         "mcap library, get_summary": lambda: timed(opened_by_library) * 1e3,
     }
-    report_spread("opening, ms", interleave(opening, max(3, count // 40)), "shmio", digits=1)
+    report_spread("opening", "ms", interleave(opening, max(3, count // 40)), "shmio", digits=1)
 
 
 def exports(file: Path, folder: Path, frames: int) -> None:

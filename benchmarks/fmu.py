@@ -32,6 +32,7 @@ from tests.fmus import build
 
 DT_NS = 20_000_000
 OURS = "shmio, the runner alone"
+FMPY_AND_CELL = "FMPy in a loop, with the runner of the A50 cell"
 OUTPUTS = {
     "tank2": ["level", "runs", "a/b caption", "phase", "calls"],
     "plant3": ["position", "small_out", "bits_out", "text_out", "big_out", "byte", "mode"],
@@ -183,7 +184,7 @@ def main() -> None:
                     },
                     rounds,
                 )
-            report(f"{name}.fmu: steps a second", samples, OURS, "more")
+            report(f"{name}.fmu", "steps/s", samples, OURS, "more", "FMPy alone")
         file = build("tank2", Path(folder))
         config = Path(folder) / "supervisor.toml"
         config.write_text(HEAD + COUPLED.format(file=file))
@@ -195,12 +196,13 @@ def main() -> None:
                     {
                         ours: local(running.segment.instance, duration_s),
                         "shmio, a laboratory: one process": laboratory(config, duration_s),
-                        "FMPy in a loop, with the runner of the A50 cell": coupled_alone(file, duration_s, cell=True),
+                        FMPY_AND_CELL: coupled_alone(file, duration_s, cell=True),
                         "FMPy in a loop, the FMUs only": coupled_alone(file, duration_s, cell=False),
                     },
                     rounds,
                 )
-            report(f"two coupled tanks of {work_us} us and the A50 cell: steps a second", samples, ours, "more")
+            title = f"two coupled tanks of {work_us} us and the A50 cell"
+            report(title, "steps/s", samples, ours, "more", FMPY_AND_CELL)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import threading
 import time
 from typing import Any
 
-from common import Child, CpuTime, begin, table
+from common import Child, CpuTime, begin, keep, table
 
 from shmio.client import Client, Update, connect
 
@@ -86,6 +86,7 @@ def measure(registers: int, hz: float, rounds: int, seconds: float) -> None:
     rows = []
     for name, found in samples.items():
         median = {key: statistics.median(one[key] for one in found) for key in found[0]}
+        keep(f"{registers} registers, {name}", median["elements"], "registers/s", "more")
         rows.append(
             [
                 name,

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from common import DB201, HERE, begin, db201, interleave, median_ratio, table
+from common import DB201, HERE, begin, db201, interleave, keep, median_ratio, table
 
 from shmio.campaigns.live import Plan
 from shmio.config import Declaration, Expectation
@@ -150,6 +150,8 @@ def main() -> None:
             ]
             for contender, values in samples.items()
         ]
+        for contender, _, _, ratio in rows[1:]:
+            keep(f"{name}: {contender}, relative to the bare runner", float(ratio), "ratio", "more")
         table([name, "best", "median", "of the bare runner"], rows)
 
 

@@ -19,7 +19,7 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
-from common import begin, table
+from common import begin, keep, table
 
 from shmio.testing.cell import BIN, Cell, until
 from shmio.testing.ports import reserved_port
@@ -29,6 +29,8 @@ AXES = 4000
 ROUNDS = 5
 PATH = "s1/Axes/7/Pos"
 FIGURES = (min, statistics.median, max)
+KEPT = {"up": "up", "attach": "attach, and read a register", "get": "shmio get", "list": "shmio list"}
+"""Titles of what the history keeps."""
 
 LAYOUT = """DATA_BLOCK DB{number}
 {{ S7_Optimized_Access := 'FALSE' }}
@@ -113,6 +115,8 @@ def main() -> None:
         (folder / "supervisor.toml").write_text("".join(parts))
         cell = Cell(folder, name, grpc)
         found = [measure(cell) for _ in range(1 if quick else ROUNDS)]
+    for what, title in KEPT.items():
+        keep(title, statistics.median(one[what] for one in found), "s", "less")
     rows = [(what, *(f"{figure([one[what] for one in found]):.2f}" for figure in FIGURES)) for what in found[0]]
     table(["", "best", "median", "worst"], rows)
 

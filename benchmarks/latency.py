@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 
-from common import HERE, Child, begin, quantiles, table
+from common import HERE, Child, begin, keep, quantiles, table
 from instance import Polled, started
 
 from shmio.config.address import Address
@@ -43,6 +43,7 @@ def measure(period_ms: float, mean_change_ms: float, duration_s: float) -> None:
         [f"poll each {period_ms:g} ms, ms", "median", "p90", "p99"],
         [[name, *(f"{value:.2f}" for value in quantiles(values))] for name, values in rows.items()],
     )
+    keep(f"poll each {period_ms:g} ms: change to client, median", quantiles(rows["change to client"])[0], "ms", "less")
     polls, overruns = (after[name] - before[name] for name in ("polls", "overruns"))
     print(f"{len(stamps)} changes, {polls} polls, {overruns} overruns")
 

@@ -198,7 +198,7 @@ def main() -> None:
                             },
                             2 if quick else 9,
                         )
-                report(f"QoS {qos}, messages a second", samples, OURS, "more")
+                report(f"QoS {qos}", "messages/s", samples, OURS, "more", "paho, bare")
             rows = []
             for qos in (0, 1):
                 found = latencies(address, qos, 50 if quick else 1500)

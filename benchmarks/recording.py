@@ -24,7 +24,7 @@ from typing import IO, cast
 
 import mcap.writer
 import zstandard
-from common import CpuTime, begin, db201, table
+from common import CpuTime, begin, db201, keep, table
 
 from shmio.emulators.programs import A50
 from shmio.layout.model import Layout
@@ -137,6 +137,7 @@ def sizes(minutes: int) -> None:
                 library(Path(folder), some),
                 ours(Path(folder), layout, some),
             ]
+        keep(f"{name}, {HZ} Hz", contenders[-1] / minutes / 1e6, "MB/min", "less")
         rows.append([name, *(f"{size / minutes / 1e6:.3f}" for size in contenders), f"{SEED_MB:g}"])
     table([f"MB a minute at {HZ} Hz", "raw frames", "mcap defaults", "shmio", "the seed"], rows)
 

@@ -68,7 +68,7 @@ def main() -> None:
                     ),
                 ):
                     samples.setdefault(f"{where}, {who}", []).append(sample())
-    report("steps a second", samples, OURS, "more")
+    report("a model with 100 registers", "steps/s", samples, OURS, "more")
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ import threading
 import time
 from pathlib import Path
 
-from common import begin, db201, quantiles, table
+from common import begin, db201, keep, quantiles, table
 
 from shmio.config import Address
 from shmio.local.attach import attach
@@ -124,12 +124,14 @@ def main() -> None:
         for hz, seconds in ((50, 3 if quick else 60), (1000, 3 if quick else 30)):
             file = record(Path(folder), 1_000_000_000 // hz, hz * seconds)
             late_us = arrivals_us(Path(folder), file)
+            keep(f"{hz} Hz: arrival after its time, median", quantiles(late_us)[0], "µs", "less")
             cuts = [f"{late:.0f}" for late in (*quantiles(late_us), max(late_us))]
             rows.append([f"{hz} Hz", f"{len(late_us)}", *cuts])
         table(["arrival after its time, us", "frames", "median", "p90", "p99", "most"], rows)
         seconds = 20 if quick else 600
         file = record(Path(folder), 20_000_000, 50 * seconds)
         rate, missed = frames_per_s(Path(folder), file, seconds)
+        keep("50 Hz, as fast as it goes", rate, "frames/s", "more")
         titles = ["as fast as it goes", "frames/s", "times real time", "missed"]
         table(titles, [["50 Hz", f"{rate:.0f}", f"{rate / 50:.0f}", f"{missed}"]])
 

@@ -18,7 +18,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import grpc
-from common import begin, table
+from common import begin, keep, table
 
 from shmio.segment import Activity, Quality, Segment
 from shmio.testing.cell import CONFIG, Cell, kill, until
@@ -83,6 +83,8 @@ def main() -> None:
             for victim in ("plc", "cell", "grpc"):
                 time.sleep(STABLE_S)
                 found[victim].append(measure(cell, segment, victim))
+    for victim, times in found.items():
+        keep(f"{victim} serves again", statistics.median(serving_s for _, serving_s in times), "s", "less")
     rows = [
         [victim, *(f"{figure(column):.2f}" for column in zip(*times, strict=True) for figure in FIGURES)]
         for victim, times in found.items()

@@ -98,7 +98,7 @@ def compare(
         samplers = {name: per_second(read, round_s) for name, read in reads.items()}
         if packages is not None:
             samplers["C snap7 db_read"] = c_client(stack, address, pdu_size, packet_size, packages, round_s)
-        report(title, interleave(samplers, rounds), OURS, "more")
+        report(title, "reads/s", interleave(samplers, rounds), OURS, "more", "python-snap7 db_read")
 
 
 def measure_link(links: dict[str, Address], calls: int) -> None:
@@ -136,10 +136,10 @@ def main() -> None:
             if pdu_size == 480:
                 measure_link(links, calls)
             for name, place in links.items():
-                compare(place, pdu_size, None, f"PDU {pdu_size}, {name}, reads/s", rounds, round_s, packages)
+                compare(place, pdu_size, None, f"PDU {pdu_size}, {name}", rounds, round_s, packages)
             if pdu_size == 480:
                 for name, place in links.items():
-                    compare(place, pdu_size, SMALL, f"packetSize {SMALL}, {name}, reads/s", rounds, round_s, packages)
+                    compare(place, pdu_size, SMALL, f"packetSize {SMALL}, {name}", rounds, round_s, packages)
 
 
 if __name__ == "__main__":

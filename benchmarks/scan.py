@@ -149,7 +149,7 @@ def compare(title: str, contenders: dict[str, Callable[[], object]], rounds: int
     for name, call in contenders.items():
         cost_ns = min(per_call_ns(call, 3)() for _ in range(3))
         samplers[name] = per_call_ns(call, max(3, min(calls, int(calls * 1000 / cost_ns))))
-    report(f"{title}, ns", interleave(samplers, rounds), OURS, "less")
+    report(title, "ns", interleave(samplers, rounds), OURS, "less")
 
 
 def measure(layout: Layout, rounds: int, calls: int) -> None:

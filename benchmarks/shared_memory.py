@@ -196,8 +196,8 @@ def measure(contenders: list[Contender], frame: bytes, rounds: int, calls: int) 
             raise SystemExit(f"{contender.name}: the frame that was read differs from the frame that was published")
     publish = {contender.name: per_call_ns(contender.publish, calls) for contender in contenders}
     snapshot = {contender.name: per_call_ns(contender.snapshot, calls) for contender in contenders}
-    report("Python, publish, ns", interleave(publish, rounds), OURS, "less")
-    report("Python, snapshot, ns", interleave(snapshot, rounds), OURS, "less")
+    report("Python, publish", "ns", interleave(publish, rounds), OURS, "less")
+    report("Python, snapshot", "ns", interleave(snapshot, rounds), OURS, "less")
 
 
 # -- the C core --------------------------------------------------------------------------------------------------------
@@ -230,8 +230,8 @@ def measure_native(rounds: int, calls: int) -> None:
         f"ring_latest, {USUAL_SLOTS} slots": samples[f"latest {USUAL_SLOTS}"],
         "memcpy (the limit)": samples["copy_out 8"],
     }
-    report("C, publish, ns", publish, "ring_publish", "less")
-    report("C, snapshot, ns", snapshot, "ring_latest", "less")
+    report("C, publish", "ns", publish, "ring_publish", "less")
+    report("C, snapshot", "ns", snapshot, "ring_latest", "less")
 
 
 def main() -> None:

@@ -8,11 +8,12 @@ the cost of the client itself.
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Callable
 from contextlib import ExitStack
 
 import ready
-from common import HERE, Child, begin, interleave, median_ratio, per_second, report, table
+from common import HERE, Child, begin, interleave, keep, median_ratio, per_second, report, table
 from instance import started
 from stepping import PATHS
 
@@ -20,6 +21,8 @@ from shmio import attach
 
 OURS = "v2, 100 topics in one stream"
 BARE = "a bare server: {}"
+NATIVE = "shmio.v1, 100 registers in one update"
+LOCAL = "a program on the host, no subscriber"
 MODEL = f"""
 [[source]]
 name = "sim"
@@ -32,7 +35,7 @@ CONTENDERS = {
     "v2, a structure of 100 as one topic": "v2-structure",
     "v2, an array of 100 as one topic": "v2-array",
     "v1, 100 topics and model/clock": "v1",
-    "shmio.v1, 100 registers in one update": "native",
+    NATIVE: "native",
     "the same, steps on a stream, one by one": "native-stream",
     "the same, many steps for one request": "native-many",
     "SimServerAPI.step, no subscriber": "alone",
@@ -70,14 +73,18 @@ def main() -> None:
                 for name, kind in CONTENDERS.items()
                 if kind in kinds
             }
-        contenders["a program on the host, no subscriber"] = local(running.segment.instance, duration_s)
+        contenders[LOCAL] = local(running.segment.instance, duration_s)
         samples = interleave(contenders, rounds)
-    report("steps a second", samples, OURS, "more")
+    report("a model with 100 registers", "steps/s", samples, OURS, "more")
+    for name in (NATIVE, LOCAL):
+        keep(f"a model with 100 registers: {name}", statistics.median(samples[name]), "steps/s", "more")
     rows = [
         [name, f"{median_ratio(samples[name], samples[bare]):.2f}"]
         for name in CONTENDERS
         if (bare := BARE.format(name)) in samples
     ]
+    for name, ratio in rows:
+        keep(f"{name}: rate relative to a bare server", float(ratio), "ratio", "more")
     table(["beside a bare server with the same client", "of its rate"], rows)
 
 

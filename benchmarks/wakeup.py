@@ -389,8 +389,8 @@ def compare(what: str, readers: Readers, ways: Sequence[Way], count: int, rounds
             called, last = readers.measure(way, count, rounds // 5, rest_s)
             calls[way.name] += called
             lasts[way.name] += last
-    report_spread(f"{what}: until the last is back, µs", lasts, OURS)
-    report_spread(f"{what}: the writer's call, µs", calls, OURS)
+    report_spread(f"{what}, until the last is back", "µs", lasts, OURS)
+    report_spread(f"{what}, the writer's call", "µs", calls, OURS)
 
 
 def measure_native(counts: Sequence[int], rounds: int) -> None:
@@ -411,8 +411,8 @@ def measure_native(counts: Sequence[int], rounds: int) -> None:
             for name, called_ns, last_ns in map(str.split, lines):
                 calls.setdefault(name, []).append(float(called_ns) / 1000)
                 lasts.setdefault(name, []).append(float(last_ns) / 1000)
-            report_spread(f"C, processes, {count}: until the last is back, µs", lasts, "ring,frame")
-            report_spread(f"C, processes, {count}: the writer's call, µs", calls, "ring,frame")
+            report_spread(f"C, processes, {count}, until the last is back", "µs", lasts, "ring,frame")
+            report_spread(f"C, processes, {count}, the writer's call", "µs", calls, "ring,frame")
 
 
 def main() -> None:

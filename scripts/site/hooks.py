@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import api_pages
 import command_pages
+import history_pages
 import proto_pages
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
@@ -21,10 +22,12 @@ EXAMPLES: Final = {f"examples/{page.parent.name}/README.md": f"examples/{page.pa
 PROJECT: Final = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md", "SECURITY.md": "security.md"}
 PAGES: Final = {**EXAMPLES, **PROJECT}
 """Pages outside docs that are pages of the site, too, with their place there."""
+HISTORY, PLOTS = history_pages.pages(ROOT / "docs/reference/benchmark-history.csv")
 GENERATED: Final = {
     "Options of all commands": command_pages.pages(),
     "Public Python names": api_pages.pages(),
     "Messages of gRPC": proto_pages.pages(ROOT / "proto"),
+    "Figures": HISTORY,
 }
 """The generated pages, by group: title and text of each, by its path."""
 STYLE: Final = ".md-grid { max-width: 78rem; }  /* tables are wide */\n"
@@ -66,6 +69,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for part in GENERATED.values():
         for path, (_, text) in part.items():
             files.append(File.generated(config, path, content=text))
+    for path, plot in PLOTS.items():
+        files.append(File.generated(config, path, content=plot))
     files.append(File.generated(config, "site.css", content=STYLE))
     for name, path in PAGES.items():
         files.append(File.generated(config, path, content=(ROOT / name).read_text()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 import shutil
 import subprocess
@@ -315,3 +316,46 @@ def test_benchmark_of_falsification() -> None:
     found = printed("falsify")
     assert len(re.findall(r"^[12] +\d+\.\d\d +\d+$", found, re.MULTILINE)) == 2, found
     assert len(re.findall(r"^(?:tpe|cmaes|random|grid) +[01] of 1 +(?:\d+|over 10)$", found, re.MULTILINE)) == 4, found
+
+
+TINY = """
+from common import begin, report
+
+begin("tiny")
+report("copy", "ns", {"ours": [20.0, 30.0, 40.0], "theirs": [60.0, 60.0, 60.0]}, "ours", "less", "theirs")
+"""
+
+
+def test_a_benchmark_stores_its_figures_with_the_commit(tmp_path: Path) -> None:
+    (tmp_path / "benchmarks").mkdir()
+    shutil.copy(ROOT / "benchmarks/common.py", tmp_path / "benchmarks")
+    (tmp_path / "benchmarks/tiny.py").write_text(TINY)
+    history = tmp_path / "docs/reference/benchmark-history.csv"
+    history.parent.mkdir(parents=True)
+    history.write_text((ROOT / "docs/reference/benchmark-history.csv").read_text().splitlines(keepends=True)[0])
+    (tmp_path / ".gitignore").write_text("__pycache__\n")
+
+    def git(*words: str) -> str:
+        command = ["git", "-c", "user.name=x", "-c", "user.email=x@x", *words]
+        return subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, text=True).stdout.strip()
+
+    def run(*options: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "benchmarks/tiny.py", *options]
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+
+    git("init", "-q")
+    git("add", ".")
+    git("commit", "-q", "-m", "x")
+    assert [run(*options).returncode for options in ((), ("--store",), ("--store",))] == [0, 0, 0]
+    with history.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["figure"], row["value"], row["unit"], row["better"]) for row in rows] == 2 * [
+        ("copy: ours", "30", "ns", "less"),
+        ("copy: ours, times as fast as theirs", "2", "ratio", "more"),
+    ]
+    assert {(row["benchmark"], row["commit"]) for row in rows} == {("tiny", git("rev-parse", "--short=8", "HEAD"))}
+    (tmp_path / "benchmarks/tiny.py").write_text(TINY + "\n")
+    refused = run("--store")
+    assert refused.returncode == 2
+    assert "commit your changes first" in refused.stderr
+    assert run("--store", "--quick").returncode == 2

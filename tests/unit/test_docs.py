@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import re
 import runpy
+from datetime import date
 from functools import cache
 from pathlib import Path
 
@@ -60,3 +62,19 @@ def test_the_tour_is_short() -> None:
     """Two screens: the tour ends within 60 lines of text, output and commands."""
     before, _, _ = (ROOT / "README.md").read_text().partition("## Three scenarios")
     assert len([line for line in before.splitlines() if line and not line.startswith("```")]) <= 60
+
+
+def test_the_history_of_the_benchmarks_can_be_plotted() -> None:
+    """A figure keeps its unit, or its plot would mix two; runs are in the order of their dates."""
+    with (ROOT / "docs/reference/benchmark-history.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    units: dict[tuple[str, str], tuple[str, str]] = {}
+    for row in rows:
+        assert (ROOT / f"benchmarks/{row['benchmark']}.py").is_file(), row
+        assert re.fullmatch(r"[0-9a-f]{8}", row["commit"]), row
+        assert float(row["value"]) > 0, row
+        assert row["better"] in ("less", "more"), row
+        unit = row["unit"], row["better"]
+        assert units.setdefault((row["benchmark"], row["figure"]), unit) == unit, row
+    dates = [date.fromisoformat(row["date"]) for row in rows]
+    assert dates == sorted(dates)
