@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -74,6 +75,9 @@ def test_a_cell_is_monitored(make_cell: Callable[..., Cell], tmp_path: Path) -> 
         figures = get(f"http://{target}/metrics")
         checked = subprocess.run(["promtool", "check", "metrics"], input=figures, capture_output=True, check=False)
         assert (checked.returncode, checked.stdout, checked.stderr) == (0, b"", b"")
+        rules = (PACKAGING / "alerts.yml").read_text()
+        for name in re.findall(r"\bshmio_\w+", rules):
+            assert f"\n{name}".encode() in figures, f"alerts.yml has the unknown metric {name}"
         subprocess.run(["promtool", "check", "rules", PACKAGING / "alerts.yml"], check=True, capture_output=True)
         with prometheus(tmp_path / "prometheus", target, server) as api:
 
