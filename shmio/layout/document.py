@@ -6,7 +6,6 @@ again and compared.
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections import Counter
 from typing import Annotated
@@ -48,8 +47,12 @@ class _Layout(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 _DECODER = msgspec.json.Decoder(_Layout)  # msgspec crashes if two threads are the first to use a type
 
 
-def load_layout(data: bytes) -> Layout:
+def load_layout(data: bytes, digest: bytes | None = None) -> Layout:
     """Read and validate JSON that ``Layout.to_json`` should have written; the data may be hostile.
+
+    Args:
+        data: The JSON.
+        digest: The layout's :attr:`Layout.hash`, if the caller knows it.
 
     Raises:
         LayoutError: The JSON is malformed, or the layout is impossible. For example, registers
@@ -62,53 +65,55 @@ def load_layout(data: bytes) -> Layout:
         document = _DECODER.decode(data)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise LayoutError(f"layout: {error}") from None
-    registers = document.registers
-    for register in registers:
+    for register in document.registers:
         if not register.dims:
             msgspec.structs.force_setattr(register, "dims", ())
-    _check(document)
     layout = Layout(
-        document.name, document.number, document.size, document.optimized, registers,
+        document.name, document.number, document.size, document.optimized, document.registers,
         document.byte_order, document.status_offset,
     )  # fmt: skip
+    _check(document)
+    _check_paths(layout)
     _check_overlay(layout)
-    vars(layout)["hash"] = hashlib.sha256(data).digest()  # faster than making the JSON again
+    if digest is not None:
+        vars(layout)["hash"] = digest
     return layout
 
 
 def _check(document: _Layout) -> None:
-    """Raise LayoutError if a register is impossible, or if two registers contradict each other."""
-    kinds: dict[tuple[str, Dims], tuple[int, int, bool]] = {}
-    end_bits = elements = 0
+    """Raise LayoutError if a register is impossible, or if two registers share bits."""
+    lengths: dict[tuple[object, ...], int] = {}
+    end = 0  # in bits
+    elements = 0
     over = 0
     for register in document.registers:
-        kind = register.type, register.dims
-        size, count, has_bit = kinds.get(kind) or kinds.setdefault(kind, _kind(register))
+        elements += register.count
         if register.over:
             over += 1
-            elements += register.count
+            _kind(register)
             continue
         if over:
             raise LayoutError(f"layout: {register.path!r} must come before the registers that lie over the block")
-        if register.size != size or register.count != count or register.partial:
-            raise LayoutError(f"layout: {register.path!r} has a size or count that does not fit its type")
         bit = register.bit
-        if (bit is not None) != has_bit or (bit and register.dims):
-            raise LayoutError(f"layout: {register.path!r} has a bit that does not fit its type")
+        shape = register.type, register.dims, register.size, register.count, bit, register.partial
+        length = lengths.get(shape) or lengths.setdefault(shape, _length(register))
         first = register.offset * 8 + (bit or 0)
-        if first < end_bits:
+        if first < end:
             raise LayoutError(f"layout: {register.path!r} overlaps the register before it")
-        end_bits = first + (1 if has_bit and not register.dims else size * 8)
-        elements += count
+        end = first + length
     size = document.size if document.status_offset is None else document.status_offset
-    if end_bits > size * 8 or size > MAX_BLOCK_BYTES or elements > MAX_ELEMENTS:
+    if end > size * 8 or size > MAX_BLOCK_BYTES or elements > MAX_ELEMENTS:
         raise LayoutError(f"layout: the registers do not fit the block of {size} bytes")
     if document.status_offset is not None and document.size != size + status_bytes(len(document.registers) - over):
         raise LayoutError(f"layout: the status area at {size} does not fit the image of {document.size} bytes")
     if document.status_offset is not None and size % 8:
         raise LayoutError(f"layout: the status area at {size} is not aligned to 8 bytes")
-    paths = [register.path for register in document.registers]
-    if len(set(paths)) < len(paths):
+
+
+def _check_paths(layout: Layout) -> None:
+    """Raise LayoutError if two registers have the same path, or if a path is not in its canonical form."""
+    paths = [register.path for register in layout.registers]
+    if len(layout.by_path) < len(paths):
         twice = next(path for path, times in Counter(paths).items() if times > 1)
         raise LayoutError(f"layout: two registers have the path {twice!r}")
     try:
@@ -137,6 +142,21 @@ def _check_overlay(layout: Layout) -> None:
 
 def _place_of(register: Register) -> tuple[object, ...]:
     return register.offset, register.bit, register.size, register.count
+
+
+def _length(register: Register) -> int:
+    """Return the number of bits of a register of the block itself.
+
+    Raises:
+        LayoutError: The type does not exist, or size, count or bit do not fit type and bounds.
+
+    """
+    size, count, has_bit = _kind(register)
+    if register.size != size or register.count != count or register.partial:
+        raise LayoutError(f"layout: {register.path!r} has a size or count that does not fit its type")
+    if (register.bit is not None) != has_bit or (register.bit and register.dims):
+        raise LayoutError(f"layout: {register.path!r} has a bit that does not fit its type")
+    return 1 if has_bit and not register.dims else size * 8
 
 
 def _kind(register: Register) -> tuple[int, int, bool]:

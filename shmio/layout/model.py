@@ -8,7 +8,6 @@ a block with standard access, as given in Siemens' STEP 7 help under "Data types
 
 from __future__ import annotations
 
-import hashlib
 import math
 import operator
 import re
@@ -250,6 +249,8 @@ class Layout:
     @cached_property
     def hash(self) -> bytes:
         """SHA-256 of the canonical JSON: equal for equal layouts."""
+        import hashlib  # noqa: PLC0415  programs that only read need no digests, and it loads OpenSSL
+
         return hashlib.sha256(self.to_json()).digest()
 
     # A structure is found as a range of sorted paths. A table of all structures could be far larger

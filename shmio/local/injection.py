@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -329,6 +328,8 @@ def _read(declarations: Iterable[Mapping[str, Any] | Declaration]) -> list[Decla
         read = parse_campaign({"injection": tables}) if tables else []
     except ConfigError as error:
         raise DeclarationError(str(error)) from None
+    import secrets  # noqa: PLC0415  programs that only read need no random numbers, and it loads OpenSSL
+
     # 53 bits: every JSON reader represents such a number exactly.
     return [msgspec.structs.replace(one, seed=secrets.randbits(53)) if one.seed is None else one for one in read]
 

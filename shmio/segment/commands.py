@@ -8,7 +8,6 @@ its writes with :class:`CommandAssembler`.
 
 from __future__ import annotations
 
-import secrets
 import struct
 from collections.abc import Iterable, Sequence
 from enum import IntEnum
@@ -50,6 +49,8 @@ def first_number(pid: int) -> int:
     is random, to differ from the numbers of the queue's previous owner, whose outcomes may still
     follow.
     """
+    import secrets  # noqa: PLC0415  programs that only read need no random numbers, and it loads OpenSSL
+
     return pid << _PID_SHIFT | secrets.randbits(_PID_SHIFT - 1) | 1
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import secrets
 import struct
 import threading
 import time
@@ -197,7 +196,8 @@ def read_block(
 
     def layout() -> Layout:
         try:
-            found = load_layout(bytes(memory[described.offset : described.offset + described.size]))
+            data = bytes(memory[described.offset : described.offset + described.size])
+            found = load_layout(data, described.digest)
         except LayoutError as error:
             raise FormatError(f"{name}: block {described.name}: {error}") from None
         if found.size != frames.frame_size:
@@ -254,6 +254,8 @@ def _build_segment(
     origin: Origin | None = None,
 ) -> None:
     """Allocate a new shared-memory object, and write the whole segment; the magic number last."""
+    import secrets  # noqa: PLC0415  programs that only read need no random numbers, and it loads OpenSSL
+
     now_ns, begin_ns = time.monotonic_ns(), origin.clock_ns if origin else 0
     size = segment_size(blocks, len(processes))
     sections_size, processes_size = _table_sizes(len(blocks), len(processes))

@@ -276,7 +276,7 @@ class Reader:
             if hashlib.sha256(data).hexdigest() != digest:
                 raise RecordingError(f"{self.file}: the layout of {channel.topic} is damaged")
             try:
-                self._layouts[digest] = load_layout(data)
+                self._layouts[digest] = load_layout(data, bytes.fromhex(digest))
             except LayoutError as error:
                 raise RecordingError(f"{self.file}: the layout of {channel.topic}: {error}") from None
         return self._layouts[digest]
