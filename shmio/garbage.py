@@ -1,4 +1,4 @@
-"""Garbage collection while a process starts.
+"""Garbage collection while a process starts, or a command makes its output.
 
 The objects that a process creates at its start, such as modules, layouts and tables, live as long as
 the process. The collector would go through all of them again and again, and free nothing.
@@ -7,6 +7,8 @@ the process. The collector would go through all of them again and again, and fre
 from __future__ import annotations
 
 import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 
 def pause() -> None:
@@ -19,3 +21,15 @@ def resume() -> None:
     if not gc.isenabled():
         gc.freeze()
         gc.enable()
+
+
+@contextmanager
+def paused() -> Iterator[None]:
+    """Collect nothing in a ``with`` block. Later collections go through what was created in it."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Final
 
 from shmio.errors import ConfigError
+from shmio.wording import printable
 
 MAX_FILE_BYTES = 5_000_000
 KEPT_FILES = 3
@@ -198,13 +199,6 @@ def stamp(time_s: float) -> str:
 def with_fields(message: str, fields: Mapping[str, object]) -> str:
     """Return a message followed by its extra fields, as ``key=value``."""
     return " ".join([message, *(f"{key}={value}" for key, value in fields.items())])
-
-
-def printable(text: str) -> str:
-    """Return text as one line, without characters that would move a terminal's cursor."""
-    if text.isprintable():
-        return text
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 MAX_LINES: Final = 20

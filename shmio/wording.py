@@ -13,6 +13,13 @@ MAX_NAMES: Final = 30
 """Maximum number of valid words that a message lists."""
 
 
+def printable(text: str) -> str:
+    """Return text as one line, without characters that would move a terminal's cursor."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
 def counted(count: int, noun: str) -> str:
     """Return a number with its noun in singular or plural, such as ``1 node`` or ``7 nodes``."""
     return f"{count} {noun}{'s' * (count != 1)}"

@@ -20,7 +20,7 @@ from types import FrameType, MappingProxyType
 from typing import Any, Final, TextIO
 
 from shmio.errors import CommandError, ConfigError, ControlError, LayoutError, ShmioError
-from shmio.logs import printable
+from shmio.wording import printable
 
 MAX_SECONDS = 86_400
 SHOWN_CHARACTERS = 60

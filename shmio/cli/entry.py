@@ -12,6 +12,8 @@ import signal
 import sys
 from types import TracebackType
 
+from shmio import garbage
+
 
 def _hook(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
     """Print the traceback of an uncaught error, except for Ctrl-C."""
@@ -56,7 +58,8 @@ def _run(module: str) -> int:
     The status is 130 if Ctrl-C interrupts it.
     """
     try:
-        main = importlib.import_module(module).main
+        with garbage.paused():
+            main = importlib.import_module(module).main
         if _HEEDED:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         status: int = main(sys.argv[1:])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import queue
-import secrets
 import sys
 import threading
 import time
@@ -25,10 +24,9 @@ from shmio.layout.topic import Topic, look_up, parse_topic
 from shmio.layout.values.codec import Value
 from shmio.layout.values.typed import read_value
 from shmio.layout.values.write import Write, paths_of
-from shmio.logs import printable
 from shmio.model.cell import Campaign, Cell
 from shmio.model.injection import InjectionEvent
-from shmio.wording import unknown
+from shmio.wording import printable, unknown
 
 TURN_S: Final = 0.2
 """Interval in s at which the command checks for events, signals and the end of its time."""
@@ -209,6 +207,8 @@ def run_campaign(cell: Cell, options: argparse.Namespace) -> int:
             Nothing was started.
 
     """
+    import secrets  # noqa: PLC0415  the other verbs need no random numbers, and it loads OpenSSL
+
     from shmio.config.campaign import read_campaign  # noqa: PLC0415  only for a file
 
     seed = secrets.randbits(SEED_BITS) if options.seed is None else options.seed

@@ -14,9 +14,8 @@ from shmio.layout.compiler import Program, Source
 from shmio.layout.image import initial_value_warnings
 from shmio.layout.model import MAX_BLOCK_BYTES, Layout, Register
 from shmio.layout.source.lexer import MAX_SOURCE_BYTES
-from shmio.logs import printable
 from shmio.version import __version__
-from shmio.wording import counted, unknown
+from shmio.wording import counted, printable, unknown
 
 _HEADINGS = ("offset", "size", "type", "path", "over", "initial", "comment")
 

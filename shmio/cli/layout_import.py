@@ -10,8 +10,7 @@ from pathlib import Path
 from shmio.cli.common import run
 from shmio.layout.importing.found import ImportingError
 from shmio.layout.importing.importer import FORMATS, MAX_BYTES, import_tags
-from shmio.logs import printable
-from shmio.wording import EXISTS, NOT_TOML
+from shmio.wording import EXISTS, NOT_TOML, printable
 
 
 def main(arguments: Sequence[str]) -> int:

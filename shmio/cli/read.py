@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
+from shmio import garbage
 from shmio.cli.common import add_full, at_least, dumps, ended_by_interrupt, room, seconds
 from shmio.errors import NotRunningError, PathError
 from shmio.layout.glob import choose
@@ -18,9 +19,9 @@ from shmio.layout.model import Register
 from shmio.layout.values.codec import Value
 from shmio.layout.values.literal import literal_text
 from shmio.layout.values.text import json_value
-from shmio.logs import printable
 from shmio.model.cell import Cell
 from shmio.model.values import Provenance, Quality, Reading
+from shmio.wording import printable
 
 TABLE_EVERY_S = 0.2
 CLOCK_CHARACTERS = 12
@@ -34,20 +35,26 @@ def list_arguments(parser: argparse.ArgumentParser) -> None:
 
 def list_registers(cell: Cell, options: argparse.Namespace) -> int:
     """Print a line for each register, or all registers as one JSON list."""
+    with garbage.paused():
+        _list(cell, options)
+    return 0
+
+
+def _list(cell: Cell, options: argparse.Namespace) -> None:
     layouts = cell.layouts()
     found = [(f"{source}/{one.path}", one) for source, one in choose(options.patterns or layouts, layouts)]
     if options.json:
         print(dumps([_described(path, one) for path, one in found]))
-        return 0
-    width = max((len(path) for path, _ in found), default=0)
+        return
+    width = 2 + max((len(path) for path, _ in found), default=0)
     lines = [
-        f"{path:<{width}}  {_type(one)}{f'  {one.comment}' if one.comment else ''}".rstrip() for path, one in found
+        path.ljust(width) + (_array_type(one) if one.dims else one.type) + (one.comment and f"  {one.comment}".rstrip())
+        for path, one in found
     ]
     if not "".join(lines).isprintable():
         lines = [printable(line) for line in lines]
     if lines:
         print("\n".join(lines))  # printing each line takes longer than making it
-    return 0
 
 
 def _described(path: str, register: Register) -> dict[str, Any]:
@@ -55,9 +62,8 @@ def _described(path: str, register: Register) -> dict[str, Any]:
     return {"path": path, "type": register.type, "dims": dims, "comment": register.comment}
 
 
-def _type(register: Register) -> str:
-    if not register.dims:
-        return register.type
+def _array_type(register: Register) -> str:
+    """Return the type of an array, with its bounds."""
     bounds = ", ".join(f"{low}..{high}" for low, high in register.dims)
     return f"ARRAY[{bounds}] OF {register.type}"
 

@@ -10,9 +10,9 @@ from typing import Final
 import msgspec
 
 from shmio.cli.common import dumps
-from shmio.logs import printable
 from shmio.model.cell import Cell
 from shmio.model.replay import ReplayChanges, ReplayStatus
+from shmio.wording import printable
 
 _VERBS: Final = {
     "status": "show how the recordings play (default)",

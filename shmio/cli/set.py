@@ -14,10 +14,9 @@ from shmio.layout.model import Layout, Register
 from shmio.layout.topic import look_up, parse_topic
 from shmio.layout.values.codec import Value
 from shmio.layout.values.typed import read_value
-from shmio.logs import printable
 from shmio.model.cell import Cell
 from shmio.model.values import WRITE_MIN_PERIODS, WRITE_TIMEOUT_S, Outcome, OutcomeKind
-from shmio.wording import unknown
+from shmio.wording import printable, unknown
 
 MATCHES = 3
 """Number of matching registers that an error about a pattern lists."""

@@ -10,9 +10,9 @@ from typing import Any, Final
 import msgspec
 
 from shmio.cli.common import dumps
-from shmio.logs import printable
 from shmio.model.cell import Cell
 from shmio.model.snapshot import SnapshotInfo
+from shmio.wording import printable
 
 _ACTIONS: Final = {
     "save": "NAME: save the present state; a snapshot of this name is replaced",

@@ -20,7 +20,6 @@ from shmio.layout.model import (
     MAX_IMAGE_BYTES,
     MAX_REGISTERS,
     ByteOrder,
-    Dims,
     Layout,
     Register,
     array_size,

@@ -30,8 +30,7 @@ from shmio.layout.s7.address import is_address
 from shmio.layout.spelling import block_path
 from shmio.layout.tags import Lines, parse_type, read_sheet, read_toml
 from shmio.layout.topic import MAX_TOPIC, canonical_path, shorten
-from shmio.logs import printable
-from shmio.wording import near, unknown
+from shmio.wording import near, printable, unknown
 
 _NEEDED: Final = ("path", "address")
 

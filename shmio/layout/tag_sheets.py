@@ -18,8 +18,7 @@ from shmio.layout.model import MAX_REGISTERS
 from shmio.layout.report import Report
 from shmio.layout.topic import shorten
 from shmio.layout.workbook import WorkbookError, read_rows
-from shmio.logs import printable
-from shmio.wording import unknown
+from shmio.wording import printable, unknown
 
 SUFFIXES: Final = (".csv", ".xlsx")
 COLUMNS: Final = ("path", "type", "address", "unit", "comment", "scale", "initial", "deadband", "writable")

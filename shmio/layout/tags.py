@@ -60,8 +60,7 @@ from shmio.layout.simlog_structures import CONTENTS, members
 from shmio.layout.source.lexer import MAX_SOURCE_BYTES
 from shmio.layout.topic import MAX_TOPIC, canonical_path, shorten
 from shmio.layout.values.literal import parse_literal, split_array
-from shmio.logs import printable
-from shmio.wording import did_you_mean, larger_than, near, unknown
+from shmio.wording import did_you_mean, larger_than, near, printable, unknown
 
 SUFFIXES: Final = (".toml", *tag_sheets.SUFFIXES)
 _MAX_ALIGN: Final = 8

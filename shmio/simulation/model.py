@@ -18,8 +18,8 @@ from shmio.layout.model import NUMBERS, Layout
 from shmio.layout.simlog_structures import members
 from shmio.layout.tags import parse_type, place_tags
 from shmio.layout.topic import canonical_path, shorten
-from shmio.logs import printable
 from shmio.simulation.images import Ends, Port
+from shmio.wording import printable
 
 _OWN: Final = frozenset({"declarations", "random", "restore_state", "save_state", "start", "step"})
 _NOT_STATE: Final = frozenset({"_ends", "_ports", "random"})

@@ -33,3 +33,14 @@ def test_without_a_pause_nothing_is_frozen() -> None:
     before = gc.get_freeze_count()
     garbage.resume()
     assert (gc.isenabled(), gc.get_freeze_count()) == (True, before)
+
+
+def test_nothing_is_collected_in_a_block_and_everything_after_it() -> None:
+    before = gc.get_freeze_count()
+    with garbage.paused():
+        assert not gc.isenabled()
+    assert (gc.isenabled(), gc.get_freeze_count()) == (True, before)
+    gc.disable()
+    with garbage.paused():
+        pass
+    assert not gc.isenabled()

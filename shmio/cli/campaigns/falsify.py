@@ -27,9 +27,9 @@ from shmio.falsification.trial import Result
 from shmio.judging.expectation import check_texts
 from shmio.lab import prepare_laboratory
 from shmio.local.snapshot_file import file_of
-from shmio.logs import printable
 from shmio.plan.processes import Plan
 from shmio.version import __version__
+from shmio.wording import printable
 
 MAX_JOBS: Final = 64
 EACH_S: Final = 0.2

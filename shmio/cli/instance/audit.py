@@ -20,8 +20,9 @@ from shmio.config import load
 from shmio.errors import ConfigError
 from shmio.local.log_files import Follower
 from shmio.local.supervisor import ask_supervisor
-from shmio.logs import printable, stamp
+from shmio.logs import stamp
 from shmio.plan.processes import AUDIT_FILE
+from shmio.wording import printable
 
 WHERE_S: Final = 5.0
 

@@ -15,8 +15,7 @@ from shmio.connectors.base import Connector
 from shmio.connectors.browsing import Browsed, Offer, Wanted
 from shmio.errors import ConfigError
 from shmio.layout.importing.found import Found
-from shmio.logs import printable
-from shmio.wording import EXISTS, NOT_TOML, unknown
+from shmio.wording import EXISTS, NOT_TOML, printable, unknown
 
 
 def browse(arguments: argparse.Namespace) -> int:

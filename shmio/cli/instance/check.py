@@ -15,13 +15,12 @@ from shmio.config import Address, Alert, Source
 from shmio.connectors.request_count import Requests
 from shmio.errors import ConfigError, ShmioError
 from shmio.layout.topic import shorten
-from shmio.logs import printable
 from shmio.plan.ports import served, taken
 from shmio.plan.prepare import Prepared, peer, prepare
 from shmio.plan.processes import Plan
 from shmio.plan.request_count import source_requests, writable_registers
 from shmio.segment import PREFIX, BlockSpec, Segment
-from shmio.wording import counted
+from shmio.wording import counted, printable
 
 MAX_PATTERNS: Final = 200
 """Maximum number of characters of a source's patterns that are printed in a line."""

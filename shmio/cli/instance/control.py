@@ -17,8 +17,8 @@ from shmio.cli.target import target
 from shmio.control import remove_socket, socket_path
 from shmio.errors import FormatError, NotRunningError, UnfinishedError
 from shmio.local.supervisor import ask_supervisor
-from shmio.logs import printable
 from shmio.segment import Segment, instances, stale_segment
+from shmio.wording import printable
 
 STOP_S = 30.0
 EXIT_S = 5.0

@@ -9,7 +9,7 @@ from pathlib import Path
 from shmio.cli.common import say
 from shmio.cli.target import config_file
 from shmio.lab.fmu.archive import export_fmu as export
-from shmio.logs import printable
+from shmio.wording import printable
 
 SHOWN = 10
 

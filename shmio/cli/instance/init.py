@@ -28,11 +28,10 @@ from shmio.errors import ConfigError, LayoutError
 from shmio.layout.compiler import Program
 from shmio.layout.model import Layout
 from shmio.layout.source.file import HEAD_BYTES, foreign
-from shmio.logs import printable
 from shmio.plan.layouts import read_program, summarize
 from shmio.plan.ports import in_use
 from shmio.segment import instances
-from shmio.wording import unknown
+from shmio.wording import printable, unknown
 
 EXAMPLE = ("supervisor.toml", "db201.db", "scene.toml")
 EXAMPLE_NAME = "a50"

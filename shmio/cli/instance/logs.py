@@ -15,9 +15,8 @@ from shmio.config import load
 from shmio.errors import ConfigError, SegmentError
 from shmio.local.log_files import Follower, as_text, last_lines, parse_line
 from shmio.local.supervisor import ask_supervisor
-from shmio.logs import printable
 from shmio.plan.processes import process_names
-from shmio.wording import unknown
+from shmio.wording import printable, unknown
 
 WHERE_S = 5.0
 SUPERVISOR = "supervisor"

@@ -11,7 +11,7 @@ from typing import Final
 
 from shmio.connectors.registry import BUILT_IN, names
 from shmio.errors import ConfigError
-from shmio.logs import printable
+from shmio.wording import printable
 
 MAX_LENGTH: Final = 40
 _NAME = re.compile(r"[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*", re.ASCII)

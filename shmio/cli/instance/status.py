@@ -20,9 +20,8 @@ from shmio.local.status import (
     status_of,
     supervisor_silence,
 )
-from shmio.logs import printable
 from shmio.segment import Segment, instances
-from shmio.wording import counted
+from shmio.wording import counted, printable
 
 _HEADINGS = ("NAME", "KIND", "STATE", "PID", "RESTARTS", "UPTIME", "")
 _LIST_HEADINGS = ("NAME", "STATE", "FILE", "LISTENS ON")

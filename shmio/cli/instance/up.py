@@ -21,13 +21,12 @@ from shmio.cli.instance.detach import Configured, Failed, Started, StartMessage,
 from shmio.cli.target import config_file
 from shmio.config import Address
 from shmio.errors import ShmioError
-from shmio.logs import printable
 from shmio.plan.prepare import Prepared, peer, prepare
 from shmio.plan.processes import BROKER, Job, Plan
 from shmio.segment import State, instances
 from shmio.supervisor.main import Supervisor
 from shmio.supervisor.start import check_startable, hold_log_folder
-from shmio.wording import counted
+from shmio.wording import counted, printable
 
 
 def up(arguments: argparse.Namespace) -> int:

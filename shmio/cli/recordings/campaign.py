@@ -10,9 +10,9 @@ from shmio.cli.recordings.common import DamageReport
 from shmio.config.campaign import Campaign, campaign_text, tables_of
 from shmio.config.declaration import check_declarations
 from shmio.errors import ConfigError, RecordingError
-from shmio.logs import printable
 from shmio.recording.campaign import derive
 from shmio.recording.rewriting import new_file
+from shmio.wording import printable
 
 
 def campaign(arguments: argparse.Namespace) -> int:

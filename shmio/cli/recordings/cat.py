@@ -23,7 +23,6 @@ from shmio.layout.model import Layout, Register
 from shmio.layout.topic import parse_topic
 from shmio.layout.values.codec import codec
 from shmio.layout.values.text import json_value, to_text
-from shmio.logs import printable
 from shmio.model.statuses import status_registers
 from shmio.recording.columns import heading
 from shmio.recording.format.encoding import EVENT, FRAME, GAP, PROCESS, STEP, Channel, Gap, ProcessChange, StepMark
@@ -33,7 +32,7 @@ from shmio.recording.times import iso, local, span
 from shmio.segment import Event, EventKind, Frame, Quality
 from shmio.segment.changed_registers import ChangeScan
 from shmio.segment.explain import ABOUT, Explained, Explainer, cells_of, kind_of, object_of
-from shmio.wording import EMPTY
+from shmio.wording import EMPTY, printable
 
 MAX_PLACES: Final = 4
 """Maximum number of an event's registers that the text output shows."""

@@ -11,11 +11,11 @@ from pathlib import Path
 
 from shmio.errors import RecordingError
 from shmio.local.replays import moment_ns
-from shmio.logs import printable
 from shmio.recording.dump import Dump, open_dump
 from shmio.recording.format.records import Damage
 from shmio.recording.reading.part import MAX_NS
 from shmio.recording.times import lost
+from shmio.wording import printable
 
 FIRST_S = 1.0
 """Time in s after which progress is shown; shorter work shows none."""

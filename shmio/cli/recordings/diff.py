@@ -10,10 +10,10 @@ from shmio.cli.common import dumps
 from shmio.cli.recordings.common import Progress
 from shmio.errors import RecordingError
 from shmio.layout.values.codec import Value
-from shmio.logs import printable
 from shmio.recording.compare import Comparison, Difference, Side, SourceDifference, compare
 from shmio.recording.dump import open_dump
 from shmio.recording.times import iso, local
+from shmio.wording import printable
 
 MAX_SHOWN = 50
 """Maximum number of registers, and of details, that the text output shows; ``--json`` prints all."""

@@ -12,13 +12,12 @@ from typing import Any
 from shmio.cli.common import dumps
 from shmio.cli.recordings.common import Progress, not_closed
 from shmio.errors import RecordingError
-from shmio.logs import printable
 from shmio.recording.check import check
 from shmio.recording.description import describe
 from shmio.recording.format.encoding import SUPERVISED
 from shmio.recording.reading.reader import Reader
 from shmio.recording.times import local
-from shmio.wording import EMPTY, counted
+from shmio.wording import EMPTY, counted, printable
 
 
 def info(arguments: argparse.Namespace) -> int:

@@ -28,7 +28,7 @@ from shmio.config import Address
 from shmio.connectors import tcp
 from shmio.connectors.mqtt.options import MqttOptions
 from shmio.errors import ConnectorError
-from shmio.logs import printable
+from shmio.wording import printable
 
 RECEIVE_BYTES: Final = 1 << 15
 """Number of bytes to receive from the socket at once."""

@@ -13,7 +13,6 @@ from shmio.connectors.mqtt.faults import ValueFaultError
 from shmio.layout import model
 from shmio.layout.model import Register
 from shmio.layout.values.codec import Scalar, Value, flatten, nest
-from shmio.logs import printable
 from shmio.model.statuses import (
     BAD_DECODING_ERROR,
     BAD_INDEX_RANGE_NO_DATA,
@@ -21,6 +20,7 @@ from shmio.model.statuses import (
     BAD_OUT_OF_RANGE,
     BAD_TYPE_MISMATCH,
 )
+from shmio.wording import printable
 
 _REALS: Final = frozenset({"REAL", "LREAL"})
 _TEXTS: Final = frozenset({"STRING", "WSTRING"})

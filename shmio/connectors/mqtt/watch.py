@@ -13,8 +13,8 @@ from shmio.connectors.mqtt.topic import Message
 from shmio.connectors.mqtt.values import decode_json
 from shmio.errors import ConfigError, PathError
 from shmio.layout.glob import Glob
-from shmio.logs import printable
 from shmio.model.statuses import BAD_NO_COMMUNICATION, BAD_WAITING_FOR_INITIAL_DATA, GOOD
+from shmio.wording import printable
 
 MAX_TEXT: Final = 4096
 

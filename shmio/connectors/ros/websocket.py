@@ -21,7 +21,7 @@ from shmio.config import Address
 from shmio.connectors import tcp
 from shmio.connectors.ros.messages import from_json
 from shmio.errors import ConnectorError
-from shmio.logs import printable
+from shmio.wording import printable
 
 if TYPE_CHECKING:
     from websockets.sync.connection import Connection

@@ -15,7 +15,7 @@ from typing import Final
 
 from shmio.endpoints.alerts.notice import Notice
 from shmio.endpoints.alerts.sender import DeliveryError
-from shmio.logs import printable
+from shmio.wording import printable
 
 MAX_AT_ONCE: Final = 4
 """Maximum number of commands that run at the same time, for all alerts together."""

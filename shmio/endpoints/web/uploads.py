@@ -24,7 +24,7 @@ from shmio.layout.importing.found import Found, ImportingError
 from shmio.layout.importing.importer import import_tags
 from shmio.layout.model import Layout, Register
 from shmio.layout.tags import SUFFIXES, place_tags
-from shmio.logs import printable
+from shmio.wording import printable
 
 MAX_BYTES: Final = 8 << 20
 """Maximum size of all files together, in bytes."""

@@ -11,8 +11,7 @@ from shmio.errors import LayoutError, PathError, ShmioError
 from shmio.layout.model import MAX_REGISTERS
 from shmio.layout.tags import place_tags
 from shmio.layout.topic import canonical_path, encode_segment, shorten
-from shmio.logs import printable
-from shmio.wording import counted
+from shmio.wording import counted, printable
 
 MAX_TEXT: Final = 1000
 _NAMES_SHOWN: Final = 5

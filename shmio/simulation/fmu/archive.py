@@ -20,7 +20,7 @@ from typing import Final
 
 from shmio.errors import ModelError
 from shmio.layout.topic import shorten
-from shmio.logs import printable
+from shmio.wording import printable
 
 MAX_FILES: Final = 10_000
 MAX_BYTES: Final = 1 << 30

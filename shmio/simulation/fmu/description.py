@@ -12,9 +12,9 @@ from typing import Any, Final, NamedTuple
 
 from shmio.errors import ModelError
 from shmio.layout.topic import encode_segment, shorten
-from shmio.logs import printable
 from shmio.simulation.fmu.archive import DESCRIPTION, Archive
 from shmio.simulation.model import Declaration, Input, Output, Parameter
+from shmio.wording import printable
 
 EXTRA: Final = "an FMU needs another library; run pip install 'shmio[fmu]'"
 MAX_STRING: Final = 254

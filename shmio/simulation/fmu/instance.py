@@ -11,9 +11,10 @@ from typing import Any, Final
 
 from shmio.errors import ModelError
 from shmio.layout.topic import shorten
-from shmio.logs import LogRateLimit, printable
+from shmio.logs import LogRateLimit
 from shmio.simulation.fmu.description import Description, Variable
 from shmio.simulation.images import Port, RegisterPort
+from shmio.wording import printable
 
 DISCARD: Final = 2
 FATAL: Final = 4

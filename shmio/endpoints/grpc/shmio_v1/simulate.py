@@ -26,12 +26,11 @@ from shmio.layout.image import initial_frame
 from shmio.layout.model import Register, index_at
 from shmio.layout.topic import find, holders, parse_topic, shorten
 from shmio.layout.values.codec import RegisterCodec, codec
-from shmio.logs import printable
 from shmio.model.values import Column
 from shmio.segment import Block, Segment
 from shmio.segment.model_channel import MAX_NAME_BYTES, ModelChannel, ModelRequest, model_ports
 from shmio.wire import shmio_v1_pb2 as wire
-from shmio.wording import unknown
+from shmio.wording import printable, unknown
 
 
 class OutputEncoder:
