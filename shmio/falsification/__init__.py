@@ -1,1 +1,1 @@
-"""Searches the ranges of a campaign for values at which an expectation fails."""
+"""Searches the ranges of a campaign for values with which an expectation fails."""

@@ -1,4 +1,4 @@
-"""Stores failing cases: a campaign that repeats, its recording and its report, in a folder each."""
+"""Stores failing cases. Each case has its own folder, with a campaign file, its recording and its report."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class Stored(NamedTuple):
     """A stored case.
 
     Attributes:
-        folder: Its folder.
-        sha256: Digest of what its recording contains.
-        problem: Why it does not repeat; empty if it does.
+        folder: Folder of the case.
+        sha256: SHA-256 of the contents of the recording (:func:`shmio.recording.digest.digest_of_contents`).
+        problem: Why the case cannot be repeated; empty if two runs gave equal results.
 
     """
 
@@ -42,9 +42,9 @@ def tables_for(tables: dict[str, Any], campaign: Path, config: Path, folder: Pat
 
     Args:
         tables: The tables of a campaign.
-        campaign: The file from which they come.
-        config: The ``supervisor.toml``.
-        folder: The new file's folder.
+        campaign: The campaign file from which the tables come.
+        config: The ``supervisor.toml`` of the campaign.
+        folder: The folder of the new file.
 
     """
 
@@ -60,18 +60,18 @@ def tables_for(tables: dict[str, Any], campaign: Path, config: Path, folder: Pat
 def store(
     folder: Path, name: str, tables: dict[str, Any], result: Result, comment: Sequence[str], limit_s: float
 ) -> Stored:
-    """Store a failing case, and run it twice from its file, each time in a new process.
+    """Store a failing case as a campaign file, and run the file twice, each time in a new process.
 
     Args:
         folder: Folder of the search.
         name: Name of the case's folder.
-        tables: The campaign, from :func:`tables_for`.
-        result: The result that it had in the search.
-        comment: Lines about it for the file.
-        limit_s: Maximum duration of a run in s.
+        tables: The tables of the campaign, from :func:`tables_for`.
+        result: The result of the case in the search.
+        comment: Lines about the case, for a comment in the file.
+        limit_s: Maximum duration of each run in s.
 
     Raises:
-        RecordingError: A file cannot be written, or the campaign does not run or takes too long.
+        RecordingError: A file cannot be written, or the campaign cannot be run or takes too long.
 
     """
     place = folder / name

@@ -1,8 +1,8 @@
-"""Searches a campaign's space for points at which an expectation fails.
+"""Searches the parameter space of a campaign for points at which an expectation fails.
 
-The search learns results in the order of the trials' numbers. It chooses the next point when it has
-learned all trials before it, except the last ``jobs - 1``. So the trials depend on the seed and on
-``jobs``, but never on how long they take.
+Trials are numbered. The search learns their results in the order of the numbers. It chooses the
+point of a trial when it has learned the results of all earlier trials except the last ``jobs - 1``.
+So the trials depend on the seed and on ``jobs``, but never on how long they take.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from shmio.falsification.shrink import Case, Shrinker
 from shmio.falsification.trial import Result, Status, Task
 
 LOOK_S: Final = 0.25
-"""Maximum time in s between two checks whether the search must stop."""
+"""Maximum time in s between two checks whether the search has been asked to stop."""
 FIRST_TRIALS: Final = 10
-"""Number of trials at the beginning of a search. If none of them can run, the search ends."""
+"""If none of this number of trials at the beginning of a search can run to its end, the search ends."""
 
 
 @dataclass
 class Tally:
-    """What a search has found up to now.
+    """What a search has found so far.
 
     Attributes:
         counts: Number of trials by status.
-        best: The trial with the least robustness.
-        best_point: Its point.
-        unclear: The first trial that is inconclusive, or could not run.
-        simulated_s: Simulated time of all trials in s.
-        done: Number of trials.
+        best: Result of the best trial, the one with the least robustness; None if no trial has any.
+        best_point: Point of the best trial.
+        unclear: Result of the first trial that was inconclusive, or could not run; None if none was.
+        simulated_s: Simulated time of all trials together, in s.
+        done: Number of trials so far.
 
     """
 
@@ -49,7 +49,7 @@ class Tally:
     done: int = 0
 
     def add(self, point: Point, result: Result) -> bool:
-        """Add a trial. Return whether it is the best one up to now."""
+        """Add a trial. Return whether it is the best trial so far."""
         self.counts[result.status] = self.counts.get(result.status, 0) + 1
         self.done += 1
         self.simulated_s += result.simulated_s
@@ -69,13 +69,13 @@ class Tally:
 
 @dataclass(frozen=True)
 class Failure:
-    """A failing trial, and the shrunk case.
+    """A failed trial, and the simpler case to which it was shrunk.
 
     Attributes:
         trial: Number of the trial.
         case: The shrunk case.
-        result: Its result.
-        runs: Number of runs that shrinking took.
+        result: Result of the shrunk case.
+        runs: Number of runs that the shrinking took.
 
     """
 
@@ -86,7 +86,7 @@ class Failure:
 
 
 class Falsifier:
-    """One search, from its beginning, or from where it was interrupted."""
+    """Carries out one search, from its beginning or from the point at which it was interrupted."""
 
     def __init__(
         self,
@@ -140,17 +140,17 @@ class Falsifier:
         return self.tally.add(point, result)
 
     def replay(self, lines: Iterator[Line], trials: int) -> tuple[list[Line], list[Line]]:
-        """Learn the results of the trials before an interruption.
+        """Learn, from the journal, the results of the trials before an interruption.
 
         Args:
-            lines: What the journal has.
+            lines: The lines of the journal (:meth:`Journal.lines`).
             trials: Number of trials of the whole search.
 
         Returns:
-            The lines of the failed trials that have no case, and of the cases.
+            The lines of the failed trials for which no case is stored, and the lines of the cases.
 
         Raises:
-            ConfigError: The search chooses other points than before.
+            ConfigError: The search does not choose the same points as before.
 
         """
         self._limit = max(trials, 1)
@@ -182,17 +182,18 @@ class Falsifier:
         *,
         to_end: bool,
     ) -> None:
-        """Run trials until the search has done ``trials``, or found a failure.
+        """Run trials until the search has done ``trials`` of them, or has found a failure.
 
         Args:
             trials: Number of trials of the whole search.
-            on_trial: Called after each trial with its point, its result, and whether it is the best.
-            on_failure: Called with each failure, shrunk.
-            to_end: Whether to go on after a failure.
+            on_trial: Called after each trial with its point, its result, and whether it is the best
+                trial so far.
+            on_failure: Called with each failure, after it was shrunk.
+            to_end: Whether to continue after a failure.
 
         Raises:
             ConfigError: None of the first trials could run, because the campaign is wrong.
-            ModelError: None of the first trials came to its end.
+            ModelError: None of the first trials could run to its end.
             RecordingError: The journal cannot be written.
 
         """
@@ -229,7 +230,7 @@ class Falsifier:
         return found
 
     def shrink(self, point: Point, result: Result, on_failure: Callable[[Failure], None]) -> None:
-        """Shrink a failing trial. If it is interrupted, do nothing."""
+        """Shrink a failed trial, and call ``on_failure``, unless the user stops the search meanwhile."""
         if self._over.is_set():
             return
         begun_s = time.monotonic()
@@ -255,10 +256,10 @@ class Falsifier:
 
 
 def check_space(space: Space) -> None:
-    """Check that there is something to search.
+    """Check that a campaign has a range or a choice to search.
 
     Raises:
-        ConfigError: The campaign has no range.
+        ConfigError: The campaign has none.
 
     """
     if not space.dimensions:

@@ -1,7 +1,8 @@
-"""The file of a search: its beginning, and the result of each trial, as one JSON object on each line.
+"""The journal of a search: a file with a JSON object on each line.
 
-A search that was interrupted at any moment continues from this file. The last line is dropped if it
-was not written to its end.
+The first line describes the search; the others have the results of trials, and stored cases. A
+search that was interrupted at any moment can continue from this file. If the last line is incomplete,
+it is dropped.
 """
 
 from __future__ import annotations
@@ -25,15 +26,15 @@ class Beginning(msgspec.Struct):
     """Everything that determines the trials of a search, except their number.
 
     Attributes:
-        shmio: The version.
+        shmio: Version of shmio.
         search: Name of the strategy.
-        seed: Its seed.
-        jobs: Number of trials at once.
-        grid: Number of values of each range, if the search is on a grid.
+        seed: Seed of the strategy.
+        jobs: Number of trials that run at once.
+        grid: Number of values of each range, if the search is on a grid; else None.
         campaign: The campaign's tables, with their ranges.
-        duration_s: Duration of a trial on the instance's clock.
-        step_ms: Length of a step; None if it is the shortest period.
-        files: What else the trials depend on: labels with digests.
+        duration_s: Duration of a trial on the instance's clock, in s.
+        step_ms: Length of a step, in ms; None: the shortest period of a source.
+        files: Digests of everything else that the trials depend on, by label.
 
     """
 
@@ -49,14 +50,14 @@ class Beginning(msgspec.Struct):
 
 
 class Line(msgspec.Struct, omit_defaults=True):
-    """A line after the first: the result of a trial with its point, or the case made from it.
+    """A line after the first: either the result of a trial, or a stored case.
 
     Attributes:
-        point: The values of the trial.
-        result: The result of the trial.
-        case: Name of the folder of a stored case.
-        trial: Number of the trial that the case was made from.
-        shrunk: The values of the case, to recognise the same case again.
+        point: For a result, the point of the trial.
+        result: For a result, the result of the trial.
+        case: For a case, the name of its folder.
+        trial: For a case, the number of the trial that was shrunk to it.
+        shrunk: For a case, what it consists of, to recognise the same case again.
 
     """
 
@@ -68,7 +69,7 @@ class Line(msgspec.Struct, omit_defaults=True):
 
 
 class Journal:
-    """The open file of a search. Only one search can have it open."""
+    """The journal of a search, open for writing. Only one search at a time can have a file open."""
 
     def __init__(self, folder: Path, beginning: Beginning, *, resume: bool) -> None:
         """Create the file, or open an existing one to go on.
@@ -137,7 +138,7 @@ class Journal:
         os.ftruncate(self._fd, end)
 
     def lines(self) -> Iterator[Line]:
-        """Yield the lines after the first: results and cases.
+        """Yield the lines after the first line: results and cases.
 
         Raises:
             ConfigError: A line is damaged.
@@ -154,7 +155,7 @@ class Journal:
         """Write a line.
 
         Raises:
-            RecordingError: It cannot be written.
+            RecordingError: The line cannot be written.
 
         """
         self._append(msgspec.json.encode(line))
@@ -170,7 +171,7 @@ class Journal:
             ) from None
 
     def close(self) -> None:
-        """Close the file, so that another search can have it."""
+        """Close the file, so that another search can open it."""
         os.close(self._fd)
 
     def __enter__(self) -> Self:
@@ -181,7 +182,7 @@ class Journal:
 
 
 def differences(before: Any, now: Any, key: str = "") -> Iterator[str]:
-    """Yield a text for each key whose values differ."""
+    """Yield a text for each key with different values before and now; ``key`` is the key of both values."""
     if isinstance(before, Mapping) and isinstance(now, Mapping):
         for name in {**before, **now}:
             inner = f"{key}.{name}".lstrip(".")

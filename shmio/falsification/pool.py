@@ -1,4 +1,4 @@
-"""Runs trials in processes of their own, several at once."""
+"""Runs several trials at once, in separate processes."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from shmio.falsification.trial import Result, Task
 
 READ_BYTES: Final = 1 << 16
 MAX_LINE_BYTES: Final = 1 << 24
-"""Maximum size of an answer."""
+"""Maximum size in bytes of an answer from a process."""
 START_S: Final = 120.0
-"""Maximum time in s that a process may take to start, which does not count as a part of its first trial."""
+"""Maximum time in s that a process may take to start; this time does not count for its first trial."""
 END_S: Final = 5.0
-"""Maximum time in s that an idle process may take to end."""
+"""Maximum time in s that an idle process may take to end when the pool is closed."""
 
 
 @dataclass
@@ -41,7 +41,7 @@ class _Process:
 
 
 class Pool:
-    """A number of processes. A process that ends or takes too long is replaced for the next trial."""
+    """A pool of processes that run trials. A process that ends or takes too long is replaced for the next trial."""
 
     def __init__(self, config: Path, folder: Path, jobs: int, limit_s: float) -> None:
         """Create the pool. Processes start when they are needed.
@@ -64,7 +64,7 @@ class Pool:
         return self.jobs - sum(one.task is not None for one in self._processes)
 
     def submit(self, task: Task) -> None:
-        """Start a trial. There must be an idle process."""
+        """Start a trial. Call this only if :attr:`idle` is not 0."""
         one = next((one for one in self._processes if one.task is None), None) or self._start()
         one.task, one.since_s = task, time.monotonic()
         one.answer.clear()
@@ -86,7 +86,7 @@ class Pool:
             self._selector.unregister(one.stdin)
 
     def wait(self, timeout_s: float) -> list[Result]:
-        """Wait for results, for at most ``timeout_s`` seconds. Return the results that have arrived."""
+        """Wait at most ``timeout_s`` seconds for results, and return the results that have arrived."""
         left_s = [self._left_s(one) for one in self._processes if one.task is not None]
         ready = self._selector.select(max(0.0, min([timeout_s, *left_s])))
         for key, events in ready:
@@ -107,14 +107,14 @@ class Pool:
         return one.since_s + (self._limit_s if one.ready else START_S) - time.monotonic()
 
     def run(self, task: Task) -> Result:
-        """Run a trial, and wait for its result. No other trial may run."""
+        """Run a trial, and return its result. No other trial may be running."""
         self.submit(task)
         while not (found := self.wait(self._limit_s)):
             pass
         return found[0]
 
     def cancel(self) -> None:
-        """End the trials that are running, without results."""
+        """End all running trials, without results."""
         for one in list(self._processes):
             if one.task is not None:
                 self._end(one)

@@ -1,4 +1,4 @@
-"""Strategies that choose the next point of a space: at random, on a grid, or by an optimiser."""
+"""Strategies that choose the next point in a parameter space: at random, on a grid, or by an optimiser."""
 
 from __future__ import annotations
 
@@ -17,36 +17,42 @@ SEARCHES: Final[tuple[SearchName, ...]] = get_args(SearchName)
 MAX_TRIALS: Final = 1_000_000
 """Maximum number of trials of a search."""
 MAX_OPTIMISED: Final = 10_000
-"""Maximum number of trials of an optimiser, whose time for a point grows with the points before."""
+"""Maximum number of trials with an optimiser, which needs more time for a point the more points it has had."""
 REMEDY: Final = "pip install 'shmio[falsify]', or use --search random or grid"
 
 
 class Search(ABC):
-    """Chooses points. The same seed, and the same results in the same order, give the same points."""
+    """Chooses points. With the same seed, and the same results in the same order, it chooses the same points."""
 
     def __init__(self, space: Space) -> None:
         self._space = space
 
     @abstractmethod
     def ask(self, number: int) -> Point | None:
-        """Return the point of a trial; None if there are no more points. Numbers come in order, from 0."""
+        """Return the point for trial ``number``; None if there are no more points.
+
+        Call this for the numbers 0, 1, 2 and so on.
+        """
 
     def tell(self, number: int, robustness: float | None) -> None:  # noqa: B027  not every search learns
-        """Learn the result of a trial; None if it has no robustness. Numbers come in order, from 0."""
+        """Learn the robustness of trial ``number``; None if it has no robustness.
+
+        Call this for the numbers 0, 1, 2 and so on.
+        """
 
 
 def begin_search(name: SearchName, space: Space, seed: int, trials: int, jobs: int) -> Search:
-    """Return a search at its beginning.
+    """Return a new search.
 
     Args:
-        name: The strategy.
-        space: The space.
-        seed: Its only source of randomness.
+        name: Name of the strategy.
+        space: The parameter space.
+        seed: Seed, which is the search's only source of randomness.
         trials: Number of trials.
-        jobs: Number of trials at once.
+        jobs: Number of trials that run at once.
 
     Raises:
-        ConfigError: An optimiser takes fewer trials.
+        ConfigError: There are more trials than an optimiser can handle.
         MissingLibraryError: The library of an optimiser is not installed.
 
     """
@@ -58,20 +64,20 @@ def begin_search(name: SearchName, space: Space, seed: int, trials: int, jobs: i
 
 
 class RandomSearch(Search):
-    """Draws each point independently. A trial's point depends only on the seed and its number."""
+    """Draws each point independently: it depends only on the seed and the number of the trial."""
 
     def __init__(self, space: Space, seed: int) -> None:
         super().__init__(space)
         self._seed = seed
 
     def ask(self, number: int) -> Point:
-        """Return the point of a trial."""
+        """Return the point for trial ``number``."""
         draw = np.random.default_rng([self._seed, number])
         return {one.name: one.at(draw.random()) for one in self._space.dimensions}
 
 
 class GridSearch(Search):
-    """Tries the points of a grid, in random order. All dimensions have about as many values."""
+    """Tries the points of a grid in random order. All dimensions have about the same number of values."""
 
     def __init__(self, space: Space, seed: int, trials: int) -> None:
         super().__init__(space)
@@ -80,7 +86,7 @@ class GridSearch(Search):
         self._order = np.random.default_rng(seed).permutation(int(np.prod(self.counts)))
 
     def ask(self, number: int) -> Point | None:
-        """Return the point of a trial; None if the grid has no more points."""
+        """Return the point for trial ``number``; None if the grid has no more points."""
         if number >= len(self._order):
             return None
         rest = int(self._order[number])
@@ -110,7 +116,7 @@ def _levels(dimensions: tuple[Dimension, ...], trials: int) -> list[int]:
 
 
 class OptunaSearch(Search):
-    """Lets a sampler of optuna choose: tree-structured Parzen estimators, or CMA-ES."""
+    """Lets a sampler of optuna choose the points: tree-structured Parzen estimators, or CMA-ES."""
 
     def __init__(self, space: Space, seed: int, trials: int, jobs: int, name: SearchName) -> None:
         super().__init__(space)
@@ -135,7 +141,7 @@ class OptunaSearch(Search):
         self._trials: dict[int, Any] = {}
 
     def ask(self, number: int) -> Point:
-        """Return the point of a trial."""
+        """Return the point for trial ``number``."""
         trial = self._trials[number] = self._study.ask(self._distributions)
         return {
             one.name: one.options[trial.params[one.name]]
@@ -145,7 +151,7 @@ class OptunaSearch(Search):
         }
 
     def tell(self, number: int, robustness: float | None) -> None:
-        """Learn the result of a trial."""
+        """Learn the robustness of trial ``number``; None if it has no robustness."""
         trial = self._trials.pop(number)
         if robustness is None:
             self._study.tell(trial, state=self._failed)

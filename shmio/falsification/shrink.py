@@ -1,4 +1,4 @@
-"""Makes a failing case simpler, as long as the same expectation fails."""
+"""Makes a failing case simpler, as long as the same expectation still fails."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from shmio.errors import ConfigError
 from shmio.falsification.trial import Result
 
 HALVINGS: Final = 4
-"""How often the shrinker halves the distance between a value and a simpler one."""
+"""How often the shrinker halves the distance between a value and a simpler value."""
 DIGITS: Final = (1, 2, 3, 4)
-"""Numbers of digits to which a number may be rounded."""
+"""The numbers of digits to which the shrinker tries to round a number, in this order."""
 ROUNDS: Final = 2
 
 
 @dataclass(frozen=True)
 class Case:
-    """A campaign with one value for each range, with fewer injections and a shorter duration.
+    """A campaign without ranges: a point of a space, perhaps with fewer injections and a shorter duration.
 
     Attributes:
         point: The value of each dimension.
-        duration_s: Duration in s.
+        duration_s: Duration of the campaign in s.
         dropped: Indices of the injections that are left out.
 
     """
@@ -35,14 +35,14 @@ class Case:
     dropped: frozenset[int] = frozenset()
 
     def tables(self, space: Space) -> dict[str, Any]:
-        """Return the campaign's tables."""
+        """Return the tables of the campaign; ``space`` is the space of the point."""
         tables = space.at(self.point)
         kept = [table for index, table in enumerate(tables.get("injection", [])) if index not in self.dropped]
         return {**tables, "duration_s": self.duration_s, "injection": kept}
 
 
 class Shrinker:
-    """Tries simpler cases, in a fixed order, up to a number of runs."""
+    """Tries simpler cases, in a fixed order, with at most a given number of runs."""
 
     def __init__(
         self, space: Space, step_s: float, runs: int, try_out: Callable[[dict[str, Any]], Result | None]
@@ -64,11 +64,11 @@ class Shrinker:
         """Whether the user wants to stop."""
 
     def shrink(self, case: Case, result: Result) -> tuple[Case, Result]:
-        """Return the simplest case that was found, and its result.
+        """Return the simplest failing case that was found, and its result.
 
         Args:
             case: A case that fails.
-            result: Its result.
+            result: The result of this case.
 
         """
         worst = result.worst

@@ -1,4 +1,4 @@
-"""Runs one trial, a campaign without ranges, in a laboratory, and returns its result."""
+"""Runs one trial in a laboratory: a campaign without ranges."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from shmio.plan.processes import Plan as InstancePlan
 from shmio.simulation.model import explain
 
 LIMIT: Final = 1e300
-"""Limit of the robustness. A greater one counts as this, because an optimiser takes no infinity."""
+"""Maximum of the robustness; greater values count as this value, because an optimiser takes no infinity."""
 
 Status = Literal["passed", "failed", "inconclusive", "error", "invalid"]
 
@@ -29,7 +29,7 @@ class Task(msgspec.Struct):
 
     Attributes:
         number: Number of the trial.
-        tables: The campaign, without ranges and with all seeds.
+        tables: The tables of the campaign, without ranges and with all seeds.
 
     """
 
@@ -43,9 +43,9 @@ class Found(msgspec.Struct):
     Attributes:
         name: Name of the expectation.
         outcome: The outcome.
-        robustness: The upper bound of its robustness; None if it has no limit.
-        reason: Why it is not passed.
-        moment_s: First moment at which it was not met, on the instance's clock.
+        robustness: Upper bound of the robustness; None if there is no bound.
+        reason: Why the expectation did not pass; empty if it passed.
+        moment_s: First moment at which the expectation was not met, on the instance's clock in s.
 
     """
 
@@ -61,14 +61,14 @@ class Result(msgspec.Struct):
 
     Attributes:
         number: Number of the trial.
-        status: ``failed`` if an expectation failed; else ``error`` if the run did not come to its
-            end, ``invalid`` if the values make no valid campaign, ``inconclusive`` if an
-            expectation is, and ``passed`` if all passed.
+        status: ``failed`` if an expectation failed; otherwise ``error`` if the run did not come to
+            its end, ``invalid`` if the campaign is not valid with these values, ``inconclusive`` if
+            an expectation is inconclusive, and ``passed`` if all expectations passed.
         expectations: The verdicts; empty if there was no run.
-        reason: Why there was no run, or why it ended early.
-        begin_s: Start of the run on the instance's clock; not 0 if it began in a snapshot.
-        simulated_s: Simulated time in s.
-        taken_s: Duration of the trial in s.
+        reason: Why there was no run, or why it ended early; empty otherwise.
+        begin_s: Start of the run on the instance's clock, in s; not 0 if it started from a snapshot.
+        simulated_s: Simulated time of the run, in s.
+        taken_s: Real time that the trial took, in s.
 
     """
 
@@ -82,10 +82,11 @@ class Result(msgspec.Struct):
 
     @property
     def robustness(self) -> float | None:
-        """The number that the search minimises: the least robustness of all expectations. Below 0: one failed.
+        """The least robustness of all expectations, which the search minimises; below 0 if one has failed.
 
-        The robustness of an expectation is the greatest that is possible, whatever unknown values
-        were: an inconclusive one is never below 0. None if there is nothing to minimise.
+        The robustness of an expectation is the greatest that is possible for any values in place of
+        unknown ones, so that of an inconclusive expectation is never below 0. None if there is
+        nothing to minimise.
         """
         if self.status in ("error", "invalid"):
             return None
@@ -94,7 +95,7 @@ class Result(msgspec.Struct):
 
     @property
     def worst(self) -> Found | None:
-        """The expectation with the least robustness; None if there is none."""
+        """The verdict on the expectation with the least robustness; None if no expectation has any."""
         known = [one for one in self.expectations if one.robustness is not None]
         return min(known, key=lambda one: one.robustness or 0.0, default=None)
 
@@ -113,7 +114,7 @@ def run_trial(instance: InstancePlan, folder: Path, task: Task) -> Result:
         task: The trial.
 
     Returns:
-        The result. It describes all errors, too.
+        The result, which also describes errors; no error is raised.
 
     """
     begun_s = time.monotonic()

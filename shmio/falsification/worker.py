@@ -1,6 +1,6 @@
-"""A process that runs trials, one after another: it reads a trial as a line of JSON, and writes its result.
+"""A process that runs trials, one after another: it reads each trial as a line of JSON, and writes its result.
 
-It first writes an empty line, which says that it is ready. A model that crashes or hangs affects only
+The process first writes an empty line when it is ready. A model that crashes or hangs affects only
 this process.
 """
 
@@ -19,9 +19,10 @@ from shmio.parent import end_with_parent
 
 
 def main() -> None:
-    """Run the trials of the parent until it closes standard input.
+    """Run the parent's trials until the parent closes standard input.
 
-    The arguments are the parent's process id, the configuration, and the campaign's folder.
+    The arguments of the process are the parent's pid, the configuration file, and the folder of the
+    campaign.
     """
     if not end_with_parent(int(sys.argv[1])):
         return

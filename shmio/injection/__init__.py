@@ -1,4 +1,4 @@
-"""Compiles and evaluates the injections that users declare. The package does no I/O."""
+"""Compiles and runs the injections that users declare. This package does no I/O."""
 
 from shmio.injection.program import Program, compile_program
 

@@ -1,9 +1,9 @@
 """Decides when a declared injection is active.
 
 An injection is active between two times, while a condition is true, or for some time after a
-condition became true. The testing metamodel of the University of York calls these three cases
+condition has become true. (The testing metamodel of the University of York calls these three cases
 activation at a fixed time, activation on a condition, and activation on a condition for a limited
-time.
+time.)
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class State(StrEnum):
     OVER = "over"
     """The injection cannot become active again."""
     LIFTED = "lifted"
-    """A client has lifted the injection, which is still in the configuration."""
+    """A client has lifted the injection, which the configuration still declares."""
 
 
 _WAITING, _ACTIVE, _OVER, _LIFTED = State  # each cycle needs these, and looking up a member of an enum is slow
@@ -31,7 +31,7 @@ class Window:
     """Limits on when, how long and how often an injection is active.
 
     ``start_ns`` and ``end_ns`` are times of the instance's clock. ``for_ns`` is the length of each
-    activation. ``times`` is the maximum number of activations. None means no limit.
+    activation, in ns. ``times`` is the maximum number of activations. None stands for no limit.
     """
 
     start_ns: int = 0
@@ -54,7 +54,7 @@ class Activation:
     cycle: int = 0
     time_ns: int = 0
     met: bool | None = None
-    """True if the last cycle was in the window and the condition was true; None before the first cycle."""
+    """True if the last cycle was in the window and the condition was true in it; None before the first cycle."""
 
     def advance(self, time_ns: int, cycle: int, *, holds: bool) -> bool:
         """Update the state for a cycle, and return whether the state has changed.
@@ -62,7 +62,7 @@ class Activation:
         Args:
             time_ns: The instance's clock in this cycle.
             cycle: The number of the cycle.
-            holds: True if the condition is true, or there is no condition.
+            holds: True if the condition is true in this cycle, or if there is no condition.
 
         """
         before, window = self.state, self.window

@@ -1,4 +1,4 @@
-"""Evaluates conditions over registers, without Python's ``eval``; ``language.py`` parses them."""
+"""Compiles and evaluates conditions over registers, without Python's ``eval``; ``language.py`` parses them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _EDGES: Final[dict[str, Callable[[Number, Number], bool]]] = {
 
 _Stack = list[Number]
 _Seen = dict[int, Number]
-"""The last argument of each edge function, by the index of the function in the expression."""
+"""The last argument of each edge function, by the index of the edge function in the expression."""
 _Step = Callable[[_Stack, Sequence[Number], _Seen], None]
 
 
@@ -42,7 +42,7 @@ _Step = Callable[[_Stack, Sequence[Number], _Seen], None]
 class Memory:
     """The last arguments of an expression's edge functions (rising, falling, changed).
 
-    The memory is empty at first. An unknown value or a division by zero empties it again.
+    The memory is empty at first. An evaluation with an unknown value or a division by zero empties it.
     """
 
     seen: _Seen = field(default_factory=dict)
@@ -51,32 +51,32 @@ class Memory:
 class Expression(NamedTuple):
     """A parsed condition, as a program for a stack machine.
 
-    Each evaluation computes every operand, even if ``and`` or ``or`` does not need it. So the edge
-    functions miss no change.
+    Each evaluation computes every operand, even if ``and`` or ``or`` does not need the operand. So the
+    edge functions miss no change.
     """
 
     steps: tuple[_Step, ...]
     references: tuple[str, ...]
-    """The registers that the expression reads, as written."""
+    """The paths of the registers that the expression reads, as written in its text."""
 
     def holds(self, values: Sequence[Number | None], memory: Memory) -> bool:
         """Return whether the expression is true; False if that is unknown.
 
         Args:
-            values: The value of each reference; None if it is unknown.
-            memory: The last arguments of the edge functions. They are updated.
+            values: The value of each register in ``references``; None if the value is unknown.
+            memory: The last arguments of the edge functions, which this updates.
 
         """
         return self.evaluate(values, memory) is True
 
     def evaluate(self, values: Sequence[Number | None], memory: Memory) -> bool | None:
-        """Return whether the expression is true.
+        """Return whether the expression is true; None if that is unknown.
 
-        The result is None if a value is unknown, or if the expression divides by zero.
+        It is unknown if a value is unknown, or if the expression divides by zero.
 
         Args:
-            values: The value of each reference; None if it is unknown.
-            memory: The last arguments of the edge functions. They are updated.
+            values: The value of each register in ``references``; None if the value is unknown.
+            memory: The last arguments of the edge functions, which this updates.
 
         """
         stack: _Stack = []
@@ -93,7 +93,7 @@ class Expression(NamedTuple):
 
 
 def parse(text: str) -> Expression:
-    """Parse a condition.
+    """Parse a condition, and return it as an expression that can be evaluated.
 
     Raises:
         ConfigError: The text is invalid. The message gives the position of the wrong character.

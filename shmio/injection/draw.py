@@ -1,8 +1,9 @@
 """Random numbers that depend only on a seed and their purpose.
 
-The generator has no state: it computes each number from counters, such as the number of the cycle.
-So an extra frame or a restarted process does not change later numbers. The mixing function is that
-of SplitMix64 (Steele, Lea, Flood: "Fast splittable pseudorandom number generators", OOPSLA 2014).
+The generator has no state: it computes each number from the seed and from counters, such as the
+number of the cycle. So neither an extra frame nor a restart of the process changes later numbers.
+The mixing function is that of SplitMix64 (Steele, Lea, Flood: "Fast splittable pseudorandom number
+generators", OOPSLA 2014).
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ Words = npt.NDArray[np.uint64]
 Floats = npt.NDArray[np.float64]
 
 FEW: Final = 16
-"""Up to this count, plain Python computes numbers faster than numpy.
+"""Up to this count of numbers, plain Python is faster than numpy.
 
-Both give the same numbers, except for the last bit of a Gaussian number.
+Both compute the same numbers, except for the last bit of a Gaussian number.
 """
 
 _MASK: Final = (1 << 64) - 1
@@ -40,8 +41,8 @@ class Purpose(IntEnum):
 class SeededRandom:
     """Generates the random numbers of one injection.
 
-    In all methods, ``run`` is the number of the activation. ``place`` is the number of the cycle or
-    write within this activation. The same arguments always give the same numbers.
+    In all methods, ``run`` is the number of the activation, and ``place`` is the number of the cycle
+    or write within this activation. The same arguments always give the same numbers.
     """
 
     def __init__(self, seed: int, name: str) -> None:
@@ -64,9 +65,9 @@ class SeededRandom:
         return (self.words(run, place, purpose, count) >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
     def gaussian(self, run: int, place: int, count: int) -> Floats:
-        """Return ``count`` normally distributed numbers of mean 0 and standard deviation 1.
+        """Return ``count`` normally distributed numbers with mean 0 and standard deviation 1.
 
-        The method is that of Box and Muller, 1958.
+        They are computed by the method of Box and Muller, 1958.
         """
         if count <= FEW:
             radii = (1 - (word >> 11) * 2.0**-53 for word in self._few(run, place, Purpose.VALUE, count))
@@ -79,7 +80,7 @@ class SeededRandom:
         return normal
 
     def one_uniform(self, run: int, place: int, purpose: Purpose = Purpose.VALUE) -> float:
-        """Return the number that :meth:`uniform` returns for a count of 1."""
+        """Return the only number that :meth:`uniform` would return for a count of 1."""
         known, word = self._of_run
         if known != run:
             word = _mix(self._key + run & _MASK)
@@ -92,7 +93,7 @@ class SeededRandom:
         return (word >> 11) * 2.0**-53
 
     def one_gaussian(self, run: int, place: int) -> float:
-        """Return the number that :meth:`gaussian` returns for a count of 1."""
+        """Return the only number that :meth:`gaussian` would return for a count of 1."""
         radius = 1 - self.one_uniform(run, place)
         return math.sqrt(-2 * math.log(radius)) * math.cos(math.tau * self.one_uniform(run, place, Purpose.ANGLE))
 
@@ -109,7 +110,7 @@ class SeededRandom:
         return (high * np.uint64(limit) >> np.uint64(32)).astype(np.intp)
 
     def happens(self, probability: float, run: int, place: int) -> bool:
-        """Return True with this probability, from 0 to 1."""
+        """Return True with the probability ``probability``, from 0 to 1, else False."""
         return probability >= 1 or self.one_uniform(run, place, Purpose.CHANCE) < probability
 
 

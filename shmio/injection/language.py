@@ -1,6 +1,6 @@
-"""The language of conditions and formulas: its grammar, and the tree that a text becomes.
+"""The language of conditions and formulas: its grammar, and a parser that turns a text into a tree.
 
-Two conditions and a formula:
+Here are two conditions and a formula, and the grammar:
 
 ::
 
@@ -22,9 +22,9 @@ Two conditions and a formula:
              | "rise" | "fall" | "rate" | "quality" | "age" | "raw"
     bounds = "[" number "," number "]"
 
-A condition has no ``implies``, no ``until`` and no other temporal operators, none of the functions
-from ``rise`` to ``raw``, and none of the words ``good``, ``uncertain`` and ``bad``. In a condition,
-all these words are names of registers.
+Only formulas have ``implies``, ``until`` and the other temporal operators, the functions from
+``rise`` to ``raw``, and the words ``good``, ``uncertain`` and ``bad``. In a condition, all these
+words are names of registers.
 
 A register is a path. Put it in quotes if it has characters other than letters, digits and
 ``_ . / % :``. A path may contain ``/``, so put blanks around the ``/`` of a division. Numbers are
@@ -60,7 +60,7 @@ _FUNCTIONS: Final = frozenset({"abs", "rising", "falling", "changed"})
 _OF_FORMULAS: Final = frozenset({"rise", "fall", "rate", "quality", "age", "raw"})
 _WINDOWS: Final = frozenset({"always", "eventually", "historically", "once"})
 TEMPORAL: Final = _WINDOWS | {"until"}
-"""The temporal operators. Those of ``_WINDOWS`` have one operand, ``until`` has two."""
+"""The temporal operators. Those in ``_WINDOWS`` have one operand; ``until`` has two."""
 _QUALITIES: Final = {"bad": 0, "uncertain": 1, "good": 2}
 _KEYWORDS: Final = frozenset({"and", "or", "not", "mod", "true", "false"}) | _FUNCTIONS
 _FORMULA_KEYWORDS: Final = _KEYWORDS | _OF_FORMULAS | TEMPORAL | {"implies", *_QUALITIES}
@@ -79,21 +79,21 @@ class Reference:
 
     path: str
     at: int = field(default=1, compare=False)
-    """Position of the path's first character in the text, counted from 1."""
+    """Position of the path's first character in the text of the condition or formula, counted from 1."""
 
 
 @dataclass(frozen=True, slots=True)
 class Operation:
     """An operator or a function with its operands.
 
-    ``name`` is the operator as written, in lower case, with these exceptions: ``neg`` is a minus sign
-    before an operand, and ``==`` and ``!=`` also stand for ``=`` and ``<>``.
+    ``name`` is the operator or function as written, in lower case, with these exceptions: ``neg``
+    stands for a minus sign before an operand, and ``==`` and ``!=`` also stand for ``=`` and ``<>``.
     """
 
     name: str
     operands: tuple[Tree, ...]
     bounds_ns: tuple[int, int] | None = None
-    """Bounds of a temporal operator; None if it has none."""
+    """Bounds of a temporal operator, in ns; None if it has none."""
     at: int = field(default=1, compare=False)
 
 
@@ -101,7 +101,7 @@ Tree = Constant | Reference | Operation
 
 
 def nodes(tree: Tree) -> Iterator[Tree]:
-    """Iterate over all parts of a tree, operands before their operator, from left to right."""
+    """Iterate over all nodes of a tree from left to right, with operands before their operator."""
     if isinstance(tree, Operation):
         for operand in tree.operands:
             yield from nodes(operand)
@@ -109,7 +109,7 @@ def nodes(tree: Tree) -> Iterator[Tree]:
 
 
 def parse_condition(text: str) -> Tree:
-    """Parse a condition.
+    """Parse the text of a condition.
 
     Raises:
         ConfigError: The text is invalid. The message gives the position of the wrong character.
@@ -119,7 +119,7 @@ def parse_condition(text: str) -> Tree:
 
 
 def parse_formula(text: str) -> Tree:
-    """Parse a formula.
+    """Parse the text of a formula.
 
     Raises:
         ConfigError: The text is invalid. The message gives the position of the wrong character.

@@ -1,8 +1,8 @@
 """The operations of declared injections, as listed in docs/reference/injections.md.
 
-An operation changes images of a whole block: arrays of shape (size,) and type uint8. A
+An operation changes images of a whole block, which are arrays of shape (size,) and type uint8. A
 ``ValueGroup`` reads and writes all values of one type in an image at once. Each activation resets
-the operation's state. If an operation is applied twice in a cycle, both results are the same.
+the operation's state. If an operation is applied twice in a cycle, the results are the same.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from shmio.layout.values.codec import REAL_MAX, scalar_codec
 Bytes = npt.NDArray[np.uint8]
 Values = npt.NDArray[Any]
 _MAX_ELEMENTS: Final = 4096
-"""Maximum number of single values in one injection. More would make the poll loop too slow."""
+"""Maximum number of single values in one injection, because more would make the poll loop too slow."""
 MAX_DELAY_CYCLES: Final = 10_000
 MAX_DELAY_BYTES: Final = 16_000_000
 """Maximum number of bytes of all images that one ``delay`` stores."""
@@ -42,8 +42,8 @@ _NUMPY: Final = {
 class ValueGroup:
     """All single values of one type in an injection's target.
 
-    The values of all groups of an injection are numbered. ``first`` is the number of this group's
-    first value.
+    The values in all groups of an injection are numbered. ``first`` is the number of the first value
+    in this group.
     """
 
     element: ElementType
@@ -60,14 +60,14 @@ class ValueGroup:
 
     @cached_property
     def span(self) -> slice | None:
-        """The bytes of the values in the block if they are contiguous, else None."""
+        """The range of bytes that the values take in the block, if they are contiguous; else None."""
         flat = self.index.ravel()
         first = int(flat[0])
         return slice(first, first + len(flat)) if (np.diff(flat) == 1).all() else None
 
     @cached_property
     def limits(self) -> tuple[Any, Any]:
-        """The smallest and the largest number of the type, as types that can be compared with :meth:`numbers`."""
+        """The smallest and the largest number of the type, for comparison with the result of :meth:`numbers`."""
         if self.dtype.kind == "f":
             most = _REAL_LIMIT if self.dtype.itemsize == 4 else float(np.finfo(np.float64).max)
             return -most, most
@@ -75,7 +75,7 @@ class ValueGroup:
         return exact(bounds.min), exact(bounds.max)
 
     def numbers(self, image: Bytes) -> Values:
-        """Return the values as an array of shape (n,) and type float64.
+        """Return the values in an image as an array of shape (n,) and type float64.
 
         For 64-bit integers, the type is long double, because a double would lose digits.
         """
@@ -99,9 +99,9 @@ class ValueGroup:
 
     @cached_property
     def single(self) -> struct.Struct | None:
-        """How the group's value is packed, if it is a single number that a double can represent; else None.
+        """The packing of the group's value; None unless it is a single number that a double can represent.
 
-        Plain Python is faster than numpy for one number, and gives the same bytes.
+        For one number, plain Python with this packing is faster than numpy, and gives the same bytes.
         """
         kind, size = self.dtype.kind, self.dtype.itemsize
         if len(self) > 1 or not (kind == "f" or (kind in "iu" and size <= 4)):
@@ -110,7 +110,13 @@ class ValueGroup:
         return struct.Struct(("<" if self.dtype.newbyteorder("<") == self.dtype else ">") + code)
 
     def change_single(self, packing: struct.Struct, image: Bytes, change: Callable[[float], float]) -> None:
-        """Change the only value: the same as :meth:`numbers` and :meth:`put_numbers`, but faster."""
+        """Change the group's only value, faster than with :meth:`numbers` and :meth:`put_numbers`.
+
+        Args:
+            packing: The packing of the value (:attr:`single`).
+            image: The image.
+            change: Returns the new number for the present number.
+        """
         at, data = self._at, image.data
         value = change(float(packing.unpack_from(data, at)[0]))
         least, most = self._range
@@ -139,7 +145,8 @@ class ValueGroup:
 
         Args:
             image: The image.
-            table: The encoded values to choose from, an array of shape (k, size). A bit is 0 or 1.
+            table: The encoded values from which to choose, an array of shape (k, size). The encoded
+                value of a bit is 0 or 1.
             choice: The row of ``table`` for each value of the group, an array of shape (n,).
 
         """
@@ -156,7 +163,7 @@ class ValueGroup:
 
 
 _Change = Callable[[ValueGroup, Values], Values]
-"""Computes the new values of a group from the present values."""
+"""A function of a group and its present values, which returns the new values."""
 
 
 def places(registers: Iterable[Register], byte_order: ByteOrder) -> list[ValueGroup]:
@@ -202,7 +209,7 @@ class OperationContext(NamedTuple):
     """Identifies the image or write to which an operation is applied.
 
     ``run`` is the number of the activation. ``place`` is the number of the cycle or write within
-    this activation. ``time_ns`` is the instance's clock.
+    this activation. ``cycle`` is the number of the cycle. ``time_ns`` is the instance's clock.
     """
 
     run: int
@@ -212,7 +219,10 @@ class OperationContext(NamedTuple):
 
 
 class StoredImage(NamedTuple):
-    """An image that an operation holds, with its cycle and instance time. ``role`` says what for."""
+    """An image that an operation holds, with its cycle and instance time.
+
+    ``role`` says for what the operation holds it; its meaning depends on the operation.
+    """
 
     role: int
     cycle: int
@@ -221,7 +231,7 @@ class StoredImage(NamedTuple):
 
 
 class Operation(ABC):
-    """Base class of operations. Each object belongs to one injection, and has its state."""
+    """Base class of operations. Each object belongs to one injection, and has the state of its operation."""
 
     exact: ClassVar[bool] = False
     """True if :meth:`apply` changes no bits but those that the injection covers."""
@@ -234,10 +244,10 @@ class Operation(ABC):
         """Change the image in place. The caller uses only the bits that the injection covers."""
 
     def passed(self, image: Bytes, at: OperationContext) -> None:  # noqa: B027  most operations have no state
-        """Record an image that the operation does not change.
+        """Take note of an image that the operation does not change.
 
-        If the injection has a probability, the caller uses this instead of :meth:`apply` for the
-        images that the injection leaves unchanged.
+        If the injection has a probability, the caller calls this instead of :meth:`apply` for each
+        image that the injection leaves unchanged.
         """
 
     def resume(self, image: Bytes) -> None:  # noqa: B027
@@ -248,7 +258,7 @@ class Operation(ABC):
         return []
 
     def restore(self, images: Sequence[StoredImage]) -> None:  # noqa: B027  most operations have no state
-        """Hold the images that :meth:`save` has returned, and no others."""
+        """Replace all images that the operation holds by those that :meth:`save` has returned."""
 
 
 def _bits(image: bytes) -> Bytes:
@@ -329,7 +339,7 @@ class Noise(Operation):
 class RandomRange(Operation):
     """``random`` with a range: replaces each number by a random number.
 
-    Integers may be equal to either end of the range.
+    Both ends of a range of integers are included.
     """
 
     def __init__(self, places: Sequence[ValueGroup], draw: SeededRandom, least: float, most: float) -> None:
@@ -375,11 +385,11 @@ class Freeze(Operation):
         self._held: Bytes | None = None
 
     def begin(self) -> None:
-        """Forget the frozen values. The values of the next image will be frozen."""
+        """Forget the frozen values, so that the values of the next image are frozen."""
         self._held = None
 
     def resume(self, image: Bytes) -> None:
-        """Freeze the values that the previous process of the source published last."""
+        """Freeze the values that the source's previous process published last."""
         self._held = image.copy()
 
     def save(self) -> list[StoredImage]:
@@ -387,7 +397,7 @@ class Freeze(Operation):
         return [] if self._held is None else [StoredImage(0, 0, 0, self._held.tobytes())]
 
     def restore(self, images: Sequence[StoredImage]) -> None:
-        """Freeze the values of a snapshot."""
+        """Freeze the values in a snapshot."""
         self._held = next((_bits(one.image) for one in images), None)
 
     def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: ARG002, D102
@@ -397,7 +407,7 @@ class Freeze(Operation):
 
 
 class Drop(Operation):
-    """``drop`` over ``/out``: drops the values of a cycle, so that readers see the previous ones.
+    """``drop`` over ``/out``: drops the values of some cycles, in which readers see the previous values.
 
     The caller calls :meth:`apply` for the cycles to drop, and :meth:`passed` for all other cycles.
     """
@@ -409,7 +419,8 @@ class Drop(Operation):
     def begin(self) -> None:
         """Forget all values.
 
-        Even if the next cycle is dropped, readers see its values, because there are no earlier ones.
+        Even if the next cycle is dropped, readers see its values, because there are no earlier
+        values.
         """
         self._held = self._passing = None
 
@@ -418,18 +429,18 @@ class Drop(Operation):
         self._held = image.copy()
 
     def save(self) -> list[StoredImage]:
-        """Return the values that readers see if the next cycle is dropped, and those of this cycle."""
+        """Return the values that readers see in a dropped cycle, and the values of the last cycle not dropped."""
         held = [] if self._held is None else [StoredImage(0, 0, 0, self._held.tobytes())]
         passing = [] if self._passing is None else [StoredImage(1, self._passing[0], 0, self._passing[1].tobytes())]
         return held + passing
 
     def restore(self, images: Sequence[StoredImage]) -> None:
-        """Restore the values of a snapshot."""
+        """Restore the values in a snapshot."""
         self._held = next((_bits(one.image) for one in images if not one.role), None)
         self._passing = next(((one.cycle, _bits(one.image)) for one in images if one.role), None)
 
     def passed(self, image: Bytes, at: OperationContext) -> None:
-        """Record the values of a cycle that is not dropped."""
+        """Store the values of a cycle that is not dropped."""
         self._settle(at.cycle)
         self._passing = at.cycle, image.copy()
 
@@ -448,7 +459,7 @@ class Drop(Operation):
 class Delay(Operation):
     """``delay`` over ``/out``: readers see values that are some time or some cycles old.
 
-    Until the activation has lasted that long, readers see its first values.
+    While the activation has lasted less than the delay, readers see its first values.
     """
 
     def __init__(self, size: int, delay_ns: int, cycles: int) -> None:
@@ -474,7 +485,7 @@ class Delay(Operation):
         return [StoredImage(0, cycle, time_ns, image.tobytes()) for cycle, time_ns, image in self._line]
 
     def restore(self, images: Sequence[StoredImage]) -> None:
-        """Store the images of a snapshot."""
+        """Store the images in a snapshot, instead of all others."""
         self._line = deque((one.cycle, one.time_ns, _bits(one.image)) for one in images)
 
     def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: D102
@@ -488,12 +499,12 @@ class Delay(Operation):
         image[:] = self._line[0][2]
 
     def due(self, cycle: int, time_ns: int, at: OperationContext) -> bool:
-        """Return whether an image of this cycle and time is old enough to be seen at ``at``."""
+        """Return whether an image of this cycle and time is old enough to be seen in the cycle ``at``."""
         return at.cycle - cycle >= self.cycles if self.cycles else at.time_ns - time_ns >= self.delay_ns
 
 
 class Flip(Operation):
-    """``flip``: inverts given bits, or one random bit of those that the injection covers."""
+    """``flip``: inverts given bits, or a random bit among those that the injection covers."""
 
     def __init__(self, mask: Bytes | None, cover: Bytes, draw: SeededRandom) -> None:
         """Create the operation.

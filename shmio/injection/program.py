@@ -47,14 +47,14 @@ MAX_REGISTERS: Final = 4096
 _MAX_REFERENCES: Final = 64
 
 _Operate = Callable[[SeededRandom], Operation]
-"""Creates the operation; the argument is its source of random numbers."""
+"""A function that creates an operation; its argument generates the operation's random numbers."""
 
 
 class Target(NamedTuple):
     """The registers that an injection changes.
 
-    They belong to one source and one direction, and do not overlap. ``cover`` is an image of the
-    block in which their bits are set.
+    The registers belong to one source and one direction, and do not overlap. ``cover`` is an image of
+    the block in which exactly their bits are set.
     """
 
     source: str
@@ -88,7 +88,7 @@ class Program:
 
     @property
     def foreign(self) -> frozenset[str]:
-        """The names of the other sources that the condition reads."""
+        """The names of the sources that the condition reads, without the source of the injection."""
         reads = self.condition.reads if self.condition else ()
         return frozenset(source for source, _ in reads if source != self.source)
 
@@ -98,8 +98,8 @@ def compile_program(declaration: Declaration, layouts: Mapping[str, Layout], per
 
     Args:
         declaration: The declared injection.
-        layouts: The layout of each source.
-        periods_ns: The period of each source, in ns.
+        layouts: The layout of each source, by source name.
+        periods_ns: The period of each source in ns, by source name.
 
     Raises:
         ConfigError: The declaration is invalid. The message begins with the wrong key.
@@ -144,7 +144,9 @@ def _read(path: str, layouts: Mapping[str, Layout]) -> tuple[str, RegisterCodec]
 
 
 def number_register(path: str, layouts: Mapping[str, Layout]) -> tuple[str, Register]:
-    """Return the source and the register that a condition names; its value must be a number or a BOOL.
+    """Return the source and the register that a path in a condition names.
+
+    The value of the register must be a number or a BOOL.
 
     Raises:
         PathError: There is no such register, or the path names an input.
@@ -173,13 +175,13 @@ def _window(declaration: Declaration) -> Window:
 
 
 def resolve(texts: Iterable[str], layouts: Mapping[str, Layout]) -> Target:
-    """Find the registers that texts name, as the target of an injection.
+    """Return the target of an injection: the registers that texts name.
 
     A text is the path of a register or of a part of it, a pattern, a structure or a whole source.
 
     Raises:
-        PathError: A text names no register, the registers are of several sources or directions,
-            they overlap, or there are too many.
+        PathError: A text names no register; or the registers belong to several sources or
+            directions, overlap, or are too many.
     """
     found: list[tuple[str, Direction, Register]] = []
     for text in texts:

@@ -1,4 +1,4 @@
-"""The laboratory: an instance whose sources are all computed, in one Python process.
+"""The laboratory: an instance in one Python process, whose sources are all computed.
 
 See docs/how-to/use-the-laboratory.md.
 """

@@ -1,8 +1,8 @@
 """Runs the sources of an instance in this process, in virtual time, without a supervisor.
 
-The laboratory uses the code of an instance: the loop, the commands and the injections of each source
-work on a segment that only this process has. So a recording is the same as that of an instance whose
-configuration says ``clock = "stepped"``.
+The laboratory uses the same code as an instance: the loop, the commands and the injections of each
+source work on a segment that only this process can use. So a recording is the same as that of an
+instance with ``clock = "stepped"`` in its configuration.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from shmio.segment import Segment
 from shmio.wording import unknown
 
 COMMANDS_S: Final = 2.0
-"""Maximum time in s that :meth:`Laboratory.close` waits for each thread."""
+"""Maximum time in s that :meth:`Laboratory.close` waits for the end of each thread."""
 
 
 def prepare_laboratory(file: Path) -> Plan:
-    """Read a configuration for laboratories. You can create any number of laboratories from one plan.
+    """Return a plan for laboratories from a configuration. One plan can serve any number of laboratories.
 
     Args:
         file: The ``supervisor.toml``. Only its sources and injections are used: emulators, endpoints
@@ -48,7 +48,7 @@ def prepare_laboratory(file: Path) -> Plan:
         The plan, for :class:`Laboratory`.
 
     Raises:
-        ConfigError: The configuration has faults, or a source that is not computed here.
+        ConfigError: The configuration has faults, or a source that cannot be computed in this process.
         LayoutError: A layout cannot be compiled.
 
     """
@@ -69,7 +69,7 @@ def prepare_laboratory(file: Path) -> Plan:
 class Laboratory:
     """An instance in this process, whose time is virtual from the start. Close it after use.
 
-    Its time begins at 0, and moves only by the steps of a cell from :meth:`attach`.
+    Its clock starts at 0, and moves only when you step a cell from :meth:`attach`.
     """
 
     def __init__(self, plan: Plan, parameters: Mapping[str, Mapping[str, object]] | None = None) -> None:
@@ -147,7 +147,7 @@ class Laboratory:
         return None if found.prompt else frozenset(found.inputs)
 
     def open(self) -> Segment:
-        """Open the segment once more, writable, as another process would. The laboratory closes it."""
+        """Open the segment once more, writable, as another process would; :meth:`close` closes it."""
         segment = self._segment.again()
         self._others.append(segment)
         return segment
@@ -156,18 +156,18 @@ class Laboratory:
         """Return a cell that is attached to the laboratory, as :func:`shmio.attach` does for an instance.
 
         Args:
-            segment: A segment from :meth:`open`; if None, a new one is opened.
+            segment: The segment to use, from :meth:`open`; None: open the segment once more.
 
         """
         segment = segment or self.open()
         return Attachment(segment, _LabCoordinator(self, segment), _LabStates(self), lambda: self.plan.snapshot_dir)
 
     def prepare(self, plan: RunPlan, seen: Callable[[Mapping[str, Rows]], None] = lambda _rows: None) -> LiveRun:
-        """Return a run of a campaign, which has not begun.
+        """Return a run of a campaign that has not begun yet.
 
         Args:
-            plan: What to do.
-            seen: Called with the new values of the signals, by source, in order of time.
+            plan: The plan of the run.
+            seen: Called with the new values of the signals, by source, in the order of time.
 
         Raises:
             ConfigError: An expectation is invalid.
@@ -180,8 +180,8 @@ class Laboratory:
         """Run a campaign, judge it and record it, as ``shmio-campaign run`` does on an instance.
 
         Args:
-            plan: What to do.
-            over: Ends the run when it is set.
+            plan: The plan of the run.
+            over: Set this event to end the run; None: the run cannot be ended early.
 
         Returns:
             The run, with its verdicts.
@@ -198,7 +198,7 @@ class Laboratory:
         return work
 
     def close(self) -> None:
-        """End the sources, and release the memory."""
+        """End all sources, and release the memory."""
         for loop in self.loops.values():
             loop.commands.stop()
         for thread in self._threads:

@@ -1,4 +1,4 @@
-"""Writes an instance as an FMU: its description, its library, and the instance's files."""
+"""Writes an instance as an FMU, which has a description, a library, and the instance's files."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ MAX_BYTES: Final = 64 << 20
 COMPILE_S: Final = 120
 """Time limit in s for the C compiler."""
 SUFFIXES: Final = frozenset({".toml", ".db", ".udt", ".scl", ".csv", ".xlsx", ".ini", ".py", ".fmu", ".npy", ".json"})
-"""Endings of the files that the FMU takes from the configuration's folder."""
+"""Suffixes of the files that are copied from the configuration's folder to the FMU."""
 _SKIPPED: Final = frozenset({"__pycache__", "node_modules", "logs", "dumps", "snapshots", "build", "dist"})
 _NOT_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 _PLATFORMS: Final = {"x86_64": "linux64"}
 
 
 def quoteattr(text: str) -> str:
-    """Return text as an attribute's value. Characters that XML 1.0 cannot contain become escape sequences."""
+    """Return text as a quoted value for XML; characters that XML 1.0 cannot contain become escape sequences."""
     return _quoteattr(_NOT_XML.sub(lambda match: f"\\u{ord(match[0]):04x}", text))
 
 
 class Exported(NamedTuple):
-    """The result of an export: number of inputs and outputs, and the registers that were left out."""
+    """The result of an export: the numbers of inputs and outputs, and the registers that were left out."""
 
     inputs: int
     outputs: int
@@ -54,8 +54,8 @@ def export_fmu(config: Path, file: Path, patterns: Sequence[str]) -> Exported:
 
     Args:
         config: The ``supervisor.toml``, whose sources must all be computed.
-        file: The FMU; an older one is replaced.
-        patterns: Registers to export; all if empty.
+        file: The FMU; an existing file is replaced.
+        patterns: Patterns of the registers to export; empty for all.
 
     Raises:
         ConfigError: The instance cannot be exported; the message says why.

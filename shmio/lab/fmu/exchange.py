@@ -1,8 +1,8 @@
 """The variables of an exported instance, and the messages between the FMU's library and its process.
 
 A message is u32 kind, u32 size, then ``size`` bytes, in the byte order of the machine. The process
-first sends the number of variables of each type. Each request then has two numbers and the values of
-all variables, and each answer the values of all variables, or an error with a text.
+first sends the number of variables of each kind. Then, each request has two numbers and the values of
+all variables. Each answer has the values of all variables, or is an error with a text.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ _LARGE: Final = frozenset({"DWORD", "LWORD", "UDINT", "LINT", "ULINT", "REAL", "
 
 
 class Group(NamedTuple):
-    """The variables of a register: one, or one for each element of an array.
+    """The variables of a register: one variable or, for an array, one for each element.
 
-    ``first`` is the index of the first variable among those of its kind.
+    ``kind`` is the type of the variables in FMI. ``first`` is the index of the first variable among
+    all variables of this kind.
     """
 
     source: str
@@ -46,7 +47,7 @@ def groups_of(lab: Laboratory, patterns: Sequence[str]) -> tuple[list[Group], li
 
     Args:
         lab: The instance.
-        patterns: Registers to export; all if empty.
+        patterns: Patterns of the registers to export; empty for all.
 
     Raises:
         PathError: A pattern matches no register.
@@ -84,7 +85,7 @@ def groups_of(lab: Laboratory, patterns: Sequence[str]) -> tuple[list[Group], li
 
 
 def kind_of(register: Register) -> str | None:
-    """Return the type of a register's variables in FMI 2.0; None if it has no such type."""
+    """Return the type in FMI 2.0 of a register's variables; None if FMI has no type for them."""
     base = register.element.base
     if base in _SMALL:
         return "Integer"
@@ -114,7 +115,7 @@ class Values:
         self._numbers = struct.Struct("=" + numbers)
 
     def encode(self, images: Mapping[str, bytes]) -> bytes:
-        """Return the values of the registers in the images of all sources."""
+        """Encode the values of all registers, from the image of each source, for a message."""
         lists: dict[str, list[Any]] = {kind: [] for kind in KINDS}
         for one in self._groups:
             value = one.codec.decode(images[one.source])
@@ -127,7 +128,7 @@ class Values:
         return numbers + b"".join(struct.pack("=I", len(text)) + text for text in texts)
 
     def decode(self, data: bytes) -> dict[str, list[Any]]:
-        """Return the values of a message by kind.
+        """Decode the values of a message, as a list for each kind.
 
         Raises:
             ValueRangeError: The message is too short.
@@ -153,7 +154,7 @@ class Values:
     def changes(
         self, before: Mapping[str, Sequence[Any]], now: Mapping[str, Sequence[Any]]
     ) -> Iterable[tuple[str, Any]]:
-        """Yield the paths and values of the inputs that have changed."""
+        """Yield (path, value) of each input whose value has changed from ``before`` to ``now``."""
         for one in self._groups:
             if not one.is_input:
                 continue

@@ -1,7 +1,7 @@
-"""The process of an exported instance: steps a laboratory for the FMU's library.
+"""The process of an exported instance, which steps a laboratory for the FMU's library.
 
-The library starts it with the folder of the FMU's resources as its argument, and a socket as file
-descriptor 3.
+The library starts the process with one argument, the folder of the FMU's resources, and with a
+socket as file descriptor 3.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from shmio.local.attach import Attachment
 
 SOCKET_FD: Final = 3
 CONFIG: Final = "cell"
-"""The folder with the instance's files, inside the resources."""
+"""Name of the folder with the instance's files, inside the FMU's resources."""
 MANIFEST: Final = "export.json"
 HELLO, INITIALISE, STEP, END = 1, 2, 3, 4
 _HEAD: Final = struct.Struct("=II")
@@ -32,7 +32,7 @@ _NS: Final = 1e9
 
 
 class Manifest(msgspec.Struct):
-    """What the export has chosen: the file of the configuration, the patterns, and all names."""
+    """What was exported: the file of the configuration, the patterns of registers, and all variables' names."""
 
     config: str
     patterns: list[str]
@@ -40,7 +40,7 @@ class Manifest(msgspec.Struct):
 
 
 class Session:
-    """Carries out the requests of the library."""
+    """Carries out the requests of the FMU's library."""
 
     def __init__(self, lab: Laboratory, cell: Attachment, manifest: Manifest) -> None:
         """Find the variables.
@@ -59,7 +59,7 @@ class Session:
         self._begun_s = 0.0
 
     def answer(self, kind: int, message: bytes) -> bytes:
-        """Carry out a request, and return the values of all variables.
+        """Carry out a request, and return the encoded values of all variables.
 
         Raises:
             ShmioError: The request cannot be carried out.
@@ -94,7 +94,7 @@ class Session:
 
 
 def image_of(cell: Attachment, source: str) -> bytes:
-    """Return the image that consumers of a source see; all zeros if there is none."""
+    """Return the image that consumers of a source see; all zeros if the source has not published any."""
     block = cell.block(source)
     frame = block.latest()
     return bytes(block.layout.size) if frame is None else frame.image
