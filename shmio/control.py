@@ -154,13 +154,13 @@ class Restart(_Request, tag="restart"):
 
 
 class Reload(_Request, tag="reload", omit_defaults=True):
-    """Read the configuration again, and apply its changes; with ``dry_run``, only report them."""
+    """Read the configuration again, and apply its changes; with ``dry_run``, only report the changes."""
 
     dry_run: bool = False
 
 
 class Where(_Request, tag="where"):
-    """Ask for the configuration file, when it was read, the log folder, and the addresses."""
+    """Ask for the configuration file, the time at which it was read, the folders, and the addresses."""
 
 
 Request = Stop | Restart | Reload | Where

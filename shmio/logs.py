@@ -31,7 +31,7 @@ KEPT_FILES = 3
 
 
 class LineFormatter(logging.Formatter):
-    """Formats a record as one line, followed by its indented traceback.
+    """Formats a record as one line, followed by the record's traceback, indented, if there is one.
 
     Control characters in the line are escaped.
     """

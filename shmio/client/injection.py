@@ -1,4 +1,7 @@
-"""Messages between an endpoint and a client that injects values or declares injections. No I/O."""
+"""Messages between an endpoint and a client that injects values or declares injections.
+
+This module does no I/O.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ from shmio.model.values import Column, Outcome
 from shmio.wire import shmio_v1_pb2 as wire
 
 _MAX_WAITING: Final = 4096
-"""Largest number of unread messages with originals, the values that an injection covers."""
+"""Maximum number of unread messages with originals, which are the values that an injection covers."""
 
 Given = Array | list[Any]
 Arrays = Mapping[Column, Given | tuple[Given, Given]]

@@ -230,7 +230,7 @@ class Rejoining:
         return answer
 
     def failed(self, part: Part, work: Work, error: Exception) -> bytes:
-        """Return the answer that the step has failed. Log the reason if it has changed."""
+        """Return the answer that the step has failed. Log the reason if it is not that of the last failure."""
         text = explain(error)
         if text != self._failure:
             self._failure = text

@@ -234,9 +234,10 @@ class Table:
         return found
 
     def value(self, place: int, arrays: Mapping[Column, Array] | None = None) -> Any:
-        """Return a register's value: a numpy scalar, an array of its shape, or text.
+        """Return the value of the register at index ``place``: a numpy scalar, an array, or text.
 
-        None stands for bytes that are not a valid value.
+        None stands for bytes that are not a valid value. ``arrays`` has the arrays from which to
+        take the value; None: those of the table, which have the latest values.
         """
         register = self.registers[place]
         array = (self.arrays if arrays is None else arrays)[register.column]
@@ -245,7 +246,7 @@ class Table:
         return None if self.invalid[place] else array[register.slot]
 
     def changed(self, changes: tuple[Change, ...]) -> list[int]:
-        """Return the indices of the changed registers, in ascending order."""
+        """Return the indices of the registers that have elements in ``changes``, in ascending order."""
         found: set[int] = set()
         for change in changes:
             slots, places = self._starts[change.column]
@@ -318,7 +319,7 @@ class Table:
         return list(map(int, places))
 
     def status(self, place: int) -> RegisterStatus | None:
-        """Return the status that the source gave a register; None if the source gives no statuses."""
+        """Return the status of the register at index ``place``; None if the source gives no statuses."""
         if self.codes is None or self.times_ns is None:
             return None
         return RegisterStatus(int(self.codes[place]), int(self.times_ns[place]))

@@ -40,7 +40,7 @@ RealtimePriority = Annotated[int, Meta(ge=1, le=99)]
 """Priority under the scheduling policy SCHED_FIFO (sched(7))."""
 
 ROLES = ("read", "write", "inject", "control")
-"""The permissions that clients of the gRPC endpoint can have."""
+"""The roles, which are permissions, that clients of the gRPC endpoint can have."""
 
 
 class Section(Struct, forbid_unknown_fields=True, kw_only=True):
@@ -204,7 +204,7 @@ class Trigger(Section):
 
 
 class Recorder(Section):
-    """``[recorder]``: the process that records all sources to ``.mem`` files."""
+    """``[recorder]``: the process that records the instance to ``.mem`` files."""
 
     directory: Text = "dumps"
     fsync_s: Annotated[float, Meta(ge=0, le=3600)] = 0.0
@@ -224,7 +224,7 @@ class Recorder(Section):
 
 
 class Replay(Section):
-    """``[replay]``: the recording that ``--mode replay`` plays in place of the sources."""
+    """``[replay]``: the recording that replaces the sources in the mode ``replay``."""
 
     file: Text | Texts | None = None
     start: float | Text | None = None

@@ -469,7 +469,7 @@ def _connector_of(source: dict[str, Any], common: Collection[str]) -> tuple[obje
 
 
 def convert(tables: dict[str, Any], kind: type[_Table]) -> _Table:
-    """Convert tables to a type.
+    """Convert the tables of a file to the type ``kind``.
 
     Raises:
         ConfigError: A key is unknown or its value is wrong; the message begins with the key.

@@ -28,7 +28,7 @@ def config_schema(connectors: Mapping[str, type[msgspec.Struct]], kinds: Collect
 
     Args:
         connectors: The type of the connector's own keys, by the name of each connector.
-        kinds: The kinds of emulators.
+        kinds: The names of all kinds of emulators.
 
     """
     schema = _document(Config, "supervisor.toml, the configuration of an instance")

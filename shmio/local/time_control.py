@@ -30,7 +30,7 @@ _PATIENCE_S: Final = 2.0
 The gRPC endpoint gives up its ownership while its clients are idle.
 """
 _LATE_NS: Final = 500_000_000
-"""If playing is late by more than this time in ns, it does not catch up."""
+"""If a step is late by more than this time in ns while time is played, playing does not catch up."""
 
 _NOBODY: Final = (
     "no source uses the instance clock, so stepping has no effect; sources with a device continue in real time"
@@ -112,14 +112,14 @@ class Coordinator:
         return self._owns
 
     def read(self) -> Clock:
-        """Read the clock page."""
+        """Return the state of the clock, from the clock page."""
         return self._segment.clock.read()
 
     def take_over(self, patience_s: float = 0.0, *, steps: bool = False) -> None:
         """Take over time: from now on, only steps move it. Do nothing if this program owns time.
 
         Args:
-            patience_s: Time to wait, in s, until an owner that does not play gives up time.
+            patience_s: Longest time to wait, in s, for an owner that is not playing to give up time.
             steps: Whether a step follows at once. Otherwise, a note of the clock says that time has
                 stopped.
 
@@ -153,7 +153,7 @@ class Coordinator:
         """Return to real time. The clock continues from the present virtual time, without an owner.
 
         Args:
-            patience_s: Time to wait, in s, until an owner that does not play gives up time.
+            patience_s: Longest time to wait, in s, for an owner that is not playing to give up time.
 
         Raises:
             TimeError: Another living process owns time, or time was virtual from the start.

@@ -192,8 +192,8 @@ class RegisterStatus(NamedTuple):
 
     Attributes:
         code: OPC UA status code.
-        source_ns: Time at which the value's origin had the value, UTC in ns since 1970; 0: unknown,
-            so that the time of the frame applies.
+        source_ns: Time stamp of the value at its origin, UTC in ns since 1970; 0: unknown, so that
+            the time of the frame applies.
     """
 
     code: int
@@ -206,7 +206,7 @@ class RegisterStatus(NamedTuple):
 
     @property
     def waits(self) -> bool:
-        """True if the register has had no value yet, so that its bytes in the image mean nothing."""
+        """True if the register has never had a value, so that its bytes in the image mean nothing."""
         return self.code & _NAMED == BAD_WAITING_FOR_INITIAL_DATA and not self.source_ns
 
     @property
@@ -268,13 +268,13 @@ class StatusArea:
         return self.times_offset + _TIME_BYTES * index, _TIME_BYTES
 
     def get(self, image: Buffer, index: int) -> RegisterStatus:
-        """Return the status of the register at an index of the layout."""
+        """Return the status of the register with this index in the layout."""
         (code,) = self._code.unpack_from(image, self.codes_offset + _CODE_BYTES * index)
         (source_ns,) = self._time.unpack_from(image, self.times_offset + _TIME_BYTES * index)
         return RegisterStatus(code, source_ns)
 
     def quality(self, image: Buffer, index: int) -> Quality:
-        """Return the quality of the register at an index of the layout."""
+        """Return the quality of the register with this index in the layout."""
         return _QUALITIES[image[self.codes_offset + _CODE_BYTES * index + self._severity_at] >> 6]
 
     def worst(self, image: Buffer, indices: Iterable[int]) -> tuple[int, RegisterStatus]:
@@ -283,7 +283,7 @@ class StatusArea:
         return found, self.get(image, found)
 
     def put(self, image: bytearray, index: int, status: RegisterStatus) -> None:
-        """Write the status of the register at an index of the layout."""
+        """Write the status of the register with this index in the layout."""
         self.write(image, index, status.code, status.source_ns)
 
     def write(self, image: bytearray, index: int, code: int, source_ns: int) -> None:

@@ -63,7 +63,7 @@ If the name is None, the function returns the files to attach for the instance.
 
 
 def no_attachments(_source: str | None, _block: int) -> list[AttachedFile]:
-    """Return no files to attach."""
+    """Return an empty list, for recordings without attached files."""
     return []
 
 
@@ -162,7 +162,7 @@ class RecordedBlock:
         return sum(lost.count for lost in self.lost.values())
 
     def come_to(self, what: str, number: int, log_ns: int) -> None:
-        """Remember that all frames or events up to this number were recorded."""
+        """Remember that all frames or events (``what``) up to this number were recorded."""
         self.log_ns = log_ns
         if what == "frames":
             self.frame = number

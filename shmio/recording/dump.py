@@ -123,7 +123,7 @@ class Dump:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The files in the order of time."""
+        """The paths of the files, in the order of time."""
         return tuple(part.file for part in self._parts)
 
     @property

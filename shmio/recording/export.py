@@ -29,7 +29,7 @@ from shmio.segment.explain import Explainer, cells_of, kind_of, object_of
 from shmio.version import __version__
 
 PIECE_BYTES: Final = 8 << 20
-"""Approximate size in bytes, in memory, of the pieces that :func:`pieces` yields."""
+"""Approximate size in memory of each piece that :func:`pieces` yields, in bytes."""
 GROUP_BYTES: Final = 16 << 20
 """Approximate size in bytes of a row group of a Parquet file.
 
@@ -66,7 +66,16 @@ def pieces(
     *,
     raw: bool = False,
 ) -> Iterator[tuple[DumpBlock, Columns]]:
-    """Yield the values of chosen registers of one source in pieces, each from one block.
+    """Yield the values of registers of one source in pieces, each from one block.
+
+    Args:
+        dump: The recording.
+        source: Name of the source.
+        chosen: The registers, by block.
+        from_ns: Start of the range of log times.
+        to_ns: End of the range of log times.
+        raw: True for the values that the source delivered, without injections; False for the values
+            that readers saw.
 
     Raises:
         PathError: There is no such source.

@@ -19,7 +19,7 @@ _ENTRY = struct.Struct("=IIII")  # offset, size, mask, index: scan_entry in _ato
 
 
 class ChangeScan:
-    """Compares the given registers in two images, in C code. Immutable."""
+    """Compares the given registers in two images, in C code. An object never changes."""
 
     def __init__(self, registers: Sequence[Register], statuses: StatusArea | None = None) -> None:
         """Prepare the comparison of these registers.

@@ -306,7 +306,7 @@ def time_lock(head: Header) -> int:
 
 
 def page_size(slots: int) -> int:
-    """Return the size of the section in bytes for a process table with this many slots."""
+    """Return the size in bytes of a clock page for a process table with this many slots."""
     return _TABLE_AT + slots * (_ENTRY.size + 8) + 2 * _REQUEST_COPY
 
 

@@ -25,7 +25,7 @@ CELL_SIZE: Final = 8 + LIST_SIZE
 
 
 class InjectionEntry(Injection[Declaration], frozen=True, omit_defaults=True):
-    """An existing injection of a source. In the list of its block, the innermost comes first."""
+    """An existing injection of a source. In a block's list, the innermost injection comes first."""
 
     @property
     def configured(self) -> bool:

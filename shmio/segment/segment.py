@@ -310,7 +310,8 @@ def _read_clock(shared: SharedObject, head: Header, entries: Sequence[SectionEnt
 class Segment:
     """The mapped shared memory of an instance.
 
-    A supervisor calls :meth:`create`. Other processes call :meth:`open`, workers with ``writable``.
+    A supervisor calls :meth:`create`. Other processes call :meth:`open`; workers do so with
+    ``writable``.
     """
 
     def __init__(self, shared: SharedObject, instance: str) -> None:

@@ -25,7 +25,7 @@ from shmio.supervisor.process import AdoptedProcess, ChildProcess, describe_end
 TICK_S: Final = 0.1
 """Interval in s at which heartbeats are checked."""
 LATE_S: Final = 0.4
-"""Time in s after which a heartbeat is late: two of its intervals."""
+"""Time in s without a heartbeat after which the heartbeat is late: two intervals between heartbeats."""
 _LOST: Final = {"mqtt": ("dropped", "changes"), "alerts": ("failed", "notices")}
 """For each kind of process, the counter of what it loses during a problem, and the noun for that in messages."""
 
@@ -63,7 +63,7 @@ class ManagedProcess:
 
     @property
     def job(self) -> Job:
-        """The process's job.
+        """The present job of the process.
 
         Raises:
             LookupError: The process has no job, because it was adopted only to be stopped.
@@ -101,7 +101,7 @@ class ManagedProcess:
         return bool(self.child is not None and job.rules is not None and known)
 
     def can_follow(self, job: Job) -> bool:
-        """Return whether the running process can take over a job and keep its connection to the device."""
+        """Return whether the process is running, and can change to a job and keep its connection to the device."""
         known = self._job is not None and job.connects_like(self._job)
         return known and self.ready and self.life.state is State.RUNNING
 

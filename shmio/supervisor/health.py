@@ -85,7 +85,7 @@ class Notifier:
         self._send("STATUS=" + text.replace("\n", " "))
 
     def beat(self, now_ns: int) -> None:
-        """Notify the watchdog of the service manager, if that is due."""
+        """Notify the watchdog of the service manager, if a notification is due."""
         if self._period_ns and now_ns - self._beat_ns >= self._period_ns:
             self._beat_ns = now_ns
             self._send("WATCHDOG=1")

@@ -41,7 +41,7 @@ MAX_ADDRESSES: Final = 16
 ACTIONS: Final = {Stop: "down", Restart: "restart", Reload: "reload"}
 """The name of each request in the audit log."""
 NAME_S: Final = 1.0
-"""Interval in s at which to check that the segment still exists under its name."""
+"""Interval in s at which to check whether the segment still exists under its name."""
 
 
 class Supervisor:

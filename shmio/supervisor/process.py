@@ -156,7 +156,7 @@ class AdoptedProcess:
         return _waited_ns(self.pid)
 
     def last_words(self) -> str:
-        """Return "", because nobody knows which lines of the log file are from this process."""
+        """Return "", because it is unknown which lines of the log file are from this process."""
         return ""
 
 

@@ -659,7 +659,7 @@ class Simulation(Member, AsyncIterator[Work]):
         await self._answer(self._part.failed(self._present(), reason))
 
     async def compute(self, work: Work, step: Step, rejoining: Rejoining) -> None:
-        """Call the program's function for a step, and answer with its outputs or its error."""
+        """Call the program's function ``step`` for a step, and answer with its outputs or its error."""
         rejoining.heed(self._part, work)
         try:
             outputs = await outputs_of(step(work.time_s, work.dt_s, work.inputs))

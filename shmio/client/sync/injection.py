@@ -138,7 +138,7 @@ class Shadow(Iterator[Update]):
                 self._changed.notify_all()
 
     def close(self) -> None:
-        """Lift the injection, unless ``keep`` was given."""
+        """Lift the injection, unless it was created with ``keep``."""
         self._stream.finish()
         self._reading.join(self._channel.timeout_s)
         self._stream.close()
@@ -176,7 +176,13 @@ class Campaign(Iterator[InjectionEvent]):
 
     @classmethod
     def create(cls, stream: Stream, lift: Lift, *, keep: bool) -> Self:
-        """Read the first answer to Declare, and return the campaign."""
+        """Wait for the first answer to a call of Declare, and return the campaign that it has created.
+
+        Args:
+            stream: The call.
+            lift: Lifts an injection.
+            keep: Whether the injections stay when this program ends.
+        """
         try:
             return cls(stream, stream.first(), lift, keep=keep)
         except BaseException:
@@ -197,7 +203,7 @@ class Campaign(Iterator[InjectionEvent]):
         return event
 
     def close(self) -> None:
-        """Lift the remaining injections, unless ``keep`` was given."""
+        """Lift the remaining injections, unless they were created with ``keep``."""
         left, self._left = self._left, {}
         try:
             for source, number in () if self._keep else left:

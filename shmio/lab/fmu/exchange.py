@@ -106,7 +106,7 @@ def _names(source: str, register: Register) -> Iterator[str]:
 
 
 class Values:
-    """The values of all variables, as lists by kind."""
+    """Encodes and decodes the values of all variables, which are lists by kind."""
 
     def __init__(self, groups: Sequence[Group]) -> None:
         self._groups = groups
