@@ -26,7 +26,7 @@
     ├── EndpointError      an endpoint cannot use its address, or has reached a limit
     ├── RemoteError        an instance cannot be reached by gRPC, or does not answer as it should
     │   ├── LostError            nothing serves this address at present; also a subclass of NotRunningError
-    │   └── UnknownClientError   the endpoint requires a token that it knows
+    │   └── UnknownClientError   the endpoint requires a token, and the client presented no valid one
     └── ControlError       the supervisor refused or did not answer
         └── UnreachableError     shmio cannot connect to the supervisor's socket
 

@@ -25,7 +25,7 @@ def resume() -> None:
 
 @contextmanager
 def paused() -> Iterator[None]:
-    """Collect nothing in a ``with`` block. Later collections go through what was created in it."""
+    """Switch garbage collection off during a ``with`` block. Objects created in it are collected later."""
     enabled = gc.isenabled()
     gc.disable()
     try:

@@ -192,7 +192,7 @@ def fields(**values: object) -> dict[str, dict[str, object]]:
 
 
 def stamp(time_s: float) -> str:
-    """Return a UNIX time as UTC in ISO 8601; sorting such texts sorts the times."""
+    """Return a UNIX time as UTC in ISO 8601; such texts sort by time."""
     return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
 
 

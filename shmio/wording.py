@@ -55,8 +55,8 @@ def unknown(what: str, word: object, names: Iterable[str], of: str = "") -> str:
         what: The kind of thing, such as ``source``.
         word: The word that the user wrote.
         names: All valid names.
-        of: What has these names, such as ``model lift``; the text then is ``unknown WHAT 'word' of
-            OF; …``.
+        of: What has these names, such as ``model lift``; then the text is ``unknown WHAT 'word' of
+            OF; …``. Empty: the message says this already.
 
     """
     known = list(names)
@@ -101,7 +101,7 @@ def plain_text(address: object, remedy: str) -> str:
 
 
 def name_one(what: str, names: Iterable[str]) -> str:
-    """Return the message for a caller who named none of several things, or for whom there is none to name."""
+    """Return the message for a user who must name one of several things, or for whom there is none to name."""
     known = list(names)
     return (
         f"there are several {what}s; name one of them: {', '.join(known[:MAX_NAMES])}"

@@ -184,7 +184,7 @@ class Worker:
 
 
 class Reload:
-    """The part of a worker in a reload, after it has read its new configuration.
+    """A reload as a worker takes part in it, after the worker has read its new configuration.
 
     Create the object before you stop any work, so that it notices if the supervisor ends meanwhile.
     """

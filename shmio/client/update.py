@@ -32,7 +32,7 @@ class Update:
         clock_ns: Time since the instance's start, in ns.
         source_ns: UTC time of the values, in ns; 0 if there are no values yet.
         marked: True if the update also says which registers are invalid or injected.
-        missed: Number of frames lost before this one. It is counted only with ``every_frame``.
+        missed: Number of frames lost before this one; counted only with ``every_frame``.
         ended: True if a reload has removed the source, or all of its requested registers.
         image: The frame as consumers see it, if ``frames`` was requested.
         raw: The frame as the source delivered it, if ``frames`` was requested.

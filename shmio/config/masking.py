@@ -22,7 +22,7 @@ _PARTS: Final = re.compile(
     r"password|passwd|passphrase|passcode|pwd|secret|token|credential|authorization|bearer|sha256|psk"
 )
 _WHOLE: Final = frozenset({"webhook"})
-"""Keys whose values may be secret, but not those of longer keys with the same word.
+"""Whole names of keys whose values may be secret; longer names that contain them are not meant.
 
 The URL of a webhook often contains a secret.
 """

@@ -40,7 +40,7 @@ RealtimePriority = Annotated[int, Meta(ge=1, le=99)]
 """Priority under the scheduling policy SCHED_FIFO (sched(7))."""
 
 ROLES = ("read", "write", "inject", "control")
-"""The roles, which are permissions, that clients of the gRPC endpoint can have."""
+"""The roles (permissions) that clients of the gRPC endpoint can have."""
 
 
 class Section(Struct, forbid_unknown_fields=True, kw_only=True):

@@ -24,7 +24,7 @@ from shmio.falsification.trial import Result, Status, Task
 LOOK_S: Final = 0.25
 """Maximum time in s between two checks whether the search has been asked to stop."""
 FIRST_TRIALS: Final = 10
-"""If none of this number of trials at the beginning of a search can run to its end, the search ends."""
+"""Number of trials at the beginning of a search; if all of them fail to run to their end, the search ends."""
 
 
 @dataclass

@@ -182,7 +182,7 @@ class Journal:
 
 
 def differences(before: Any, now: Any, key: str = "") -> Iterator[str]:
-    """Yield a text for each key with different values before and now; ``key`` is the key of both values."""
+    """Yield a text for each key whose value differs between ``before`` and ``now``, which have the key ``key``."""
     if isinstance(before, Mapping) and isinstance(now, Mapping):
         for name in {**before, **now}:
             inner = f"{key}.{name}".lstrip(".")

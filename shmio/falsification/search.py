@@ -17,7 +17,7 @@ SEARCHES: Final[tuple[SearchName, ...]] = get_args(SearchName)
 MAX_TRIALS: Final = 1_000_000
 """Maximum number of trials of a search."""
 MAX_OPTIMISED: Final = 10_000
-"""Maximum number of trials with an optimiser, which needs more time for a point the more points it has had."""
+"""Maximum number of trials with an optimiser, because its time for a point grows with the number of points."""
 REMEDY: Final = "pip install 'shmio[falsify]', or use --search random or grid"
 
 

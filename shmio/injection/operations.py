@@ -221,7 +221,7 @@ class OperationContext(NamedTuple):
 class StoredImage(NamedTuple):
     """An image that an operation holds, with its cycle and instance time.
 
-    ``role`` says for what the operation holds it; its meaning depends on the operation.
+    ``role`` is the purpose of the image, as a number that only the operation knows.
     """
 
     role: int
@@ -244,7 +244,7 @@ class Operation(ABC):
         """Change the image in place. The caller uses only the bits that the injection covers."""
 
     def passed(self, image: Bytes, at: OperationContext) -> None:  # noqa: B027  most operations have no state
-        """Take note of an image that the operation does not change.
+        """Take an image into account that the operation does not change.
 
         If the injection has a probability, the caller calls this instead of :meth:`apply` for each
         image that the injection leaves unchanged.

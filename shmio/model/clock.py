@@ -89,7 +89,7 @@ class Clock(NamedTuple):
 
 
 class ClockStatus(msgspec.Struct):
-    """Status of the instance's clock. ``mode`` is wall or virtual; ``step``: number of the last finished step.
+    """Status of the instance's clock. ``mode`` is wall or virtual; ``step`` is the last finished step.
 
     ``note`` says which processes a step waits for, why the last step failed, or on which sources it
     had no effect. Before the first step, it says how to return to real time.

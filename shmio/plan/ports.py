@@ -90,7 +90,7 @@ def taken(plan: Plan) -> Iterator[str]:
 
 
 def in_use(address: Address) -> bool:
-    """Return whether the address is in use; a host name is in use if all of its addresses are.
+    """Return whether the address is in use; for a host name, whether all of its addresses are in use.
 
     Raises:
         ConfigError: The host name cannot be resolved.

@@ -33,7 +33,7 @@ events.
 """
 
 BROKER: Final = "broker"
-"""Name of the process of shmio's own MQTT broker, whose kind is ``mqtt`` as that of the bridge.
+"""Name of the process of shmio's own MQTT broker. Like the bridge, the process has the kind ``mqtt``.
 
 The broker starts before the bridge and stops after it, so that the bridge can disconnect properly.
 """

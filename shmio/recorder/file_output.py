@@ -111,7 +111,7 @@ class Output:
     # ---- called by the recorder's thread -----------------------------------------------------------------------------
 
     def write(self, data: bytes | memoryview) -> int:
-        """Append data to the present piece, without waiting for the disk; return their number of bytes."""
+        """Append data to the present piece, without waiting for the disk; return the number of bytes."""
         self._piece += data
         return len(data)
 

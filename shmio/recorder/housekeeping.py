@@ -56,7 +56,7 @@ class Housekeeper:
         self._thread = threading.Thread(target=self._run, name="keeper", daemon=True)
 
     def start(self) -> None:
-        """Start the thread, which first checks the folder at once."""
+        """Start the thread, which checks the folder at once, and then at intervals."""
         self._thread.start()
 
     def stop(self, patience_s: float = 0.5) -> None:

@@ -1,4 +1,4 @@
-"""Records a file when a trigger fires. The file also has the seconds before that."""
+"""Records a file when a trigger fires. The file also has the seconds before the trigger."""
 
 from __future__ import annotations
 

@@ -265,7 +265,7 @@ class Dump:
         return next(self.events(source, after_ns + 1), None)
 
     def next_change(self, path: str, after_ns: int = -1, to_ns: int = MAX_NS) -> Entry[Frame] | None:
-        """Return the first frame after ``after_ns`` in which readers saw one of some registers change.
+        """Return the first frame after ``after_ns`` in which readers saw a register of a path change.
 
         Args:
             path: A register, a structure or a pattern of one source.

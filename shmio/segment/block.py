@@ -339,9 +339,9 @@ class Block:
     def now_ns(self) -> int:
         """Return the present time in ns on the clock that determines the age of frames.
 
-        If the source replays a recording, this is the clock of its playhead. If it uses the
-        instance clock in another way, it is that clock. For all other sources, it is
-        CLOCK_MONOTONIC.
+        For a source that replays a recording, this is the clock of its playhead. For any other
+        source that uses the instance clock, this is the instance clock. For all other sources, this
+        is CLOCK_MONOTONIC.
         """
         if self.playhead is not None:
             return self.playhead.now_ns()

@@ -255,7 +255,7 @@ class ClockPage:
         self.delivered_bell.ring()
 
     def abstain(self, index: int) -> None:
-        """Let steps no longer wait for the process in a slot, until it calls :meth:`deliver` again.
+        """Make steps no longer wait for the process in a slot, until it calls :meth:`deliver` again.
 
         Only that process may call this.
         """
@@ -281,7 +281,7 @@ class ClockPage:
         self._request.write(_REQUEST.pack(request.number, request.action, request.pid, folder, name))
 
     def state_answer(self, index: int) -> tuple[int, bool]:
-        """Return the number of the last request that the process in a slot has answered, and if it succeeded.
+        """Return (number, success) of the last request that the process in a slot has answered.
 
         The number is 0 if the process has answered none.
         """

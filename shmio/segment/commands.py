@@ -301,7 +301,7 @@ class CommandAssembler:
 
 
 End = tuple[EventKind, str]
-"""Outcome of an item, and the reason: one of ``ENDS``, or ACCEPTED if the caller waits only for that."""
+"""Outcome of an item (one of ``ENDS``, or ACCEPTED if the caller waits only for that), and the reason."""
 
 
 def worst(ends: Sequence[End]) -> End:

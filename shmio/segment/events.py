@@ -96,7 +96,7 @@ ENDS: Final = frozenset(
         EventKind.NOTED,
     }
 )
-"""Kinds of events that are the outcome of an item; REJECTED is the outcome of a whole command."""
+"""Kinds of events that give the outcome of an item; REJECTED gives the outcome of a whole command."""
 DONE: Final = frozenset({EventKind.WRITTEN, EventKind.TAKEN, EventKind.SHADOWED})
 """Those kinds in :data:`ENDS` that are successes: the device, consumers or an injection got the value."""
 
@@ -117,8 +117,8 @@ class Event(NamedTuple):
         incarnation: Number of times that the source's process has been started, including the
             present start.
         quality: Quality after the event.
-        writer: Number of the queue that the command came from; NO_WRITER: it came from
-            none.
+        writer: Number of the queue from which the command came; NO_WRITER: the event is not about
+            a command from a queue.
         command: Number that the writer gave the command; 0: none.
         item: Index of the first item of the command that the event is about.
         items: Number of the command's items that the event is about.

@@ -71,7 +71,7 @@ class SectionKind(IntEnum):
 
 
 class Header(msgspec.Struct, frozen=True):
-    """The fields of the header that never change. Offsets and sizes are in bytes, times in ns."""
+    """The fields of the header that are written at creation. Offsets and sizes are in bytes, times in ns."""
 
     epoch: int
     size: int
@@ -248,8 +248,8 @@ def _config_field(file: Path) -> bytes:
 def write_supervised_since(memory: memoryview, since_ns: int) -> None:
     """Write the time at which the supervisor started, CLOCK_MONOTONIC in ns.
 
-    Call this only if the instance's clock was not 0 at that time; the start of the instance is the
-    default.
+    Call this only if the instance's clock was not 0 at that time. Without this call, readers take
+    the start of the instance.
     """
     _atomics.store64(memory, SUPERVISED_SINCE_OFFSET, since_ns)
 

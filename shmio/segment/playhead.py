@@ -103,7 +103,7 @@ class PlayState(NamedTuple):
         return self.loop and self.until_ns >= self.end_ns
 
     def at_ns(self, clock_ns: int) -> int:
-        """Return the position at a time of the instance's clock, which is always within the played range."""
+        """Return the position, within the played range, at a time of the instance's clock."""
         reach_ns = self.reach_ns(clock_ns)
         if reach_ns >= self.end_ns and self.wraps and not self.paused:
             return self.begin_ns + (reach_ns - self.begin_ns) % (self.end_ns - self.begin_ns)

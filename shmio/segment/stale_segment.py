@@ -215,8 +215,8 @@ def _opened(workers: Iterable[Worker]) -> Iterator[list[Worker]]:
 def holder(slot: ProcessSlot, shared: SharedObject) -> Worker | None:
     """Return the process that has locked a slot; None if it is unknown or has ended.
 
-    If the process with the worker's pid has not mapped the segment, the worker has ended, and the
-    process has got the same pid.
+    A process that has the worker's pid, but has not mapped the segment, does not count: the worker
+    has ended, and its pid is in use again.
     """
     pid = slot.report.pid
     if not pid:

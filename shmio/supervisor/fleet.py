@@ -172,7 +172,8 @@ class ManagedProcess:
     def waited_ns(self) -> int:
         """Return the time in ns for which the process has waited for a processor.
 
-        It is counted from the start of the process; if its heartbeat is late, from when that began.
+        The time is counted from the start of the process or, if its heartbeat is late, from the time
+        at which the heartbeat became late.
         """
         return 0 if self.child is None else self.child.waited_ns() - (self._waited_ns or 0)
 
@@ -234,7 +235,7 @@ def brief(error: Exception) -> str:
 
 
 class Fleet:
-    """All processes of a segment. When a process ends, the selector returns the function to call as data."""
+    """All processes of a segment. The selector's data for the pidfd of a process is the function to call."""
 
     def __init__(
         self, segment: Segment, selector: selectors.BaseSelector, limits: Limits, modules: Mapping[str, str]

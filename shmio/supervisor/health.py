@@ -22,7 +22,7 @@ from shmio.supervisor.policy import State
 from shmio.supervisor.process import NOTIFY_VARIABLES
 
 QUALITY_S: Final = 0.5
-"""Interval in s at which the quality of the sources is checked when the instance has started."""
+"""Interval in s at which the quality of the sources is checked after the start of the instance."""
 LOOK_S: Final = 5.0
 """Interval in s at which the folder of the log files is checked."""
 SILENT_S: Final = 15.0

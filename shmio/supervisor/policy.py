@@ -294,7 +294,7 @@ Ranked = Sequence[tuple[int, Life]]
 
 
 def to_start(processes: Ranked) -> list[int]:
-    """Return the indices of the processes to start: those of the lowest rank that has not been started yet.
+    """Return the indices of the processes to start: all of the lowest rank that has not been started yet.
 
     Higher ranks wait until all processes of lower ranks have run for the first time, or have failed.
     """
@@ -306,7 +306,7 @@ def to_start(processes: Ranked) -> list[int]:
 
 
 def to_stop(processes: Ranked) -> list[int]:
-    """Return the indices of the processes to stop: those of the highest rank that has not stopped yet.
+    """Return the indices of the processes to stop: all of the highest rank that has not stopped yet.
 
     Stuck processes do not delay the stop of others.
     """

@@ -15,7 +15,7 @@ from pathlib import Path
 import shmio
 
 NOTIFY_VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
-"""Environment variables of the service manager, see sd_notify(3) and sd_watchdog_enabled(3)."""
+"""Environment variables that the service manager sets: sd_notify(3), sd_watchdog_enabled(3)."""
 _DESCRIPTION = "description"
 _PACKAGED = ("site-packages", "dist-packages")
 _TAIL_BYTES = 4096

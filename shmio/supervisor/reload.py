@@ -171,9 +171,9 @@ class InstanceChange:
         return [job for job in self.plan.jobs if job.name in names]
 
     def step(self) -> bool:
-        """Do what is possible now; return True if the change is complete.
+        """Carry on as far as possible without waiting; return True if the change is complete.
 
-        It is complete when each process that the change starts runs, or has failed once.
+        The change is complete when each process that it starts runs, or has failed once.
         """
         if not self._stopped:
             self._stopped = self._stop()
@@ -336,9 +336,9 @@ class Reloader:
         self._change = InstanceChange(self._fleet, self._segment, self.plan)
 
     def reload(self, answer: Answer) -> None:
-        """Begin to make a new plan, to be applied later. If another reload is in progress, refuse.
+        """Begin a reload: make a new plan, which :meth:`step` will apply. Refuse if a reload is in progress.
 
-        ``answer`` gets the outcome of the reload.
+        The client that waits for ``answer`` gets the outcome of the reload.
         """
         reason = self.busy() or (self._planning and "another reload is being prepared; try again when it is done")
         if reason:
@@ -371,7 +371,7 @@ class Reloader:
         self._previewers, self._next_previewers = [], []
 
     def step(self) -> None:
-        """Do what is possible now of the reload, the change and the previews."""
+        """Carry on with the reload, the change and the previews, as far as possible without waiting."""
         if self._planning is not None and (self._planning.over or self._planning.late):
             planning, self._planning = self._planning, None
             self._begin(planning)

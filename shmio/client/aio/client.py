@@ -119,7 +119,7 @@ class Client:
 
         Args:
             patterns: Paths, elements, slices, structures, globs, or the names of sources.
-            originals: Whether also to read the values that the source delivered, without
+            originals: Whether to read, in addition, the values that the source delivered, without
                 injections.
 
         Raises:
@@ -157,8 +157,8 @@ class Client:
             deadband: Changes of a number by at most this amount are not reported.
 
         Returns:
-            An iterator over updates (:class:`Update`). Its first step raises PathError if a pattern
-            matches no register.
+            An iterator over updates (:class:`Update`). If a pattern matches no register, the first
+            iteration raises PathError.
         """
         request = calls.subscribe_request(
             patterns, every_frame=every_frame, frames=frames, max_rate_hz=max_rate_hz, deadband=deadband
@@ -659,7 +659,7 @@ class Simulation(Member, AsyncIterator[Work]):
         await self._answer(self._part.failed(self._present(), reason))
 
     async def compute(self, work: Work, step: Step, rejoining: Rejoining) -> None:
-        """Call the program's function ``step`` for a step, and answer with its outputs or its error."""
+        """Call the function ``step`` for the requested step ``work``; answer with its outputs or its error."""
         rejoining.heed(self._part, work)
         try:
             outputs = await outputs_of(step(work.time_s, work.dt_s, work.inputs))

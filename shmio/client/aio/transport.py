@@ -17,7 +17,7 @@ from shmio.errors import RemoteError
 
 Outputs = Mapping[str, object] | None
 Step = Callable[[float, float, Values], Outputs | Awaitable[Outputs]]
-"""Function of ``(time_s, dt_s, inputs)`` that returns the outputs at the end of a step by path.
+"""Function of ``(time_s, dt_s, inputs)`` that returns the outputs, by path, at the end of a step.
 
 It may be a coroutine function. Times are in s.
 """

@@ -17,7 +17,10 @@ from shmio.errors import RemoteError
 
 Outputs = Mapping[str, object] | None
 Step = Callable[[float, float, Values], Outputs]
-"""Function of ``(time_s, dt_s, inputs)`` that returns the outputs at the end of a step by path; times in s."""
+"""Function of ``(time_s, dt_s, inputs)`` that returns the outputs, by path, at the end of a step.
+
+Times are in s.
+"""
 CLOSED: Final = ValueError
 """Error that grpcio raises for a call on a closed channel."""
 sleep: Final = time.sleep

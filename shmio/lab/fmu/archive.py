@@ -1,4 +1,4 @@
-"""Writes an instance as an FMU, which has a description, a library, and the instance's files."""
+"""Writes an instance as an FMU: a file with a description, a library, and the instance's files."""
 
 from __future__ import annotations
 

@@ -233,7 +233,7 @@ class Survey:
 
 
 def survey(reader: Reader) -> Survey:
-    """Survey a recording by reading the headers and chunk indexes of the file; continue after damage.
+    """Survey a recording by going through the whole file, but reading few chunks; continue after damage.
 
     Raises:
         RecordingError: The file is not a recording of shmio.
