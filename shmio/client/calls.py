@@ -168,14 +168,14 @@ def ns(dt_s: float | None) -> int:
 
 
 def read_request(patterns: Iterable[str], *, originals: bool) -> Any:
-    """Return the request for Read."""
+    """Return the request of the call Read."""
     return wire.ReadRequest(patterns=patterns, originals=originals)
 
 
 def subscribe_request(
     patterns: Iterable[str], *, every_frame: bool, frames: bool, max_rate_hz: float, deadband: float
 ) -> Any:
-    """Return the request for Subscribe."""
+    """Return the request of the call Subscribe."""
     return wire.SubscribeRequest(
         patterns=patterns,
         mode=wire.MODE_EVERY_FRAME if every_frame else wire.MODE_LATEST,
@@ -186,7 +186,7 @@ def subscribe_request(
 
 
 def write_request(values: Mapping[str, object], timeout_s: float | None, *, until_accepted: bool) -> Any:
-    """Return the request for Write.
+    """Return the request of the call Write.
 
     Raises:
         ValueRangeError: A value has an unsupported Python type.
@@ -240,7 +240,7 @@ class Stepped:
 
 
 def steps_requests(count: int, dt_s: float | None) -> list[Any]:
-    """Return the requests that start a stream of steps (Steps).
+    """Return the first requests of the call Steps.
 
     Raises:
         ValueRangeError: The count or the length is out of range.
@@ -292,7 +292,7 @@ def _process(found: Any) -> dict[str, Any]:
 
 
 def replay_request(changes: ReplayChanges) -> Any:
-    """Return the request for Replay; times are sent as text."""
+    """Return the request of the call Replay, in which times are text."""
     keys: dict[str, Any] = {**changes}
     for key in {"seek", "until"} & keys.keys():
         keys[key] = str(keys[key])
@@ -319,5 +319,5 @@ def snapshot(found: Any) -> SnapshotInfo:
 
 
 def replay_patience_s(changes: ReplayChanges) -> float | None:
-    """Return the time-out of a Replay request, in s; None if the client's time-out applies."""
+    """Return the time-out of a call of Replay, in s; None if the client's time-out applies."""
     return _SEARCH_PATIENCE_S if "change" in changes or "event" in changes else None

@@ -44,7 +44,7 @@ def inject_request(
     for_s: float | None,
     originals: bool,
 ) -> bytes:
-    """Return the first message of an Inject call, which creates the injection.
+    """Return the first request of the call Inject, which creates the injection.
 
     Raises:
         ValueRangeError: An argument is invalid.
@@ -150,7 +150,7 @@ def ends(values: Mapping[str, object], outcome: Any, *, more: bool) -> list[Outc
 
 
 def declare_request(declarations: Iterable[Mapping[str, Any] | msgspec.Struct], *, keep: bool) -> Any:
-    """Return the request for Declare. Raise ValueRangeError if a key or value is invalid."""
+    """Return the request of the call Declare. Raise ValueRangeError if a key or value is invalid."""
     given = [one if isinstance(one, Mapping) else msgspec.to_builtins(one) for one in declarations]
     tables = [declaration_to_wire(table, f"injection[{index}]") for index, table in enumerate(given)]
     return wire.DeclareRequest(declarations=tables, keep=keep)

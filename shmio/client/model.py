@@ -180,7 +180,7 @@ class Member:
 
 
 def join_request(source: str, name: str) -> bytes:
-    """Return the first message, with which the model joins a source."""
+    """Return the first request of the call Simulate, with which the model joins a source."""
     return wire.SimulateRequest(join=wire.Join(source=source, name=name)).SerializeToString()
 
 
@@ -208,7 +208,7 @@ class Rejoining:
         return again and time.monotonic() - self._lost_s < self._patience_s
 
     def heed(self, part: Part, work: Work) -> None:
-        """Log why the endpoint refused the previous answer, if it did."""
+        """Log why the endpoint refused the previous answer, if it refused the answer."""
         if work.refused:
             log.warning("%s: %s", part.source, work.refused)
 

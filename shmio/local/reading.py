@@ -54,7 +54,7 @@ class View:
 
     @property
     def cycle(self) -> int:
-        """Cycle of the source's schedule."""
+        """Cycle of the source's schedule; in virtual time, the number of the step."""
         return self.frame.cycle
 
     @property

@@ -1,4 +1,4 @@
-"""Implements ``--mode replay``: replaces a configuration's sources by those of a recording."""
+"""Implements the mode ``replay``: replaces the sources in a configuration by those of a recording."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ In this time, the processes start.
 
 
 class Replayed(NamedTuple):
-    """A configuration that was changed for a replay."""
+    """A configuration that was changed for the mode ``replay``."""
 
     config: Config
     origin: Origin
@@ -44,7 +44,7 @@ class Recordings:
         self._recording: Recording | None = None
 
     def get(self, files: Sequence[str]) -> Recording:
-        """Return the recording in these files. The next call may close it.
+        """Return the recording in these files. The next call may close this recording.
 
         Raises:
             RecordingError: The recording cannot be opened.

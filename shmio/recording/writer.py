@@ -162,14 +162,14 @@ class Writer:
         return self._schemas[name]
 
     def frame(self, channels: Channels, frame: Frame, log_ns: int) -> None:
-        """Add a frame."""
+        """Add a frame with the log time ``log_ns``."""
         told_ns = frame.source_ns if frame.source_ns > 0 else log_ns
         sequence = frame.number & 0xFFFFFFFF
         data = encode_frame_v2(frame, sequence, log_ns, told_ns)
         self._mcap.add_message(channels.frames, log_ns, data, told_ns, sequence)
 
     def event(self, channels: Channels, event: Event, log_ns: int) -> None:
-        """Add an event."""
+        """Add an event with the log time ``log_ns``."""
         told_ns = event.utc_ns if event.utc_ns > 0 else log_ns
         self._mcap.add_message(channels.events, log_ns, encode_event(event), told_ns, event.number & 0xFFFFFFFF)
 

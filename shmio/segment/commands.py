@@ -181,13 +181,13 @@ class Command(msgspec.Struct, frozen=True):
 
 
 def capacity_for(layout_size: int) -> int:
-    """Return the capacity of a queue in bytes: a power of two, at least 4 times the size of the layout."""
+    """Return the capacity of a queue in bytes: a power of two, at least 4 times the layout's size in bytes."""
     wanted = max(_MIN_CAPACITY, 4 * layout_size)
     return 1 << (wanted - 1).bit_length()
 
 
 def section_size(layout_size: int) -> int:
-    """Return the size of a block's commands section in bytes."""
+    """Return the size in bytes of the commands section of a block whose layout has ``layout_size`` bytes."""
     return _SECTION_HEADER_SIZE + WRITERS * (_atomics.QUEUE_HEADER_SIZE + capacity_for(layout_size))
 
 

@@ -229,8 +229,8 @@ class Client:
             ranges: Bytes and bits of a frame to cover, in addition to registers or instead of them.
             source: Source of the ranges if you give no pattern, such as ``cell`` or ``cell/in``.
             priority: Injections with a higher priority cover those with a lower one.
-            keep: Whether the injection stays when this program ends, until somebody lifts it.
-            name: Name in the list of injections.
+            keep: Whether the injection stays when this program ends, until a program lifts it.
+            name: Name of the injection in events and lists.
             for_s: Time in s after which the injection is lifted; None for no limit.
             originals: Whether to receive the values that the injection covers. To read them,
                 iterate over the injection.
@@ -362,7 +362,7 @@ class Client:
             await sleep(RETRY_S)
 
     async def clock(self) -> Clock:
-        """Return the state of the clock."""
+        """Return the state of the instance's clock."""
         return calls.clock((await self._call(self._stub.GetStatus, wire.GetStatusRequest())).clock)
 
     async def real_sources(self) -> list[str]:

@@ -32,7 +32,7 @@ def outputs_of(found: Outputs) -> Outputs:
 
 
 class Channel:
-    """The connection of one client."""
+    """The gRPC connection of one client."""
 
     def __init__(self, target: Target, timeout_s: float) -> None:
         self.target = target
@@ -53,7 +53,7 @@ class Channel:
 
 
 class Stream(Iterator[Any]):
-    """Answers to one request. The iteration ends when the stream or its channel is closed.
+    """Iterator over the answers to one request. It ends when the stream or its channel is closed.
 
     Raises:
         ShmioError: The endpoint ended the stream.
