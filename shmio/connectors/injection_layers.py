@@ -120,6 +120,10 @@ class LayerStack:
     layers: list[Layer] = field(default_factory=list)
     now: CycleImage = field(default_factory=lambda: CycleImage(-1, 0, b""))
 
+    def __post_init__(self) -> None:
+        self._effective = bytearray(self.size)
+        self._image = np.frombuffer(self._effective, np.uint8)
+
     def add(self, injection: Layer) -> str:
         """Add a layer; return the reason why it cannot be added, or "" if it was added."""
         if any(layer.id == injection.id for layer in self.layers):
@@ -140,16 +144,19 @@ class LayerStack:
         self.layers = [layer for layer in self.layers if not which(layer)]
         return lifted
 
-    def effective(self, raw: bytes) -> bytes | None:
-        """Return the image that readers see instead of ``raw``; None if no active layer covers ``/out``."""
-        layers = [layer for layer in self.layers if layer.direction is _OUT and layer.active]
-        if not layers:
-            return None
-        buffer = bytearray(raw)
-        image = np.frombuffer(buffer, np.uint8)
-        for layer in layers:
-            layer.show(image, self.now)
-        return bytes(buffer)
+    def effective(self, raw: bytes) -> bytes | bytearray | None:
+        """Return the image that readers see instead of ``raw``; None if no active layer covers ``/out``.
+
+        The next call overwrites the image.
+        """
+        image = None
+        for layer in self.layers:
+            if layer.direction is _OUT and layer.active:
+                if image is None:
+                    self._effective[:] = raw
+                    image = self._image
+                layer.show(image, self.now)
+        return None if image is None else self._effective
 
     def seen(self, raw: bytes, inner: Iterable[Layer]) -> Bits:
         """Return a copy of the image ``raw`` after applying the layers ``inner``, which cover ``/out``."""
@@ -347,11 +354,11 @@ class DeclaredLayer(Layer):
 
         ``values`` are the values that the condition reads.
         """
-        condition = self.program.condition
-        holds = condition is None or condition.expression.holds(values, self.memory)
-        runs = self.activation.runs
-        changed = self.activation.advance(now.time_ns, now.cycle, holds=holds)
-        if self.activation.runs != runs:
+        condition, activation = self.program.condition, self.activation
+        holds = condition is None or condition.expression.evaluate(values, self.memory) is True
+        runs = activation.runs
+        changed = activation.advance(now.time_ns, now.cycle, holds=holds)
+        if activation.runs != runs:
             self.operation.begin()
             self.writes = 0
         return changed

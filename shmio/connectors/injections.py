@@ -12,7 +12,7 @@ import secrets
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 import numpy as np
@@ -109,16 +109,14 @@ class ConditionValues:
 
     def of(self, condition: Condition) -> Sequence[Number | None]:
         """Return the values that a condition reads; each unknown value is None."""
-        values: list[Number | None] = []
+        images = self._images
+        values: list[Any] = []  # only numbers, because number_register() has checked the registers' types
         for source, codec in condition.reads:
-            image = self._image(source)
-            value = None if image is None else codec.decode(image)
-            values.append(value if isinstance(value, bool | int | float) else None)
+            image = images[source] if source in images else self._fetch(source)
+            values.append(None if image is None else codec.decode(image))
         return values
 
-    def _image(self, source: str) -> bytes | None:
-        if source in self._images:
-            return self._images[source]
+    def _fetch(self, source: str) -> bytes | None:
         self._images[source] = None
         block = self._blocks.get(source)
         try:
@@ -336,33 +334,30 @@ class DeclaredInjections:
         if cycle == looked:
             return []
         readings: ConditionValues | None = None
-        changed = False
-        turned = []
+        changed = over = False
+        events = []
         for layer in self._layers:
             before = layer.active
             values: Sequence[Number | None] = ()
-            if layer.program.condition is not None:
+            if (condition := layer.program.condition) is not None:
                 if readings is None:
                     step = state.step if self._own.attributes.stepped and state.virtual else None
                     readings = ConditionValues(self._own.source, image, self._blocks, step)
-                values = readings.of(layer.program.condition)
+                values = readings.of(condition)
             if layer.advance(now, values):
                 changed = True
                 if layer.active is not before:
-                    turned.append(_activation_event(layer))
+                    events.append(_activation_event(layer))
+            over = over or layer.activation.state is _OVER
         if changed:
             self._publisher.publish()
-        events = turned
         if len(stack.layers) > len(self._layers):  # clients' layers get values from declared ones
-            events = [*self._publisher.computed(image.base), *turned]
-        return events + self._lift_finished()
+            events = [*self._publisher.computed(image.base), *events]
+        return events + self._lift_finished() if over else events
 
     def _lift_finished(self) -> list[Record]:
         """Lift the injections that are over, and return the events about them."""
-        for layer in self._layers:
-            if layer.activation.state is _OVER and _finished(layer):
-                break
-        else:
+        if not any(_finished(layer) for layer in self._layers):
             return []
         over = {layer.id for layer in self._layers if _finished(layer)}
         records = self._publisher.removed(lambda layer: layer.id in over, "over")

@@ -179,9 +179,8 @@ class WallClock:
     def __init__(self) -> None:
         self._stopped = threading.Event()
 
-    def now_ns(self) -> int:
-        """Return the time of CLOCK_MONOTONIC in ns."""
-        return time.monotonic_ns()
+    now_ns = staticmethod(time.monotonic_ns)
+    """Returns the time of CLOCK_MONOTONIC in ns."""
 
     def wait_ns(self, duration_ns: int) -> bool:
         """Wait for ``duration_ns``, or until the loop must stop.

@@ -25,9 +25,15 @@ FEW: Final = 16
 Both compute the same numbers, except for the last bit of a Gaussian number.
 """
 
+BATCH: Final = 64
+"""How many single numbers are computed at once."""
+
 _MASK: Final = (1 << 64) - 1
 _GOLDEN: Final = 0x9E3779B97F4A7C15
 _FIRST, _SECOND = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
+
+
+_NO_BATCH: Final[tuple[int, int, list[float]]] = (-1, 0, [])
 
 
 class Purpose(IntEnum):
@@ -48,7 +54,8 @@ class SeededRandom:
     def __init__(self, seed: int, name: str) -> None:
         """Create the generator. For the same seed, different names give different numbers."""
         self._key = int.from_bytes(hashlib.sha256(f"{seed}/{name}".encode()).digest()[:8], "little")
-        self._of_run = -1, 0  # the number of a run, and the mixed word that depends on it alone
+        self._batches: dict[Purpose, tuple[int, int, list[float]]] = {}
+        """For each purpose, the first numbers of BATCH places: the run, the first place, and the numbers."""
 
     def words(self, run: int, place: int, purpose: Purpose, count: int) -> Words:
         """Return ``count`` random 64-bit integers: an array of shape (count,) and type uint64."""
@@ -80,17 +87,21 @@ class SeededRandom:
         return normal
 
     def one_uniform(self, run: int, place: int, purpose: Purpose = Purpose.VALUE) -> float:
-        """Return the only number that :meth:`uniform` would return for a count of 1."""
-        known, word = self._of_run
-        if known != run:
-            word = _mix(self._key + run & _MASK)
-            self._of_run = run, word
-        for part in (place, purpose, 0):  # _mix, without its calls
-            word = word + part + _GOLDEN & _MASK
-            word = (word ^ word >> 30) * _FIRST & _MASK
-            word = (word ^ word >> 27) * _SECOND & _MASK
-            word ^= word >> 31
-        return (word >> 11) * 2.0**-53
+        """Return the only number that :meth:`uniform` would return for a count of 1.
+
+        Cycles follow one another, so this computes the numbers of the next cycles, too, by numpy.
+        """
+        known, first, numbers = self._batches.get(purpose, _NO_BATCH)
+        if known == run and 0 <= place - first < BATCH:
+            return numbers[place - first]
+        base = _mix(self._key + run & _MASK) + _GOLDEN & _MASK
+        words: Words = np.arange(place, place + BATCH, dtype=np.uint64) + np.uint64(base)
+        words = _mix_all(words)
+        for part in (purpose, 0):
+            words = _mix_all(words + np.uint64(part + _GOLDEN))
+        numbers = ((words >> np.uint64(11)).astype(np.float64) * 2.0**-53).tolist()
+        self._batches[purpose] = run, place, numbers
+        return float(numbers[0])
 
     def one_gaussian(self, run: int, place: int) -> float:
         """Return the only number that :meth:`gaussian` would return for a count of 1."""

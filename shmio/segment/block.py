@@ -461,6 +461,7 @@ class BlockWriter:
             at: Times of the start event; None: now.
         """
         self.block = block
+        self._frames, self._events = block.ring, block.events.ring
         self._clock_ns = clock_ns
         self._lock = threading.Lock()  # frames and events must have one common order
         self.cycle = 0
@@ -473,8 +474,8 @@ class BlockWriter:
         None: events get the present UTC time.
         """
         self._quality = Quality.BAD
-        self.incarnation = block.ring.begin()
-        block.events.ring.begin(self.incarnation)
+        self.incarnation = self._frames.begin()
+        self._events.begin(self.incarnation)
         self.event(Record(EventKind.STARTED, f"pid {os.getpid()}"), at=at)
 
     def now_ns(self) -> int:
@@ -513,12 +514,12 @@ class BlockWriter:
         """
         with self._lock:
             if at is None:
-                now_ns = self.now_ns()
+                now_ns = self.block.now_ns() if self.at_ns is None else self.at_ns
                 clock_ns = self._clock_ns(now_ns)
             else:
                 now_ns, clock_ns, _ = at
             self._quality = quality
-            return self.block.ring.publish(
+            return self._frames.publish(
                 raw,
                 effective,
                 cycle,
@@ -527,7 +528,7 @@ class BlockWriter:
                 time.time_ns() if source_ns is None else source_ns,
                 quality,
                 provenance,
-                self.block.events.head(),
+                self._events.head(),
                 0 if asked_ns is None else min(-(-max(0, now_ns - asked_ns) // 1000), _MAX_DELAY_US),
                 cut(reason, REASON_SIZE) if reason else b"",
             )
@@ -551,7 +552,7 @@ class BlockWriter:
         """
         with self._lock:
             now_ns, clock_ns, utc_ns = at or self._present()
-            number = self.block.events.ring.publish(
+            number = self._events.publish(
                 record.pack(),
                 None,
                 self.cycle,
@@ -560,11 +561,11 @@ class BlockWriter:
                 utc_ns or time.time_ns(),
                 self._quality if quality is None else quality,
                 Provenance.LIVE,
-                self.block.ring.head(),
+                self._frames.head(),
                 0,
                 cut(record.text, REASON_SIZE),
             )
-            self.block.ring.wake()
+            self._frames.wake()
             return number
 
 

@@ -147,9 +147,8 @@ class PageClock:
         self._seen = self._bell.value()
         self._stopped = False
 
-    def now_ns(self) -> int:
-        """Return the time of CLOCK_MONOTONIC in ns."""
-        return time.monotonic_ns()
+    now_ns = staticmethod(time.monotonic_ns)
+    """Returns the time of CLOCK_MONOTONIC in ns."""
 
     def wait_ns(self, duration_ns: int | None) -> bool:
         """Wait for a wake-up, at most ``duration_ns`` (None: without limit).

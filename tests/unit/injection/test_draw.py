@@ -27,6 +27,13 @@ def test_numbers_of_a_place_do_not_depend_on_the_order_of_calls(seed: int, run: 
     assert one.uniform(run, place + 1, 4).tolist() == later.tolist()
 
 
+@given(st.lists(st.tuples(st.integers(1, 2), st.integers(0, 100) | places, st.sampled_from(Purpose)), max_size=20))
+def test_single_numbers_are_those_of_an_array_in_any_order(calls: list[tuple[int, int, Purpose]]) -> None:
+    draw = SeededRandom(1, "x")
+    for run, place, purpose in calls:
+        assert draw.one_uniform(run, place, purpose) == draw.uniform(run, place, 1, purpose)[0]
+
+
 def test_each_seed_name_activation_place_and_purpose_has_its_own_numbers() -> None:
     found = [
         SeededRandom(seed, name).words(run, place, purpose, 1)[0]
