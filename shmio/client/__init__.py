@@ -86,9 +86,9 @@ def connect(
     Args:
         address: ``HOST:PORT`` or ``unix:PATH``.
         ca: PEM file of the certificate authority to trust; None: the client does not use TLS.
-        certificate: PEM file of a client certificate, if the endpoint needs one.
-        key: PEM file of the certificate's key.
-        token: Token of this client, if the endpoint needs one.
+        certificate: PEM file of a client certificate, if the endpoint needs one; else None.
+        key: PEM file of the certificate's key; None without a certificate.
+        token: Token of this client, if the endpoint needs one; else None.
         token_in_plain_text: Whether the client may send the token to another host without TLS.
         timeout_s: Time-out in s of each call that the endpoint should answer immediately.
 

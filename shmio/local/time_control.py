@@ -215,7 +215,7 @@ class Coordinator:
         Even if the step fails, its number is used, and time has moved.
 
         Args:
-            dt_ns: Length of the step; None: the step size.
+            dt_ns: Length of the step in ns; None: the step size.
 
         Raises:
             TimeError: Another process owns time, a source failed, or a source or a delivering
@@ -235,7 +235,7 @@ class Coordinator:
                     block.ring.wait(seen, rest_ns)
 
     def stepping(self, dt_ns: int | None = None) -> Generator[StepWait, None, Step]:
-        """Do a step without blocking: yield what to wait for, and continue when resumed.
+        """Do a step as :meth:`step` does, but yield what to wait for instead of waiting.
 
         If you do not run the generator to its end, close it. Until then, call no other method of
         this coordinator.
@@ -486,6 +486,8 @@ class Timekeeper:
 
     def play(self, rate: float = 1.0, dt_ns: int | None = None) -> None:
         """Start to step in a thread, ``rate`` times as fast as real time.
+
+        ``dt_ns`` is the length of each step in ns; None: the step size.
 
         Raises:
             TimeError: Another program owns time.

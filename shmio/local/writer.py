@@ -131,7 +131,8 @@ class PendingCommand(msgspec.Struct):
 class SourceWriter:
     """Sends one writer's commands to a source, and waits for their outcomes.
 
-    Several threads may use it.
+    Several threads may use an object. In all methods, ``timeout_s`` is the time in s that the command
+    may wait for the source; None: :attr:`timeout_s`.
     """
 
     def __init__(self, block: Block, writer: int) -> None:

@@ -216,7 +216,7 @@ def make_plan(
             read it, by emulator name.
         config_file: Path of the configuration file.
         mode: ``live``, ``log`` or ``replay``.
-        declared: The encoded injections for each source's process, by source name.
+        declared: The encoded injections for each source's process, by source name; None: none.
         warnings: Warnings about the configuration.
         computed: Names of the sources that follow the instance's clock.
         replayed: Names of those computed sources that play a recording.

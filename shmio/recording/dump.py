@@ -171,8 +171,8 @@ class Dump:
 
         Args:
             sources: Names of the sources; None for all.
-            from_ns: Start of the range.
-            to_ns: End of the range.
+            from_ns: Start of the range, log time in ns.
+            to_ns: End of the range, log time in ns.
 
         Raises:
             PathError: There is no such source.
@@ -191,8 +191,8 @@ class Dump:
 
         Args:
             source: Name of the source; None if there is only one.
-            from_ns: Start of the range.
-            to_ns: End of the range.
+            from_ns: Start of the range, log time in ns.
+            to_ns: End of the range, log time in ns.
 
         Raises:
             PathError: There is no such source.
@@ -218,8 +218,8 @@ class Dump:
 
         Args:
             sources: Names of the sources; None for all.
-            from_ns: Start of the range.
-            to_ns: End of the range.
+            from_ns: Start of the range, log time in ns.
+            to_ns: End of the range, log time in ns.
 
         Raises:
             PathError: There is no such source.
@@ -234,7 +234,7 @@ class Dump:
 
         Args:
             source: Name of the source; None if there is only one.
-            time_ns: The time; the end of the recording if not given.
+            time_ns: The log time in ns; default: the end of the recording.
 
         Returns:
             The frame; None if the source has no frame at or before this time.
@@ -257,7 +257,7 @@ class Dump:
 
         Args:
             source: Name of the source; None for any source.
-            after_ns: The time; the start of the recording if not given.
+            after_ns: The log time in ns; default: the start of the recording.
 
         Raises:
             PathError: There is no such source.
@@ -269,8 +269,8 @@ class Dump:
 
         Args:
             path: A register, a structure or a pattern of one source.
-            after_ns: The time after which to search.
-            to_ns: The time at which the search ends.
+            after_ns: Log time in ns after which to search.
+            to_ns: Log time in ns at which the search ends.
 
         Returns:
             The frame; None if there is no change.
@@ -300,8 +300,8 @@ class Dump:
 
         Args:
             source: Name of the source; None if there is only one.
-            from_ns: Start of the range.
-            to_ns: End of the range.
+            from_ns: Start of the range, log time in ns.
+            to_ns: End of the range, log time in ns.
             raw: True for the images that the source delivered, without injections; False for the
                 images that readers saw.
 
@@ -330,8 +330,8 @@ class Dump:
 
         Args:
             paths: Registers, elements, structures or patterns.
-            from_ns: Start of the range.
-            to_ns: End of the range.
+            from_ns: Start of the range, log time in ns.
+            to_ns: End of the range, log time in ns.
             raw: True for the values that the source delivered, without injections; False for the
                 values that readers saw.
 

@@ -72,8 +72,8 @@ def pieces(
         dump: The recording.
         source: Name of the source.
         chosen: The registers, by block.
-        from_ns: Start of the range of log times.
-        to_ns: End of the range of log times.
+        from_ns: Start of the range, log time in ns.
+        to_ns: End of the range, log time in ns.
         raw: True for the values that the source delivered, without injections; False for the values
             that readers saw.
 
@@ -280,8 +280,8 @@ def export_events(
         sources: Names of the sources.
         stream: The new file.
         form: ``csv`` or ``parquet``.
-        from_ns: Start of the range of log times.
-        to_ns: End of the range of log times.
+        from_ns: Start of the range, log time in ns.
+        to_ns: End of the range, log time in ns.
         progress: Called with the time in ns, from the start of the recording, up to which it is
             done.
 
@@ -365,8 +365,8 @@ def export_mcap(
         dump: The recording.
         chosen: The registers to export, by block.
         stream: The new file.
-        from_ns: Start of the range of log times.
-        to_ns: End of the range of log times.
+        from_ns: Start of the range, log time in ns.
+        to_ns: End of the range, log time in ns.
         raw: True to export the values that the source delivered, without injections; False to export
             the values that readers saw.
         progress: Called with the time in ns, from the start of the recording, up to which it is

@@ -47,8 +47,8 @@ def judge_recording(
     Args:
         dump: The recording.
         judge: A new judge for this recording, from :func:`recording_judge`.
-        from_ns: Start of the range, log time.
-        to_ns: End of the range, log time.
+        from_ns: Start of the range, log time in ns.
+        to_ns: End of the range, log time in ns.
         seen: Called with the values of the signals in each chunk, by source, in the order of time.
 
     """

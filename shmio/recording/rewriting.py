@@ -220,8 +220,8 @@ def part(
 
     Args:
         dump: The recording.
-        from_ns: Start of the range of time.
-        to_ns: End of the range of time.
+        from_ns: Start of the range, log time in ns.
+        to_ns: End of the range, log time in ns.
         sources: Names of the sources; None for all.
         registers: Paths of the registers; empty for all. The path of an element selects its whole
             array. The bytes of all other registers become zero.

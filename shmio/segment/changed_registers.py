@@ -49,7 +49,10 @@ class ChangeScan:
 
 
 def entries(registers: Sequence[Register], index: int, statuses: StatusArea | None = None) -> bytes:
-    """Encode a part of a scan: the scan reports ``index`` if any of these registers has changed."""
+    """Encode a part of a scan: the scan reports ``index`` if any of these registers has changed.
+
+    ``statuses`` is the status area of the layout; None: the scan ignores statuses.
+    """
     found = [_ENTRY.pack(*run, index) for register in registers for run in runs(register)]
     if statuses is not None:
         indices = dict.fromkeys(statuses.indices(registers))

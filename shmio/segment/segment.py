@@ -348,7 +348,7 @@ class Segment:
             processes: The instance's processes.
             mode: Mode of the instance.
             control: Path of the control socket.
-            config: Resolved path of the configuration file.
+            config: Resolved path of the configuration file; None: there is none.
             group: Group whose members may read the segment; None: only this user may.
             stepped: Whether time is virtual from the start.
             origin: Start time of an instance that replays a recording; None: the clock starts at 0

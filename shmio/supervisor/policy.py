@@ -257,7 +257,7 @@ def due(life: Life, now_ns: int, *, ready: bool, quiet_ns: int, limits: Limits, 
 
     Args:
         life: The state of the process.
-        now_ns: The present time.
+        now_ns: The present time, CLOCK_MONOTONIC.
         ready: True if the process has reported that it runs.
         quiet_ns: Time since the last heartbeat, in ns.
         limits: The limits that apply.
@@ -344,9 +344,9 @@ def start_over(
     Args:
         processes: Rank and state of each process.
         qualities: The quality of each source; None for a source without a frame.
-        since_ns: When the last process became ready. From then on, sources have ``settle_s`` to
-            deliver a frame.
-        now_ns: The present time.
+        since_ns: When the last process became ready, CLOCK_MONOTONIC. From then on, sources have
+            ``settle_s`` to deliver a frame.
+        now_ns: The present time, CLOCK_MONOTONIC.
         limits: The limits that apply.
 
     """

@@ -333,7 +333,8 @@ class Client:
             step: Called as ``step(time_s, dt_s, inputs)``; returns all or some outputs by path. If
                 it raises an error, the step fails, and the logger ``shmio.client`` logs the reason.
             name: Name of the model in messages.
-            start: Called with the :class:`Simulation` each time the model has joined.
+            start: Called with the :class:`Simulation` each time the model has joined; None: not
+                called.
             patience_s: Time in s for which to try again if the instance does not run or the
                 connection is lost.
 
@@ -399,6 +400,10 @@ class Client:
 
     def steps(self, count: int = 0, dt_s: float | None = None) -> Steps:
         """Return an iterator that takes control of time and does ``count`` steps: see :class:`Steps`.
+
+        Args:
+            count: Number of steps; 0 if you will only call :meth:`Steps.step`.
+            dt_s: Length of each step in s; None for the step size.
 
         Raises:
             ValueRangeError: The count or the step size is out of range.
@@ -589,6 +594,8 @@ class Steps(AsyncIterator[Stepped]):
 
     async def step(self, dt_s: float | None = None) -> Stepped:
         """Request one more step, and wait until this step and all earlier ones are done.
+
+        ``dt_s`` is the length of the step in s; None for the step size.
 
         Raises:
             ShmioError: As for the iteration.

@@ -141,7 +141,7 @@ class Condition(asyncio.Condition):
     """Condition on which several tasks can wait, each with its own time-out."""
 
     async def wait_until(self, predicate: Callable[[], bool], timeout_s: float | None = None) -> bool:
-        """Wait until the predicate is true. Return False after a time-out."""
+        """Wait until the predicate is true; return False after ``timeout_s`` seconds (None: never)."""
         with suppress(TimeoutError):
             async with asyncio.timeout(timeout_s):
                 await self.wait_for(predicate)

@@ -56,8 +56,8 @@ class Shadow(Iterator[Update]):
         """Give values, and wait for their outcomes.
 
         Args:
-            values: Values by path.
-            arrays: Values by the columns of ``table``.
+            values: Values by path; None for none.
+            arrays: Values by the columns of ``table``; None for none.
             raw: Values as raw bytes: see :data:`shmio.client.injection.Raw`.
 
         Returns:

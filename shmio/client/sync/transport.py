@@ -134,7 +134,7 @@ class Condition(threading.Condition):
     """Condition on which several threads can wait, each with its own time-out."""
 
     def wait_until(self, predicate: Callable[[], bool], timeout_s: float | None = None) -> bool:
-        """Wait until the predicate is true. Return False after a time-out."""
+        """Wait until the predicate is true; return False after ``timeout_s`` seconds (None: never)."""
         return self.wait_for(predicate, timeout_s)
 
 

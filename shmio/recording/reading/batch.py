@@ -102,8 +102,8 @@ def batch(data: bytes, channel: Channel, size: int, from_ns: int, to_ns: int, *,
         data: The uncompressed chunk.
         channel: The channel.
         size: Size of an image in bytes.
-        from_ns: First log time.
-        to_ns: Last log time.
+        from_ns: First log time, in ns.
+        to_ns: Last log time, in ns.
         raw: True for the images that the source delivered; False for the images that readers saw.
 
     Raises:

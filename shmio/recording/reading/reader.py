@@ -140,8 +140,8 @@ class Reader:
 
         Args:
             wanted: Returns whether to read a channel.
-            from_ns: Start of the range.
-            to_ns: End of the range.
+            from_ns: Start of the range, log time in ns.
+            to_ns: End of the range, log time in ns.
             damaged: Called for each damaged place in the range; reading then continues with the next
                 intact chunk. None: damage raises RecordingError.
             records: The records to read; None for the whole file.
