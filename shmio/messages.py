@@ -62,7 +62,13 @@ def value_to_wire(value: object, path: str) -> wire.Value:
 
 
 def value_from_wire(value: wire.Value, path: str) -> object:
-    """Convert a message to a Python value; raise ValueRangeError if the message has no value."""
+    """Convert a message to a Python value.
+
+    ``path`` is the path of the register, for error messages.
+
+    Raises:
+        ValueRangeError: The message has no value.
+    """
     kind = value.WhichOneof("kind")
     if kind is None:
         raise ValueRangeError(f"{path}: no value is given")

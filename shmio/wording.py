@@ -101,7 +101,7 @@ def plain_text(address: object, remedy: str) -> str:
 
 
 def name_one(what: str, names: Iterable[str]) -> str:
-    """Return the message for a user who must name one of several things, or for whom there is none to name."""
+    """Return the message for a user who must name one of several things (``what``), or has none to name."""
     known = list(names)
     return (
         f"there are several {what}s; name one of them: {', '.join(known[:MAX_NAMES])}"

@@ -168,14 +168,14 @@ def ns(dt_s: float | None) -> int:
 
 
 def read_request(patterns: Iterable[str], *, originals: bool) -> Any:
-    """Return the request of the call Read."""
+    """Return the request of the call Read, with the arguments of ``Client.read``."""
     return wire.ReadRequest(patterns=patterns, originals=originals)
 
 
 def subscribe_request(
     patterns: Iterable[str], *, every_frame: bool, frames: bool, max_rate_hz: float, deadband: float
 ) -> Any:
-    """Return the request of the call Subscribe."""
+    """Return the request of the call Subscribe, with the arguments of ``Client.subscribe``."""
     return wire.SubscribeRequest(
         patterns=patterns,
         mode=wire.MODE_EVERY_FRAME if every_frame else wire.MODE_LATEST,
@@ -186,7 +186,7 @@ def subscribe_request(
 
 
 def write_request(values: Mapping[str, object], timeout_s: float | None, *, until_accepted: bool) -> Any:
-    """Return the request of the call Write.
+    """Return the request of the call Write, with the arguments of ``Client.write``.
 
     Raises:
         ValueRangeError: A value has an unsupported Python type.

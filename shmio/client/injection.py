@@ -44,7 +44,7 @@ def inject_request(
     for_s: float | None,
     originals: bool,
 ) -> bytes:
-    """Return the first request of the call Inject, which creates the injection.
+    """Return the first request of the call Inject, with the arguments of ``Client.inject``.
 
     Raises:
         ValueRangeError: An argument is invalid.

@@ -54,7 +54,7 @@ _TYPES: Final = {
 
 
 def too_long(text: str, most: int = MAX_KEY) -> int:
-    """Return the line of the first key with too many characters or parts; 0 if there is none."""
+    """Return the line of the first key with more than ``most`` characters, or too many parts; 0 if there is none."""
     if all(len(line) <= most and line.count(".") < MAX_PARTS for line in text.split("\n")):
         return 0
     return Lines(text, most).too_long

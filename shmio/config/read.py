@@ -508,7 +508,7 @@ def unknown_option(index: int, key: str, known: list[str]) -> str:
 
 
 def check_text(value: Any, key: str) -> None:
-    """Check that no text in a value contains control characters, which harm file names and terminals.
+    """Check that no text in the value of ``key`` has control characters, which harm file names and terminals.
 
     (A type with a pattern would be simpler, but makes msgspec 0.22 crash when Python exits.)
 
@@ -521,7 +521,7 @@ def check_text(value: Any, key: str) -> None:
 
 
 def text_faults(value: Any, key: str) -> Iterator[str]:
-    """Yield a fault for each text with control characters in a value, however deeply the text is nested."""
+    """Yield a fault for each text with control characters in the value of ``key``, however deeply it is nested."""
     if isinstance(value, str) and any(char < " " or char == "\x7f" for char in value):
         path = "; write a path with backslashes in single quotes" if _SLIPPED.search(value) else ""
         yield f"{key}: must not contain control characters{path}"

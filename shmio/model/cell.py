@@ -284,7 +284,7 @@ class Cell(Closable, Protocol):
         """
 
     def lift(self, source: str, number: int) -> None:
-        """Lift an injection, whichever program created it.
+        """Lift the injection with this number, whichever program created it.
 
         Raises:
             PathError: There is no such source or injection.

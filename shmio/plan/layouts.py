@@ -58,7 +58,7 @@ class LayoutFiles:
         return self._compile(key, section, paths, program, block.name, optimized=optimized)[0]
 
     def all(self, key: str, section: Source | Emulator) -> tuple[Layout, ...]:
-        """Return all layouts of a section's files.
+        """Return all layouts of a section's files; ``key`` is the key of the section, for messages.
 
         Raises:
             ConfigError: A file is missing.

@@ -108,7 +108,10 @@ def last_positions(
 
 
 def trigger_interrupted(directory: Path, segment: Segment, by: str, beat: Callable[[], object] = lambda: None) -> bool:
-    """Return whether the previous recorder died while it wrote a triggered recording."""
+    """Return whether the previous recorder died while it wrote a triggered recording.
+
+    The arguments are as for :func:`last_positions`.
+    """
     for file in _of_this_run(directory, segment, by, beat)[:1]:
         with suppress(OSError, RecordingError), Reader(file, own=True, beat=beat) as reader:
             return reader.records.footer() is None and "trigger" in about_of(file, segment.instance, by)

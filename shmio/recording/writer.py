@@ -81,7 +81,7 @@ class Channels:
 
 
 class Writer:
-    """Writes one recording. Use it from one thread only."""
+    """Writes one recording. Use it from one thread only. Log times (``log_ns``) are in ns."""
 
     def __init__(self, output: Output, about: Mapping[str, str]) -> None:
         """Begin the recording. ``about`` is the metadata about the instance."""

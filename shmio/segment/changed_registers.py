@@ -40,7 +40,7 @@ class ChangeScan:
         return scan
 
     def changed(self, old: bytes, new: bytes) -> list[int]:
-        """Return the ascending indices of the registers whose bytes differ.
+        """Return the ascending indices of the registers whose bytes differ in the images ``old`` and ``new``.
 
         Raises:
             ValueError: The images differ in size, or are too short for the registers.

@@ -154,7 +154,7 @@ class ClockPage:
 
     @staticmethod
     def write_new(memory: memoryview, offset: int, slots: int, *, virtual: bool, time_ns: int) -> None:
-        """Write the page of a new segment.
+        """Write the page of a new segment, at ``offset`` in the memory, for ``slots`` process slots.
 
         With ``virtual``, the clock stays at ``time_ns`` until the first step.
         """

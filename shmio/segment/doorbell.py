@@ -56,7 +56,14 @@ class WakeSource(Protocol):
     """An object that a :class:`Relay` can wait for: a :class:`Doorbell`, or a ring with a doorbell."""
 
     def relay(self, shared: bytearray, descriptor: int, turn_ns: int, /) -> None:
-        """Make ``descriptor`` readable at each ring, until the relay is stopped; do not hold the GIL."""
+        """Make ``descriptor`` readable at each ring, until the relay is stopped, without the GIL.
+
+        Args:
+            shared: Memory of ``RELAY_SIZE`` bytes, through which the relay stops this and clears the
+                descriptor.
+            descriptor: An eventfd.
+            turn_ns: Maximum time in ns between two notifications.
+        """
 
 
 class Relay:

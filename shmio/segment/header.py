@@ -99,7 +99,7 @@ class Header(msgspec.Struct, frozen=True):
 
     @classmethod
     def read(cls, memory: memoryview, name: str) -> Header:
-        """Read and check a header.
+        """Read and check a header; ``name`` is the name of the segment, for messages.
 
         Raises:
             UnfinishedError: The segment is incomplete.
@@ -195,7 +195,7 @@ def retired(memory: memoryview, header: Header, index: int) -> bool:
 
 
 def read_sections(memory: memoryview, header: Header, count: int, name: str) -> list[SectionEntry]:
-    """Return the first ``count`` entries of the section table.
+    """Return the first ``count`` entries of the section table; ``name`` is the segment's name, for messages.
 
     Raises:
         FormatError: A section is not within the segment.

@@ -132,7 +132,7 @@ DeclaredCell = ListCell[Declaration]
 
 
 def injection_list_cell(memory: memoryview, offset: int, size: int) -> InjectionListCell:
-    """Open the section of existing injections, which the source writes.
+    """Open the section of existing injections, which the source writes, by its offset and size in bytes.
 
     Raises:
         ValueError: The section is too short.
@@ -141,7 +141,7 @@ def injection_list_cell(memory: memoryview, offset: int, size: int) -> Injection
 
 
 def declared_cell(memory: memoryview, offset: int, size: int) -> DeclaredCell:
-    """Open the section of configured injections, which the supervisor writes.
+    """Open the section of configured injections, which the supervisor writes, by its offset and size in bytes.
 
     Raises:
         ValueError: The section is too short.

@@ -131,7 +131,12 @@ def _named(layout: Layout, key: str, patterns: Sequence[str]) -> set[int]:
 
 
 def section(ring_header: bytes, slot_bytes: int) -> tuple[int, bytes]:
-    """Return the size and the first bytes of a new section; its two rings both start with ``ring_header``."""
+    """Return the size and the first bytes of a new section.
+
+    Args:
+        ring_header: The first bytes of each of its two rings.
+        slot_bytes: Size of a slot of the rings, in bytes.
+    """
     ring_size = _atomics.RING_HEADER_SIZE + SLOTS * slot_bytes
     begin = _SIZE.pack(ring_size).ljust(_RINGS_AT, b"\0") + ring_header.ljust(ring_size, b"\0") + ring_header
     return _RINGS_AT + 2 * ring_size, begin

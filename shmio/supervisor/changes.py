@@ -35,7 +35,7 @@ class Changes:
 
 
 def reconcile(plan: Plan, epoch: int, fleet: Fleet, blocks: Iterable[Block]) -> Changes:
-    """Compare a plan with the present processes and blocks.
+    """Compare a plan with the present processes (``fleet``) and blocks of the segment with this epoch.
 
     If a source's block is replaced, the source's process is restarted, because it writes to one block
     only. If the source connects to its device as before, the process instead keeps its connection,
@@ -216,7 +216,10 @@ def injections_by_name(document: bytes) -> dict[str, Declaration]:
 def injection_changes(
     source: str, before: Mapping[str, Declaration], after: Mapping[str, Declaration]
 ) -> Iterator[str]:
-    """Yield a line for each injection of a source that is created, changed or lifted."""
+    """Yield a line for each injection of a source that is created, changed or lifted by a change of plan.
+
+    ``before`` and ``after`` have the declared injections by name.
+    """
     for name in {**before, **after}:
         if before.get(name) != after.get(name):
             what = "created" if name not in before else "changed" if name in after else "lifted"

@@ -280,7 +280,10 @@ def due(life: Life, now_ns: int, *, ready: bool, quiet_ns: int, limits: Limits, 
 
 
 def adopted(spawned_ns: int, restarts: int) -> Life:
-    """Return the state of an adopted process, from its former supervisor's entry in the process table."""
+    """Return the state of an adopted process.
+
+    The time of its start and its number of restarts are from the process table.
+    """
     return Life(State.RUNNING, spawned_ns=spawned_ns, ready_ns=spawned_ns, starts=restarts + 1, ran=True)
 
 

@@ -276,7 +276,7 @@ class Client:
         return injection.injections(await self._call(self._stub.ListInjections, request))
 
     async def lift(self, source: str, number: int) -> None:
-        """Lift an injection, whichever program created it.
+        """Lift the injection with this number, whichever program created it.
 
         Raises:
             PathError: There is no such injection.

@@ -275,7 +275,7 @@ class Client:
         return injection.injections(self._call(self._stub.ListInjections, request))
 
     def lift(self, source: str, number: int) -> None:
-        """Lift an injection, whichever program created it.
+        """Lift the injection with this number, whichever program created it.
 
         Raises:
             PathError: There is no such injection.

@@ -209,7 +209,12 @@ class Part:
     def batches(self, number: int, size: int, from_ns: int, to_ns: int, *, raw: bool) -> Iterator[Batch]:
         """Yield the frames of a channel as arrays, chunk by chunk.
 
-        ``size`` is the number of bytes of an image.
+        Args:
+            number: Number of the channel.
+            size: Size of an image in bytes.
+            from_ns: First log time, in ns.
+            to_ns: Last log time, in ns.
+            raw: True for the images that the source delivered; False for the images that readers saw.
         """
         channel = self.reader.channels[number]
         for found in self._each(
@@ -219,7 +224,7 @@ class Part:
                 yield found
 
     def frames(self, number: int, size: int, from_ns: int, to_ns: int) -> Iterator[tuple[int, Frame]]:
-        """Yield the frames of a channel as objects, with their log times."""
+        """Yield the frames of a channel as objects, with their log times: see :meth:`batches`."""
         channel = self.reader.channels[number]
         for found in self._each(number, from_ns, to_ns, lambda data: frames(data, channel, size, from_ns, to_ns)):
             yield from found
@@ -289,7 +294,10 @@ class Entry(NamedTuple, Generic[ItemT_co]):
 def messages_of(
     part: Part, within: Contents, channels: Collection[int], from_ns: int, to_ns: int
 ) -> Iterator[tuple[Contents, Entry[Item]]]:
-    """Yield the messages of some channels in a range of log times, each with the contents of its file."""
+    """Yield the messages of some channels of ``part`` in a range of log times.
+
+    Each is yielded together with ``within``, the contents of the file.
+    """
     for channel, log_ns, item in part.messages(channels, from_ns, to_ns):
         block = (
             within.numbered.get((item.source, item.block))
@@ -311,7 +319,10 @@ def batches_of(frames: Iterable[Entry[Frame]], *, raw: bool) -> Iterator[tuple[D
 
 
 def latest_of(part: Part, within: Contents, source: str, time_ns: int) -> Entry[Frame] | None:
-    """Return a source's last frame at or before a time, from one file; None if the file has none."""
+    """Return a source's last frame at or before a time in one file; None if there is none.
+
+    ``within`` has the contents of the file.
+    """
     for messages in part.messages_before(within.frames(source), time_ns):
         for message in reversed(messages):
             if isinstance(message.item, Frame):

@@ -58,7 +58,7 @@ class Chunks:
         return len(self._at)
 
     def add(self, chunk: Record, first_ns: int, last_ns: int, channels: Collection[int]) -> None:
-        """Add the next chunk.
+        """Add the next chunk, with the log times of its first and last message, and its channels' numbers.
 
         Raises:
             RecordingError: There are more chunks than any recorder writes.
