@@ -391,6 +391,78 @@ class OpcUa(Section):
     client: list[Client] = []
 
 
+class FabricRule(Section):
+    """``[[fabric.rule]]``: which frames of matching sources the uplink publishes.
+
+    The first rule that matches a source applies. ``registers`` are globs for the registers to
+    publish; without them, all are published. With ``send = "changes"``, frames without a change of
+    these registers are left out.
+    """
+
+    match: Text | Texts
+    send: Literal["frames", "changes", "nothing"] = "frames"
+    max_rate_hz: Annotated[float, Meta(gt=0, le=1e6)] | None = None
+    registers: Annotated[list[Text], Meta(max_length=1000)] = []
+
+    @property
+    def patterns(self) -> list[str]:
+        """Globs for the names of sources."""
+        return _listed(self.match)
+
+
+class FabricAllow(Section):
+    """``[[fabric.allow]]``: what the programs of other cells may do; without it, they may only read.
+
+    ``sender`` are globs for the names of cells.
+    """
+
+    sender: Text | Texts
+    roles: Texts
+
+    @property
+    def patterns(self) -> list[str]:
+        """Globs for the names of the cells that send commands."""
+        return _listed(self.sender)
+
+
+class FabricHistory(Section):
+    """``[fabric.history]``: the stream in which the servers keep what the cell publishes."""
+
+    keep_days: Annotated[float, Meta(gt=0, le=100_000)] = 7.0
+    keep_mb: Annotated[float, Meta(gt=0, le=1e9)] = 1000.0
+    replicas: Annotated[int, Meta(ge=1, le=5)] = 1
+
+
+class Fabric(Section):
+    """``[fabric]``: the connection to the NATS servers that join instances on many hosts.
+
+    With ``cell``, the instance is published under this name. Sources with ``connector = "fabric"``
+    use the same connection. ``listen`` and ``directory`` are for the embedded server.
+    """
+
+    server: Text | Texts
+    cell: Text | None = None
+    listen: Text | None = None
+    directory: Text = "fabric"
+    insecure: bool = False
+    tls: MqttTls | None = None
+    credentials: Text | None = None
+    backlog_mb: Annotated[float, Meta(ge=0, le=65536)] = 16.0
+    rule: list[FabricRule] = []
+    allow: list[FabricAllow] = []
+    history: FabricHistory | None = None
+
+    @property
+    def embedded(self) -> bool:
+        """True if the instance runs the server."""
+        return self.server == "embedded"
+
+    @property
+    def servers(self) -> list[str]:
+        """URLs of the servers of others; empty if the server is embedded."""
+        return [] if self.embedded else _listed(self.server)
+
+
 class Metrics(Section):
     """``[metrics]``: the address at which Prometheus can read the figures of the instance."""
 
@@ -487,6 +559,7 @@ class Config(Section):
     grpc: Grpc | None = None
     mqtt: Mqtt | None = None
     opcua: OpcUa | None = None
+    fabric: Fabric | None = None
     metrics: Metrics | None = None
     web: Web | None = None
     recorder: Recorder | None = None

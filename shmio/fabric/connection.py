@@ -1,0 +1,143 @@
+"""Connects to the NATS servers of the fabric."""
+
+from __future__ import annotations
+
+import logging
+import ssl
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from shmio.config.model import MqttTls
+from shmio.config.tls import client_context
+from shmio.errors import ConfigError, RemoteError
+from shmio.libraries import library
+
+if TYPE_CHECKING:
+    from nats.aio.client import Client
+
+INSTALL: Final = "pip install 'shmio[fabric]'"
+CONNECT_S: Final = 5.0
+PING_S: Final = 1.0
+"""Interval between two pings of the server, in s."""
+MAX_PINGS: Final = 2
+"""Number of unanswered pings after which the connection counts as lost."""
+RETRY_S: Final = 0.5
+"""Wait between two attempts to connect again, in s."""
+
+log = logging.getLogger("shmio.fabric")
+
+
+class Access(msgspec.Struct, frozen=True):
+    """The addresses of the servers, and what shmio presents to them.
+
+    Attributes:
+        servers: URLs such as ``nats://host:4222``. The client tries them in turn.
+        tls: PEM files; None: without TLS, unless the URL begins with ``tls://``.
+        credentials: Path of a file with a JWT and its NKey (``.creds``), or with the seed of an
+            NKey; None: without authentication.
+
+    """
+
+    servers: tuple[str, ...]
+    tls: MqttTls | None = None
+    credentials: str | None = None
+
+    def __str__(self) -> str:
+        return ", ".join(self.servers)
+
+
+async def connect(
+    access: Access,
+    name: str,
+    *,
+    patient: bool = True,
+    lost: Callable[[], Awaitable[None]] | None = None,
+    back: Callable[[], Awaitable[None]] | None = None,
+) -> Client:
+    """Connect to the first server that answers.
+
+    The connection is restored by itself when it is lost. While it is lost, publishing raises
+    ``nats.errors.OutboundBufferLimitError`` instead of storing messages.
+
+    Args:
+        access: The servers.
+        name: Name of this client for the server's monitoring.
+        patient: True: try until a server answers. False: try each server once.
+        lost: Called when the connection is lost.
+        back: Called when the connection is restored.
+
+    Raises:
+        ConfigError: A TLS or credentials file cannot be used.
+        MissingLibraryError: nats-py is not installed.
+        RemoteError: With ``patient`` False, no server can be reached; always, a server refuses the
+            credentials.
+
+    """
+    nats = library("nats", INSTALL)
+    library("nats.errors", INSTALL)
+    problem: list[BaseException] = []
+
+    async def failed(error: BaseException) -> None:
+        if not problem or str(problem[-1]) != str(error):
+            log.info("fabric: %s", _said(error))
+        problem[:] = [error]
+
+    options: dict[str, Any] = {
+        "servers": list(access.servers),
+        "name": name,
+        "error_cb": failed,
+        "disconnected_cb": lost,
+        "reconnected_cb": back,
+        "connect_timeout": CONNECT_S,
+        "reconnect_time_wait": RETRY_S,
+        "max_reconnect_attempts": -1 if patient else 1,
+        "allow_reconnect": patient,
+        "ping_interval": PING_S,
+        "max_outstanding_pings": MAX_PINGS,
+        "pending_size": 0,  # a message for a dead link is not stored for later
+        **_tls(access),
+        **_credentials(access),
+    }
+    try:
+        return await nats.connect(**options)  # type: ignore[no-any-return]
+    except nats.errors.AuthorizationError:
+        raise RemoteError(f"{access}: the server refuses these credentials; check fabric.credentials") from None
+    except (OSError, nats.errors.Error) as error:  # a time-out is an OSError
+        raise RemoteError(
+            f"{access}: no NATS server can be reached: {_said(problem[-1] if problem else error)}"
+        ) from None
+
+
+def _tls(access: Access) -> dict[str, Any]:
+    if access.tls is not None:
+        return {"tls": client_context(access.tls, "fabric.tls.")}
+    if any(server.startswith("tls://") for server in access.servers):
+        return {"tls": ssl.create_default_context()}
+    return {}
+
+
+def _credentials(access: Access) -> dict[str, Any]:
+    if access.credentials is None:
+        return {}
+    library("nkeys", INSTALL)
+    try:
+        text = Path(access.credentials).read_text(encoding="ascii")
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "the file is not text"
+        raise ConfigError(f"fabric.credentials: {access.credentials}: {why}") from None
+    if "BEGIN NATS USER JWT" in text:
+        return {"user_credentials": access.credentials}
+    seed = text.strip()
+    if not seed.startswith("SU"):
+        raise ConfigError(
+            f"fabric.credentials: {access.credentials} is neither a .creds file nor the seed of a user's NKey, which "
+            "begins with SU"
+        )
+    return {"nkeys_seed_str": seed}
+
+
+def _said(error: BaseException) -> str:
+    return str(error) or type(error).__name__

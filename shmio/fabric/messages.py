@@ -1,0 +1,148 @@
+"""Messages of the fabric: a source's frames and events, and requests for those that are missing.
+
+A message has a fixed header and entries, in the order in which the source published them. An entry
+has the encoding of a recording (docs/reference/dump-format.md). The uplink numbers the messages of
+each source without gaps, so a mirror knows which ones it has not received.
+docs/reference/fabric.md describes the bytes.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Iterator
+from typing import Final, NamedTuple
+
+import msgspec
+
+from shmio.recording.format.encoding import (
+    Gap,
+    decode_event,
+    decode_frame,
+    decode_gap,
+    encode_event,
+    encode_frame,
+    encode_json,
+)
+from shmio.segment.block import Frame
+from shmio.segment.events import Event
+
+VERSION: Final = 1
+MAX_MESSAGE_BYTES: Final = 1 << 20
+"""Largest message: the limit that a NATS server has if its configuration gives no other."""
+MAX_ENTRY_BYTES: Final = MAX_MESSAGE_BYTES - 4096
+PREFERRED_BYTES: Final = 1 << 18
+"""A message is ended when it has this many bytes."""
+
+_HEADER: Final = struct.Struct("<BBHIQQ8sqQ")
+_ENTRY: Final = struct.Struct("<BI")
+_AGE_AT: Final = _HEADER.size - 8
+_FRAME: Final = 1
+_EVENT: Final = 2
+_GAP: Final = 3
+
+
+class Header(NamedTuple):
+    """The header of a message.
+
+    Attributes:
+        left_out: Number of frames before this message that a rule of the uplink has left out since
+            the previous message. They are not missing.
+        stream: Number of the uplink's numbering; a restarted uplink has another.
+        number: Number of the message within the stream; the first is 1.
+        layout: First 8 bytes of the hash of the layout of the frames.
+        made_ns: UTC time on the owner's host at which the uplink made the message, in ns since 1970.
+        age_ns: Time in ns from ``made_ns`` until the message was sent. For a message that is
+            published as soon as it is made, this is 0.
+
+    """
+
+    left_out: int
+    stream: int
+    number: int
+    layout: bytes
+    made_ns: int
+    age_ns: int = 0
+
+
+Entry = Frame | Event | Gap
+
+
+def encode(header: Header, entries: Iterable[Entry]) -> bytearray:
+    """Encode a message. :func:`with_age` changes its age later."""
+    left_out = min(header.left_out, 0xFFFFFFFF)
+    head = VERSION, 0, 0, left_out, header.stream, header.number, header.layout, header.made_ns, header.age_ns
+    data = bytearray(_HEADER.pack(*head))
+    for entry in entries:
+        if isinstance(entry, Frame):
+            kind, content = _FRAME, encode_frame(entry)
+        elif isinstance(entry, Event):
+            kind, content = _EVENT, encode_event(entry)
+        else:
+            kind, content = _GAP, encode_json(entry)
+        data += _ENTRY.pack(kind, len(content))
+        data += content
+    return data
+
+
+def with_age(data: bytearray, age_ns: int) -> bytes:
+    """Return a message with another age."""
+    struct.pack_into("<Q", data, _AGE_AT, max(0, age_ns))
+    return bytes(data)
+
+
+def decode_header(data: bytes) -> Header:
+    """Decode the header of a message.
+
+    Raises:
+        ValueError: The message is malformed, or a newer version of shmio made it.
+
+    """
+    if len(data) < _HEADER.size:
+        raise ValueError("the message is shorter than its header")
+    version, _, _, left_out, stream, number, layout, made_ns, age_ns = _HEADER.unpack_from(data)
+    if version != VERSION:
+        raise ValueError(f"the message has version {version}, but this version of shmio reads only {VERSION}")
+    if not stream or not number:
+        raise ValueError("the message has no number")
+    return Header(left_out, stream, number, layout, made_ns, age_ns)
+
+
+def decode_entries(data: bytes) -> Iterator[Entry]:
+    """Yield the entries of a message.
+
+    Raises:
+        ValueError: The message is malformed.
+
+    """
+    at = _HEADER.size
+    while at < len(data):
+        if len(data) - at < _ENTRY.size:
+            raise ValueError("the message ends within an entry")
+        kind, size = _ENTRY.unpack_from(data, at)
+        at += _ENTRY.size
+        content = data[at : at + size]
+        if len(content) != size:
+            raise ValueError("the message ends within an entry")
+        at += size
+        if kind == _FRAME:
+            yield decode_frame(content)
+        elif kind == _EVENT:
+            yield decode_event(content)
+        elif kind == _GAP:
+            try:
+                yield decode_gap(content)
+            except msgspec.MsgspecError as error:
+                raise ValueError(f"a gap is malformed: {error}") from None
+        # An entry of another kind comes from a newer version: this version skips it.
+
+
+class MissingRequest(msgspec.Struct, frozen=True):
+    """A request for the messages of a stream from ``first`` to ``last``.
+
+    The uplink sends each of them to the request's reply subject, in order, with its age, and then an
+    empty message. It leaves out the messages that it no longer has.
+    """
+
+    stream: int
+    first: int
+    last: int

@@ -1,0 +1,78 @@
+"""Names of cells, and the subjects on which a cell publishes and listens."""
+
+from __future__ import annotations
+
+import re
+from typing import Final, NamedTuple
+
+from shmio.errors import ConfigError
+
+ROOT: Final = "shmio"
+"""First token of all subjects of the fabric."""
+_PART: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,39}\Z")
+
+
+class CellName(NamedTuple):
+    """The name of a cell in the fabric, written ``plant.line.cell``."""
+
+    plant: str
+    line: str
+    cell: str
+
+    @classmethod
+    def parse(cls, text: str) -> CellName:
+        """Parse a name such as ``plant1.line3.a50``.
+
+        Raises:
+            ConfigError: The text is not the name of a cell.
+
+        """
+        parts = text.split(".")
+        if len(parts) != 3 or not all(map(_PART.match, parts)):
+            raise ConfigError(
+                f"{text!r} is not the name of a cell; write plant.line.cell, such as plant1.line3.a50, each part with "
+                "at most 40 letters, digits, _ and -"
+            )
+        return cls(*parts)
+
+    def __str__(self) -> str:
+        return ".".join(self)
+
+    @property
+    def subject(self) -> str:
+        """The subject that all subjects of the cell begin with."""
+        return f"{ROOT}.{self}"
+
+    @property
+    def status(self) -> str:
+        """The subject on which the cell publishes its state."""
+        return f"{self.subject}.status"
+
+    def live(self, source: str) -> str:
+        """Return the subject of a source's new frames and events."""
+        return f"{self.subject}.{token(source)}.live"
+
+    def late(self, source: str) -> str:
+        """Return the subject of a source's frames and events that are published again after a lost connection."""
+        return f"{self.subject}.{token(source)}.late"
+
+    def missing(self, source: str) -> str:
+        """Return the subject of requests for messages of a source that a mirror has not received."""
+        return f"{self.subject}.{token(source)}.missing"
+
+    def command(self, source: str, sender: CellName) -> str:
+        """Return the subject of a cell's commands to a source.
+
+        The sender's name is in the subject, so that the server can refuse a false name.
+        """
+        return f"{self.subject}.{token(source)}.command.{sender}"
+
+
+def token(source: str) -> str:
+    """Return a source's name as one token of a subject, in which a dot would begin another token."""
+    return source.replace(".", "~")
+
+
+def source_of(token: str) -> str:
+    """Return the source's name from its token; the opposite of :func:`token`."""
+    return token.replace("~", ".")

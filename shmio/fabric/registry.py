@@ -1,0 +1,249 @@
+"""The registry of the fabric: which cells exist, who owns them, and the layouts of their sources.
+
+It is a key-value bucket of JetStream. An uplink claims the name of its cell, and renews the entry
+each ``RENEW_S``. An entry that is older than ``DEAD_S`` belongs to a cell that is down.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from datetime import datetime
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+import zstandard
+
+from shmio.errors import ConflictError, RemoteError
+from shmio.fabric.names import CellName
+from shmio.layout.document import load_layout
+from shmio.layout.model import Layout
+from shmio.libraries import library
+
+if TYPE_CHECKING:
+    from nats.aio.client import Client
+    from nats.js.kv import KeyValue
+
+CELLS: Final = "shmio_cells"
+"""Bucket of the cells."""
+LAYOUTS: Final = "shmio_layouts"
+"""Bucket of the layouts, by their hash."""
+RENEW_S: Final = 2.0
+DEAD_S: Final = 10.0
+MAX_LAYOUT_BYTES: Final = 64 << 20
+_INSTALL: Final = "pip install 'shmio[fabric]'"
+
+
+class SourceEntry(msgspec.Struct, frozen=True):
+    """A source that a cell offers.
+
+    Attributes:
+        name: Name of the source.
+        layout: Hash of the layout of its frames, in hexadecimal digits.
+        period_ns: Time between two cycles, in ns.
+        stale_ns: Age in ns at which a frame becomes bad.
+        stream: Number of the uplink's numbering of its messages.
+        quality: Present quality: good, uncertain or bad.
+        reason: Why the quality is not good.
+        registers: Number of registers.
+
+    """
+
+    name: str
+    layout: str
+    period_ns: int
+    stale_ns: int
+    stream: int
+    quality: str = "bad"
+    reason: str = ""
+    registers: int = 0
+
+
+class CellEntry(msgspec.Struct, frozen=True):
+    """A cell in the registry.
+
+    Attributes:
+        cell: Name of the cell.
+        host: Name of the host on which it runs.
+        instance: Name of the instance.
+        version: Version of shmio.
+        epoch: Number of this start of the instance.
+        state: State of the instance, such as running or degraded.
+        started_utc_ns: Time of the start, UTC in ns since 1970.
+        renewed_utc_ns: Time of the last renewal on the owner's clock, UTC in ns since 1970.
+        web: Address of the cell's web page; empty if it has none.
+        sources: The sources that the cell offers.
+
+    """
+
+    cell: str
+    host: str
+    instance: str
+    version: str
+    epoch: str
+    state: str
+    started_utc_ns: int
+    renewed_utc_ns: int
+    web: str = ""
+    sources: tuple[SourceEntry, ...] = ()
+
+    def source(self, name: str) -> SourceEntry | None:
+        """Return the source of this name; None if the cell does not offer it."""
+        return next((source for source in self.sources if source.name == name), None)
+
+
+class Seen(msgspec.Struct, frozen=True):
+    """A cell as the registry has it. ``age_s`` is the time since its last renewal, by the server's clock."""
+
+    entry: CellEntry
+    age_s: float
+    revision: int
+
+    @property
+    def alive(self) -> bool:
+        """True if the cell has renewed its entry in time."""
+        return self.age_s < DEAD_S
+
+
+class Registry:
+    """Reads and writes the registry through a connection."""
+
+    def __init__(self, client: Client, cells: KeyValue, layouts: KeyValue) -> None:
+        """Use :meth:`open` instead."""
+        self._client = client
+        self._cells = cells
+        self._layouts = layouts
+
+    @classmethod
+    async def open(cls, client: Client, *, replicas: int = 1) -> Registry:
+        """Open the registry, and create its buckets if they are missing.
+
+        Args:
+            client: The connection.
+            replicas: Number of servers that store new buckets.
+
+        Raises:
+            RemoteError: The server has no JetStream, or refuses access.
+
+        """
+        return cls(client, await _bucket(client, CELLS, replicas), await _bucket(client, LAYOUTS, replicas))
+
+    async def claim(self, entry: CellEntry) -> int:
+        """Claim the name of a cell; return the revision of its entry for :meth:`renew`.
+
+        Raises:
+            ConflictError: Another instance that is alive has this name; the message names both hosts.
+
+        """
+        errors = library("nats.js.errors", _INSTALL)
+        for _ in range(5):
+            seen = await self.find(entry.cell)
+            data = msgspec.json.encode(entry)
+            try:
+                if seen is None:
+                    return await self._cells.create(entry.cell, data)
+                other = seen.entry
+                own = (other.host, other.instance) == (entry.host, entry.instance)
+                if seen.alive and not own and other.state != "stopped":
+                    raise ConflictError(
+                        f"the fabric already has a cell {entry.cell}: instance {other.instance} on host {other.host}, "
+                        f"renewed {seen.age_s:.0f} s ago; this is instance {entry.instance} on host {entry.host}; "
+                        "give one of them another fabric.cell"
+                    )
+                return await self._cells.update(entry.cell, data, last=seen.revision)
+            except errors.KeyWrongLastSequenceError:
+                continue  # another instance was faster: look again
+        raise ConflictError(f"several instances claim the cell {entry.cell} at the same time; stop all but one")
+
+    async def renew(self, entry: CellEntry, revision: int) -> int:
+        """Renew the entry of a cell; return its new revision.
+
+        Raises:
+            ConflictError: Another instance has claimed the name since.
+
+        """
+        errors = library("nats.js.errors", _INSTALL)
+        try:
+            return await self._cells.update(entry.cell, msgspec.json.encode(entry), last=revision)
+        except errors.KeyWrongLastSequenceError:
+            return await self.claim(entry)
+
+    async def find(self, cell: CellName | str) -> Seen | None:
+        """Return a cell's entry; None if the registry does not have it."""
+        errors = library("nats.js.errors", _INSTALL)
+        try:
+            found = await self._cells.get(str(cell))
+        except errors.KeyNotFoundError:
+            return None
+        return await self._seen(found)
+
+    async def cells(self) -> list[Seen]:
+        """Return all cells, in the order of their names."""
+        errors = library("nats.js.errors", _INSTALL)
+        try:
+            keys = await self._cells.keys()
+        except errors.NoKeysError:
+            return []
+        found = [await self.find(key) for key in sorted(keys)]
+        return [seen for seen in found if seen is not None]
+
+    async def _seen(self, found: Any) -> Seen | None:
+        message = await self._client.jetstream().get_msg(f"KV_{CELLS}", seq=found.revision)
+        now = await self._server_time()
+        try:
+            entry = msgspec.json.decode(found.value or b"", type=CellEntry)
+        except msgspec.MsgspecError:
+            return None  # not from shmio, or damaged
+        age_s = 0.0 if message.time is None else max(0.0, now - message.time.timestamp())
+        return Seen(entry, age_s, found.revision)
+
+    async def _server_time(self) -> float:
+        """Return the server's time, as entries have it: the clocks of the hosts may differ."""
+        answer = await self._client.request(f"$JS.API.STREAM.INFO.KV_{CELLS}")
+        return datetime.fromisoformat(msgspec.json.decode(answer.data, type=_StreamInfo).ts).timestamp()
+
+    async def put_layout(self, layout: Layout) -> None:
+        """Store a layout, unless the registry has it already."""
+        errors = library("nats.js.errors", _INSTALL)
+        try:
+            await self._layouts.create(layout.hash.hex(), zstandard.compress(layout.to_json()))
+        except errors.KeyWrongLastSequenceError:
+            return
+
+    async def layout(self, digest: str) -> Layout:
+        """Return the layout with a hash.
+
+        Raises:
+            RemoteError: The registry does not have it, or it is damaged.
+
+        """
+        errors = library("nats.js.errors", _INSTALL)
+        try:
+            found = await self._layouts.get(digest)
+        except errors.KeyNotFoundError:
+            raise RemoteError(f"the fabric has no layout {digest[:16]}; restart the cell that offers it") from None
+        try:
+            data = zstandard.ZstdDecompressor().decompress(found.value or b"", max_output_size=MAX_LAYOUT_BYTES)
+        except zstandard.ZstdError as error:
+            raise RemoteError(f"the layout {digest[:16]} in the fabric is damaged: {error}") from None
+        if hashlib.sha256(data).hexdigest() != digest:
+            raise RemoteError(f"the layout {digest[:16]} in the fabric is damaged: its hash is wrong")
+        return load_layout(data)
+
+
+class _StreamInfo(msgspec.Struct):
+    ts: str
+
+
+async def _bucket(client: Client, name: str, replicas: int) -> KeyValue:
+    errors = library("nats.js.errors", _INSTALL)
+    nats_errors = library("nats.errors", _INSTALL)
+    stream = client.jetstream()
+    try:
+        try:
+            return await stream.key_value(name)
+        except errors.BucketNotFoundError:
+            return await stream.create_key_value(bucket=name, history=1, replicas=replicas)
+    except (errors.ServiceUnavailableError, nats_errors.NoRespondersError):
+        raise RemoteError("the NATS server has no JetStream; start it with -js, or set jetstream in its file") from None
+    except (errors.APIError, nats_errors.TimeoutError) as error:
+        raise RemoteError(f"the NATS server does not give access to its bucket {name}: {error}") from None
