@@ -1,4 +1,4 @@
-"""Messages of the fabric: a source's frames and events, and requests for those that are missing.
+"""Messages of the fabric: a source's frames and events, requests for those missing, and commands.
 
 A message has a fixed header and entries, in the order in which the source published them. An entry
 has the encoding of a recording (docs/reference/dump-format.md). The uplink numbers the messages of
@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 
 import msgspec
 
+from shmio.model.values import OutcomeKind
 from shmio.recording.format.encoding import (
     Gap,
     decode_event,
@@ -146,3 +147,97 @@ class MissingRequest(msgspec.Struct, frozen=True):
     stream: int
     first: int
     last: int
+
+
+MAX_ITEMS: Final = 4096
+"""Maximum number of writes of a command."""
+MAX_WAIT_S: Final = 60.0
+"""Longest time for which the owner waits for the outcome of a command, in s."""
+
+
+class WriteItem(msgspec.Struct, frozen=True, array_like=True):
+    """A write to bytes of a source, or to one bit of a byte, as in the commands of a segment.
+
+    Attributes:
+        offset: Position of the first byte in the source's image.
+        mask: 0: write all of ``data``. Otherwise one bit: write only this bit of one byte.
+        data: The bytes.
+
+    """
+
+    offset: int
+    mask: int
+    data: bytes
+
+
+class CommandRequest(msgspec.Struct, frozen=True):
+    """A command of another cell to a source. The source carries out all writes or none.
+
+    Attributes:
+        expires_ns: Time on the owner's clock, as ``made_ns`` of a message, after which the source
+            must not begin. The outcome of a command that comes later is expired.
+        layout: First 8 bytes of the hash of the layout that the offsets belong to. The owner
+            rejects a command for another layout.
+        writes: The writes.
+
+    """
+
+    expires_ns: int
+    layout: bytes
+    writes: list[WriteItem]
+
+
+class CommandReply(msgspec.Struct, frozen=True):
+    """The outcomes of a command: one for each write, in their order.
+
+    Attributes:
+        outcomes: The outcomes, each a value of :class:`shmio.model.values.OutcomeKind`.
+        reasons: For each outcome, its reason; empty for a success.
+
+    """
+
+    outcomes: list[str]
+    reasons: list[str]
+
+
+def encode_command(message: CommandRequest | CommandReply) -> bytes:
+    """Encode a command or its reply."""
+    return msgspec.msgpack.encode(message)
+
+
+def decode_request(data: bytes) -> CommandRequest:
+    """Decode a command.
+
+    Raises:
+        ValueError: The message is not a command.
+
+    """
+    try:
+        request = msgspec.msgpack.decode(data, type=CommandRequest)
+    except msgspec.MsgspecError as error:
+        raise ValueError(f"the message is not a command: {error}") from None
+    if not 0 < len(request.writes) <= MAX_ITEMS:
+        raise ValueError(f"a command has 1 to {MAX_ITEMS} writes, but this one has {len(request.writes)}")
+    for item in request.writes:
+        bit = len(item.data) == 1 and 0 < item.mask < 256 and item.mask & (item.mask - 1) == 0
+        if item.offset < 0 or not item.data or (item.mask and not bit):
+            raise ValueError("a write of the command is malformed")
+    return request
+
+
+def decode_reply(data: bytes, items: int) -> CommandReply:
+    """Decode the reply to a command with this number of writes.
+
+    Raises:
+        ValueError: The message is not such a reply.
+
+    """
+    try:
+        reply = msgspec.msgpack.decode(data, type=CommandReply)
+        for outcome in reply.outcomes:
+            OutcomeKind(outcome)
+    except (msgspec.MsgspecError, ValueError) as error:
+        raise ValueError(f"the message is not a reply to a command: {error}") from None
+    if len(reply.outcomes) != items or len(reply.reasons) != items:
+        raise ValueError("the reply has another number of outcomes than the command has writes")
+    return reply
