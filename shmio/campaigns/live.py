@@ -22,8 +22,9 @@ from shmio.judging.source import Frames, Rows
 from shmio.local.attach import Attachment
 from shmio.model.snapshot import SnapshotInfo
 from shmio.recorder.file_output import Output
-from shmio.recorder.instance_follower import BlockEntry, InstanceEntry, InstanceFollower, StartPositions
+from shmio.recorder.instance_follower import InstanceEntry, InstanceFollower, StartPositions
 from shmio.recorder.recorder import CLOSE_S, AttachedFiles, Recorder, no_attachments
+from shmio.recording.block_follower import BlockEntry
 from shmio.recording.injection_times import InjectionTimes
 from shmio.recording.judge import GoldenRecordings
 from shmio.segment import Block, Event, Frame, Segment

@@ -13,6 +13,7 @@ import msgspec
 
 from shmio.config.alert import alert_faults, resolve_alert
 from shmio.config.declaration import declaration_faults
+from shmio.config.fabric import check_fabric, resolve_fabric
 from shmio.config.faults import MAX_KEY, MAX_PARTS, Faults, decode, explain, explain_toml, too_long
 from shmio.config.listening import check_listening, resolve
 from shmio.config.model import (
@@ -22,6 +23,10 @@ from shmio.config.model import (
     Config,
     Declaration,
     Emulator,
+    Fabric,
+    FabricAllow,
+    FabricHistory,
+    FabricRule,
     Grpc,
     Instance,
     Listening,
@@ -47,7 +52,9 @@ from shmio.config.web import check_web, resolve_web
 from shmio.errors import ConfigError
 from shmio.wording import already_named, did_you_mean, larger_than, listed, near, unknown
 
-SECTION_PROCESSES = frozenset({"alerts", "broker", "grpc", "metrics", "mqtt", "opcua", "recorder", "supervisor", "web"})
+SECTION_PROCESSES = frozenset(
+    {"alerts", "broker", "fabric", "grpc", "metrics", "mqtt", "nats", "opcua", "recorder", "supervisor", "web"}
+)
 MAX_FILE_BYTES = 1 << 20
 MAX_PROPERTIES_BYTES = 64 << 10
 MAX_DEPTH = 64
@@ -74,6 +81,11 @@ _TABLES: dict[str, type[Section]] = {
     "opcua": OpcUa,
     "opcua.account": Token,
     "opcua.client": Client,
+    "fabric": Fabric,
+    "fabric.tls": MqttTls,
+    "fabric.rule": FabricRule,
+    "fabric.allow": FabricAllow,
+    "fabric.history": FabricHistory,
     "metrics": Metrics,
     "web": Web,
     "recorder": Recorder,
@@ -93,6 +105,8 @@ _SEVERAL = {
     "mqtt.topic",
     "opcua.account",
     "opcua.client",
+    "fabric.rule",
+    "fabric.allow",
 }
 _SLIPPED = re.compile(r"[A-Za-z]:[\x00-\x1f\\]")  # a Windows path in double quotes, \t being a tab
 DERIVED: Final[Mapping[type[Section], tuple[str, ...]]] = {Config: ("folder",), Source: ("options", "texts")}
@@ -272,6 +286,8 @@ def _examine(tables: dict[str, Any], folder: Path, faults: Faults) -> Examined:
     with faults.catching():
         check_opcua(config)
     with faults.catching():
+        check_fabric(config)
+    with faults.catching():
         check_web(config)
     if config.grpc:
         with faults.catching():
@@ -280,6 +296,8 @@ def _examine(tables: dict[str, Any], folder: Path, faults: Faults) -> Examined:
         resolve_mqtt(config.mqtt, config)
     if config.opcua:
         resolve_opcua(config.opcua, config)
+    if config.fabric:
+        resolve_fabric(config.fabric, config)
     resolve_web(config)
     for alert in config.alert:
         resolve_alert(alert, config)

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from shmio.config.model import MqttTls
+from shmio.config.address import Address
+from shmio.config.model import Fabric, MqttTls
 from shmio.config.tls import client_context
 from shmio.errors import ConfigError, RemoteError
 from shmio.libraries import library
@@ -38,12 +39,28 @@ class Access(msgspec.Struct, frozen=True):
         tls: PEM files; None: without TLS, unless the URL begins with ``tls://``.
         credentials: Path of a file with a JWT and its NKey (``.creds``), or with the seed of an
             NKey; None: without authentication.
+        pinned: PEM file with the certificate of the instance's own server, the only one to trust;
+            None: an authority must have issued the server's certificate.
 
     """
 
     servers: tuple[str, ...]
     tls: MqttTls | None = None
     credentials: str | None = None
+    pinned: str | None = None
+
+    @classmethod
+    def of(cls, fabric: Fabric) -> Access:
+        """Return the access to the servers of a checked section."""
+        if not fabric.embedded:
+            return cls(tuple(fabric.servers), fabric.tls, fabric.credentials)
+        listen = Address.parse(str(fabric.listen))
+        here = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(listen.host, listen.host)  # noqa: S104  a key
+        url = f"nats://{Address(here, listen.port)}"
+        if fabric.tls is None:
+            return cls((url,))
+        shown = fabric.tls if fabric.tls.ca is not None else None  # the server asks its clients for certificates
+        return cls((url,), shown, pinned=fabric.tls.certificate)
 
     def __str__(self) -> str:
         return ", ".join(self.servers)
@@ -76,8 +93,9 @@ async def connect(
             credentials.
 
     """
-    nats = library("nats", INSTALL)
-    library("nats.errors", INSTALL)
+    errors = library("nats.errors", INSTALL)
+    from shmio.fabric.client import FabricClient  # noqa: PLC0415  it needs the extra
+
     problem: list[BaseException] = []
 
     async def failed(error: BaseException) -> None:
@@ -99,19 +117,23 @@ async def connect(
         "max_outstanding_pings": MAX_PINGS,
         "pending_size": 0,  # a message for a dead link is not stored for later
         **_tls(access),
-        **_credentials(access),
+        **read_credentials(access),
     }
     try:
-        return await nats.connect(**options)  # type: ignore[no-any-return]
-    except nats.errors.AuthorizationError:
+        client = FabricClient()
+        await client.connect(**options)
+    except errors.AuthorizationError:
         raise RemoteError(f"{access}: the server refuses these credentials; check fabric.credentials") from None
-    except (OSError, nats.errors.Error) as error:  # a time-out is an OSError
+    except (OSError, errors.Error) as error:  # a time-out is an OSError
         raise RemoteError(
             f"{access}: no NATS server can be reached: {_said(problem[-1] if problem else error)}"
         ) from None
+    return client
 
 
 def _tls(access: Access) -> dict[str, Any]:
+    if access.pinned is not None:
+        return {"tls": _pinned(access)}
     if access.tls is not None:
         return {"tls": client_context(access.tls, "fabric.tls.")}
     if any(server.startswith("tls://") for server in access.servers):
@@ -119,7 +141,27 @@ def _tls(access: Access) -> dict[str, Any]:
     return {}
 
 
-def _credentials(access: Access) -> dict[str, Any]:
+def _pinned(access: Access) -> ssl.SSLContext:
+    """Return a TLS context that trusts one certificate, whatever names it has."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname = False
+    context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
+    try:
+        context.load_verify_locations(access.pinned)
+        if access.tls is not None and access.tls.certificate is not None:
+            context.load_cert_chain(access.tls.certificate, access.tls.key)
+    except OSError as error:  # an SSLError is an OSError
+        raise ConfigError(f"fabric.tls: {access.pinned}: {error.strerror or error}") from None
+    return context
+
+
+def read_credentials(access: Access) -> dict[str, Any]:
+    """Return the client's options for the credentials.
+
+    Raises:
+        ConfigError: The file cannot be used.
+
+    """
     if access.credentials is None:
         return {}
     library("nkeys", INSTALL)

@@ -17,7 +17,7 @@ from shmio.segment.header import State as InstanceState
 from shmio.segment.processes import Phase, ProcessSlot
 from shmio.segment.segment import Segment, running_instances
 
-READERS: Final = frozenset({"grpc", "mqtt", "opcua", "web", "recorder", "alerts"})
+READERS: Final = frozenset({"fabric", "grpc", "mqtt", "opcua", "web", "recorder", "alerts"})
 """Kinds of the processes that can read the frames of sources."""
 SILENT_S = 5.0
 """After this time in s without a heartbeat, a supervisor is reported as not responding."""
@@ -186,7 +186,7 @@ def complaint(kind: str, note: str) -> str:
     harmless = {"recorder": "to ", "alerts": "active: "}.get(kind)
     if harmless is not None:
         return "" if note.startswith(harmless) else note
-    return note if kind in ("mqtt", "grpc", "opcua", "web") else ""
+    return note if kind in ("fabric", "mqtt", "grpc", "opcua", "web") else ""
 
 
 def assess(running: Sequence[bool], qualities: Sequence[Quality | None], note: str = "") -> InstanceState:

@@ -14,15 +14,19 @@ from typing import Final
 from shmio import realtime
 from shmio.config import Alert, Config, Metrics, Mqtt, OpcUa, UnixAddress, parse_address
 from shmio.config.credentials import read_accounts, read_headers, read_password, read_tokens
+from shmio.config.fabric import check_library as check_fabric_library
 from shmio.config.folder import unwritable
 from shmio.config.listening import encrypted
-from shmio.config.model import ROLES, MqttTls
+from shmio.config.model import ROLES, Fabric, MqttTls
 from shmio.config.opcua import check_library as check_opcua_library
 from shmio.config.tls import client_context, read_tls, server_context
 from shmio.config.web import check_library as check_web_library
 from shmio.config.web import http_sections
+from shmio.endpoints.fabric.server import check_installed
 from shmio.endpoints.mqtt.broker.program import choose_broker, find_mosquitto
 from shmio.errors import ConfigError
+from shmio.fabric.connection import Access, read_credentials
+from shmio.fabric.names import CellName
 
 FIRST_UID: Final = 1000
 NOBODY: Final = 65534
@@ -61,6 +65,9 @@ def check_host(config: Config, catching: Callable[[], AbstractContextManager[Non
     if config.opcua:
         with catching():
             warnings += _check_opcua(config.opcua)
+    if config.fabric:
+        with catching():
+            _check_fabric(config.fabric)
     for key, section in http_sections(config):
         with catching():
             _check_http(key, section)
@@ -102,6 +109,23 @@ def _check_opcua(opcua: OpcUa) -> Iterator[str]:
             f"opcua.certificate: {opcua.certificate}: this certificate has no application URI (a URI among its "
             "subject alternative names); many clients refuse such a certificate"
         )
+
+
+def _check_fabric(fabric: Fabric) -> None:
+    """Check the libraries, the embedded server, the cell's name, and the files."""
+    check_fabric_library()
+    if fabric.embedded:
+        check_installed()
+        if reason := unwritable(Path(fabric.directory)):
+            raise ConfigError(f"fabric.directory: {reason.reason}")
+    if fabric.cell is not None:
+        try:
+            CellName.parse(fabric.cell)
+        except ConfigError as error:
+            raise ConfigError(f"fabric.cell: {error}") from None
+    if fabric.tls is not None:
+        (server_context if fabric.embedded else client_context)(fabric.tls, "fabric.tls.")
+    read_credentials(Access.of(fabric))
 
 
 def _check_http(key: str, section: Metrics) -> None:
@@ -170,7 +194,13 @@ def _check_folder(key: str, folder: Path) -> list[str]:
 
 def exposure(config: Config) -> str | None:
     """Return a line that says what other users of this host may do without credentials; None if nothing."""
-    ways = [*_open_grpc(config), *_open_mqtt(config), *_open_opcua(config), *_open_web(config)]
+    ways = [
+        *_open_grpc(config),
+        *_open_mqtt(config),
+        *_open_opcua(config),
+        *_open_fabric(config),
+        *_open_web(config),
+    ]
     users = other_users() if ways else []
     if not users:
         return None
@@ -231,6 +261,13 @@ def _open_opcua(config: Config) -> Iterator[str]:
     given = opcua.anonymous if opcua.anonymous is not None else [] if guarded else ROLES
     if roles := [role for role in given if role != "read"]:
         yield f"{_joined(roles)} by OPC UA at {opcua.listen}"
+
+
+def _open_fabric(config: Config) -> Iterator[str]:
+    """Yield a text that says what clients may do at the embedded NATS server."""
+    fabric = config.fabric
+    if fabric is not None and fabric.embedded and not (fabric.tls and fabric.tls.ca):
+        yield f"publish everything, values and commands too, by NATS at {fabric.listen}"
 
 
 def _open_web(config: Config) -> Iterator[str]:

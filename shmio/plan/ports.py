@@ -40,6 +40,8 @@ def check_listening(config: Config) -> None:
         listening.append(("mqtt.listen", config.mqtt.listen))
     if config.opcua:
         listening.append(("opcua.listen", config.opcua.listen))
+    if config.fabric and config.fabric.listen:
+        listening.append(("fabric.listen", config.fabric.listen))
     if config.web:
         listening.append(("web.listen", config.web.listen))
     if config.metrics:

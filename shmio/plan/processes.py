@@ -11,7 +11,9 @@ import msgspec
 
 from shmio.audit.file import AuditSettings
 from shmio.config import Config, Mqtt
+from shmio.config.model import Fabric
 from shmio.errors import ConfigError
+from shmio.fabric.connection import Access
 from shmio.layout.model import Layout
 from shmio.segment import Attributes, BlockSpec, Origin, ProcessSpec, segment_size
 
@@ -23,6 +25,7 @@ RANKS: Final[Mapping[str, int]] = {
     "mqtt": 2,
     "opcua": 2,
     "web": 2,
+    "fabric": 2,
     "alerts": 3,
 }
 """Order in which kinds of processes start: emulators and recorder, sources, endpoints, alerts.
@@ -39,6 +42,9 @@ The broker starts before the bridge and stops after it, so that the bridge can d
 """
 
 
+NATS: Final = "nats"
+"""Name of the process of the embedded NATS server; its kind is fabric. It starts first, and stops last."""
+
 ALERTS: Final = "alerts"
 """Name of the process that sends the alerts."""
 
@@ -48,13 +54,14 @@ def rank(name: str, kind: str) -> int:
 
     A process of a kind that this version of shmio does not know stops last.
     """
-    return 0 if (name, kind) == (BROKER, "mqtt") else RANKS.get(kind, 0)
+    return 0 if (name, kind) in ((BROKER, "mqtt"), (NATS, "fabric")) else RANKS.get(kind, 0)
 
 
 MODULES: Final[Mapping[str, str]] = {
     "alerts": "shmio.endpoints.alerts",
     "source": "shmio.connectors",
     "emulator": "shmio.emulators",
+    "fabric": "shmio.endpoints.fabric",
     "grpc": "shmio.endpoints.grpc",
     "mqtt": "shmio.endpoints.mqtt",
     "opcua": "shmio.endpoints.opcua",
@@ -274,6 +281,8 @@ def make_plan(
         sections += _mqtt(config.mqtt)
     if config.opcua and mode != "log":
         sections.append(("opcua", "opcua", msgspec.to_builtins(config.opcua)))
+    if config.fabric and mode != "log":
+        sections += _fabric(config, config.fabric)
     if config.metrics and mode != "log":
         sections.append(("metrics", "web", msgspec.to_builtins(config.metrics) | {"folders": _folders(config)}))
     if config.web and mode != "log":
@@ -324,6 +333,7 @@ def process_names(config: Config) -> list[str]:
     names += ["grpc"] if config.grpc else []
     names += [name for name, _, _ in _mqtt(config.mqtt)] if config.mqtt else []
     names += ["opcua"] if config.opcua else []
+    names += [name for name, _, _ in _fabric(config, config.fabric)] if config.fabric else []
     names += ["metrics"] if config.metrics else []
     names += ["web"] if config.web else []
     names += [ALERTS] if config.alert else []
@@ -368,6 +378,23 @@ def _mqtt(mqtt: Mqtt) -> list[tuple[str, str, dict[str, Any]]]:
     broker |= {key: section[key] for key in ("broker", "password_file", "tls", "prefix")}
     bridge = section | {"password_file": None, "tls": None}
     return [(BROKER, "mqtt", broker), ("mqtt", "mqtt", bridge)]
+
+
+def _fabric(config: Config, fabric: Fabric) -> list[tuple[str, str, dict[str, Any]]]:
+    """Return name, kind and section of the embedded server's process and of the uplink's, as far as they exist."""
+    found: list[tuple[str, str, dict[str, Any]]] = []
+    if fabric.embedded:
+        own = ("listen", "directory", "tls")
+        found.append((NATS, "fabric", {key: msgspec.to_builtins(getattr(fabric, key)) for key in own}))
+    if fabric.cell is not None:
+        keys = ("cell", "backlog_mb", "rule", "allow", "history")
+        section = {key: msgspec.to_builtins(getattr(fabric, key)) for key in keys}
+        section["access"] = msgspec.to_builtins(Access.of(fabric))
+        if config.web is not None:
+            scheme = "http" if config.web.certificate is None else "https"
+            section["web"] = f"{scheme}://{config.web.listen}"
+        found.append(("fabric", "fabric", section))
+    return found
 
 
 def _job(

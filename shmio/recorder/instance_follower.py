@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from typing import Final, Generic, NamedTuple, TypeVar
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from typing import Final, NamedTuple
 
 from shmio.model.clock import Clock
-from shmio.recording.format.encoding import BlockPosition, Gap, ProcessChange, ProcessEvent, Reason, StepMark
-from shmio.recording.selection import RecordedRegisters, Selection
-from shmio.segment import Block, Cursor, Event, Frame, Segment
+from shmio.recording.block_follower import BlockEntry, BlockFollower
+from shmio.recording.format.encoding import BlockPosition, ProcessChange, ProcessEvent, Reason, StepMark
+from shmio.recording.selection import Selection
+from shmio.segment import Block, Segment
 from shmio.segment.events import EVENT_SIZE
 from shmio.segment.processes import Phase, ProcessSlot
 
@@ -28,139 +29,12 @@ BATCH_BYTES: Final = 2 << 20
 
 _DOWN: Final[Mapping[Phase, ProcessEvent]] = {Phase.BACKOFF: ProcessEvent.DIED, Phase.FATAL: ProcessEvent.GAVE_UP}
 
-Item = TypeVar("Item", bound=Frame | Event)
-
-
-class BlockEntry(NamedTuple):
-    """A frame, an event or a gap of a block, with its log time."""
-
-    log_ns: int
-    follower: BlockFollower
-    item: Frame | Event | Gap
-
 
 class InstanceEntry(NamedTuple):
     """The end of a step or a process change of the instance, with its log time."""
 
     log_ns: int
     item: StepMark | ProcessChange
-
-
-class _Stream(Generic[Item]):
-    """The frames or the events of a block, with the position up to which they were read."""
-
-    def __init__(self, what: str, cursor: Cursor[Item], log_ns: int, reason: Reason) -> None:
-        self.what = what
-        self.cursor = cursor
-        self.last = cursor.last
-        self.reason = reason
-        self.log_ns = log_ns
-        self.held: Item | None = None
-
-    def peek(self) -> Item | None:
-        if self.held is None:
-            self.held = self.cursor.poll()
-        return self.held
-
-
-class BlockFollower:
-    """Reads the frames and events of one block in order.
-
-    ``done`` is True if a reload has retired the block, and all its entries have been read.
-    """
-
-    def __init__(
-        self,
-        block: Block,
-        number: int,
-        place: BlockPosition,
-        reason: Reason,
-        log_time: Callable[[int], int],
-        *,
-        over: bool = False,
-        part: RecordedRegisters | None = None,
-    ) -> None:
-        """Start to follow a block.
-
-        Args:
-            block: The block.
-            number: Number of the block in the recording.
-            place: The position after which to start.
-            reason: Reason for a gap at the start.
-            log_time: Converts CLOCK_MONOTONIC to log time.
-            over: True if a reload has already retired the block.
-            part: The registers to record; None for all.
-        """
-        self.block = block
-        self.number = number
-        self.begin = place
-        self.over = over
-        self.part = part or RecordedRegisters(block.layout)
-        self.done = False
-        self._log_time = log_time
-        self._log_ns = place.log_ns
-        self._frames = _Stream("frames", block.cursor(after=place.frame), place.log_ns, reason)
-        self._events = _Stream("events", block.events.cursor(after=place.event), place.log_ns, reason)
-
-    @property
-    def last(self) -> int:
-        """Number of the last frame that was read or counted as missed."""
-        return self._frames.cursor.last
-
-    def restart_time(self) -> None:
-        """Let the log time go back: give the next entries their own times, even if earlier ones have later times."""
-        self._log_ns = 0
-
-    def take(self, limit: int) -> Iterator[BlockEntry]:
-        """Yield unread entries that were published so far: about ``limit`` at most."""
-        retired = self.block.retired  # before the read, so that the last entries are read, too
-        for _ in range(limit):
-            side = self._next()
-            if side is None:
-                self.done = retired
-                self._frames.reason = self._events.reason = Reason.OVERTAKEN  # later entries are new
-                return
-            yield from self._entries(side)
-
-    def remaining(self) -> Iterator[BlockEntry]:
-        """Yield gaps for the frames and events that were overwritten after the last entry that was read."""
-        for side in (self._frames, self._events):
-            if side.cursor.last > side.last and side.held is None:
-                yield BlockEntry(self._log_ns, self, self._gap(side, side.cursor.last, 0))
-
-    def _next(self) -> _Stream[Frame] | _Stream[Event] | None:
-        """Return the stream that has the next entry; None if there is no new entry."""
-        frame = self._frames.peek()
-        event = self._events.peek()
-        if event is None:
-            return None if frame is None else self._frames
-        if frame is None and event.frame > self._frames.cursor.last:
-            frame = self._frames.peek()  # it was published between the two reads
-        return self._events if frame is None or event.frame < frame.number else self._frames
-
-    def _entries(self, side: _Stream[Frame] | _Stream[Event]) -> Iterator[BlockEntry]:
-        item = side.held
-        assert item is not None  # noqa: S101  _next has polled it
-        # The time never decreases, so that entries stay in order even if the block's clock goes back.
-        self._log_ns = log_ns = max(self._log_ns, self._log_time(self.block.clock.monotonic_ns(item.clock_ns)))
-        if item.number > side.last + 1:
-            yield BlockEntry(log_ns, self, self._gap(side, item.number - 1, log_ns))
-        side.held, side.last, side.log_ns, side.reason = None, item.number, log_ns, Reason.OVERTAKEN
-        yield BlockEntry(log_ns, self, item)
-
-    def _gap(self, side: _Stream[Frame] | _Stream[Event], last: int, before_ns: int) -> Gap:
-        first = side.last + 1
-        return Gap(
-            self.block.source,
-            self.number,
-            side.what,
-            first,
-            last,
-            last - first + 1,
-            side.reason,
-            side.log_ns,
-            before_ns,
-        )
 
 
 class _ProcessState(NamedTuple):

@@ -20,12 +20,11 @@ from shmio.errors import ConfigError, RecordingError
 from shmio.recorder.file_output import Output, create
 from shmio.recorder.instance_follower import (
     TURN_S,
-    BlockEntry,
-    BlockFollower,
     InstanceEntry,
     InstanceFollower,
     StartPositions,
 )
+from shmio.recording.block_follower import BlockEntry, BlockFollower
 from shmio.recording.format.encoding import BlockPosition, Gap, ProcessChange, Reason
 from shmio.recording.writer import JSON, TEXT, TOML, Channels, Writer, layout_files
 from shmio.segment import Event, Frame

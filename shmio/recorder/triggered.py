@@ -16,8 +16,9 @@ from shmio.injection.condition import Memory
 from shmio.injection.language import Number
 from shmio.injection.program import NEVER, compile_condition
 from shmio.layout.values.codec import RegisterCodec
-from shmio.recorder.instance_follower import TURN_S, BlockEntry, InstanceEntry, InstanceFollower
+from shmio.recorder.instance_follower import TURN_S, InstanceEntry, InstanceFollower
 from shmio.recorder.recorder import CLOSE_S, AttachedFiles, Counters, RotatingRecorder, is_process_change
+from shmio.recording.block_follower import BlockEntry
 from shmio.recording.format.encoding import BlockPosition, Gap, Reason
 from shmio.segment import Block, Frame, Quality
 from shmio.segment.block import Layouts

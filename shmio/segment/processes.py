@@ -40,6 +40,7 @@ COUNTERS: Final[Mapping[str, tuple[str, ...]]] = {
     "emulator": ("cycles", "overruns"),
     "grpc": ("streams", "messages", "dropped", "published", "refused", "bytes", "waiting_bytes"),
     "mqtt": ("messages", "commands", "refused", "waiting", "backlog", "dropped", "connects", "missed", "bytes"),
+    "fabric": ("messages", "late", "backlog", "dropped", "missed", "commands", "refused", "connects", "bytes"),
     "opcua": ("sessions", "items", "writes", "refused", "bytes", "messages"),
     "recorder": ("frames", "events", "missed", "bytes"),
     "web": ("requests", "refused", "connections", "pages", "messages", "bytes", "answer_bytes"),
@@ -54,7 +55,7 @@ EXTERNAL_SLOTS: Final = 4
 They are the last slots of the table. Their programs have the first command queues.
 """
 
-WRITERS: Final[Mapping[str, int]] = {"grpc": 4, "mqtt": 5, "opcua": 6}
+WRITERS: Final[Mapping[str, int]] = {"grpc": 4, "mqtt": 5, "opcua": 6, "fabric": 7}
 """For each process of the instance that sends commands: the number of its command queue.
 
 The keys are the names of the processes, which are also their kinds.

@@ -158,11 +158,17 @@ def _describe(job: Job, prepared: Prepared) -> str:
         return f"to {config['directory']}"
     if job.kind == "mqtt":
         return f"{config['broker']} on {config['listen']}" if job.name == BROKER else f"under {config['prefix']}/"
+    if job.kind == "fabric":
+        return f"cell {config['cell']} at {', '.join(config['access']['servers'])}" if "cell" in config else _at(job)
     if job.kind == "web":
         scheme = "https" if config["certificate"] else "http"
         return f"{scheme}://{config['listen']}/{'' if job.name == 'web' else 'metrics'}"
     if job.kind == "alerts":
         return f"watching {counted(len(config['alert']), 'alert')}"
+    return _at(job)
+
+
+def _at(job: Job) -> str:
     return f"on {', '.join(job.listening)}"
 
 

@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-ENDPOINTS: Final = ("grpc", "mqtt", "opcua", "web")
+ENDPOINTS: Final = ("fabric", "grpc", "mqtt", "opcua", "web")
 """Kinds of processes that have clients."""
 MAX_CLIENTS: Final = 50
 """Maximum number of clients that are listed for an endpoint, those with the most connections first."""

@@ -78,6 +78,17 @@ _COUNTERS: Final[Mapping[str, Mapping[str, _Named]]] = {
         "missed": _Named("shmio_mqtt_missed_frames", "Frames that the bridge was too slow to read."),
         "bytes": _Named("shmio_mqtt_sent_bytes", "Bytes of the topics and payloads of published messages."),
     },
+    "fabric": {
+        "messages": _Named("shmio_fabric_messages", "Messages that were published."),
+        "late": _Named("shmio_fabric_late_messages", "Messages that were published late."),
+        "backlog": _Named("shmio_fabric_backlog_messages", "Messages that wait to be published.", gauge=True),
+        "dropped": _Named("shmio_fabric_dropped_messages", "Messages that the full backlog dropped."),
+        "missed": _Named("shmio_fabric_missed", "Frames and events that the uplink was too slow to read."),
+        "commands": _Named("shmio_fabric_commands", "Commands that came from other cells."),
+        "refused": _Named("shmio_fabric_refused", "Commands that were refused."),
+        "connects": _Named("shmio_fabric_connects", "Connections that were made to a server."),
+        "bytes": _Named("shmio_fabric_sent_bytes", "Bytes of the messages that were published."),
+    },
     "opcua": {
         "sessions": _Named("shmio_opcua_sessions", "Sessions that are open.", gauge=True),
         "items": _Named("shmio_opcua_monitored_items", "Monitored items.", gauge=True),

@@ -18,8 +18,9 @@ from shmio.local.time_control import Coordinator
 from shmio.recorder import file_output as output_module
 from shmio.recorder.file_output import Output
 from shmio.recorder.housekeeping import Housekeeper
-from shmio.recorder.instance_follower import BlockEntry, InstanceFollower
+from shmio.recorder.instance_follower import InstanceFollower
 from shmio.recorder.recorder import RotatingRecorder, no_attachments
+from shmio.recording.block_follower import BlockEntry
 from shmio.recording.check import check
 from shmio.recording.format.encoding import BlockPosition, Gap, Reason
 from shmio.recording.reading.reader import Reader

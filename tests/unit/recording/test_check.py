@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from mcap.opcode import Opcode
 
 from shmio.errors import RecordingError
-from shmio.recorder import instance_follower
+from shmio.recording import block_follower
 from shmio.recording.check import Findings, check
 from shmio.recording.format.records import MAGIC, Damage, Record
 from shmio.recording.reading.reader import Message, Reader
@@ -219,7 +219,7 @@ def test_missing_numbers_outside_of_gaps_are_reported(
     publish(writer, 5)
     work.run_once()
     with monkeypatch.context() as broken:
-        broken.setattr(instance_follower.BlockFollower, "_entries", lambda self, side: iter(_dropped(side)))
+        broken.setattr(block_follower.BlockFollower, "_entries", lambda self, side: iter(_dropped(side)))
         publish(writer, 3)
         work.run_once()
     publish(writer, 2)
@@ -229,7 +229,7 @@ def test_missing_numbers_outside_of_gaps_are_reported(
     ]
 
 
-def _dropped(side: instance_follower._Stream[Frame]) -> list[instance_follower.BlockEntry]:
+def _dropped(side: block_follower._Stream[Frame]) -> list[block_follower.BlockEntry]:
     assert side.held is not None
     side.last, side.held = side.held.number, None
     return []

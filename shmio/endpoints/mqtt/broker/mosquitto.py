@@ -156,7 +156,7 @@ class Mosquitto:
         write_private(place / "mosquitto.conf", configuration(settings, place, anonymous=None in given))
         self._socket = place / SOCKET
         self._last = ""
-        command = [sys.executable, "-P", "-m", "shmio.endpoints.mqtt.broker.parent_watch", str(os.getpid()), program]
+        command = [sys.executable, "-P", "-m", "shmio.parent", str(os.getpid()), program]
         self._process = subprocess.Popen(
             [*command, "-c", str(place / "mosquitto.conf")],
             stdin=subprocess.DEVNULL,

@@ -1,0 +1,1 @@
+"""The uplink, which publishes the cell in the fabric, and the embedded NATS server."""

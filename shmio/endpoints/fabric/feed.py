@@ -1,0 +1,167 @@
+"""Follows one block: reads its frames and events, and leaves out what the rules do not publish."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Iterator, Sequence
+from fnmatch import fnmatchcase
+from typing import Final, NamedTuple
+
+from shmio.config.model import FabricRule
+from shmio.fabric.messages import MAX_ENTRY_BYTES, PREFERRED_BYTES, Entry
+from shmio.layout.model import Layout
+from shmio.recording.block_follower import BlockFollower
+from shmio.recording.format.encoding import BlockPosition, Gap, Reason
+from shmio.recording.selection import Selection
+from shmio.segment import Block, Frame
+from shmio.segment.doorbell import TURN_NS
+
+MAX_ENTRIES: Final = 32
+"""Maximum number of entries that are read before the uplink does other work."""
+FIRST_RULE: Final = FabricRule(match="*")
+"""The rule for sources that no rule of the configuration matches: publish all frames."""
+
+
+def rule_for(rules: Sequence[FabricRule], source: str) -> FabricRule:
+    """Return the first rule that matches a source."""
+    return next((rule for rule in rules if any(fnmatchcase(source, one) for one in rule.patterns)), FIRST_RULE)
+
+
+class Batch(NamedTuple):
+    """Entries of one message.
+
+    Attributes:
+        entries: The frames, events and gaps.
+        left_out: Number of frames that the rule has left out since the previous batch.
+
+    """
+
+    entries: list[Entry]
+    left_out: int
+
+
+class Feed:
+    """Follows one block. After its creation, use it only in the event loop's thread."""
+
+    def __init__(
+        self,
+        block: Block,
+        rule: FabricRule,
+        sources: Collection[str],
+        log_time: Callable[[int], int],
+        place: BlockPosition,
+    ) -> None:
+        """Create the feed. For a large layout this takes seconds.
+
+        Args:
+            block: The block to follow.
+            rule: What to publish.
+            sources: Names of all sources of the instance.
+            log_time: Converts CLOCK_MONOTONIC to the time of messages.
+            place: Position after which to begin.
+
+        """
+        self.block = block
+        part = Selection(None, rule.registers).part(block, sources)
+        self._keep = None if part is None else part.keep
+        self.layout: Layout = block.layout if part is None else part.layout
+        """The layout of the published frames: the registers that the rule names."""
+        self.digest = self.layout.hash
+        self.turn_ns = min(TURN_NS, block.stale_ns)
+        self._rule = rule
+        self._changes = rule.send == "changes"
+        self._pause_ns = 0 if rule.max_rate_hz is None else round(1e9 / rule.max_rate_hz)
+        self._follower = BlockFollower(block, 1, place, Reason.OVERTAKEN, log_time, part=part)
+        self._last: Frame | None = None
+        self._published_ns = 0
+        self._held: Frame | None = None
+        """The newest frame, if ``max_rate_hz`` has left it out."""
+        self.left_out = 0
+        """Number of frames that the rule has left out."""
+        self._counted = 0
+        self.missed = 0
+        """Number of frames and events that the source overwrote before they were read."""
+
+    @property
+    def last(self) -> int:
+        """Number of the last frame that was read."""
+        return self._follower.last
+
+    @property
+    def ended(self) -> bool:
+        """True if a reload has retired the block, and all its entries have been read."""
+        return self._follower.done
+
+    def read(self) -> tuple[list[Batch], bool]:
+        """Read new entries; return them in batches, and whether more are waiting."""
+        taken = list(self._follower.take(MAX_ENTRIES))
+        if self._follower.done:
+            taken += self._follower.remaining()
+        entries: list[Entry] = []
+        for _, _, item in taken:
+            if isinstance(item, Frame):
+                entries += self._chosen(item if self._keep is None else self._keep(item))
+            else:
+                if isinstance(item, Gap):
+                    self.missed += item.count
+                entries.append(item)
+        if not taken and self._held is not None and time.monotonic_ns() - self._published_ns >= self._pause_ns:
+            entries += self._publish(self._held)
+        return list(self._batches(entries)), len(taken) >= MAX_ENTRIES
+
+    def _batches(self, entries: list[Entry]) -> Iterator[Batch]:
+        """Group entries so that no message becomes too large."""
+        group: list[Entry] = []
+        size = 0
+        for entry in entries:
+            own = _size(entry)
+            if group and (size >= PREFERRED_BYTES or size + own > MAX_ENTRY_BYTES):
+                yield self._batch(group)
+                group, size = [], 0
+            group.append(entry)
+            size += own
+        if group:
+            yield self._batch(group)
+
+    def _batch(self, entries: list[Entry]) -> Batch:
+        left_out, self._counted = self.left_out - self._counted, self.left_out
+        return Batch(entries, left_out)
+
+    def _chosen(self, frame: Frame) -> Iterator[Frame]:
+        """Yield the frame, unless the rule leaves it out."""
+        now_ns = time.monotonic_ns()
+        if not self._changes and not self._pause_ns:
+            yield frame
+            return
+        if self._held is not None:
+            self._held = None
+            self.left_out += 1
+        last = self._last
+        if last is None or _state(last) != _state(frame):
+            yield from self._publish(frame)
+        elif self._changes and now_ns - self._published_ns < self.block.stale_ns // 2 and _same(last, frame):
+            self.left_out += 1
+        elif now_ns - self._published_ns < self._pause_ns:
+            self._held = frame
+        else:
+            yield from self._publish(frame)
+
+    def _publish(self, frame: Frame) -> Iterator[Frame]:
+        self._last, self._held, self._published_ns = frame, None, time.monotonic_ns()
+        yield frame
+
+
+def _state(frame: Frame) -> tuple[object, ...]:
+    """Return what a frame says apart from its values and times. A change is always published."""
+    return frame.quality, frame.provenance, frame.reason, frame.incarnation, frame.effective is None
+
+
+def _same(one: Frame, other: Frame) -> bool:
+    return one.raw == other.raw and one.effective == other.effective
+
+
+def _size(entry: Entry) -> int:
+    """Return an upper bound of the size of an encoded entry."""
+    if isinstance(entry, Frame):
+        return 512 + len(entry.raw) + len(entry.effective or b"")
+    return 512

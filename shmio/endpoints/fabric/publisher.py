@@ -1,0 +1,210 @@
+"""Sends the messages of the backlog: new ones at once, and those that an outage delayed when it is over."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections import deque
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import msgspec
+
+from shmio.endpoints.fabric.backlog import Backlog, Kept, Row
+from shmio.fabric.connection import INSTALL
+from shmio.fabric.messages import MissingRequest, with_age
+from shmio.libraries import library
+
+if TYPE_CHECKING:
+    from nats.aio.client import Client
+    from nats.aio.msg import Msg
+
+WINDOW_BYTES: Final = 2 << 20
+"""Maximum number of bytes that are sent and not yet confirmed by the server. Messages beyond wait in the backlog."""
+LATE_BYTES: Final = WINDOW_BYTES // 2
+"""Part of the window that late messages may use, so that new messages always have room."""
+CONFIRM_S: Final = 0.1
+"""Pause between two questions to the server whether it has the messages, in s."""
+LIVE_NS: Final = 1_000_000_000
+"""If the next message is older than this, in ns, newer messages pass it, and it follows as late."""
+CONFIRM_TIMEOUT_S: Final = 30.0
+
+log = logging.getLogger("shmio.fabric")
+
+
+class _Sent(NamedTuple):
+    """A message that was sent and is not confirmed."""
+
+    place: int
+    kept: Kept
+
+
+class Publisher:
+    """Sends the messages of a backlog. Use it only in the event loop's thread."""
+
+    def __init__(self, backlog: Backlog) -> None:
+        self.sent = 0
+        """Number of messages that were sent."""
+        self.sent_bytes = 0
+        self.late = 0
+        """Number of messages that were sent as late."""
+        self._backlog = backlog
+        self._client: Client | None = None
+        self._due = asyncio.Event()
+        self._asked = asyncio.Event()
+        self._hurry = asyncio.Event()
+        self._place = 0
+        self._unconfirmed: deque[_Sent] = deque()
+        self._unconfirmed_bytes = 0
+        self._tasks: list[asyncio.Task[None]] = []
+        self._errors = library("nats.errors", INSTALL)
+
+    @property
+    def up(self) -> bool:
+        """True if messages are being sent."""
+        return self._client is not None
+
+    def begin(self, client: Client) -> None:
+        """Send messages on a new or restored connection, beginning with those that the server may not have."""
+        self.end()
+        for row in self._backlog.rows.values():
+            row.begin_again()
+        self._client = client
+        loop = asyncio.get_running_loop()
+        self._tasks = [loop.create_task(self._send_all(client)), loop.create_task(self._confirm_all(client))]
+        self._due.set()
+
+    def end(self) -> None:
+        """Stop sending, because the connection was lost."""
+        self._client = None
+        for task in self._tasks:
+            task.cancel()
+        self._tasks = []
+        self._unconfirmed.clear()
+        self._unconfirmed_bytes = 0
+        self._asked.clear()
+
+    def wake(self) -> None:
+        """Send the new messages of the backlog."""
+        self._due.set()
+
+    async def finish(self, timeout_s: float) -> None:
+        """Wait until the server has all messages, at most for a time in s."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                while self.up and (self._backlog.waiting or self._unconfirmed):
+                    self._hurry.set()
+                    await asyncio.sleep(0.01)
+
+    # ---- sending -----------------------------------------------------------------------------------------------------
+
+    async def _send_all(self, client: Client) -> None:
+        with suppress(self._errors.Error):  # the connection is lost: begin() sends these messages again
+            while True:
+                await self._due.wait()
+                self._due.clear()
+                await self._send_new(client)
+                await self._send_late(client)
+
+    async def _send_new(self, client: Client) -> None:
+        now_ns = time.monotonic_ns()
+        for row in tuple(self._backlog.rows.values()):
+            following = row.find(row.next)
+            if row.next <= row.last and (following is None or now_ns - following.made_ns > LIVE_NS):
+                row.skip()
+            while row.next <= row.last and self._unconfirmed_bytes < WINDOW_BYTES:
+                kept = row.find(row.next)
+                row.next += 1
+                if kept is not None:
+                    await self._send(client, row.live, kept)
+
+    async def _send_late(self, client: Client) -> None:
+        """Send late messages, the oldest of all rows first, as long as they leave room for new ones."""
+        while self._unconfirmed_bytes < LATE_BYTES:
+            oldest: tuple[Row, Kept] | None = None
+            for row in self._backlog.rows.values():
+                while row.late and row.find(row.late[0]) is None:  # the backlog has dropped it
+                    row.late.popleft()
+                kept = row.find(row.late[0]) if row.late else None
+                if kept is not None and (oldest is None or kept.made_ns < oldest[1].made_ns):
+                    oldest = row, kept
+            if oldest is None:
+                return
+            row, kept = oldest
+            row.late.popleft()
+            self.late += 1
+            await self._send(client, row.late_subject, kept)
+
+    async def _send(self, client: Client, subject: str, kept: Kept) -> None:
+        data = aged(kept)
+        await client.publish(subject, data)
+        kept.sent = True
+        self.sent += 1
+        self.sent_bytes += len(data)
+        self._place += 1
+        self._unconfirmed.append(_Sent(self._place, kept))
+        self._unconfirmed_bytes += kept.size
+        self._asked.set()
+        if self._unconfirmed_bytes >= LATE_BYTES // 2:
+            self._hurry.set()
+
+    # ---- confirmation ------------------------------------------------------------------------------------------------
+
+    async def _confirm_all(self, client: Client) -> None:
+        """Ask the server again and again whether it has what was sent. It answers in the order of sending."""
+        with suppress(self._errors.Error, TimeoutError):
+            while True:
+                await self._asked.wait()
+                if not self._hurry.is_set():
+                    with suppress(TimeoutError):
+                        async with asyncio.timeout(CONFIRM_S):
+                            await self._hurry.wait()
+                self._hurry.clear()
+                self._asked.clear()
+                place = self._place
+                await client.flush(timeout=int(CONFIRM_TIMEOUT_S))
+                self._confirm(place)
+
+    def _confirm(self, place: int) -> None:
+        while self._unconfirmed and self._unconfirmed[0].place <= place:
+            kept = self._unconfirmed.popleft().kept
+            kept.confirmed = True
+            self._unconfirmed_bytes -= kept.size
+        if self._backlog.waiting:
+            self._due.set()
+
+    # ---- requests for missing messages -------------------------------------------------------------------------------
+
+    async def answer(self, row: Row | None, message: Msg) -> None:
+        """Answer a request for missing messages, and end the answer with an empty message."""
+        if not message.reply or self._client is None:
+            return
+        client = self._client
+        try:
+            wanted = msgspec.json.decode(message.data, type=MissingRequest)
+        except msgspec.MsgspecError:
+            wanted = MissingRequest(0, 0, 0)
+        with suppress(self._errors.Error, TimeoutError):
+            size = 0
+            if row is not None and row.stream == wanted.stream:
+                for number in row.between(wanted.first, wanted.last):
+                    kept = row.find(number)
+                    if kept is None:
+                        continue
+                    await client.publish(message.reply, aged(kept))
+                    size += kept.size
+                    if size >= LATE_BYTES // 2:
+                        await client.flush(timeout=int(CONFIRM_TIMEOUT_S))
+                        size = 0
+            await client.publish(message.reply, b"")
+
+
+def aged(kept: Kept) -> bytes:
+    """Return a message with its present age; a message that was just made has the age 0."""
+    age_ns = time.monotonic_ns() - kept.made_ns
+    return with_age(kept.data, age_ns if age_ns > FRESH_NS else 0)
+
+
+FRESH_NS: Final = 20_000_000
+"""Age in ns below which a message counts as just made."""

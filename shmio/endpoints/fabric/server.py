@@ -1,0 +1,225 @@
+"""The NATS server that the instance runs: its configuration and its process."""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import os
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from shmio.config import Address
+from shmio.config.model import MqttTls
+from shmio.errors import ConfigError, EndpointError
+from shmio.fabric.messages import MAX_MESSAGE_BYTES
+
+PROGRAM: Final = "nats-server"
+CONFIGURATION: Final = "nats-server.conf"
+LOCK: Final = "lock"
+START_S: Final = 10.0
+STOP_S: Final = 5.0
+MAX_UNSENT_BYTES: Final = 64 << 20
+"""Maximum size of what waits for a slow client, in bytes. Beyond it, the server disconnects the client."""
+MAX_MEMORY_BYTES: Final = 256 << 20
+"""Maximum size of the streams that the server keeps in memory, in bytes. The fabric keeps all streams on the disk."""
+_STAMP: Final = re.compile(r"^\[\d+\] (?:\d{4}/\d\d/\d\d \d\d:\d\d:\d\d\.\d+ )?")
+_LEVEL: Final = re.compile(r"^\[(INF|WRN|ERR|FTL|DBG|TRC)\] ")
+
+log = logging.getLogger("shmio.fabric")
+
+
+class ServerSettings(msgspec.Struct, frozen=True):
+    """What the server's process needs of the configuration.
+
+    Attributes:
+        listen: Address at which clients connect.
+        directory: Path of the directory with the server's files.
+        tls: PEM files; None: without TLS.
+
+    """
+
+    listen: str
+    directory: str
+    tls: MqttTls | None = None
+
+
+def find_server() -> str | None:
+    """Return the path of the NATS server; None if it is not installed."""
+    own = Path(sys.executable).with_name(PROGRAM)  # where pip installs it
+    return str(own) if os.access(own, os.X_OK) else shutil.which(PROGRAM)
+
+
+def check_installed() -> None:
+    """Check that the NATS server is installed.
+
+    Raises:
+        ConfigError: It is not installed.
+
+    """
+    if find_server() is None:
+        raise ConfigError(
+            "fabric.server: the embedded NATS server is not installed; run pip install 'shmio[fabric]', or set "
+            "fabric.server to the URL of another server"
+        )
+
+
+def configuration(settings: ServerSettings, name: str) -> bytes:
+    """Return the server's configuration file. The server also reads JSON.
+
+    Args:
+        settings: The address, the directory and the PEM files.
+        name: Name of the server, for its log and its monitoring.
+
+    """
+    listen = Address.parse(settings.listen)
+    found: dict[str, Any] = {
+        "host": listen.host,
+        "port": listen.port,
+        "server_name": name,
+        "jetstream": {"store_dir": settings.directory, "max_memory_store": MAX_MEMORY_BYTES},
+        "max_payload": MAX_MESSAGE_BYTES,
+        "max_pending": MAX_UNSENT_BYTES,
+    }
+    if settings.tls is not None:
+        found["tls"] = _tls(settings.tls)
+    return msgspec.json.format(msgspec.json.encode(found)) + b"\n"
+
+
+def _tls(tls: MqttTls) -> Mapping[str, Any]:
+    files = {"cert_file": tls.certificate, "key_file": tls.key}
+    return files if tls.ca is None else {**files, "ca_file": tls.ca, "verify": True}
+
+
+class NatsServer:
+    """The server's process.
+
+    Start it from the main thread, because the process ends with the thread that started it.
+    """
+
+    def __init__(self, settings: ServerSettings, name: str) -> None:
+        """Start the server.
+
+        Raises:
+            ConfigError: The server is not installed.
+            EndpointError: The directory cannot be used.
+
+        """
+        check_installed()
+        self._listen = Address.parse(settings.listen)
+        self._last = ""
+        self._lock = _prepare(Path(settings.directory))
+        file = Path(settings.directory) / CONFIGURATION
+        try:
+            fd = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+            with open(fd, "wb") as stream:  # noqa: PTH123  a descriptor
+                stream.write(configuration(settings, name))
+            command = [sys.executable, "-P", "-m", "shmio.parent", str(os.getpid()), str(find_server())]
+            self._process = subprocess.Popen(
+                [*command, "-c", str(file)],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                encoding="utf-8",
+                errors="replace",
+            )
+        except OSError as error:
+            os.close(self._lock)
+            raise EndpointError(f"{file}: {error.strerror}") from None
+        self._reader = threading.Thread(target=self._read, name="server's log", daemon=True)
+        self._reader.start()
+
+    def await_start(self, beat: Callable[[], object]) -> None:
+        """Wait until the server accepts connections.
+
+        Args:
+            beat: Called repeatedly while waiting.
+
+        Raises:
+            EndpointError: The server has ended, or takes too long. The message has its last error.
+
+        """
+        until_s = time.monotonic() + START_S
+        here = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self._listen.host, self._listen.host)  # noqa: S104  a key
+        while True:
+            self.check()
+            try:
+                with socket.create_connection((here, self._listen.port), 1.0) as probe:
+                    if probe.recv(4) == b"INFO":
+                        return
+            except OSError:
+                pass
+            if time.monotonic() > until_s:
+                raise EndpointError(f"the NATS server does not accept connections: {self._last}")
+            beat()
+            time.sleep(0.02)
+
+    def check(self) -> None:
+        """Check that the server is running.
+
+        Raises:
+            EndpointError: The server has ended.
+
+        """
+        code = self._process.poll()
+        if code is not None:
+            self._reader.join(1.0)
+            raise EndpointError(f"the NATS server has ended: {self._last or f'exit status {code}'}")
+
+    def stop(self) -> None:
+        """Stop the server."""
+        self._process.terminate()
+        try:
+            self._process.wait(STOP_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._reader.join(1.0)
+        if self._process.stderr is not None:
+            self._process.stderr.close()
+        os.close(self._lock)
+
+    def _read(self) -> None:
+        """Copy the server's log lines to the log of this process."""
+        for line in self._process.stderr or ():
+            text = _STAMP.sub("", line.strip())
+            level = _LEVEL.match(text)
+            text = text[level.end() :] if level else text
+            kind = level.group(1) if level else "ERR"
+            if kind == "INF":
+                log.debug("nats-server: %s", text)
+                continue
+            if kind in ("ERR", "FTL"):
+                self._last = text
+            log.log(logging.WARNING if kind == "WRN" else logging.ERROR, "nats-server: %s", text)
+
+
+def _prepare(directory: Path) -> int:
+    """Create the directory, and return a descriptor of its lock file, which no other server may hold.
+
+    Raises:
+        EndpointError: The directory cannot be used.
+
+    """
+    try:
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        fd = os.open(directory / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    except OSError as error:
+        raise EndpointError(f"fabric.directory: {directory}: {error.strerror}") from None
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(fd)
+        raise EndpointError(
+            f"fabric.directory: {directory}: another NATS server uses this directory; choose another one"
+        ) from None
+    return fd

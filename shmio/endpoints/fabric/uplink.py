@@ -1,0 +1,357 @@
+"""The uplink: publishes the sources of the instance, and keeps the cell's entry in the registry."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+import socket
+import time
+from collections.abc import Container, Iterator, Sequence
+from contextlib import suppress
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from shmio.config.model import FabricAllow, FabricHistory, FabricRule
+from shmio.endpoints.fabric.backlog import Backlog, Kept, Row
+from shmio.endpoints.fabric.feed import Feed, rule_for
+from shmio.endpoints.fabric.publisher import Publisher
+from shmio.errors import ConfigError, ConflictError, RemoteError
+from shmio.fabric.connection import INSTALL, Access, connect
+from shmio.fabric.messages import Header, encode
+from shmio.fabric.names import CellName, source_of
+from shmio.fabric.registry import RENEW_S, CellEntry, Registry, SourceEntry
+from shmio.libraries import library
+from shmio.local.status import status_of
+from shmio.recording.format.encoding import BlockPosition
+from shmio.segment import Block, ProcessSlot, Segment
+from shmio.segment.doorbell import Relay
+from shmio.segment.header import State
+from shmio.version import __version__
+
+if TYPE_CHECKING:
+    from nats.aio.client import Client
+    from nats.aio.msg import Msg
+
+MIRROR: Final = "fabric"
+"""Connector of the sources that are mirrors. They are published only by their owner."""
+STOPPED: Final = str(State.STOPPED)
+RETRY_S: Final = 1.0
+"""Pause in s before another attempt to claim the cell."""
+LEAVE_S: Final = 2.0
+"""Time limit in s for sending the last messages when the uplink stops."""
+MAX_REQUESTS: Final = 1024
+"""Maximum number of requests of other cells that wait. Further requests are dropped."""
+
+log = logging.getLogger("shmio.fabric")
+
+
+class UplinkSettings(msgspec.Struct, frozen=True):
+    """What the uplink's process needs of the configuration.
+
+    Attributes:
+        access: The servers.
+        cell: Name of the cell.
+        backlog_mb: Maximum size of the backlog, in MB.
+        rule: What to publish of which source.
+        allow: What other cells may do.
+        history: The stream in which the servers keep the messages; None: there is none.
+        web: Address of the cell's web page; empty if it has none.
+
+    """
+
+    access: Access
+    cell: str
+    backlog_mb: float
+    rule: Sequence[FabricRule] = ()
+    allow: Sequence[FabricAllow] = ()
+    history: FabricHistory | None = None
+    web: str = ""
+
+
+class Uplink:
+    """Publishes a segment. Use it only in the event loop's thread."""
+
+    def __init__(self, segment: Segment, slot: ProcessSlot, settings: UplinkSettings) -> None:
+        self.cell = CellName.parse(settings.cell)
+        self.backlog = Backlog(round(settings.backlog_mb * 1e6))
+        self.publisher = Publisher(self.backlog)
+        self.problem = ""
+        """The present problem; empty if there is none."""
+        self.connects = 0
+        self._segment, self._settings, self._slot = segment, settings, slot
+        self._errors = library("nats.errors", INSTALL)
+        self._generation = -1
+        self._first = True
+        self._feeds: dict[str, Feed] = {}
+        self._relays: dict[int, Relay] = {}
+        self._stopped: list[Relay] = []
+        self._reading: asyncio.Task[list[Feed]] | None = None
+        self._missed = 0
+        self._connected = asyncio.Event()
+        self._changed = asyncio.Event()
+        self._client: Client | None = None
+        self._claimed = self._closing = False
+        self._revision = 0
+        self._known_layouts: set[bytes] = set()
+
+    @property
+    def counters(self) -> tuple[int, ...]:
+        """The counters, in the order in which the process table names them."""
+        publisher = self.publisher
+        missed = self._missed + sum(feed.missed for feed in self._feeds.values())
+        return (
+            publisher.sent, publisher.late, self.backlog.waiting, self.backlog.dropped, missed, 0, 0, self.connects,
+            publisher.sent_bytes,
+        )  # fmt: skip
+
+    @property
+    def readers(self) -> Iterator[tuple[Block, int]]:
+        """The blocks that the uplink reads, each with the number of the last frame read."""
+        return ((feed.block, feed.last) for feed in self._feeds.values())
+
+    # ---- sources that come and go ------------------------------------------------------------------------------------
+
+    async def start(self) -> None:
+        """Follow all sources from now on."""
+        self._add(await asyncio.to_thread(self._read_blocks, ()))
+
+    def follow_reloads(self) -> None:
+        """Add and remove sources after a reload. A thread reads new layouts, because that may take seconds."""
+        if self._reading is not None and self._reading.done():
+            reading, self._reading = self._reading, None
+            self._add(reading.result())
+        if self._reading is None and self._segment.generation != self._generation:
+            known = {feed.block.section for feed in self._feeds.values()}
+            self._reading = asyncio.get_running_loop().create_task(asyncio.to_thread(self._read_blocks, known))
+        if self._reading is not None:
+            return
+        for feed in [feed for feed in self._feeds.values() if feed.ended]:
+            source = feed.block.source
+            if source not in self._segment.blocks:
+                self._stop(feed)
+                del self._feeds[source]
+                self.backlog.remove(source)
+                self._changed.set()
+                log.info("a reload removed the source %s", source)
+
+    def _read_blocks(self, known: Container[int]) -> list[Feed]:
+        self._generation = self._segment.generation  # first, so that the next check notices a change meanwhile
+        self._segment.refresh()
+        blocks = self._segment.blocks
+        return [
+            self._new_feed(block, list(blocks))
+            for block in blocks.values()
+            if block.section not in known and block.attributes.connector != MIRROR
+            if rule_for(self._settings.rule, block.source).send != "nothing"
+        ]
+
+    def _new_feed(self, block: Block, sources: Sequence[str]) -> Feed:
+        # A block of a reload is published from its first frame on.
+        place = BlockPosition(block.ring.head(), block.events.head()) if self._first else BlockPosition()
+        return Feed(block, rule_for(self._settings.rule, block.source), sources, self._log_time, place)
+
+    def _add(self, feeds: list[Feed]) -> None:
+        self._first = False
+        loop = asyncio.get_running_loop()
+        for feed in feeds:
+            source = feed.block.source
+            if (before := self._feeds.get(source)) is not None:
+                while self._poll(before):
+                    pass
+                self._stop(before)
+            else:
+                self.backlog.rows[source] = Row(self.cell, source, secrets.randbits(63) | 1)
+            self._feeds[source] = feed
+            relay = Relay(feed.block.ring, f"bell-{source}", feed.turn_ns)
+            self._relays[feed.block.section] = relay
+            loop.add_reader(relay.descriptor, partial(self._wake, feed, relay))
+        if feeds:
+            self._changed.set()
+
+    def _stop(self, feed: Feed) -> None:
+        self._missed += feed.missed
+        relay = self._relays.pop(feed.block.section)
+        asyncio.get_running_loop().remove_reader(relay.descriptor)
+        relay.stop()
+        self._stopped = [one for one in self._stopped if one.alive] + [relay]
+
+    # ---- new entries -------------------------------------------------------------------------------------------------
+
+    def _log_time(self, monotonic_ns: int) -> int:
+        """Convert CLOCK_MONOTONIC to UTC, as the start of the instance had it: changes of the clock have no effect."""
+        head = self._segment.header
+        return max(0, head.started_utc_ns + monotonic_ns - head.started_ns)
+
+    def _wake(self, feed: Feed, relay: Relay) -> None:
+        relay.acknowledge()
+        self._poll_on(feed)
+
+    def _poll_on(self, feed: Feed) -> None:
+        if self._feeds.get(feed.block.source) is feed and self._poll(feed):
+            asyncio.get_running_loop().call_soon(self._poll_on, feed)
+
+    def _poll(self, feed: Feed) -> bool:
+        """Put new entries into the backlog, and return whether more are waiting."""
+        batches, more = feed.read()
+        row = self.backlog.rows[feed.block.source]
+        for batch in batches:
+            now_ns = time.monotonic_ns()
+            number = row.last + 1
+            header = Header(batch.left_out, row.stream, number, feed.digest[:8], self._log_time(now_ns))
+            self.backlog.put(row, Kept(number, encode(header, batch.entries), now_ns))
+        if batches:
+            self.publisher.wake()
+        return more
+
+    # ---- the connection ----------------------------------------------------------------------------------------------
+
+    async def run(self) -> None:
+        """Keep the connection and the cell's entry, until the task is cancelled.
+
+        Raises:
+            ConfigError: Another living cell has this name, or a file cannot be used.
+            RemoteError: A server refuses the credentials.
+
+        """
+        self.problem = f"{self._settings.access}: no NATS server has answered yet"
+        self._client = await connect(
+            self._settings.access, f"shmio {self.cell}", lost=self._on_lost, back=self._on_connected
+        )
+        await self._client.subscribe(self.cell.missing("*"), cb=self._on_missing, pending_msgs_limit=MAX_REQUESTS)
+        await self._on_connected()
+        while True:
+            await self._connected.wait()
+            if await self._establish(self._client):
+                await self._stay()
+            else:
+                await asyncio.sleep(RETRY_S)
+
+    async def _on_connected(self) -> None:
+        self.connects += 1
+        log.info("connected to %s", self._settings.access)
+        self._connected.set()
+
+    async def _on_lost(self) -> None:
+        self._connected.clear()
+        self._changed.set()
+        self.publisher.end()
+        if self._closing:
+            return
+        self.problem = f"{self._settings.access}: the connection is lost; the backlog keeps new messages"
+        log.warning("%s", self.problem)
+
+    async def _establish(self, client: Client) -> bool:
+        """Claim the cell, then publish. Return False if the registry does not answer."""
+        try:
+            self._registry = await Registry.open(client)
+            await self._renew(self._registry)
+        except ConflictError as error:
+            raise ConfigError(str(error)) from None
+        except (RemoteError, self._errors.Error, TimeoutError) as error:
+            self._complain(error)
+            if not self._claimed:
+                return False
+        else:
+            self.problem = ""
+        if self._connected.is_set():
+            self.publisher.begin(client)
+        return True
+
+    async def _stay(self) -> None:
+        """Renew the cell's entry until the connection is lost."""
+        while True:
+            with suppress(TimeoutError):
+                async with asyncio.timeout(RENEW_S):
+                    await self._changed.wait()
+            self._changed.clear()
+            if not self.publisher.up:
+                return
+            try:
+                await self._renew(self._registry)
+            except ConflictError as error:
+                raise ConfigError(str(error)) from None
+            except (RemoteError, self._errors.Error, TimeoutError) as error:
+                if self.publisher.up:
+                    self._complain(error)
+            else:
+                self.problem = ""
+
+    def _complain(self, error: Exception) -> None:
+        why = str(error) or type(error).__name__
+        problem = f"{self._settings.access}: the registry does not answer: {why}"
+        if problem != self.problem:
+            self.problem = problem
+            log.warning("%s", problem)
+
+    async def _renew(self, registry: Registry) -> None:
+        """Store the layouts and the cell's entry, and publish the entry."""
+        for feed in tuple(self._feeds.values()):
+            if feed.digest not in self._known_layouts:
+                await registry.put_layout(feed.layout)
+                self._known_layouts.add(feed.digest)
+        entry = self._entry()
+        if self._claimed:
+            self._revision = await registry.renew(entry, self._revision)
+        else:
+            self._revision = await registry.claim(entry)
+            self._claimed = True
+            log.info("this instance is the cell %s of the fabric", self.cell)
+        if self._client is not None:
+            await self._client.publish(self.cell.status, msgspec.json.encode(entry))
+
+    def _entry(self, *, stopped: bool = False) -> CellEntry:
+        head = self._segment.header
+        state = str(status_of(self._segment, "", "fabric").state)
+        if stopped or state == STOPPED:  # a cell that publishes is not stopped, whatever has become of its supervisor
+            state = STOPPED if stopped else str(State.DEGRADED)
+        return CellEntry(
+            str(self.cell), socket.gethostname(), self._segment.instance, __version__, f"{head.epoch:016x}", state,
+            head.started_utc_ns, self._log_time(time.monotonic_ns()), self._settings.web,
+            tuple(self._source_entry(feed) for feed in self._feeds.values()),
+        )  # fmt: skip
+
+    def _source_entry(self, feed: Feed) -> SourceEntry:
+        block = feed.block
+        frame = block.latest()
+        quality, reason = ("bad", "no frame yet") if frame is None else map(str, block.assess(frame))
+        return SourceEntry(
+            block.source, feed.digest.hex(), block.period_ns, block.stale_ns,
+            self.backlog.rows[block.source].stream, quality, reason, len(feed.layout.registers),
+        )  # fmt: skip
+
+    # ---- requests ----------------------------------------------------------------------------------------------------
+
+    async def _on_missing(self, message: Msg) -> None:
+        source = source_of(message.subject.split(".")[4])
+        await self.publisher.answer(self.backlog.rows.get(source), message)
+
+    # ---- the end -----------------------------------------------------------------------------------------------------
+
+    async def close(self) -> None:
+        """Send the last messages, and mark the cell as stopped."""
+        self._closing = True
+        for feed in tuple(self._feeds.values()):
+            while self._poll(feed):
+                pass
+            self._stop(feed)
+        await self.publisher.finish(LEAVE_S)
+        client = self._client
+        if client is not None and self._connected.is_set():
+            with suppress(RemoteError, ConflictError, self._errors.Error, TimeoutError):
+                async with asyncio.timeout(LEAVE_S):
+                    if self._claimed:
+                        entry = self._entry(stopped=True)
+                        await self._registry.renew(entry, self._revision)
+                        await client.publish(self.cell.status, msgspec.json.encode(entry))
+        self.publisher.end()
+        if client is not None:
+            with suppress(self._errors.Error, OSError, TimeoutError):
+                async with asyncio.timeout(LEAVE_S):
+                    await client.close()
+        if self._reading is not None:
+            await asyncio.wait((self._reading,))
+        for relay in self._stopped:
+            relay.join()

@@ -1,0 +1,28 @@
+"""The NATS client, changed so that it leaves a dead connection at once.
+
+Import this module only when nats-py is installed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+
+from nats.aio.client import Client
+
+
+class FabricClient(Client):
+    """A NATS client that drops its connection, and all that waits to be sent, when the connection is lost.
+
+    The library's client first waits until the peer has taken what waits. A peer that is gone does not
+    take anything, so the client would not connect again for minutes. Afterwards it would send what
+    waited, as if it were new.
+    """
+
+    async def _process_op_err(self, e: Exception) -> None:
+        if self.is_connected or self.is_connecting:
+            self._pending = []
+            self._pending_data_size = 0
+            writer = getattr(self._transport, "_io_writer", None)
+            if isinstance(writer, asyncio.StreamWriter):
+                writer.transport.abort()
+        await super()._process_op_err(e)
