@@ -84,6 +84,7 @@ START_PROCESSES = (
     "tests/unit/client/test_generated.py",
     "tests/unit/test_client_distribution.py::test_each_module",
     "tests/unit/endpoints/alerts/test_command.py",
+    "tests/unit/endpoints/fabric/",
     "tests/unit/endpoints/mqtt/broker/",
     "tests/unit/endpoints/web/test_uploads.py",
     "tests/unit/endpoints/web/test_dropped.py::test_page_",

@@ -91,9 +91,10 @@ class Link:
         """Close all connections."""
         with suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)
+        self._threads[0].join()
         self._listener.close()
+        self._open.clear()
         self._close_all()
-        self._open.set()
         for thread in self._threads:
             thread.join()
 
@@ -129,8 +130,9 @@ class Link:
             while self._open.is_set() and (data := source.recv(1 << 16)):
                 if self._open.is_set():
                     target.sendall(data)
-            if self._open.is_set():
-                target.close()
+        if self._open.is_set():  # a thread may still read from it, so do not close it here
+            with suppress(OSError):
+                target.shutdown(socket.SHUT_RDWR)
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 
-from nats.aio.client import Client
+from nats.aio.client import Client, Srv
 
 
 class FabricClient(Client):
@@ -22,7 +22,14 @@ class FabricClient(Client):
         if self.is_connected or self.is_connecting:
             self._pending = []
             self._pending_data_size = 0
-            writer = getattr(self._transport, "_io_writer", None)
-            if isinstance(writer, asyncio.StreamWriter):
-                writer.transport.abort()
+            self._abort()
         await super()._process_op_err(e)
+
+    async def _connect_to_server(self, s: Srv) -> None:
+        self._abort()  # of an attempt that failed: the library would leave its socket open
+        await super()._connect_to_server(s)
+
+    def _abort(self) -> None:
+        writer = getattr(self._transport, "_io_writer", None)
+        if isinstance(writer, asyncio.StreamWriter):
+            writer.transport.abort()
