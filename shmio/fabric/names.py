@@ -60,6 +60,11 @@ class CellName(NamedTuple):
         """Return the subject of requests for messages of a source that a mirror has not received."""
         return f"{self.subject}.{token(source)}.missing"
 
+    @property
+    def command_subjects(self) -> str:
+        """The subjects of all commands to the cell, with wildcards."""
+        return f"{self.subject}.*.command.*.*.*"
+
     def command(self, source: str, sender: CellName) -> str:
         """Return the subject of a cell's commands to a source.
 

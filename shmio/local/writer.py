@@ -16,7 +16,7 @@ from shmio.config import Declaration
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.model import Register
 from shmio.layout.topic import find
-from shmio.layout.values.write import Write, apply, bits_of, cover, encode, merge
+from shmio.layout.values.write import Write, apply, bits_of, cover, encode, merge, path_at
 from shmio.model.values import WRITE_MIN_PERIODS, WRITE_TIMEOUT_S, Outcome, OutcomeKind
 from shmio.segment.commands import (
     EMPTY,
@@ -175,6 +175,16 @@ class SourceWriter:
                 After any of these errors, nothing has been sent.
         """
         return self._send_values({path: (self._register(path), value) for path, value in values.items()}, timeout_s)
+
+    def submit_writes(self, writes: Sequence[Write], timeout_s: float | None = None) -> PendingCommand:
+        """Send writes as one command, without waiting. The source checks them, and accepts all or none.
+
+        Raises:
+            CommandError: The queue has no room. Nothing has been sent.
+        """
+        layout = self.block.layout
+        paths = tuple(path_at(layout, write.offset) or f"byte {write.offset}" for write in writes)
+        return self._send(paths, writes, timeout_s)
 
     def shadow(self, injection: int, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
         """Give values to an injection, and wait for the outcome of each value.

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from fnmatch import fnmatchcase
 from typing import Final, NamedTuple
 
 from shmio.config.model import FabricRule
 from shmio.fabric.messages import MAX_ENTRY_BYTES, PREFERRED_BYTES, Entry
 from shmio.layout.model import Layout
+from shmio.layout.values.write import Write, covering
 from shmio.recording.block_follower import BlockFollower
 from shmio.recording.format.encoding import BlockPosition, Gap, Reason
 from shmio.recording.selection import Selection
@@ -67,6 +68,7 @@ class Feed:
         self.layout: Layout = block.layout if part is None else part.layout
         """The layout of the published frames: the registers that the rule names."""
         self.digest = self.layout.hash
+        self._visible = covering(self.layout.registers, self.layout.size) if rule.registers else None
         self.turn_ns = min(TURN_NS, block.stale_ns)
         self._rule = rule
         self._changes = rule.send == "changes"
@@ -91,6 +93,18 @@ class Feed:
     def ended(self) -> bool:
         """True if a reload has retired the block, and all its entries have been read."""
         return self._follower.done
+
+    def publishes(self, writes: Iterable[Write]) -> bool:
+        """Return whether writes stay within the registers that are published."""
+        for offset, mask, data in writes:
+            if offset + len(data) > self.block.layout.size:
+                return False
+            if self._visible is None:
+                continue
+            visible = self._visible[offset : offset + len(data)]
+            if len(visible) != len(data) or any((mask or 0xFF) & ~bits for bits in visible):
+                return False
+        return True
 
     def read(self) -> tuple[list[Batch], bool]:
         """Read new entries; return them in batches, and whether more are waiting."""

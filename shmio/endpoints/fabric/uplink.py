@@ -16,9 +16,10 @@ import msgspec
 
 from shmio.config.model import FabricAllow, FabricHistory, FabricRule
 from shmio.endpoints.fabric.backlog import Backlog, Kept, Row
+from shmio.endpoints.fabric.commands import CommandReceiver
 from shmio.endpoints.fabric.feed import Feed, rule_for
 from shmio.endpoints.fabric.publisher import Publisher
-from shmio.errors import ConfigError, ConflictError, RemoteError
+from shmio.errors import ConfigError, ConflictError, RemoteError, SegmentError
 from shmio.fabric.connection import INSTALL, Access, connect
 from shmio.fabric.messages import Header, encode
 from shmio.fabric.names import CellName, source_of
@@ -81,7 +82,17 @@ class Uplink:
         self.problem = ""
         """The present problem; empty if there is none."""
         self.connects = 0
-        self._segment, self._settings, self._slot = segment, settings, slot
+        self._segment, self._settings = segment, settings
+        if slot.writer is None:
+            raise SegmentError("the segment has no command queue for this process")
+        self.commands = CommandReceiver(
+            settings.allow,
+            slot.writer,
+            lambda: self._log_time(time.monotonic_ns()),
+            self._reply,
+            str(settings.access),
+        )
+        self._replies: set[asyncio.Task[None]] = set()
         self._errors = library("nats.errors", INSTALL)
         self._generation = -1
         self._first = True
@@ -103,7 +114,8 @@ class Uplink:
         publisher = self.publisher
         missed = self._missed + sum(feed.missed for feed in self._feeds.values())
         return (
-            publisher.sent, publisher.late, self.backlog.waiting, self.backlog.dropped, missed, 0, 0, self.connects,
+            publisher.sent, publisher.late, self.backlog.waiting, self.backlog.dropped, missed, self.commands.received,
+            self.commands.refused, self.connects,
             publisher.sent_bytes,
         )  # fmt: skip
 
@@ -173,6 +185,7 @@ class Uplink:
 
     def _stop(self, feed: Feed) -> None:
         self._missed += feed.missed
+        self.commands.remove(feed.block)
         relay = self._relays.pop(feed.block.section)
         asyncio.get_running_loop().remove_reader(relay.descriptor)
         relay.stop()
@@ -195,6 +208,7 @@ class Uplink:
 
     def _poll(self, feed: Feed) -> bool:
         """Put new entries into the backlog, and return whether more are waiting."""
+        self.commands.poll(feed.block)
         batches, more = feed.read()
         row = self.backlog.rows[feed.block.source]
         for batch in batches:
@@ -221,6 +235,7 @@ class Uplink:
             self._settings.access, f"shmio {self.cell}", lost=self._on_lost, back=self._on_connected
         )
         await self._client.subscribe(self.cell.missing("*"), cb=self._on_missing, pending_msgs_limit=MAX_REQUESTS)
+        await self._client.subscribe(self.cell.command_subjects, cb=self._on_command, pending_msgs_limit=MAX_REQUESTS)
         await self._on_connected()
         while True:
             await self._connected.wait()
@@ -328,6 +343,22 @@ class Uplink:
         source = source_of(message.subject.split(".")[4])
         await self.publisher.answer(self.backlog.rows.get(source), message)
 
+    async def _on_command(self, message: Msg) -> None:
+        tokens = message.subject.split(".")
+        source, sender = source_of(tokens[4]), ".".join(tokens[6:])
+        self.commands.take(sender, source, self._feeds.get(source), message.data, message.reply)
+
+    def _reply(self, subject: str, data: bytes) -> None:
+        """Send a reply, unless the connection is lost: then the sender does not learn the outcome."""
+        task = asyncio.get_running_loop().create_task(self._send_reply(subject, data))
+        self._replies.add(task)
+        task.add_done_callback(self._replies.discard)
+
+    async def _send_reply(self, subject: str, data: bytes) -> None:
+        if self._client is not None:
+            with suppress(self._errors.Error):
+                await self._client.publish(subject, data)
+
     # ---- the end -----------------------------------------------------------------------------------------------------
 
     async def close(self) -> None:
@@ -337,6 +368,8 @@ class Uplink:
             while self._poll(feed):
                 pass
             self._stop(feed)
+        if self._replies:
+            await asyncio.wait(self._replies)
         await self.publisher.finish(LEAVE_S)
         client = self._client
         if client is not None and self._connected.is_set():

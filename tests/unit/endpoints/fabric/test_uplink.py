@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import json
 
 import pytest
 
+from shmio.config.model import FabricRule
 from shmio.errors import ConfigError
 from shmio.fabric.connection import Access, connect
 from shmio.fabric.registry import Registry
@@ -14,7 +16,10 @@ from tests.nats_server import NatsServer, link
 from tests.unit.endpoints.fabric.harness import (
     CELL,
     LAYOUT,
+    TIMEOUT_S,
+    Got,
     Listener,
+    decoded,
     in_loop,
     listening,
     new_uplink,
@@ -107,6 +112,105 @@ async def _outage(segment: Segment, url: str, listener: Listener, cut: object, h
     assert all(one.header.age_ns > 0 for one in late)
     counts = sorted({count for one in got for count in one.counts})
     assert counts == list(range(1, 102)), "nothing is lost"
+
+
+async def _missing(listener: Listener, stream: int, first: int, last: int, source: str = "cell") -> list[Got]:
+    """Ask for missing messages."""
+    inbox = listener.client.new_inbox()
+    answers = await listener.client.subscribe(inbox)
+    request = {"stream": stream, "first": first, "last": last}
+    await listener.client.publish(f"shmio.{CELL}.{source}.missing", json.dumps(request).encode(), reply=inbox)
+    got = []
+    while (message := await answers.next_msg(TIMEOUT_S)).data:
+        got.append(decoded(message))
+    await answers.unsubscribe()
+    return got
+
+
+@in_loop
+async def test_missing_messages_are_sent_again(segment: Segment, server: NatsServer) -> None:
+    writer = segment.writer("cell")
+    async with listening(server.url) as listener, uplink(segment, server.url, backlog_mb=0.002) as found:
+        await until(lambda: found.publisher.up)
+        sent = []
+        for count in range(1, 31):
+            publish(writer, count)
+            sent += await listener.until(count)
+        stream = sent[0].header.stream
+        again = await _missing(listener, stream, 1, 30)
+        assert 0 < len(again) < 10, "the backlog is small"
+        assert [one.header.number for one in again] == list(range(31 - len(again), 31))
+        assert [one.entries for one in again] == [one.entries for one in sent[-len(again) :]]
+        (newest,) = await _missing(listener, stream, 30, 1 << 62)
+        assert newest.header.number == 30
+        assert await _missing(listener, stream + 1, 1, 30) == []
+        assert await _missing(listener, stream, 1, 30, source="none") == []
+        inbox = listener.client.new_inbox()
+        answers = await listener.client.subscribe(inbox)
+        await listener.client.publish(f"shmio.{CELL}.cell.missing", b"\xff{", reply=inbox)
+        assert (await answers.next_msg(TIMEOUT_S)).data == b"", "a malformed request has an empty answer"
+
+
+@in_loop
+async def test_a_long_outage_needs_bounded_memory(segment: Segment, server: NatsServer) -> None:
+    writer = segment.writer("cell")
+    async with listening(server.url) as listener, uplink(segment, server.url, backlog_mb=0.01) as found:
+        await until(lambda: found.publisher.up)
+        await asyncio.to_thread(server.stop)
+        await until(lambda: not found.publisher.up)
+        for count in range(1, 1001):
+            publish(writer, count)
+            await asyncio.sleep(0)
+        await until(lambda: found._feeds["cell"].last == 1000)
+        await until(lambda: found.backlog.rows["cell"].last > 0)
+        assert found.backlog.bytes <= 10_000
+        dropped = found.backlog.dropped
+        assert dropped or found.backlog.rows["cell"].last < 50
+        await asyncio.to_thread(server.start)
+        got = await listener.until(1000)
+        assert (got[0].kind, got[0].counts[-1]) == ("live", 1000), "the newest comes first"
+        await until(lambda: not found.backlog.waiting)
+
+
+@in_loop
+async def test_rules_leave_out_frames(segment: Segment, server: NatsServer) -> None:
+    writer = segment.writer("cell")
+    changes = FabricRule(match="c*", send="changes", registers=["cell/count"])
+    async with listening(server.url) as listener, uplink(segment, server.url, rule=[changes]) as found:
+        await until(lambda: found.publisher.up)
+        for other in range(10):
+            publish(writer, 1, other)
+        publish(writer, 2, 99)
+        got = await listener.until(2)
+        frames = [entry for one in got for entry in one.entries if isinstance(entry, Frame)]
+        assert [frame.number for frame in frames] == [1, 11]
+        assert [frame.raw[4:] for frame in frames] == [bytes(4)] * 2, "the other register is not published"
+        assert sum(one.header.left_out for one in got) == 9
+        assert got[0].header.layout != LAYOUT.hash[:8]
+
+
+@in_loop
+async def test_a_rate_limit_sends_the_last_frame(segment: Segment, server: NatsServer) -> None:
+    writer = segment.writer("cell")
+    slow = FabricRule(match="*", max_rate_hz=4)
+    async with listening(server.url) as listener, uplink(segment, server.url, rule=[slow]) as found:
+        await until(lambda: found.publisher.up)
+        for count in range(1, 21):
+            publish(writer, count)
+        got = await listener.until(20)
+        counts = [count for one in got for count in one.counts]
+        assert (counts[0], counts[-1]) == (1, 20)
+        assert len(counts) + sum(one.header.left_out for one in got) == 20
+        assert len(counts) < 10
+
+
+@in_loop
+async def test_nothing_is_published_of_a_source(segment: Segment, server: NatsServer) -> None:
+    async with uplink(segment, server.url, rule=[FabricRule(match=["a", "cell"], send="nothing")]) as found:
+        await until(lambda: found.publisher.up)
+        publish(segment.writer("cell"), 1)
+        assert found._entry().sources == ()
+        assert not found.backlog.rows
 
 
 @in_loop
