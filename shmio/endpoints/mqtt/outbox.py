@@ -202,7 +202,7 @@ class Outbox:
         """Queue the present state of these topics. It is sent after the backlog."""
         if self._connection.up:
             self._waiting |= dict.fromkeys(channels)
-            if not self._catching_up:
+            if not self._catching_up and self._backlog.count:
                 self._catching_up, self._catch_up_bytes = True, self._most
 
     def queue_result(self, message: Message, properties: Properties | None) -> None:

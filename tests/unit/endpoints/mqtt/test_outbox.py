@@ -185,6 +185,17 @@ def test_a_broker_slower_than_the_changes_still_catches_up() -> None:
     assert outbox.dropped == 0
 
 
+def test_the_first_state_is_sent_once() -> None:
+    """A bridge connects before it has read the first frames, which change every topic."""
+    connection = FakeConnection()
+    outbox, channels = Outbox(connection, connection, 10_000), [Counter("a"), Counter("b")]
+    outbox.keeping = True
+    outbox.resend(channels)
+    outbox.mark_all(channels)
+    outbox.flush()
+    assert connection.sent == ["a0", "b0"]
+
+
 def test_a_change_after_the_resend_is_sent() -> None:
     """The backlog is sent without the retain flag, so the broker would retain an older value."""
     connection = FakeConnection()
