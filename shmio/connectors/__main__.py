@@ -11,21 +11,25 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from shmio import worker
+import msgspec
+
+from shmio import control, worker
 from shmio.connectors import registry
-from shmio.connectors.base import Connector, Replayed
+from shmio.connectors.base import Connector, Mirrored, Replayed
 from shmio.connectors.injections import blocks_of, owner_of
 from shmio.connectors.models.stepped import PageClock, SteppedLoop, connected_inputs
 from shmio.connectors.poll_loop import Schedule, SourceLoop, WallClock
-from shmio.errors import ConfigError, ConnectorError
+from shmio.errors import ConfigError, ConnectorError, ShmioError
 from shmio.local.state_requests import StateRequests
 from shmio.segment import Segment
 from shmio.worker import BEAT_S, Reload, Worker
 
 if TYPE_CHECKING:
+    from shmio.connectors.fabric.loop import MirrorLoop
     from shmio.connectors.replay.loop import ReplayLoop
 
 SWITCH_S = 0.0005  # with Python's default of 5 ms, other threads would delay the poll thread too long
+RELOAD_S = 120.0
 LAST_WORDS_S = 4.0  # less than the supervisor's grace period
 REPLAY_TIMEOUT_S = 1.0
 ATTEMPT_S = 15.0  # less than the time for which the supervisor waits until the process runs again
@@ -35,7 +39,7 @@ HANG_MARGIN_S = 30.0  # added to the time-out, because asyncio's look-up of a ho
 class _LoopHandle(NamedTuple):
     """A source's loop, the function that stops it, and the time-out of the source's methods in s."""
 
-    loop: SourceLoop | SteppedLoop | ReplayLoop
+    loop: SourceLoop | SteppedLoop | ReplayLoop | MirrorLoop
     stop: Callable[[], None]
     timeout_s: float
 
@@ -163,6 +167,8 @@ def _loop_of(worker: Worker, predecessor: SourceLoop | None = None) -> _LoopHand
     options = registry.convert_options(name, worker.config["options"])
     if issubclass(found, Replayed):
         return _replay_loop(worker, options)
+    if issubclass(found, Mirrored):
+        return _mirror_loop(worker, options)
     layout = segment.blocks[worker.name].layout
     if issubclass(found, Connector):
         layout = layout.base  # without registers over the block, which the device does not have
@@ -223,6 +229,46 @@ def _replay_loop(worker: Worker, options: Any) -> _LoopHandle:
         blocks=partial(blocks_of, segment),
     )
     return _LoopHandle(loop, clock.stop, REPLAY_TIMEOUT_S)
+
+
+def _mirror_loop(worker: Worker, options: Any) -> _LoopHandle:
+    """Create the loop that reproduces a source of another cell."""
+    from shmio.connectors.fabric.link import Link  # noqa: PLC0415  the other sources need no fabric
+    from shmio.connectors.fabric.loop import ANSWER_S, MirrorLoop  # noqa: PLC0415
+    from shmio.connectors.fabric.source import Mirror, Settings  # noqa: PLC0415
+
+    segment = worker.segment
+    mirror = Mirror(options, worker.name)
+    settings = msgspec.convert(worker.config["fabric"], Settings)
+    clock = PageClock(segment.clock, worker.slot.index)
+    name = f"shmio {segment.instance}/{worker.name}"
+    loop = MirrorLoop(
+        mirror,
+        segment.writer(worker.name),
+        clock,
+        lambda received, answered: Link(
+            settings.access, mirror.cell, mirror.source, name, settings.sender, received, answered
+        ),
+        worker.config["writable"],
+        allow_nonfinite=worker.config["allow_nonfinite"],
+        armed=segment.blocks[worker.name].attributes.armed,
+        owner_of=partial(owner_of, segment),
+        blocks=partial(blocks_of, segment),
+        changed=partial(_ask_to_reload, segment.instance),
+    )
+    return _LoopHandle(loop, clock.stop, ANSWER_S)
+
+
+def _ask_to_reload(instance: str) -> None:
+    """Ask the supervisor to reload, so that it reads the new layout of a mirrored source."""
+
+    def ask() -> None:
+        try:
+            control.request(control.socket_path(instance), control.Reload(), RELOAD_S)
+        except ShmioError as error:
+            logging.getLogger("shmio.source").warning("the supervisor did not reload: %s", error)
+
+    threading.Thread(target=ask, name="reload", daemon=True).start()
 
 
 def _guarded(run: Callable[[], None]) -> None:

@@ -1,8 +1,8 @@
-"""The base classes of sources: Connector, Computed and Replayed.
+"""The base classes of sources: Connector, Computed, Replayed and Mirrored.
 
-A Connector reads a device, a Computed source calculates its values, and a Replayed source plays a
-recording. Each kind has a loop that calls its methods: ``poll_loop``, ``models.stepped`` and
-``replay.loop``.
+A Connector reads a device, a Computed source calculates its values, a Replayed source plays a
+recording, and a Mirrored source reproduces a source of another instance. Each kind has a loop that
+calls its methods: ``poll_loop``, ``models.stepped``, ``replay.loop`` and ``fabric.loop``.
 """
 
 from __future__ import annotations
@@ -437,5 +437,25 @@ class Replayed(ABC):
         Raises:
             ConfigError: The recording cannot be played. The message begins with the configuration
                 key that is wrong.
+
+        """
+
+
+class Mirrored(ABC):
+    """Base class for a source that reproduces a source of another instance, with its layout."""
+
+    Options: ClassVar[type[msgspec.Struct]]
+    """The source's own keys of ``[[source]]``. The struct must refuse unknown keys."""
+
+    @abstractmethod
+    def __init__(self, options: Any, name: Any) -> None:
+        """Check the options, without connecting.
+
+        Args:
+            options: An instance of ``Options``.
+            name: The name of the source.
+
+        Raises:
+            ConfigError: An option is wrong. The message begins with the configuration key.
 
         """

@@ -1,7 +1,7 @@
 """Finds connectors by name: built-in ones, and entry points of the group ``shmio.connectors``.
 
-Most connectors read a device. The others compute their values or play a recording, and follow the
-instance clock.
+Most connectors read a device. Others compute their values or play a recording, and follow the
+instance clock; one reproduces a source of another instance.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from shmio.config.faults import explain
-from shmio.connectors.base import Computed, Connector, Replayed
+from shmio.connectors.base import Computed, Connector, Mirrored, Replayed
 from shmio.errors import ConfigError
 from shmio.wording import unknown
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 GROUP = "shmio.connectors"
 
 BUILT_IN = {
+    "fabric": "shmio.connectors.fabric.source:Mirror",
     "memory": "shmio.connectors.models.memory:Memory",
     "modbus": "shmio.connectors.modbus.connector:ModbusConnector",
     "mqtt": "shmio.connectors.mqtt.connector:MqttConnector",
@@ -84,7 +85,7 @@ def _package(point: EntryPoint) -> str:
     return point.dist.name if point.dist is not None else f"the package of {point.value}"
 
 
-def load(name: str) -> type[Connector] | type[Computed] | type[Replayed]:
+def load(name: str) -> type[Connector] | type[Computed] | type[Replayed] | type[Mirrored]:
     """Import a connector by name.
 
     Raises:
@@ -106,7 +107,7 @@ def load(name: str) -> type[Connector] | type[Computed] | type[Replayed]:
             found = points[0].load()
         except Exception as error:
             raise ConfigError(f"connector {name!r} ({points[0].value}) cannot be imported: {error}") from error
-    if not (isinstance(found, type) and issubclass(found, Connector | Computed | Replayed)):
+    if not (isinstance(found, type) and issubclass(found, Connector | Computed | Replayed | Mirrored)):
         raise ConfigError(f"connector {name!r} is not a subclass of shmio.connectors.base.Connector")
     return found
 

@@ -13,7 +13,7 @@ from shmio.config import Config, Source
 from shmio.config.faults import Faults
 from shmio.config.read import unknown_option
 from shmio.connectors import registry
-from shmio.connectors.base import Computed, Connector, Replayed
+from shmio.connectors.base import Computed, Connector, Mirrored, Replayed
 from shmio.connectors.models.simulation import Answer, Request, Simulation
 from shmio.errors import ConfigError, PathError, RecordingError, ShmioError, ValueRangeError
 from shmio.layout.document import load_layout
@@ -22,6 +22,7 @@ from shmio.layout.model import Layout
 from shmio.layout.topic import find, parse_topic
 from shmio.layout.values.codec import codec
 from shmio.plan.layouts import LayoutFiles
+from shmio.plan.processes import fabric_access
 from shmio.plan.replay import Recordings
 from shmio.wording import near, unknown
 
@@ -85,6 +86,10 @@ def _check_source(
         found.replayed.append(source.name)
         if options is not None:
             found.layouts[source.name] = _recorded(key, source, config, recordings)
+        return
+    if issubclass(connector, Mirrored):
+        if options is not None:
+            found.layouts[source.name] = _mirrored(key, source, config, files)
         return
     if source.connector == "simulation":
         if options is not None:
@@ -201,6 +206,31 @@ def _recorded(key: str, source: Source, config: Config, recordings: Recordings) 
         raise ConfigError(f"{key}.{error}") from None
     source.period_ms, source.stale_ms = block.period_ns / 1e6, block.stale_ns / 1e6
     return block.layout
+
+
+def _mirrored(key: str, source: Source, config: Config, files: LayoutFiles) -> Layout:
+    """Return the layout of a source that mirrors another cell's source.
+
+    It comes from the registry, with the period and the stale age, unless the configuration names files.
+    """
+    from shmio.connectors.fabric.source import CACHE, Mirror, Settings, offered  # noqa: PLC0415
+
+    if config.fabric is None:
+        raise ConfigError(f"{key}.connector: a mirror needs a table [fabric] with the server's address")
+    mirror = Mirror(msgspec.convert(source.options, Mirror.Options), source.name)
+    if str(mirror.cell) == config.fabric.cell:
+        raise ConfigError(f"{key}.cell: {mirror.cell} is this instance; name the cell of another instance")
+    if source.layout is not None:
+        return files.get(key, source, None)
+    file = config.log_dir / CACHE.format(source.name)
+    try:
+        offer, old = offered(mirror, msgspec.convert(fabric_access(config.fabric), Settings).access, file)
+    except ConfigError as error:
+        raise ConfigError(f"{key}.{error}") from None
+    if old:
+        files.warnings.append(f"{key}: the layout is the one that {file.name} has kept: {old}")
+    source.period_ms, source.stale_ms = offer.period_ns / 1e6, source.stale_ms or offer.stale_ns / 1e6
+    return offer.layout
 
 
 def _model(key: str, source: Source, config: Config, files: LayoutFiles) -> tuple[Layout, tuple[str, ...]]:

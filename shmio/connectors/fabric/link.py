@@ -1,0 +1,224 @@
+"""The connection of a mirror to the fabric, in a thread of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+from collections.abc import Callable, Coroutine
+from concurrent.futures import Future
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from shmio.connectors.fabric.order import Missing
+from shmio.errors import RemoteError, ShmioError
+from shmio.fabric.connection import INSTALL, Access, connect
+from shmio.fabric.messages import (
+    CommandReply,
+    CommandRequest,
+    MissingRequest,
+    decode_reply,
+    encode_command,
+)
+from shmio.fabric.names import CellName
+from shmio.libraries import library
+from shmio.model.values import OutcomeKind
+
+if TYPE_CHECKING:
+    from nats.aio.client import Client
+    from nats.aio.msg import Msg
+
+MAX_WAITING: Final = 65_536
+"""Maximum number of messages that wait for the mirror's loop. It requests those that are dropped."""
+IDLE_S: Final = 1.0
+"""Time without an answer after which a request for missing messages has ended, in s."""
+_NOT_SENT: Final = "the connection to the fabric is lost"
+
+log = logging.getLogger("shmio.source")
+
+
+class Link:
+    """Receives the messages of one source, and sends requests and commands to its owner.
+
+    The methods may be called by any thread. ``received`` and ``answered`` are called in the link's
+    thread.
+    """
+
+    def __init__(
+        self,
+        access: Access,
+        cell: CellName,
+        source: str,
+        client_name: str,
+        sender: CellName | None,
+        received: Callable[[bytes], None],
+        answered: Callable[[Missing], None],
+    ) -> None:
+        """Create the link; :meth:`start` connects it.
+
+        Args:
+            access: The servers.
+            cell: The cell that owns the source.
+            source: Name of the source in that cell.
+            client_name: Name of this client for the server.
+            sender: The cell to which this instance belongs; None if it has no name in the fabric,
+                so that it can send no commands.
+            received: Called with each message.
+            answered: Called when the answer to a request for missing messages is complete.
+
+        """
+        self._access = access
+        self._cell = cell
+        self._source = source
+        self._name = client_name
+        self._sender = sender
+        self._received = received
+        self._answered = answered
+        self._loop = asyncio.new_event_loop()
+        self._client: Client | None = None
+        self._thread = threading.Thread(target=self._run, name="fabric", daemon=True)
+        self.problem = "the fabric is not connected yet"
+        """Why there is no connection; empty if there is one."""
+
+    @property
+    def connected(self) -> bool:
+        """True while the link is connected."""
+        return not self.problem
+
+    def start(self) -> None:
+        """Connect in the background, again and again until a server answers."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Close the connection, and end the thread."""
+        if self._thread.is_alive():
+            self._loop.call_soon_threadsafe(self._loop.stop)
+            self._thread.join()
+
+    def request(self, missing: Missing) -> None:
+        """Request missing messages. Each is passed to ``received``, then ``answered`` is called."""
+        self._submit(self._request(missing))
+
+    def command(self, request: CommandRequest, timeout_s: float) -> Future[CommandReply]:
+        """Send a command to the owner, and return its reply as a future."""
+        return self._submit(self._command(request, timeout_s))
+
+    # ---- in the link's thread ------------------------------------------------------------------------------------
+
+    def _submit(self, work: Coroutine[Any, Any, Any]) -> Future[Any]:
+        return asyncio.run_coroutine_threadsafe(work, self._loop)
+
+    def _run(self) -> None:
+        loop = self._loop
+        asyncio.set_event_loop(loop)
+        opening = loop.create_task(self._open())
+        try:
+            loop.run_forever()
+        finally:
+            opening.cancel()
+            loop.run_until_complete(self._end(opening))
+            loop.run_until_complete(loop.shutdown_asyncgens())
+            loop.close()
+
+    async def _end(self, opening: asyncio.Task[None]) -> None:
+        await asyncio.gather(opening, return_exceptions=True)
+        if self._client is not None:
+            await self._client.close()
+        others = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in others:
+            task.cancel()
+        await asyncio.gather(*others, return_exceptions=True)
+
+    async def _open(self) -> None:
+        try:
+            self._client = await connect(self._access, self._name, lost=self._lost, back=self._back)
+            for subject in (self._cell.live(self._source), self._cell.late(self._source)):
+                await self._client.subscribe(subject, cb=self._take, pending_msgs_limit=MAX_WAITING)
+            await self._client.flush()
+        except ShmioError as error:
+            self.problem = str(error)
+            log.error("%s", error)
+        except (OSError, library("nats.errors", INSTALL).Error) as error:
+            self.problem = f"the fabric refuses the connection: {error}"
+            log.error("%s", self.problem)
+        else:
+            self.problem = ""
+            log.info("connected to the fabric at %s", self._access)
+
+    async def _lost(self) -> None:
+        if not self.problem:
+            log.warning("%s", _NOT_SENT)
+        self.problem = _NOT_SENT
+
+    async def _back(self) -> None:
+        self.problem = ""
+        log.info("connected to the fabric again")
+
+    async def _take(self, message: Msg) -> None:
+        self._received(message.data)
+
+    async def _request(self, missing: Missing) -> None:
+        client = self._client
+        if client is None or not client.is_connected:
+            return
+        errors = library("nats.errors", INSTALL)
+        inbox = client.new_inbox()
+        answers = await client.subscribe(inbox)
+        request = msgspec.json.encode(MissingRequest(missing.stream, missing.first, missing.last))
+        try:
+            await client.publish(self._cell.missing(self._source), request, reply=inbox)
+            while True:
+                answer = await answers.next_msg(timeout=IDLE_S)
+                if answer.headers and answer.headers.get("Status") == "503":
+                    return  # no uplink runs: the request is repeated
+                if not answer.data:
+                    self._answered(missing)
+                    return
+                self._received(answer.data)
+        except (TimeoutError, errors.Error):
+            return  # the loop repeats the request, or gives up
+        finally:
+            with suppress(errors.Error):
+                await answers.unsubscribe()
+
+    async def _command(self, request: CommandRequest, timeout_s: float) -> CommandReply:
+        errors = library("nats.errors", INSTALL)
+        count, client = len(request.writes), self._client
+        if self._sender is None:
+            return _all(count, OutcomeKind.REJECTED, "this instance has no name in the fabric; set fabric.cell")
+        if client is None or not client.is_connected:
+            return _all(count, OutcomeKind.EXPIRED, self.problem or _NOT_SENT)
+        subject = self._cell.command(self._source, self._sender)
+        try:
+            reply = await client.request(subject, encode_command(request), timeout=timeout_s)
+            return decode_reply(reply.data, count)
+        except errors.NoRespondersError:
+            why = f"{self._cell} takes no commands: its uplink does not run, or fabric.allow names no sender"
+            return _all(count, OutcomeKind.EXPIRED, why)
+        except errors.OutboundBufferLimitError:
+            return _all(count, OutcomeKind.EXPIRED, _NOT_SENT)
+        except (OSError, errors.Error, ValueError) as error:
+            why = "no answer came" if isinstance(error, TimeoutError) else str(error)
+            return _all(count, OutcomeKind.UNKNOWN, f"{self._cell}: {why}")
+
+
+def _all(count: int, kind: OutcomeKind, reason: str) -> CommandReply:
+    return CommandReply([kind.value] * count, [reason] * count)
+
+
+async def call_once(access: Access, work: Callable[[Client], Coroutine[Any, Any, Any]]) -> Any:
+    """Connect once, and return the result of ``work`` with the connection.
+
+    Raises:
+        RemoteError: No server can be reached, or it does not answer.
+
+    """
+    client = await connect(access, "shmio", patient=False)
+    try:
+        return await work(client)
+    except (TimeoutError, library("nats.errors", INSTALL).Error) as error:
+        raise RemoteError(f"{access}: {error or 'the server does not answer'}") from None
+    finally:
+        await client.close()

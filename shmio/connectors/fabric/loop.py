@@ -1,0 +1,334 @@
+"""The loop of a mirror: publishes the frames and events of another cell's source, in their order."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future
+from typing import Final, cast
+
+from shmio.connectors.base import Lost as LostWrite
+from shmio.connectors.base import UnconfirmedError
+from shmio.connectors.commands import CommandProcessor
+from shmio.connectors.fabric.link import MAX_WAITING, Link
+from shmio.connectors.fabric.order import Lost, MessageOrder, Missing, Received
+from shmio.connectors.fabric.source import Mirror
+from shmio.connectors.injections import Blocks, OwnerOf
+from shmio.connectors.models.stepped import StepClock
+from shmio.connectors.output import Image, Output
+from shmio.connectors.poll_loop import Counters, QualityLog
+from shmio.fabric.messages import CommandReply, CommandRequest, Entry, WriteItem, decode_entries, decode_header
+from shmio.layout.values.write import Write
+from shmio.model.values import OutcomeKind
+from shmio.segment import NO_WRITER, BlockWriter, Event, EventKind, Frame, Provenance, Quality, Record
+from shmio.segment.commands import MAX_WRITES
+from shmio.wording import counted
+
+BEGIN_NS: Final = 1_000_000_000
+"""Time in ns after which the owner no longer begins a write."""
+ANSWER_S: Final = 2.0
+"""Longest wait for the outcome of a write, in s."""
+REPORT_NS: Final = 10_000_000_000
+"""Shortest time in ns between two reports of malformed messages."""
+_LEFT_OUT: Final = frozenset({EventKind.STARTED, EventKind.STOPPED, EventKind.QUALITY})
+"""Events of the owner that the mirror replaces by its own."""
+
+log = logging.getLogger("shmio.source")
+
+Connect = Callable[[Callable[[bytes], None], Callable[[Missing], None]], Link]
+"""Makes the link; its arguments are those of :class:`Link` of the same names."""
+
+
+class MirrorLoop:
+    """Publishes what the owner's uplink sends, and passes writes on to the owner.
+
+    Frames keep their cycle, source time, quality and provenance. A message that comes late has the
+    age that it had when the owner sent it, so readers see its frames as stale. Missing messages are
+    requested, and later messages wait for them; if the owner no longer has them, the loop reports
+    a gap.
+    """
+
+    def __init__(
+        self,
+        mirror: Mirror,
+        writer: BlockWriter,
+        clock: StepClock,
+        connect: Connect,
+        writable: Iterable[str] = (),
+        *,
+        allow_nonfinite: Iterable[str] = (),
+        armed: bool = False,
+        owner_of: OwnerOf = lambda _: None,
+        blocks: Blocks | None = None,
+        changed: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Create the loop.
+
+        Args:
+            mirror: The source to reproduce.
+            writer: Writes the block.
+            clock: The loop's clock; the link wakes it.
+            connect: Makes the link to the fabric.
+            writable: Patterns of the registers that commands of this instance may write. The owner
+                has such a list, too.
+            allow_nonfinite: Patterns of the registers to which NaN and infinities may be written.
+            armed: Whether injections of this instance may change what is sent to the owner.
+            owner_of: Returns the process that uses a command queue.
+            blocks: Returns the blocks of all sources.
+            changed: Called when the owner's layout is another one, at most once.
+
+        """
+        self._mirror = mirror
+        self._writer = writer
+        self._clock = clock
+        self._changed: Callable[[], None] | None = changed
+        self._layout = writer.block.layout.hash[:8]
+        self._output = Output(writer, clock.now_ns)
+        self.commands = CommandProcessor(
+            self._output, writable, clock.now_ns, allow_nonfinite=allow_nonfinite, armed=armed, owner_of=owner_of,
+            blocks=blocks, accepted=clock.nudge,
+        )  # fmt: skip
+        self._quality_log = QualityLog(writer)
+        self.counters = Counters()
+        self._order = MessageOrder()
+        self._inbox: deque[Received | Missing] = deque()
+        self._link = connect(self._receive, self._answered)
+        self._reply: Future[CommandReply] | None = None
+        self._last_ns = clock.now_ns()  # when the last frame was published
+        self._open = False
+        self._bad = True  # the last frame was bad
+        self._reported_ns = -REPORT_NS
+        self.missing = 0
+        """Number of frames that the owner no longer had."""
+        self._cycle: int | None = None
+        self._number = 0  # of the owner's last frame
+        self._left_out = 0  # frames that the owner's rules have left out since then
+
+    @property
+    def note(self) -> str:
+        """Why quality is not good; empty if it is."""
+        return self._quality_log.note
+
+    # ---- in the link's thread ------------------------------------------------------------------------------------
+
+    def _receive(self, data: bytes) -> None:
+        if len(self._inbox) >= MAX_WAITING:
+            return  # the loop will request it
+        try:
+            header = decode_header(data)
+        except ValueError as error:
+            self._report(error)
+            return
+        self._inbox.append(Received(header, data, self._clock.now_ns()))
+        self._clock.nudge()
+
+    def _answered(self, missing: Missing) -> None:
+        self._inbox.append(missing)
+        self._clock.nudge()
+
+    # ---- in the loop's thread ------------------------------------------------------------------------------------
+
+    def run(self) -> None:
+        """Mirror until the clock tells the loop to stop, then publish a last, bad frame."""
+        self._link.start()
+        try:
+            while not self._run_once():
+                pass
+        finally:
+            self.commands.stop()
+            self._confirm()
+            self._link.close()
+            self._fail("the source was stopped")
+            self._writer.event(Record(EventKind.STOPPED))
+
+    def _run_once(self) -> bool:
+        """Publish what has come, pass on writes, then wait. Return whether the loop must stop."""
+        while self._inbox:
+            one = self._inbox.popleft()
+            found = (
+                self._order.answered(one, self._clock.now_ns()) if isinstance(one, Missing) else self._order.add(one)
+            )
+            self._deliver(found)
+        now_ns = self._clock.now_ns()
+        self._deliver(self._order.expired(now_ns))
+        if (missing := self._order.missing(now_ns)) is not None and self._link.connected:
+            self._link.request(missing)
+        self._confirm()
+        if self.commands.waiting and not self.commands.unconfirmed:
+            self._carry_out()
+        return self._clock.wait_ns(self._watch(self._clock.now_ns()))
+
+    def _watch(self, now_ns: int) -> int:
+        """Publish a bad frame if the last one is too old. Return how long the loop may wait, in ns."""
+        stale_ns = self._writer.block.stale_ns
+        due_ns = self._last_ns + stale_ns
+        if now_ns >= due_ns and not self._bad:
+            why = (
+                self._link.problem
+                or f"{self._mirror.cell} has sent nothing for {(now_ns - self._last_ns) / 1e6:.0f} ms"
+            )
+            self._fail(why)
+        elif self._link.problem and self._bad and self._link.problem != self.note and self._cycle is None:
+            self._fail(self._link.problem)
+        wait_ns = 500_000_000 if self._bad else max(1_000_000, due_ns - now_ns)
+        patience_ns = self._order.patience_ns(now_ns)
+        return wait_ns if patience_ns is None else min(wait_ns, patience_ns)
+
+    # ---- frames and events ---------------------------------------------------------------------------------------
+
+    def _deliver(self, found: Iterable[Received | Lost]) -> None:
+        for one in found:
+            if isinstance(one, Lost):
+                log.warning(
+                    "%s no longer has %s, which this host has not received",
+                    self._mirror, counted(one.last - one.first + 1, "message"),
+                )  # fmt: skip
+                continue
+            if one.header.layout != self._layout:
+                self._refuse_layout()
+                continue
+            late_ns = one.header.age_ns + (self._clock.now_ns() - one.at_ns)
+            self._left_out += one.header.left_out
+            try:
+                for entry in decode_entries(one.data):
+                    self._publish(entry, late_ns)
+            except ValueError as error:
+                self._report(error)
+
+    def _publish(self, entry: Entry, late_ns: int) -> None:
+        if isinstance(entry, Frame):
+            self._show(entry, late_ns)
+        elif isinstance(entry, Event):
+            self._happen(entry)
+        else:
+            self._tell_gap(entry.what, entry.first, entry.last, f"{self._mirror.cell}: {entry.reason}")
+            if entry.what == "frames":
+                self._number = entry.last
+
+    def _find_gap(self, number: int) -> None:
+        """Report the frames that are missing before a frame of the owner, except those that its rules leave out."""
+        first, left_out, self._left_out = self._number + 1, self._left_out, 0
+        if 1 < first < number - left_out:
+            self._tell_gap("frames", first, number - 1 - left_out, "the owner no longer had them")
+        self._number = number
+
+    def _show(self, frame: Frame, late_ns: int) -> None:
+        if len(frame.raw) != self._writer.block.layout.size:
+            raise ValueError(f"a frame has {len(frame.raw)} bytes instead of {self._writer.block.layout.size}")
+        now_ns = self._clock.now_ns()
+        self._find_gap(frame.number)
+        self._writer.cycle = self._cycle = frame.cycle
+        self._bad = frame.quality is Quality.BAD
+        self._last_ns = now_ns
+        self._quality_log.update(frame.quality, frame.reason, frame.cycle, f", mirrored from {self._mirror}")
+        age_ns = late_ns + 1000 * frame.delay_us
+        image = Image(
+            frame.raw, frame.cycle, frame.source_ns, frame.quality, frame.provenance, frame.reason, now_ns - age_ns,
+            frame.effective,
+        )  # fmt: skip
+        self._output.publish(image)
+        self.counters.polls += 1
+        self.counters.round_trip_us = late_ns // 1000
+        if not self._open and not self._bad:
+            self._open = True
+            self.counters.connects += 1
+            self.commands.open()
+        self.commands.release(frame.cycle)
+
+    def _happen(self, event: Event) -> None:
+        """Publish an event of the owner without its writer, so that no client takes it for an answer to itself."""
+        if event.kind in _LEFT_OUT:
+            return
+        self._writer.cycle = event.cycle
+        record = Record(
+            cast(EventKind, event.kind), event.text, NO_WRITER, event.command, event.item,
+            min(event.items, MAX_WRITES), event.offset, event.mask, event.size, event.data, event.injection,
+        )  # fmt: skip
+        self._writer.event(record, quality=event.quality)
+
+    def _tell_gap(self, what: str, first: int, last: int, why: str) -> None:
+        if what == "frames":
+            self.counters.overruns += last - first + 1
+            self.missing += last - first + 1
+        text = f"{what} {first} to {last} are missing, {why}"
+        log.warning("%s", text)
+        self._writer.event(Record(EventKind.NOTED, text))
+
+    def _fail(self, reason: str) -> None:
+        """Publish the last image with bad quality, and stop accepting writes."""
+        self._open = False
+        self.commands.close(reason)
+        self._bad = True
+        if self._quality_log.update(Quality.BAD, reason, self._writer.cycle):
+            last = self._output.last
+            provenance = Provenance.LIVE if last is None else last.provenance
+            image = Image(
+                self._output.raw, self._writer.cycle, self._output.source_ns, Quality.BAD, provenance, reason,
+                shown=None if last is None else last.shown,
+            )  # fmt: skip
+            self._output.publish(image)
+
+    def _refuse_layout(self) -> None:
+        self._fail(f"{self._mirror} has another layout now; run shmio-supervisor reload")
+        if self._changed is not None:
+            changed, self._changed = self._changed, None
+            changed()
+
+    def _report(self, error: ValueError) -> None:
+        now_ns = self._clock.now_ns()
+        if now_ns - self._reported_ns >= REPORT_NS:
+            self._reported_ns = now_ns
+            log.warning("%s sent a malformed message: %s", self._mirror, error)
+
+    # ---- writes --------------------------------------------------------------------------------------------------
+
+    def _carry_out(self) -> None:
+        try:
+            self.commands.carry_out(self._send)
+        except UnconfirmedError as error:
+            log.warning("%s", error)
+
+    def _send(self, writes: Sequence[Write]) -> Sequence[str] | None:
+        newest = self._order.newest
+        if newest is None:
+            return ["no message of the owner has come yet"] * len(writes)
+        header = newest.header
+        owner_ns = header.made_ns + header.age_ns + self._clock.now_ns() - newest.at_ns
+        request = CommandRequest(owner_ns + BEGIN_NS, self._layout, [WriteItem(*write) for write in writes])
+        self._reply = self._link.command(request, ANSWER_S)
+        self._reply.add_done_callback(lambda _: self._clock.nudge())
+        return None
+
+    def _confirm(self) -> None:
+        if not self.commands.unconfirmed:
+            return
+        try:
+            self.commands.confirm(self._outcomes)
+        except UnconfirmedError as error:
+            log.warning("%s", error)
+
+    def _outcomes(self) -> Sequence[str] | None:
+        reply = self._reply
+        if reply is None or not reply.done():
+            return None
+        self._reply = None
+        kinds = [OutcomeKind(kind) for kind in reply.result().outcomes]
+        found = [_outcome(*pair) for pair in zip(kinds, reply.result().reasons, strict=True)]
+        if any(isinstance(outcome, LostWrite) for outcome in found):
+            reason = next(filter(None, reply.result().reasons), "no answer came")
+            raise UnconfirmedError(reason, found)
+        return cast(Sequence[str], found)
+
+
+def _outcome(kind: OutcomeKind, reason: str) -> str | LostWrite:
+    """Convert an outcome at the owner to that of a connector's write."""
+    if kind is OutcomeKind.WRITTEN:
+        return ""
+    if kind is OutcomeKind.EXPIRED:
+        return LostWrite.UNSENT
+    if kind is OutcomeKind.TAKEN:
+        return "an injection of the owner took the value in place of the device"
+    if kind in (OutcomeKind.REFUSED, OutcomeKind.REJECTED):
+        return reason or str(kind)
+    return LostWrite.UNKNOWN
