@@ -1,0 +1,313 @@
+"""A mirror's loop: frames and events as the owner published them, gaps, late messages, and writes."""
+
+from __future__ import annotations
+
+import os
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager
+from typing import Any, cast
+
+import pytest
+
+from shmio.connectors.fabric.link import Link
+from shmio.connectors.fabric.loop import MirrorLoop
+from shmio.connectors.fabric.order import Missing
+from shmio.connectors.fabric.source import Mirror
+from shmio.connectors.injection_layers import Owner
+from shmio.connectors.models.stepped import PageClock
+from shmio.errors import CommandError
+from shmio.fabric.messages import CommandReply, CommandRequest, Entry, Header, encode, with_age
+from shmio.layout.model import Layout, Register
+from shmio.local.writer import SourceWriter
+from shmio.recording.format.encoding import Gap, Reason
+from shmio.segment import (
+    NO_WRITER,
+    Attributes,
+    BlockSpec,
+    Event,
+    EventKind,
+    Frame,
+    ProcessSpec,
+    Provenance,
+    Quality,
+    Segment,
+)
+
+LAYOUT = Layout(
+    "DB1", 1, 4, False, (Register("count", "INT", (), 0, None, 2, 1), Register("other", "INT", (), 2, None, 2, 1))
+)
+MS = 1_000_000
+S = 1_000 * MS
+STALE_NS = 1500 * MS
+PATIENCE_S = 20.0
+STREAM = 11
+
+
+def frame(number: int, count: int, **told: Any) -> Frame:
+    values: dict[str, Any] = {"quality": Quality.GOOD, "provenance": Provenance.SIMULATED, "reason": "", "effective": None} | told
+    return Frame(
+        number, 1000 + number, 0, number, 5 * S + number, 3, values["quality"], values["provenance"], 0, 250,
+        values["reason"], struct.pack(">HH", count, 0), values["effective"],
+    )  # fmt: skip
+
+
+class FakeLink:
+    """The fabric's side of a mirror."""
+
+    def __init__(self, received: Callable[[bytes], None], answered: Callable[[Missing], None]) -> None:
+        self.send, self.answered = received, answered
+        self.problem = ""
+        self.requests: list[Missing] = []
+        self.asked = threading.Event()
+        self.commands: list[CommandRequest] = []
+        self.reply = CommandReply([], [])
+        self.number = 0
+
+    @property
+    def connected(self) -> bool:
+        return not self.problem
+
+    def start(self) -> None:
+        """Be connected from the start."""
+
+    def close(self) -> None:
+        """Hold nothing."""
+
+    def request(self, missing: Missing) -> None:
+        self.requests.append(missing)
+        self.asked.set()
+
+    def command(self, request: CommandRequest, timeout_s: float) -> Future[CommandReply]:
+        assert timeout_s > 0
+        self.commands.append(request)
+        future: Future[CommandReply] = Future()
+        future.set_result(self.reply)
+        return future
+
+    def message(self, *entries: Entry, skip: int = 0, age_ns: int = 0, left_out: int = 0, **head: Any) -> bytes:
+        """Return the next message of the stream; ``skip`` leaves out numbers before it."""
+        self.number += 1 + skip
+        values: dict[str, Any] = {"layout": LAYOUT.hash[:8], "stream": STREAM} | head
+        header = Header(left_out, values["stream"], self.number, values["layout"], time.time_ns())
+        return with_age(encode(header, entries), age_ns)
+
+
+class Mirroring:
+    """A mirror's process, run in threads."""
+
+    def __init__(self, segment: Segment) -> None:
+        self.segment = segment
+        slot = segment.processes.find("cell")
+        assert slot.take()
+        self.block = segment.blocks["cell"]
+        self.cursor, self.events = self.block.cursor(), self.block.events.cursor()
+        self.clock = PageClock(segment.clock, slot.index)
+        self.changes = 0
+        self.changed = threading.Event()
+
+        def connect(received: Callable[[bytes], None], answered: Callable[[Missing], None]) -> Link:
+            self.link = FakeLink(received, answered)
+            return cast("Link", self.link)
+
+        self.loop = MirrorLoop(
+            Mirror(Mirror.Options(cell="plant1.line3.a50"), "cell"),
+            segment.writer("cell"),
+            self.clock,
+            connect,
+            ("count",),
+            owner_of=lambda writer: Owner(writer, os.getpid()),
+            changed=self._changed,
+        )
+        self._threads = [threading.Thread(target=run) for run in (self.loop.run, self.loop.commands.run)]
+        for thread in self._threads:
+            thread.start()
+
+    def _changed(self) -> None:
+        self.changes += 1
+        self.changed.set()
+
+    def send(self, *entries: Entry, **more: Any) -> None:
+        self.link.send(self.link.message(*entries, **more))
+
+    def next(self) -> Frame:
+        found = self.cursor.next(PATIENCE_S)
+        assert found is not None, "no frame"
+        return found
+
+    def event(self, kind: EventKind) -> Event:
+        """Return the next event of a kind."""
+        while True:
+            found = self.events.next(PATIENCE_S)
+            assert found is not None, f"no event {kind}"
+            if found.kind == kind:
+                return found
+
+    def stop(self) -> None:
+        self.clock.stop()
+        for thread in self._threads:
+            thread.join()
+
+
+@pytest.fixture
+def mirroring(instance: str) -> Iterator[Mirroring]:
+    with running(instance) as found:
+        yield found
+
+
+@contextmanager
+def running(instance: str) -> Iterator[Mirroring]:
+    block = BlockSpec("cell", LAYOUT, 20 * MS, STALE_NS, 1 << 20, Attributes("fabric", ("count",)))
+    with Segment.create(instance, [block], [ProcessSpec("cell", "source")]) as segment:
+        mirroring = Mirroring(segment)
+        try:
+            yield mirroring
+        finally:
+            mirroring.stop()
+            segment.unlink()
+
+
+def test_frames_keep_what_the_owner_published(mirroring: Mirroring) -> None:
+    doubtful = frame(8, 2, quality=Quality.UNCERTAIN, reason="2 of 4 nodes", effective=b"\0\x09\0\0")
+    mirroring.send(frame(7, 1), doubtful)
+    first, second = mirroring.next(), mirroring.next()
+    assert (first.cycle, first.source_ns, first.raw) == (1007, 5 * S + 7, b"\0\1\0\0")
+    assert (first.quality, first.provenance, first.effective) == (Quality.GOOD, Provenance.SIMULATED, None)
+    assert (second.quality, second.reason, second.effective) == (Quality.UNCERTAIN, "2 of 4 nodes", b"\0\x09\0\0")
+    assert first.delay_us >= 250
+
+
+def test_late_frames_are_stale_but_keep_their_quality(mirroring: Mirroring) -> None:
+    mirroring.send(frame(7, 1), age_ns=30 * S)
+    late = mirroring.next()
+    assert late.quality is Quality.GOOD
+    assert late.delay_us > 29_000_000
+    assert mirroring.block.assess(late)[0] is Quality.BAD
+
+
+def test_missing_messages_are_requested_and_come_before_later_ones(mirroring: Mirroring) -> None:
+    mirroring.send(frame(7, 1))
+    assert mirroring.next().cycle == 1007
+    missed = mirroring.link.message(frame(8, 2))
+    mirroring.send(frame(9, 3))
+    assert mirroring.link.asked.wait(PATIENCE_S)
+    assert mirroring.link.requests == [Missing(STREAM, 2, 2)]
+    mirroring.link.send(missed)
+    mirroring.link.answered(Missing(STREAM, 2, 2))
+    assert [mirroring.next().cycle, mirroring.next().cycle] == [1008, 1009]
+    assert mirroring.loop.missing == 0
+
+
+def test_frames_that_the_owner_no_longer_has_are_reported_as_a_gap(mirroring: Mirroring) -> None:
+    mirroring.send(frame(7, 1))
+    mirroring.send(frame(57, 3), skip=49)
+    assert mirroring.link.asked.wait(PATIENCE_S)
+    mirroring.link.answered(mirroring.link.requests[0])
+    assert "frames 8 to 56" in mirroring.event(EventKind.NOTED).text
+    assert [mirroring.next().cycle, mirroring.next().cycle] == [1007, 1057]
+    assert mirroring.loop.missing == mirroring.loop.counters.overruns == 49
+
+
+def test_frames_that_the_owners_rules_leave_out_are_no_gap(mirroring: Mirroring) -> None:
+    mirroring.send(frame(7, 1))
+    mirroring.send(frame(17, 2), left_out=9)
+    mirroring.send(Gap("cell", 1, "frames", 18, 20, 3, Reason.OVERTAKEN), frame(21, 3))
+    assert "frames 18 to 20" in mirroring.event(EventKind.NOTED).text
+    assert [mirroring.next().cycle for _ in range(3)] == [1007, 1017, 1021]
+    assert mirroring.loop.missing == 3
+
+
+def test_a_silent_owner_makes_the_source_bad_until_it_sends_again(mirroring: Mirroring) -> None:
+    mirroring.send(frame(7, 1))
+    mirroring.next()
+    bad = mirroring.next()
+    assert bad.quality is Quality.BAD
+    assert "plant1.line3.a50" in bad.reason
+    assert bad.raw == b"\0\1\0\0"
+    mirroring.send(frame(8, 2))
+    assert mirroring.next().quality is Quality.GOOD
+
+
+def test_a_lost_connection_is_the_reason_for_bad_quality(mirroring: Mirroring) -> None:
+    mirroring.send(frame(7, 1))
+    mirroring.next()
+    mirroring.link.problem = "the connection is lost"
+    assert mirroring.next().reason == "the connection is lost"
+    assert mirroring.loop.note == "the connection is lost"
+
+
+def test_events_of_the_owner_have_no_writer(mirroring: Mirroring) -> None:
+    written = Event(
+        4, EventKind.WRITTEN, 7, 1007, 0, 0, 9, 3, Quality.GOOD, 5, 99, 1, 2, 0, 0, 2, b"\0\5", "by the owner"
+    )
+    quality = written._replace(kind=EventKind.QUALITY, number=5)
+    mirroring.send(frame(7, 1), quality, written)
+    event = mirroring.event(EventKind.WRITTEN)
+    assert (event.writer, event.command, event.text, event.data, event.cycle) == (
+        NO_WRITER,
+        99,
+        "by the owner",
+        b"\0\5",
+        1007,
+    )
+
+
+def test_another_layout_makes_the_source_bad_and_asks_for_a_reload_once(mirroring: Mirroring) -> None:
+    mirroring.send(frame(7, 1))
+    mirroring.next()
+    mirroring.send(frame(8, 2), layout=b"another!")
+    bad = mirroring.next()
+    assert (bad.quality, "reload" in bad.reason) == (Quality.BAD, True)
+    mirroring.send(frame(9, 2), layout=b"another!")
+    assert mirroring.changed.wait(PATIENCE_S)
+    assert mirroring.changes == 1
+
+
+def test_malformed_messages_change_nothing(mirroring: Mirroring) -> None:
+    mirroring.link.send(b"\xff" * 100)
+    mirroring.send(frame(7, 1)._replace(raw=b"too long for the block"))
+    mirroring.send(frame(8, 2))
+    assert mirroring.next().cycle == 1008
+
+
+def written(mirroring: Mirroring, kind: str, reason: str = "") -> tuple[str, str]:
+    mirroring.send(frame(7, 1))
+    mirroring.next()
+    mirroring.event(EventKind.QUALITY)
+    mirroring.link.reply = CommandReply([kind], [reason])
+    [outcome] = SourceWriter(mirroring.block, 0).write({"count": 77})
+    return str(outcome.kind), outcome.text
+
+
+def test_a_write_goes_to_the_owner_before_its_time_runs_out(mirroring: Mirroring) -> None:
+    assert written(mirroring, "written") == ("written", "")
+    [request] = mirroring.link.commands
+    [item] = request.writes
+    assert (item.offset, item.mask, item.data, request.layout) == (0, 0, b"\0\x4d", LAYOUT.hash[:8])
+    assert abs(request.expires_ns - time.time_ns()) < 10 * S
+
+
+@pytest.mark.parametrize(
+    ("kind", "seen"),
+    [
+        ("refused", "refused"),
+        ("rejected", "refused"),
+        ("taken", "refused"),
+        ("expired", "expired"),
+        ("unknown", "unknown"),
+        ("accepted", "unknown"),
+    ],
+)
+def test_outcomes_of_the_owner(mirroring: Mirroring, kind: str, seen: str) -> None:
+    assert written(mirroring, kind, "the reason")[0] == seen
+
+
+def test_registers_that_are_not_writable_here_stay_here(mirroring: Mirroring) -> None:
+    mirroring.send(frame(7, 1))
+    mirroring.next()
+    with pytest.raises(CommandError, match="writable"):
+        SourceWriter(mirroring.block, 0).write({"other": 1})
+    assert mirroring.link.commands == []
