@@ -209,6 +209,20 @@ class Registry:
         except errors.KeyWrongLastSequenceError:
             return
 
+    async def layout_like(self, head: bytes) -> Layout:
+        """Return the layout whose hash begins with these bytes.
+
+        Raises:
+            RemoteError: The registry does not have it, or it is damaged.
+
+        """
+        errors = library("nats.js.errors", _INSTALL)
+        try:
+            keys = await self._layouts.keys()
+        except errors.NoKeysError:
+            keys = []
+        return await self.layout(next((key for key in keys if key.startswith(head.hex())), head.hex()))
+
     async def layout(self, digest: str) -> Layout:
         """Return the layout with a hash.
 
