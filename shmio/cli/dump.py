@@ -118,8 +118,16 @@ def _parser() -> argparse.ArgumentParser:
     _some(cut)
     add_json(cut)
 
+    fetch = verb("fetch", "write a part of a cell's history, which the servers of a fabric keep, to a new file")
+    fetch.add_argument("place", metavar="nats://HOST:PORT/PLANT.LINE.CELL")
+    _credentials(fetch)
+    _output(fetch, "the new file")
+    _times(fetch, "2026-11-21T08:30:00")
+    add_json(fetch)
+
     export = verb("export", "write values for other programs: Parquet, CSV, or MCAP for viewers")
-    export.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    export.add_argument("files", nargs="+", metavar="FILE", help="recordings, or nats://HOST:PORT/PLANT.LINE.CELL")
+    _credentials(export)
     _output(export, "the new file, or for tables a new folder with a file for each block")
     export.add_argument(
         "--format",
@@ -189,11 +197,15 @@ def _output(verb: argparse.ArgumentParser, text: str, *, required: bool = True) 
     verb.add_argument("-o", dest="output", type=Path, required=required, metavar="FILE", help=text)
 
 
-def _times(verb: argparse.ArgumentParser) -> None:
+def _credentials(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument(
+        "--credentials", metavar="FILE", help="what the fabric's servers require: a .creds file, or an NKey's seed"
+    )
+
+
+def _times(verb: argparse.ArgumentParser, form: str = "2026-11-21T08:30:00, or seconds of the recording") -> None:
     for option, what in (("--from", "begin"), ("--to", "end")):
-        verb.add_argument(
-            option, dest=what, metavar="TIME", help=f"{what} there: 2026-11-21T08:30:00, or seconds of the recording"
-        )
+        verb.add_argument(option, dest=what, metavar="TIME", help=f"{what} there: {form}")
 
 
 def _some(verb: argparse.ArgumentParser) -> None:

@@ -11,12 +11,12 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
-from urllib.parse import urlsplit
 
-from shmio.errors import ConfigError, RecordingError, RemoteError
-from shmio.fabric.connection import INSTALL, Access, connect
+from shmio.errors import RecordingError, RemoteError
+from shmio.fabric.connection import INSTALL, connect
 from shmio.fabric.messages import Entry, Header, decode_entries, decode_header
 from shmio.fabric.names import CellName, source_of
+from shmio.fabric.place import Place
 from shmio.fabric.registry import Registry
 from shmio.layout.model import Layout
 from shmio.libraries import library
@@ -37,33 +37,6 @@ _BATCH: Final = 500
 _S: Final = 1_000_000_000
 
 log = logging.getLogger("shmio.fabric")
-
-
-class Place(NamedTuple):
-    """Where a cell's history is: the servers, and the cell."""
-
-    access: Access
-    cell: CellName
-
-
-def is_place(text: str) -> bool:
-    """Return whether a text names a cell's history, and not a file."""
-    return text.startswith(("nats://", "tls://"))
-
-
-def parse_place(text: str, credentials: str | None = None) -> Place:
-    """Parse ``nats://HOST:PORT/plant.line.cell``.
-
-    Raises:
-        RecordingError: The text is not such a URL.
-
-    """
-    parts = urlsplit(text)
-    try:
-        cell = CellName.parse(parts.path.strip("/"))
-    except ConfigError as error:
-        raise RecordingError(f"{text}: {error}") from None
-    return Place(Access((f"{parts.scheme}://{parts.netloc}",), credentials=credentials), cell)
 
 
 def stream_of(cell: CellName) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -15,12 +16,14 @@ from shmio.config.read import unknown_option
 from shmio.connectors import registry
 from shmio.connectors.base import Computed, Connector, Mirrored, Replayed
 from shmio.connectors.models.simulation import Answer, Request, Simulation
-from shmio.errors import ConfigError, PathError, RecordingError, ShmioError, ValueRangeError
+from shmio.errors import ConfigError, PathError, RecordingError, RemoteError, ShmioError, ValueRangeError
+from shmio.fabric.place import is_place, parse_place
 from shmio.layout.document import load_layout
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
 from shmio.layout.topic import find, parse_topic
 from shmio.layout.values.codec import codec
+from shmio.local.replays import date_ns
 from shmio.plan.layouts import LayoutFiles
 from shmio.plan.processes import fabric_access
 from shmio.plan.replay import Recordings
@@ -195,10 +198,10 @@ def _recorded(key: str, source: Source, config: Config, recordings: Recordings) 
                 f"{key}.{name}: leave out this key in a replay, because its registers are those of the recording"
             )
     options = msgspec.convert(source.options, Replay.Options)
-    source.options["file"] = [str(config.path(file)) for file in files(options)]
     try:
+        source.options["file"] = [_file(file, source, config) for file in files(options)]
         recording = recordings.get(source.options["file"])
-    except RecordingError as error:
+    except (RecordingError, RemoteError) as error:
         raise ConfigError(f"{key}.file: {error}") from None
     try:
         block = chosen(recording, options, source.name)[1].block
@@ -206,6 +209,31 @@ def _recorded(key: str, source: Source, config: Config, recordings: Recordings) 
         raise ConfigError(f"{key}.{error}") from None
     source.period_ms, source.stale_ms = block.period_ns / 1e6, block.stale_ns / 1e6
     return block.layout
+
+
+def _file(name: str, source: Source, config: Config) -> str:
+    """Return the path of a recording; a cell's history in a fabric is first copied to a file in the folder of the logs.
+
+    Raises:
+        RecordingError: The history cannot be copied.
+        RemoteError: No server of the fabric can be reached.
+
+    """
+    if not is_place(name):
+        return str(config.path(name))
+    from shmio.fabric.history import fetch  # noqa: PLC0415  most recordings are files
+
+    times = source.options.get("start"), source.options.get("end")
+    try:
+        begin, end = (date_ns(time) if isinstance(time, str) else None for time in times)
+    except ValueError:
+        begin = end = None  # the replay reports the time
+    digest = hashlib.sha256(repr((name, times)).encode()).hexdigest()[:16]
+    file = config.log_dir / f"{source.name}.{digest}.mem"
+    if not file.exists():  # so that a restart plays the same history
+        config.log_dir.mkdir(parents=True, exist_ok=True)
+        fetch(parse_place(name, None if config.fabric is None else config.fabric.credentials), file, begin, end)
+    return str(file)
 
 
 def _mirrored(key: str, source: Source, config: Config, files: LayoutFiles) -> Layout:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from shmio.errors import RecordingError
-from shmio.local.replays import moment_ns
+from shmio.fabric.place import is_place, parse_place
+from shmio.local.replays import date_ns, moment_ns
 from shmio.recording.dump import Dump, open_dump
 from shmio.recording.format.records import Damage
 from shmio.recording.reading.part import MAX_NS
@@ -112,6 +114,45 @@ def time_range(arguments: argparse.Namespace, start_ns: int) -> tuple[int, int]:
     if from_ns > to_ns:
         raise RecordingError(f"--to {end} is before --from {begin}")
     return from_ns, to_ns
+
+
+@contextmanager
+def local_files(arguments: argparse.Namespace) -> Iterator[list[Path]]:
+    """Yield the files of a command; a cell's history in a fabric becomes a temporary file."""
+    with TemporaryDirectory(prefix="shmio-") as folder:
+        yield [
+            _fetched(name, arguments, Path(folder) / f"{index}.mem") if is_place(name) else Path(name)
+            for index, name in enumerate(arguments.files)
+        ]
+
+
+def _fetched(name: str, arguments: argparse.Namespace, file: Path) -> Path:
+    fetch_history(name, arguments, file)
+    return file
+
+
+def fetch_history(name: str, arguments: argparse.Namespace, file: Path) -> int:
+    """Write a cell's history between ``--from`` and ``--to`` to a file; return the number of its frames.
+
+    Raises:
+        RecordingError: A time is invalid, or there is no history.
+        RemoteError: No server can be reached.
+
+    """
+    from shmio.fabric.history import fetch  # noqa: PLC0415  most recordings are files
+
+    place = parse_place(name, arguments.credentials)
+    with Progress(f"reading the history of {place.cell}"):
+        return fetch(place, file, _date("--from", arguments.begin), _date("--to", arguments.end))
+
+
+def _date(option: str, text: str | None) -> int | None:
+    try:
+        return None if text is None else date_ns(text)
+    except (ValueError, TypeError):
+        raise RecordingError(
+            f"{option}: {text!r} is not a time such as 2026-11-21T08:30:00, which a history needs"
+        ) from None
 
 
 def _parse(option: str, text: str, start_ns: int) -> int:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from shmio.cli.common import dumps, say
-from shmio.cli.recordings.common import DamageReport, Progress, time_range
+from shmio.cli.recordings.common import DamageReport, Progress, local_files, time_range
 from shmio.errors import PathError, RecordingError
 from shmio.recording.dump import Chosen, Dump
 from shmio.recording.export import TABLES, BlockTables, export_events, export_mcap, pieces
@@ -35,7 +35,8 @@ def export(arguments: argparse.Namespace) -> int:
             f"{arguments.output}: --events writes one table; choose a name that ends in .csv or .parquet"
         )
     with (
-        report.open(arguments.files) as dump,
+        local_files(arguments) as files,
+        report.open(files) as dump,
         Progress(f"exporting to {arguments.output}") as progress,
     ):
         from_ns, to_ns = time_range(arguments, dump.begin_ns)

@@ -1,0 +1,37 @@
+"""The URL of a cell's history, which can stand in the place of a recording's file."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+from urllib.parse import urlsplit
+
+from shmio.errors import ConfigError, RecordingError
+from shmio.fabric.connection import Access
+from shmio.fabric.names import CellName
+
+
+class Place(NamedTuple):
+    """Where a cell's history is: the servers, and the cell."""
+
+    access: Access
+    cell: CellName
+
+
+def is_place(text: str) -> bool:
+    """Return whether a text names a cell's history, and not a file."""
+    return text.startswith(("nats://", "tls://"))
+
+
+def parse_place(text: str, credentials: str | None = None) -> Place:
+    """Parse ``nats://HOST:PORT/plant.line.cell``.
+
+    Raises:
+        RecordingError: The text is not such a URL.
+
+    """
+    parts = urlsplit(text)
+    try:
+        cell = CellName.parse(parts.path.strip("/"))
+    except ConfigError as error:
+        raise RecordingError(f"{text}: {error}") from None
+    return Place(Access((f"{parts.scheme}://{parts.netloc}",), credentials=credentials), cell)
