@@ -1,0 +1,314 @@
+"""The fabric between two hosts, which are network namespaces: a mirror under cut links.
+
+Usage (as root): python -m tests.faults.two_hosts [--calm SECONDS] [--cuts N] [--cut SECONDS] [--writes N] [--seed N]
+
+The near host runs the A50 cell, the server and the uplink. The far host runs a mirror, a recorder and a gRPC client.
+First the link works, and the two recordings must be equal. Then it is cut again and again: the mirror must turn bad
+within its stale age, recover, and deliver what it missed, in order and once. At last, programs write through the
+mirror while the link is cut at random, and each outcome must be true.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import shutil
+import statistics
+import struct
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+import shmio
+from shmio.model.values import OutcomeKind
+from shmio.segment import EventKind, Frame, Quality, Segment
+from shmio.testing.cell import BIN, until
+
+NEAR: Final = """
+[instance]
+name = "near{mark}"
+[[source]]
+name = "cell"
+connector = "s7"
+layout = "db201.db"
+host = "127.0.0.1"
+port = 1102
+period_ms = 20
+writable = ["Outputs", "Robot_*/*"]
+[[emulator]]
+name = "plc"
+kind = "s7"
+layout = "db201.db"
+program = "a50"
+listen = "127.0.0.1:1102"
+[recorder]
+[fabric]
+server = "embedded"
+listen = "10.77.{net}.1:4222"
+insecure = true
+cell = "plant1.line3.near"
+[[fabric.allow]]
+sender = "plant1.line3.far"
+roles = ["write"]
+"""
+FAR: Final = """
+[instance]
+name = "far{mark}"
+[[source]]
+name = "cell"
+connector = "fabric"
+cell = "plant1.line3.near"
+writable = ["Outputs", "Robot_*/*"]
+[recorder]
+[grpc]
+listen = ["unix:grpc.sock"]
+[fabric]
+server = "nats://10.77.{net}.1:4222"
+insecure = true
+cell = "plant1.line3.far"
+"""
+REGISTER: Final = "cell/Robot_800/Axs1_Pos"
+PATIENCE_S: Final = 60.0
+
+
+class Hosts:
+    """Two network namespaces with a link between them that can be cut."""
+
+    def __init__(self, mark: int) -> None:
+        self.names = (f"shmio-n{mark}", f"shmio-f{mark}")
+        self.net = mark % 250
+        self._link = f"shn{mark}", f"shf{mark}"
+
+    def __enter__(self) -> Hosts:
+        near, far = self._link
+        ip("link", "add", near, "type", "veth", "peer", "name", far)
+        for name, link, number in zip(self.names, self._link, (1, 2), strict=True):
+            ip("netns", "add", name)
+            ip("link", "set", link, "netns", name)
+            ip("-n", name, "addr", "add", f"10.77.{self.net}.{number}/24", "dev", link)
+            ip("-n", name, "link", "set", link, "up")
+            ip("-n", name, "link", "set", "lo", "up")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for name in self.names:
+            subprocess.run(["ip", "netns", "del", name], check=False)
+
+    def cut(self) -> None:
+        """Cut the link: packets are lost without a message."""
+        ip("-n", self.names[0], "link", "set", self._link[0], "down")
+
+    def restore(self) -> None:
+        """Restore the link."""
+        ip("-n", self.names[0], "link", "set", self._link[0], "up")
+
+    @contextmanager
+    def running(self, host: int, folder: Path, instance: str) -> Iterator[Segment]:
+        """Run the instance of a folder on a host; yield its segment."""
+        at = ["ip", "netns", "exec", self.names[host]]
+        up = subprocess.run(
+            [*at, BIN / "shmio-supervisor", "up", "--detach"], cwd=folder, capture_output=True, text=True, check=False
+        )
+        logs = "\n".join(file.read_text() for file in sorted((folder / "logs").glob("*.log")))
+        assert up.returncode == 0, f"{up.stdout}{up.stderr}\n{logs}"
+        try:
+            with Segment.open(instance) as segment:
+                yield segment
+        finally:
+            subprocess.run([BIN / "shmio-supervisor", "down"], cwd=folder, capture_output=True, check=False)
+
+
+def ip(*arguments: str) -> None:
+    subprocess.run(["ip", *arguments], check=True)
+
+
+class Watcher(threading.Thread):
+    """Follows all frames of the source ``cell`` of an instance."""
+
+    def __init__(self, cell: Segment) -> None:
+        super().__init__(daemon=True)
+        self._block = cell.blocks["cell"]
+        self._cursor = self._block.cursor()
+        self._ends = threading.Event()
+        self.frames: list[Frame] = []
+        self.start()
+
+    def run(self) -> None:
+        while not self._ends.is_set():
+            if (frame := self._cursor.next(0.2)) is not None:
+                self.frames.append(frame._replace(raw=frame.raw[:16], effective=None))
+
+    def await_frames(self, count: int) -> None:
+        until(lambda: len(self.frames) >= count, f"{count} frames come", PATIENCE_S)
+
+    def stop(self) -> list[Frame]:
+        self._ends.set()
+        self.join()
+        assert self._cursor.missed == 0, "the test missed frames"
+        return self.frames
+
+
+def is_good(cell: Segment) -> bool:
+    block = cell.blocks["cell"]
+    frame = block.latest()
+    return frame is not None and block.assess(frame)[0] is not Quality.BAD
+
+
+def calm(near: Segment, far: Segment, seconds: float) -> dict[str, Any]:
+    """Compare all frames of both hosts while the link works."""
+    there, here = Watcher(near), Watcher(far)
+    time.sleep(seconds)
+    source, mirror = there.stop(), here.stop()
+    first, last = mirror[0].cycle, min(mirror[-1].cycle, source[-1].cycle)
+    sent = {frame.cycle: frame for frame in source}
+    got = [frame for frame in mirror if first <= frame.cycle <= last and frame.cycle in sent]
+    wanted = [cycle for cycle in sent if first <= cycle <= last]
+    assert [frame.cycle for frame in got] == wanted, "a frame is missing, or comes twice"
+    for frame in got:
+        own = sent[frame.cycle]
+        assert (frame.raw, frame.source_ns, frame.quality) == (own.raw, own.source_ns, own.quality)
+    delays = [(frame.publish_ns - sent[frame.cycle].publish_ns) / 1e6 for frame in got]
+    return {"frames": len(got), "delay_ms": statistics.median(delays), "delay_max_ms": max(delays)}
+
+
+def cuts(hosts: Hosts, near: Segment, far: Segment, count: int, seconds: float) -> dict[str, Any]:
+    """Cut the link and restore it; check what the mirror publishes."""
+    stale_ms = far.blocks["cell"].stale_ns / 1e6
+    bad, good, delivered, late = [], [], 0, 0
+    for _ in range(count):
+        until(lambda: is_good(far), "the mirror is good", PATIENCE_S)
+        there, here = Watcher(near), Watcher(far)
+        here.await_frames(5)
+        hosts.cut()
+        cut_s = time.monotonic()
+        until(lambda: not is_good(far), "the mirror is bad", PATIENCE_S)
+        bad.append((time.monotonic() - cut_s) * 1e3)
+        time.sleep(max(0.0, seconds - (time.monotonic() - cut_s)))
+        hosts.restore()
+        restored_s = time.monotonic()
+        until(lambda: is_good(far), "the mirror is good again", PATIENCE_S)
+        good.append((time.monotonic() - restored_s) * 1e3)
+        time.sleep(1.0)
+        source, mirror = there.stop(), here.stop()
+        cycles = [frame.cycle for frame in mirror if frame.quality is not Quality.BAD]
+        assert cycles == sorted(set(cycles)), "the frames of the mirror are not in order, or come twice"
+        sent = [frame.cycle for frame in source if cycles[0] <= frame.cycle <= cycles[-1]]
+        missing = set(sent) - set(cycles)
+        assert not missing, f"{len(missing)} frames are missing"
+        delivered += len(cycles)
+        late += sum(frame.delay_us > 1e6 for frame in mirror)
+    return {
+        "cuts": count, "bad after, ms": [round(one) for one in bad], "stale_ms": stale_ms,
+        "good after, ms": [round(one) for one in good], "frames": delivered, "late": late,
+    }  # fmt: skip
+
+
+def writes(hosts: Hosts, near: Segment, far: Segment, count: int, chance: random.Random) -> dict[str, Any]:
+    """Write through the mirror while the link is cut at random; compare the outcomes with what the owner did."""
+    ends = threading.Event()
+
+    def disturb() -> None:
+        while not ends.wait(chance.uniform(0.5, 4.0)):
+            hosts.cut()
+            ends.wait(chance.uniform(0.1, 4.0))
+            hosts.restore()
+
+    events = near.blocks["cell"].events.cursor()
+    done: set[int] = set()
+    reader_ends = threading.Event()
+
+    def read() -> None:
+        while not reader_ends.is_set():
+            event = events.next(0.2)
+            if event is not None and event.kind in (EventKind.ACCEPTED, EventKind.WRITTEN) and event.data:
+                done.add(int.from_bytes(event.data, "big"))
+
+    reader, disturber = threading.Thread(target=read), threading.Thread(target=disturb)
+    reader.start()
+    disturber.start()
+    outcomes: dict[int, OutcomeKind] = {}
+    cell = shmio.attach(far.instance)
+    try:
+        for number in range(1, count + 1):
+            value = float(number)
+            try:
+                [outcome] = cell.set({REGISTER: value})
+            except shmio.errors.ShmioError as error:
+                print("write", number, error)
+                continue
+            outcomes[number] = outcome.kind
+            if outcome.kind is not OutcomeKind.WRITTEN:
+                time.sleep(0.05)
+    finally:
+        cell.close()
+        ends.set()
+        disturber.join()
+        hosts.restore()
+    until(lambda: is_good(far), "the mirror is good again", PATIENCE_S)
+    time.sleep(3.0)
+    reader_ends.set()
+    reader.join()
+    for number, kind in outcomes.items():
+        reached = int.from_bytes(struct.pack(">f", float(number)), "big") in done
+        if kind is OutcomeKind.WRITTEN:
+            assert reached, f"write {number} counts as written, but the owner did not see it"
+        elif kind is not OutcomeKind.UNKNOWN:
+            assert not reached, f"write {number} counts as {kind}, but the owner carried it out"
+    kinds = list(outcomes.values())
+    return {str(kind): kinds.count(kind) for kind in OutcomeKind if kind in kinds}
+
+
+def compare(folders: Sequence[Path]) -> str:
+    """Compare the recordings of both hosts; return what differs, empty if nothing does."""
+    files = [sorted((folder / "dumps").glob("*.mem"))[0] for folder in folders]
+    done = subprocess.run(
+        [BIN / "shmio-dump", "diff", *files, "--ignore", "times,events,ends"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return done.stdout if done.returncode else ""
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--calm", type=float, default=10.0)
+    parser.add_argument("--cuts", type=int, default=10)
+    parser.add_argument("--cut", type=float, default=30.0)
+    parser.add_argument("--writes", type=int, default=1000)
+    parser.add_argument("--seed", type=int, default=1)
+    arguments = parser.parse_args()
+    mark = os.getpid() % 10_000
+    root = Path(__file__).parents[2]
+    with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
+        folders = [Path(name) / "near", Path(name) / "far"]
+        hosts = stack.enter_context(Hosts(mark))
+        for folder, text in zip(folders, (NEAR, FAR), strict=True):
+            folder.mkdir()
+            shutil.copy(root / "db201.db", folder)
+            (folder / "supervisor.toml").write_text(text.format(mark=mark, net=hosts.net))
+        with (
+            hosts.running(0, folders[0], f"near{mark}") as near,
+            hosts.running(1, folders[1], f"far{mark}") as far,
+        ):
+            until(lambda: is_good(far), "the mirror is good", PATIENCE_S)
+            print("calm:", calm(near, far, arguments.calm), flush=True)
+            if arguments.cuts:
+                print("cuts:", cuts(hosts, near, far, arguments.cuts, arguments.cut), flush=True)
+            if arguments.writes:
+                chance = random.Random(arguments.seed)
+                print("writes:", writes(hosts, near, far, arguments.writes, chance), flush=True)
+        difference = compare(folders)
+        print("recordings:", difference or "equal", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
