@@ -274,7 +274,7 @@ def make_plan(
     for source in config.source:
         keys: dict[str, Any] = {"snapshots": str(config.snapshot_dir)} if source.name in computed else {}
         if source.connector == "fabric" and config.fabric is not None:
-            keys["fabric"] = fabric_access(config.fabric)
+            keys["fabric"] = mirror_settings(config.fabric)
         sections.append((source.name, "source", msgspec.to_builtins(source) | keys))
     if config.grpc and mode != "log":
         place = {"group": config.instance.group, "config_file": str(config_file.resolve())}
@@ -342,11 +342,9 @@ def process_names(config: Config) -> list[str]:
     return [*names, "recorder"] if config.recorder else names
 
 
-def fabric_access(fabric: Fabric) -> dict[str, Any]:
-    """Return what a process needs to connect to the fabric, and the instance's name in it."""
-    servers = [f"nats://{fabric.listen}"] if fabric.embedded else fabric.servers
-    tls, credentials = msgspec.to_builtins(fabric.tls), fabric.credentials
-    return {"servers": servers, "tls": tls, "credentials": credentials, "cell": fabric.cell}
+def mirror_settings(fabric: Fabric) -> dict[str, Any]:
+    """Return what the process of a mirror needs to connect to the fabric, and the instance's name in it."""
+    return {"access": msgspec.to_builtins(Access.of(fabric)), "cell": fabric.cell}
 
 
 def _folders(config: Config) -> dict[str, str]:

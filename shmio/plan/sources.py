@@ -17,6 +17,7 @@ from shmio.connectors import registry
 from shmio.connectors.base import Computed, Connector, Mirrored, Replayed
 from shmio.connectors.models.simulation import Answer, Request, Simulation
 from shmio.errors import ConfigError, PathError, RecordingError, RemoteError, ShmioError, ValueRangeError
+from shmio.fabric.connection import Access
 from shmio.fabric.place import is_place, parse_place
 from shmio.layout.document import load_layout
 from shmio.layout.image import initial_frame
@@ -25,7 +26,6 @@ from shmio.layout.topic import find, parse_topic
 from shmio.layout.values.codec import codec
 from shmio.local.replays import date_ns
 from shmio.plan.layouts import LayoutFiles
-from shmio.plan.processes import fabric_access
 from shmio.plan.replay import Recordings
 from shmio.wording import near, unknown
 
@@ -241,7 +241,7 @@ def _mirrored(key: str, source: Source, config: Config, files: LayoutFiles) -> L
 
     It comes from the registry, with the period and the stale age, unless the configuration names files.
     """
-    from shmio.connectors.fabric.source import CACHE, Mirror, Settings, offered  # noqa: PLC0415
+    from shmio.connectors.fabric.source import CACHE, Mirror, offered  # noqa: PLC0415
 
     if config.fabric is None:
         raise ConfigError(f"{key}.connector: a mirror needs a table [fabric] with the server's address")
@@ -252,7 +252,7 @@ def _mirrored(key: str, source: Source, config: Config, files: LayoutFiles) -> L
         return files.get(key, source, None)
     file = config.log_dir / CACHE.format(source.name)
     try:
-        offer, old = offered(mirror, msgspec.convert(fabric_access(config.fabric), Settings).access, file)
+        offer, old = offered(mirror, Access.of(config.fabric), file)
     except ConfigError as error:
         raise ConfigError(f"{key}.{error}") from None
     if old:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import msgspec
 
-from shmio.config.model import MqttTls
 from shmio.connectors.base import Mirrored
 from shmio.connectors.fabric.link import call_once
 from shmio.errors import ConfigError, RemoteError
@@ -30,17 +29,10 @@ CACHE: Final = "{}.mirrored.json"
 
 
 class Settings(msgspec.Struct, frozen=True):
-    """What a mirror's process needs from the section ``[fabric]``."""
+    """What a mirror's process needs from the section ``[fabric]``: the servers, and the instance's name."""
 
-    servers: tuple[str, ...]
-    tls: MqttTls | None = None
-    credentials: str | None = None
+    access: Access
     cell: str | None = None
-
-    @property
-    def access(self) -> Access:
-        """The servers, and what to present to them."""
-        return Access(self.servers, self.tls, self.credentials)
 
     @property
     def sender(self) -> CellName | None:

@@ -48,10 +48,10 @@ STREAM = 11
 
 
 def frame(number: int, count: int, **told: Any) -> Frame:
-    values: dict[str, Any] = {"quality": Quality.GOOD, "provenance": Provenance.SIMULATED, "reason": "", "effective": None} | told
+    values: dict[str, Any] = {"quality": Quality.GOOD, "provenance": Provenance.SIMULATED, "reason": ""} | told
     return Frame(
         number, 1000 + number, 0, number, 5 * S + number, 3, values["quality"], values["provenance"], 0, 250,
-        values["reason"], struct.pack(">HH", count, 0), values["effective"],
+        values["reason"], struct.pack(">HH", count, 0), values.get("effective"),
     )  # fmt: skip
 
 
