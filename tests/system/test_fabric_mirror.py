@@ -1,0 +1,127 @@
+"""Two instances that the fabric joins: the far one mirrors a source of the near one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+import shmio
+from shmio.model.values import OutcomeKind, Quality
+from shmio.testing.cell import Cell, until
+from shmio.testing.ports import reserved_port
+
+TAGS = """
+[registers]
+speed = { type = "REAL", comment = "of the belt" }
+count = { type = "DINT" }
+"""
+NEAR = """
+[instance]
+name = "{instance}n"
+[[source]]
+name = "belt"
+connector = "memory"
+tags = "tags.toml"
+period_ms = 20
+writable = ["**"]
+[fabric]
+server = "embedded"
+listen = "{nats}"
+cell = "plant1.line3.near"
+[[fabric.allow]]
+sender = "plant1.line3.far"
+roles = ["write"]
+"""
+FAR = """
+[instance]
+name = "{instance}f"
+[[source]]
+name = "mirrored"
+connector = "fabric"
+cell = "plant1.line3.near"
+source = "belt"
+writable = ["speed"]
+[fabric]
+server = "nats://{nats}"
+cell = "plant1.line3.far"
+"""
+
+
+@pytest.fixture
+def cells(tmp_path: Path, instance: str) -> Iterator[tuple[Cell, Cell]]:
+    with reserved_port() as nats, ExitStack() as stack:
+        found = []
+        for mark, text in (("n", NEAR), ("f", FAR)):
+            folder = tmp_path / mark
+            folder.mkdir()
+            (folder / "supervisor.toml").write_text(text.format(instance=instance, nats=nats))
+            found.append(Cell(folder, f"{instance}{mark}", nats))
+            stack.callback(found[-1].supervisor, "down")
+        near, far = found
+        (near.folder / "tags.toml").write_text(TAGS)
+        near.up()
+        far.up()
+        yield near, far
+
+
+def test_a_mirror_shows_what_the_owner_has_and_passes_writes_on(cells: tuple[Cell, Cell]) -> None:
+    near, far = cells
+    with shmio.attach(near.instance, writable=True) as owner, shmio.attach(far.instance, writable=True) as mirror:
+        [outcome] = owner.set({"belt/speed": 1.5})
+        assert outcome.kind is OutcomeKind.WRITTEN
+        until(lambda: mirror.get("mirrored/speed")[0].value == 1.5, "the mirror has the owner's value")
+        [reading] = mirror.get("mirrored/speed")
+        [own] = owner.get("belt/speed")
+        assert (reading.quality, reading.provenance, reading.source_time) == (
+            Quality.GOOD,
+            own.provenance,
+            own.source_time,
+        )
+        assert reading.register.comment == "of the belt"
+
+        [outcome] = mirror.set({"mirrored/speed": 2.5})
+        assert (outcome.kind, outcome.reason) == (OutcomeKind.WRITTEN, "")
+        assert owner.get("belt/speed")[0].value == 2.5
+        until(lambda: mirror.get("mirrored/speed")[0].value == 2.5, "the mirror shows its own write")
+
+
+def test_a_mirror_is_bad_while_the_owner_is_away(cells: tuple[Cell, Cell]) -> None:
+    near, far = cells
+    with shmio.attach(far.instance) as mirror:
+        until(lambda: mirror.get("mirrored/count")[0].quality is Quality.GOOD, "the mirror is good")
+        near.down()
+        until(lambda: mirror.get("mirrored/count")[0].quality is Quality.BAD, "the mirror is bad")
+        near.up()
+        until(lambda: mirror.get("mirrored/count")[0].quality is Quality.GOOD, "the mirror is good again")
+
+
+def test_a_mirror_follows_a_change_of_the_layout(cells: tuple[Cell, Cell]) -> None:
+    near, far = cells
+    with shmio.attach(far.instance) as mirror:
+        until(lambda: mirror.get("mirrored/count")[0].quality is Quality.GOOD, "the mirror is good")
+        (near.folder / "tags.toml").write_text(TAGS + 'torque = { type = "REAL" }\n')
+        near.output("shmio-supervisor", "reload")
+
+        def has_torque() -> bool:
+            try:
+                return mirror.get("mirrored/torque")[0].quality is Quality.GOOD
+            except shmio.errors.PathError:
+                return False
+
+        until(has_torque, "the mirror has the new register")
+
+
+def test_faults_in_the_configuration_of_a_mirror_are_named(cells: tuple[Cell, Cell]) -> None:
+    _, far = cells
+    file = far.folder / "supervisor.toml"
+    text = file.read_text()
+    file.write_text(text.replace('source = "belt"', 'source = "bolt"'))
+    done = far.supervisor("check")
+    assert done.returncode == 1
+    assert "source[0].source" in done.stderr
+    assert "did you mean 'belt'" in done.stderr
+    file.write_text(text.replace('cell = "plant1.line3.near"', 'cell = "plant1.line3.neer"'))
+    assert "did you mean 'plant1.line3.near'" in far.supervisor("check").stderr
