@@ -83,7 +83,7 @@ def test_a_mirror_shows_what_the_owner_has_and_passes_writes_on(cells: tuple[Cel
         assert reading.register.comment == "of the belt"
 
         [outcome] = mirror.set({"mirrored/speed": 2.5})
-        assert (outcome.kind, outcome.reason) == (OutcomeKind.WRITTEN, "")
+        assert (outcome.kind, outcome.text) == (OutcomeKind.WRITTEN, "")
         assert owner.get("belt/speed")[0].value == 2.5
         until(lambda: mirror.get("mirrored/speed")[0].value == 2.5, "the mirror shows its own write")
 
