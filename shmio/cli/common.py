@@ -108,9 +108,11 @@ class _VerbParser(argparse.ArgumentParser):
         return found, rest
 
 
-def add_verbs(parser: argparse.ArgumentParser) -> argparse._SubParsersAction[argparse.ArgumentParser]:
+def add_verbs(
+    parser: argparse.ArgumentParser, dest: str = "verb"
+) -> argparse._SubParsersAction[argparse.ArgumentParser]:
     """Return the object with which to add verbs to a command."""
-    return parser.add_subparsers(dest="verb", required=True, metavar="VERB", parser_class=_VerbParser)
+    return parser.add_subparsers(dest=dest, required=True, metavar="VERB", parser_class=_VerbParser)
 
 
 def complete(parser: argparse.ArgumentParser) -> None:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from shmio.cli import completion, inject, read, replay, snapshot, step
 from shmio.cli import set as set_verb
-from shmio.cli.common import add_json, add_verbs, complete, ended_by_interrupt, run
+from shmio.cli.common import add_json, add_verbs, complete, ended_by_interrupt, load, run
 from shmio.config.address import UNIX, Address
 from shmio.errors import ConfigError, UnknownClientError
 from shmio.layout.spelling import may_be_tia_spelling, topic_path
@@ -22,6 +22,7 @@ from shmio.version import __version__
 
 PROGRAM = "shmio"
 
+FABRIC_HELP = "See all cells of a fabric, and configure its servers: see docs/how-to/join-hosts.md."
 SHELL_HELP = "Print the code with which a shell completes command lines: see docs/reference/cli-shmio.md."
 
 
@@ -71,6 +72,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(set_verb.shield(words) if words[:1] in (["set"], ["inject"]) else words)
 
     def command() -> int:
+        if arguments.verb == "fabric":
+            return load("shmio.cli.fabric.verbs:execute")(arguments)
         verb: Verb | None = VERBS.get(arguments.verb)
         if verb is None:
             print(completion.script(arguments.shell))
@@ -171,6 +174,10 @@ def _parser() -> argparse.ArgumentParser:
     for name, verb in VERBS.items():
         sub = verbs.add_parser(name, parents=[common], help=verb.help, description=verb.help)
         verb.arguments(sub)
+    if find_spec("shmio.fabric") is not None:  # not part of shmio-client
+        from shmio.cli.fabric.verbs import add_arguments  # noqa: PLC0415
+
+        add_arguments(verbs.add_parser("fabric", help=FABRIC_HELP, description=FABRIC_HELP))
     shell = verbs.add_parser("completion", help=SHELL_HELP, description=SHELL_HELP)
     shell.add_argument("shell", choices=completion.SHELLS, metavar="SHELL", help=", ".join(completion.SHELLS))
     return parser

@@ -1,4 +1,4 @@
-"""The NATS client, changed so that it leaves a dead connection at once.
+"""The NATS client, changed so that it leaves a dead connection at once, and flushes reliably.
 
 Import this module only when nats-py is installed.
 """
@@ -6,8 +6,12 @@ Import this module only when nats-py is installed.
 from __future__ import annotations
 
 import asyncio
+from contextlib import suppress
+from typing import Final
 
-from nats.aio.client import Client, Srv
+from nats.aio.client import PING_PROTO, Client, Srv
+
+CLOSE_S: Final = 1.0
 
 
 class FabricClient(Client):
@@ -28,6 +32,19 @@ class FabricClient(Client):
     async def _connect_to_server(self, s: Srv) -> None:
         self._abort()  # of an attempt that failed: the library would leave its socket open
         await super()._connect_to_server(s)
+
+    async def _send_ping(self, future: asyncio.Future[bool] | None = None) -> None:
+        """Send a ping behind all that waits to be sent: the library's ping overtakes it, so flush() ends too soon."""
+        self._pongs.append(asyncio.Future() if future is None else future)
+        await self._send_command(PING_PROTO)
+        await self._flush_pending()
+
+    async def abandon(self) -> None:
+        """Close a connection that was not established. After a failed TLS handshake, close() waits for ever."""
+        self._abort()
+        with suppress(TimeoutError):
+            async with asyncio.timeout(CLOSE_S):
+                await self.close()
 
     def _abort(self) -> None:
         writer = getattr(self._transport, "_io_writer", None)

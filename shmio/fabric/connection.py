@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import ssl
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -119,16 +119,32 @@ async def connect(
         **_tls(access),
         **read_credentials(access),
     }
+    client = FabricClient()
     try:
-        client = FabricClient()
         await client.connect(**options)
-    except errors.AuthorizationError:
-        raise RemoteError(f"{access}: the server refuses these credentials; check fabric.credentials") from None
     except (OSError, errors.Error) as error:  # a time-out is an OSError
-        raise RemoteError(
-            f"{access}: no NATS server can be reached: {_said(problem[-1] if problem else error)}"
-        ) from None
+        await client.abandon()
+        why = problem[-1] if problem else error
+        if isinstance(why, errors.AuthorizationError) or "authorization violation" in str(why).lower():
+            raise RemoteError(f"{access}: {_refused(access)}") from None
+        raise RemoteError(f"{access}: no NATS server can be reached: {_said(why)}") from None
     return client
+
+
+async def call_once(access: Access, work: Callable[[Client], Coroutine[Any, Any, Any]]) -> Any:
+    """Connect once, and return the result of ``work`` with the connection.
+
+    Raises:
+        RemoteError: No server can be reached, or it does not answer.
+
+    """
+    client = await connect(access, "shmio", patient=False)
+    try:
+        return await work(client)
+    except (TimeoutError, library("nats.errors", INSTALL).Error) as error:
+        raise RemoteError(f"{access}: {error or 'the server does not answer'}") from None
+    finally:
+        await client.close()
 
 
 def _tls(access: Access) -> dict[str, Any]:
@@ -178,7 +194,36 @@ def read_credentials(access: Access) -> dict[str, Any]:
             f"fabric.credentials: {access.credentials} is neither a .creds file nor the seed of a user's NKey, which "
             "begins with SU"
         )
-    return {"nkeys_seed_str": seed}
+    return {"nkeys_seed_str": seed, "inbox_prefix": inbox_prefix(public_key(seed, access.credentials))}
+
+
+def public_key(seed: str, file: str | Path) -> str:
+    """Return the public NKey of a user's seed.
+
+    Raises:
+        ConfigError: The text is not a seed. The message names the file.
+
+    """
+    nkeys = library("nkeys", INSTALL)
+    try:
+        key: str = nkeys.from_seed(bytearray(seed, "ascii")).public_key.decode()
+    except (nkeys.NkeysError, ValueError):
+        raise ConfigError(f"fabric.credentials: {file}: the seed is damaged; copy the file again") from None
+    return key
+
+
+def inbox_prefix(key: str) -> str:
+    """Return the beginning of the subjects at which the user with this public NKey receives replies.
+
+    Each user has another one, so that a server can keep a user from reading the replies to others.
+    """
+    return f"_INBOX.{key}"
+
+
+def _refused(access: Access) -> str:
+    if access.credentials is None:
+        return "the server asks for credentials; name the file with this host's seed in fabric.credentials"
+    return f"the server does not know the credentials in {access.credentials}, or has removed them"
 
 
 def _said(error: BaseException) -> str:

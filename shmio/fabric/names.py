@@ -48,6 +48,11 @@ class CellName(NamedTuple):
         """The subject on which the cell publishes its state."""
         return f"{self.subject}.status"
 
+    @property
+    def history(self) -> str:
+        """The name of the JetStream stream that keeps what the cell has published."""
+        return "-".join((ROOT, *self))
+
     def live(self, source: str) -> str:
         """Return the subject of a source's new frames and events."""
         return f"{self.subject}.{token(source)}.live"

@@ -6,9 +6,10 @@ each ``RENEW_S``. An entry that is older than ``DEAD_S`` belongs to a cell that 
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 from datetime import datetime
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 import zstandard
@@ -27,9 +28,13 @@ CELLS: Final = "shmio_cells"
 """Bucket of the cells."""
 LAYOUTS: Final = "shmio_layouts"
 """Bucket of the layouts, by their hash."""
+BUCKETS: Final = (CELLS, LAYOUTS)
 RENEW_S: Final = 2.0
 DEAD_S: Final = 10.0
 MAX_LAYOUT_BYTES: Final = 64 << 20
+MAX_REQUESTS: Final = 256
+"""Maximum number of entries that are requested at the same time."""
+TIMEOUT_S: Final = 5.0
 _INSTALL: Final = "pip install 'shmio[fabric]'"
 
 
@@ -169,37 +174,43 @@ class Registry:
 
     async def find(self, cell: CellName | str) -> Seen | None:
         """Return a cell's entry; None if the registry does not have it."""
-        errors = library("nats.js.errors", _INSTALL)
-        try:
-            found = await self._cells.get(str(cell))
-        except errors.KeyNotFoundError:
-            return None
-        return await self._seen(found)
+        _, now = await self._keys(CELLS, str(cell))
+        return await self._find(str(cell), now)
 
     async def cells(self) -> list[Seen]:
         """Return all cells, in the order of their names."""
+        keys, now = await self._keys(CELLS)
+        found: list[Seen] = []
+        for at in range(0, len(keys), MAX_REQUESTS):
+            some = await asyncio.gather(*(self._find(key, now) for key in keys[at : at + MAX_REQUESTS]))
+            found += [seen for seen in some if seen is not None]
+        return found
+
+    async def _find(self, key: str, now: float) -> Seen | None:
+        """Return the entry with a key; ``now`` is the server's time."""
         errors = library("nats.js.errors", _INSTALL)
         try:
-            keys = await self._cells.keys()
-        except errors.NoKeysError:
-            return []
-        found = [await self.find(key) for key in sorted(keys)]
-        return [seen for seen in found if seen is not None]
-
-    async def _seen(self, found: Any) -> Seen | None:
-        message = await self._client.jetstream().get_msg(f"KV_{CELLS}", seq=found.revision)
-        now = await self._server_time()
-        try:
-            entry = msgspec.json.decode(found.value or b"", type=CellEntry)
-        except msgspec.MsgspecError:
-            return None  # not from shmio, or damaged
+            message = await self._client.jetstream().get_msg(f"KV_{CELLS}", subject=f"$KV.{CELLS}.{key}")
+            entry = msgspec.json.decode(message.data or b"", type=CellEntry)
+        except (errors.NotFoundError, msgspec.MsgspecError):
+            return None  # removed, or not from shmio
+        if entry.cell != key or message.seq is None:
+            return None
         age_s = 0.0 if message.time is None else max(0.0, now - message.time.timestamp())
-        return Seen(entry, age_s, found.revision)
+        return Seen(entry, age_s, message.seq)
 
-    async def _server_time(self) -> float:
-        """Return the server's time, as entries have it: the clocks of the hosts may differ."""
-        answer = await self._client.request(f"$JS.API.STREAM.INFO.KV_{CELLS}")
-        return datetime.fromisoformat(msgspec.json.decode(answer.data, type=_StreamInfo).ts).timestamp()
+    async def _keys(self, bucket: str, pattern: str = ">") -> tuple[list[str], float]:
+        """Return the keys of a bucket, sorted, and the server's time: the clocks of the hosts may differ.
+
+        The library lists keys by a consumer. A user who may create consumers may let the server send
+        what is stored to any subject, so the users of the fabric may not.
+        """
+        start = f"$KV.{bucket}."
+        request = msgspec.json.encode({"subjects_filter": start + pattern})
+        answer = await self._client.request(f"$JS.API.STREAM.INFO.KV_{bucket}", request, timeout=TIMEOUT_S)
+        info = msgspec.json.decode(answer.data, type=_StreamInfo)
+        now = datetime.fromisoformat(info.ts).timestamp()
+        return sorted(subject.removeprefix(start) for subject in info.state.subjects or ()), now
 
     async def put_layout(self, layout: Layout) -> None:
         """Store a layout, unless the registry has it already."""
@@ -216,11 +227,7 @@ class Registry:
             RemoteError: The registry does not have it, or it is damaged.
 
         """
-        errors = library("nats.js.errors", _INSTALL)
-        try:
-            keys = await self._layouts.keys()
-        except errors.NoKeysError:
-            keys = []
+        keys, _ = await self._keys(LAYOUTS)
         return await self.layout(next((key for key in keys if key.startswith(head.hex())), head.hex()))
 
     async def layout(self, digest: str) -> Layout:
@@ -244,8 +251,13 @@ class Registry:
         return load_layout(data)
 
 
+class _StreamState(msgspec.Struct):
+    subjects: dict[str, int] | None = None
+
+
 class _StreamInfo(msgspec.Struct):
     ts: str
+    state: _StreamState
 
 
 async def _bucket(client: Client, name: str, replicas: int) -> KeyValue:
@@ -256,8 +268,31 @@ async def _bucket(client: Client, name: str, replicas: int) -> KeyValue:
         try:
             return await stream.key_value(name)
         except errors.BucketNotFoundError:
-            return await stream.create_key_value(bucket=name, history=1, replicas=replicas)
+            await _create(client, name, replicas)
+            return await stream.key_value(name)
     except (errors.ServiceUnavailableError, nats_errors.NoRespondersError):
         raise RemoteError("the NATS server has no JetStream; start it with -js, or set jetstream in its file") from None
     except (errors.APIError, nats_errors.TimeoutError) as error:
-        raise RemoteError(f"the NATS server does not give access to its bucket {name}: {error}") from None
+        raise RemoteError(
+            f"the NATS server does not give access to its bucket {name}: {error}; if shmio fabric server-config made "
+            "its configuration, run shmio fabric prepare once with the administrator's seed"
+        ) from None
+
+
+async def _create(client: Client, name: str, replicas: int) -> None:
+    """Create a bucket. A layout is stored once: nobody can replace it.
+
+    Roll-ups are not allowed: by them, a cell that may write only its own key could remove all others.
+    """
+    api = library("nats.js.api", _INSTALL)
+    config = api.StreamConfig(
+        name=f"KV_{name}",
+        subjects=[f"$KV.{name}.>"],
+        discard=api.DiscardPolicy.NEW,
+        discard_new_per_subject=name == LAYOUTS,
+        max_msgs_per_subject=1,
+        allow_rollup_hdrs=False,
+        deny_delete=True,
+        num_replicas=replicas,
+    )
+    await client.jetstream().add_stream(config)

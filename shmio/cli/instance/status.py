@@ -50,16 +50,16 @@ def _table(status: InstanceStatus) -> list[str]:
     supervisor = status.supervisor
     facts = [f"{status.instance}: {status.state}", f"mode {status.mode}", f"segment {status.segment}"]
     if supervisor:
-        facts.append(f"supervisor pid {supervisor.pid}, up {_duration(supervisor.uptime_s)}")
+        facts.append(f"supervisor pid {supervisor.pid}, up {duration(supervisor.uptime_s)}")
     lines = [", ".join(facts)]
     if status.note:
         lines.append(status.note)
     if status.clock and status.clock.mode != "wall":
         lines.append(clock_line(status.clock))
-    return lines + _columns([_HEADINGS, *(_row(process) for process in status.processes)])
+    return lines + columns([_HEADINGS, *(_row(process) for process in status.processes)])
 
 
-def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
+def columns(rows: Sequence[Sequence[str]]) -> list[str]:
     """Return rows as lines with aligned columns."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]) - 1)]
     padded = ([*(cell.ljust(width) for cell, width in zip(row, widths, strict=False)), row[-1]] for row in rows)
@@ -81,7 +81,7 @@ def _row(process: ProcessStatus) -> tuple[str, ...]:
     if process.kind == "mqtt" and (missed := process.counters.get("missed")):
         details.append(f"{counted(missed, 'frame')} missed")
     pid = "-" if process.pid is None else str(process.pid)
-    uptime = _duration(process.uptime_s)
+    uptime = duration(process.uptime_s)
     return process.name, process.kind, process.state, pid, str(process.restarts), uptime, "; ".join(details)
 
 
@@ -95,7 +95,8 @@ def _said(process: ProcessStatus) -> bool:
     )
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """Return a time in s as text, such as ``2 h 10 min``."""
     whole = int(seconds)
     days, hours, minutes = whole // 86400, whole // 3600 % 24, whole // 60 % 60
     if days:
@@ -164,4 +165,4 @@ def _list_table(found: list[Listed]) -> list[str]:
     for one in found:
         listen = ", ".join(f"{process} {' '.join(addresses)}" for process, addresses in one.listen.items())
         rows.append((one.name, one.state, one.file or "-", "; ".join(filter(None, (listen, one.note))) or "-"))
-    return _columns(rows)
+    return columns(rows)

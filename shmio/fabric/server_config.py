@@ -1,0 +1,142 @@
+"""Makes the configuration of the NATS servers of a fabric: their users, and what each may do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final, Literal, NamedTuple
+
+import msgspec
+
+from shmio.config.address import Address
+from shmio.config.model import MqttTls
+from shmio.fabric.messages import MAX_MESSAGE_BYTES
+from shmio.fabric.names import CellName
+from shmio.fabric.permissions import (
+    EVERYTHING,
+    Permissions,
+    cell_permissions,
+    history_reader_permissions,
+    viewer_permissions,
+)
+
+ROUTE_PORTS: Final = 2000
+"""The servers of a cluster connect to each other at the port for clients plus this number."""
+MAX_UNSENT_BYTES: Final = 64 << 20
+"""Maximum size of what waits for a slow client. Beyond it, the server disconnects the client."""
+ROUTE_USER: Final = "shmio"
+CLUSTER: Final = "shmio"
+
+Kind = Literal["admin", "cell", "viewer", "history-reader"]
+
+
+class User(NamedTuple):
+    """A user of the servers. ``key`` is the public NKey."""
+
+    kind: Kind
+    name: str
+    key: str
+
+
+class ServerSettings(msgspec.Struct):
+    """What all servers of a fabric share.
+
+    Attributes:
+        listen: Addresses for clients, one for each server. Several servers are a cluster.
+        store: Directory in which a server keeps its streams.
+        tls: PEM files of the servers; with ``ca``, clients need a certificate, too. None: without TLS.
+        insecure: True if other hosts may connect without TLS.
+        route_password: With it, the servers of a cluster accept each other.
+
+    """
+
+    listen: list[str]
+    store: str
+    tls: MqttTls | None = None
+    insecure: bool = False
+    route_password: str = ""
+
+
+def server_configuration(settings: ServerSettings, index: int, users: Sequence[User]) -> str:
+    """Return the configuration file of one server.
+
+    Args:
+        settings: What all servers share.
+        index: Which of ``settings.listen`` the server is.
+        users: Who may connect.
+
+    """
+    listen = Address.parse(settings.listen[index])
+    name = f"shmio-{index + 1}"
+    alone = len(settings.listen) == 1
+    store = settings.store if alone else f"{settings.store}/{name}"
+    sections: dict[str, Any] = {
+        "host": listen.host,
+        "port": listen.port,
+        "server_name": name,
+        "max_payload": MAX_MESSAGE_BYTES,
+        "max_pending": MAX_UNSENT_BYTES,
+        "jetstream": {"store_dir": store},
+    }
+    if settings.tls is not None:
+        sections["tls"] = _tls(settings.tls)
+    if not alone:
+        sections["cluster"] = _cluster(settings, index)
+    lines = [
+        "# shmio fabric server-config wrote this file, and replaces it: run the command again instead of editing.",
+        *(f"{key}: {_text(value)}" for key, value in sections.items()),
+        "authorization: {",
+        "  users: [",
+    ]
+    streams = tuple(CellName.parse(user.name).history for user in users if user.kind == "cell")
+    for user in users:
+        allowed = _permissions(user, streams)
+        entry = {
+            "nkey": user.key,
+            "permissions": {
+                "publish": {"allow": allowed.publish},
+                "subscribe": {"allow": allowed.subscribe},
+            },
+        }
+        lines += [f"    # {user.kind} {user.name}".rstrip(), f"    {_text(entry)}"]
+    return "\n".join([*lines, "  ]", "}", ""])
+
+
+def _text(value: Any) -> str:
+    return msgspec.json.encode(value).decode()
+
+
+def _permissions(user: User, streams: tuple[str, ...]) -> Permissions:
+    if user.kind == "cell":
+        cell = CellName.parse(user.name)
+        return cell_permissions(cell, user.key, cell.history)
+    if user.kind == "viewer":
+        return viewer_permissions(user.key)
+    return history_reader_permissions(user.key, streams) if user.kind == "history-reader" else EVERYTHING
+
+
+def _tls(tls: MqttTls) -> dict[str, Any]:
+    files = {"cert_file": tls.certificate, "key_file": tls.key}
+    return files if tls.ca is None else {**files, "ca_file": tls.ca, "verify": True}
+
+
+def _cluster(settings: ServerSettings, index: int) -> dict[str, Any]:
+    routes = [_route(address) for address in settings.listen]
+    others = [
+        f"nats-route://{ROUTE_USER}:{settings.route_password}@{route}"
+        for number, route in enumerate(routes)
+        if number != index
+    ]
+    found: dict[str, Any] = {
+        "name": CLUSTER,
+        "listen": str(routes[index]),
+        "authorization": {"user": ROUTE_USER, "password": settings.route_password},
+        "routes": others,
+    }
+    if settings.tls is not None:
+        found["tls"] = _tls(settings.tls)
+    return found
+
+
+def _route(listen: str) -> Address:
+    address = Address.parse(listen)
+    return Address(address.host, address.port + ROUTE_PORTS)
