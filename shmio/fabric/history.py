@@ -39,11 +39,6 @@ _S: Final = 1_000_000_000
 log = logging.getLogger("shmio.fabric")
 
 
-def stream_of(cell: CellName) -> str:
-    """Return the name of the stream that keeps the history of a cell."""
-    return "shmio-" + "-".join(cell)
-
-
 class _Piece(NamedTuple):
     """A frame, event or gap of a source, with its log time."""
 
@@ -156,7 +151,7 @@ async def _messages(client: Client, cell: CellName, begin_ns: int | None, end_ns
     config |= {"ack_policy": api.AckPolicy.NONE, "inactive_threshold": 60.0}
     try:
         reader = await stream.pull_subscribe(
-            f"{cell.subject}.*.*", stream=stream_of(cell), config=api.ConsumerConfig(**config)
+            f"{cell.subject}.*.*", stream=cell.history, config=api.ConsumerConfig(**config)
         )
     except errors.NotFoundError:
         raise RemoteError(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from shmio.cli.common import ended_by_interrupt
 from shmio.cli.target import target
+from shmio.config.fabric import SCHEMES
 from shmio.config.model import MqttTls
 from shmio.config.read import load
 from shmio.errors import ConfigError, ControlError, NotRunningError
@@ -37,7 +38,7 @@ def access(options: argparse.Namespace) -> Access:
     if options.config is not None or options.instance is not None:
         raise ConfigError("--server already names the fabric; remove -c and --instance")
     for url in options.server:
-        if not url.startswith(("nats://", "tls://")):
+        if not url.startswith(tuple(f"{scheme}://" for scheme in SCHEMES)):
             raise ConfigError(f"--server: {url!r} is not a NATS server; write nats://HOST:4222 or tls://HOST:4222")
     if (options.certificate is None) != (options.key is None):
         raise ConfigError("--certificate: give both --certificate and --key, or neither")

@@ -13,8 +13,8 @@ from typing import Final
 import msgspec
 
 from shmio.cli.common import dumps
-from shmio.cli.fabric.verbs import LISTEN
 from shmio.config.address import Address
+from shmio.config.fabric import LISTEN
 from shmio.config.model import MqttTls
 from shmio.config.tls import server_context
 from shmio.errors import ConfigError

@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Final
 
 from shmio.cli.common import add_json, add_verbs, at_least, load
-
-LISTEN: Final = "127.0.0.1:4222"
-"""Address of a new server."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -70,7 +66,7 @@ def _add_server_config(parser: argparse.ArgumentParser) -> None:
         ("--history-reader", "readers", "NAME", "add viewers who may also read the histories of the cells"),
     ):
         parser.add_argument(option, dest=dest, nargs="+", action="extend", default=[], metavar=name, help=text)
-    text = f"address for clients (default: {LISTEN}); several: one for each server of a cluster"
+    text = "address for clients (default: 127.0.0.1:4222); several: one for each server of a cluster"
     parser.add_argument("--listen", nargs="+", metavar="HOST:PORT", help=text)
     text = "a server keeps its data in the folder jetstream there (default: DIR)"
     parser.add_argument("--store", type=Path, metavar="FOLDER", help=text)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from shmio.connectors.fabric.order import Missing
-from shmio.errors import RemoteError, ShmioError
+from shmio.errors import ShmioError
 from shmio.fabric.connection import INSTALL, Access, connect
 from shmio.fabric.messages import (
     CommandReply,
@@ -206,19 +206,3 @@ class Link:
 
 def _all(count: int, kind: OutcomeKind, reason: str) -> CommandReply:
     return CommandReply([kind.value] * count, [reason] * count)
-
-
-async def call_once(access: Access, work: Callable[[Client], Coroutine[Any, Any, Any]]) -> Any:
-    """Connect once, and return the result of ``work`` with the connection.
-
-    Raises:
-        RemoteError: No server can be reached, or it does not answer.
-
-    """
-    client = await connect(access, "shmio", patient=False)
-    try:
-        return await work(client)
-    except (TimeoutError, library("nats.errors", INSTALL).Error) as error:
-        raise RemoteError(f"{access}: {error or 'the server does not answer'}") from None
-    finally:
-        await client.close()

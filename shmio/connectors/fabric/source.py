@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 import msgspec
 
 from shmio.connectors.base import Mirrored
-from shmio.connectors.fabric.link import call_once
 from shmio.errors import ConfigError, RemoteError
-from shmio.fabric.connection import Access
+from shmio.fabric.connection import Access, call_once
 from shmio.fabric.names import CellName
 from shmio.fabric.registry import Registry
 from shmio.layout.document import load_layout
