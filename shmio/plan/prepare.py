@@ -1,4 +1,8 @@
-"""Makes a plan from a configuration file: compiles layouts, and checks connectors and emulators."""
+"""Makes a plan from a configuration file: compiles layouts, and checks connectors and emulators.
+
+It imports models, injections and selections only for a configuration that has them: these modules
+load numpy, and no process of the instance starts before the plan is ready.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +20,11 @@ from shmio.config.credentials import read_accounts
 from shmio.config.faults import Faults
 from shmio.config.read import examine
 from shmio.config.web import http_sections
-from shmio.connectors.models.simulation import Simulation
 from shmio.emulators.areas import TableMemory, is_table, place_name
 from shmio.emulators.device import Served
 from shmio.emulators.kinds import FAULTY, KINDS, S7, create
 from shmio.emulators.programs import IDLE, is_user_code
 from shmio.errors import ConfigError, PathError
-from shmio.injection.program import compile_condition
 from shmio.layout.glob import Glob
 from shmio.layout.image import initial_value_warnings
 from shmio.layout.model import Layout
@@ -30,14 +32,12 @@ from shmio.layout.spelling import block_path, topic_path
 from shmio.layout.topic import find, look_up, names_part, near, parse_topic
 from shmio.layout.values.write import chosen
 from shmio.plan.host import check_host, exposure
-from shmio.plan.injections import check_injections
 from shmio.plan.layouts import LayoutFiles
 from shmio.plan.ports import check_listening
 from shmio.plan.processes import ALERTS, Plan, make_plan, process_names
 from shmio.plan.replay import Recordings, replayed
 from shmio.plan.scene import check_scene
 from shmio.plan.sources import check_sources, describe, note_options
-from shmio.recording.selection import Selection
 from shmio.wording import did_you_mean, unknown
 
 DEVICE_KEYS = ("nodes", "unit", "word_order", "byte_order")
@@ -112,8 +112,11 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
     with faults.catching():
         config = _spelled(config, layouts)
     declared, described = dict[str, bytes](), tuple[str, ...]()
-    with faults.catching():
-        declared, described = check_injections(config, layouts)
+    if config.injection:
+        from shmio.plan.injections import check_injections  # noqa: PLC0415  loads numpy
+
+        with faults.catching():
+            declared, described = check_injections(config, layouts)
     scene = check_scene(config, layouts, faults, replayed=mode == "replay")
     if config.recorder and config.recorder.trigger:
         with faults.catching():
@@ -209,9 +212,15 @@ def peer(source: Source) -> str:
     return str(Address(host, port)) if host and port else str(host or "")
 
 
+def _check_condition(when: str, layouts: dict[str, Layout]) -> None:
+    from shmio.injection.program import compile_condition  # noqa: PLC0415  loads numpy
+
+    compile_condition(when, layouts)
+
+
 def _check_trigger(when: str, layouts: dict[str, Layout]) -> None:
     try:
-        compile_condition(when, layouts)
+        _check_condition(when, layouts)
     except ConfigError as error:
         raise ConfigError(f"recorder.trigger.{error}") from None
 
@@ -220,7 +229,7 @@ def _check_alert(key: str, alert: Alert, config: Config, layouts: dict[str, Layo
     """Check that what an alert watches exists."""
     try:
         if alert.when is not None:
-            compile_condition(alert.when, layouts)
+            _check_condition(alert.when, layouts)
         others = [name for name in process_names(config) if name != ALERTS]
         for name, patterns, known in (("process", alert.processes, others), ("source", alert.sources, list(layouts))):
             for pattern in patterns:
@@ -258,6 +267,8 @@ def _check_served(key: str, emulator: Emulator, served: Sequence[Served], config
         raise ConfigError(f"{key}.dbNumber: leave out this key, because each address of a tag table names its block")
     program = emulator.program
     if is_user_code(program):
+        from shmio.connectors.models.simulation import Simulation  # noqa: PLC0415  loads numpy
+
         options = Simulation.Options(program, emulator.parameters, folder=str(config.path(emulator.folder)))
         describe(key, options, served[0].layout, "program")
         program = IDLE  # the user's code stays out of this process
@@ -421,7 +432,9 @@ def _odd_accounts(mqtt: Mqtt, address: Address) -> Iterator[str]:
 
 def _odd_recorder(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
     """Yield warnings about patterns of ``recorder.registers`` that match nothing."""
-    if config.recorder is not None:
+    if config.recorder is not None and config.recorder.registers:
+        from shmio.recording.selection import Selection  # noqa: PLC0415  loads numpy
+
         for text in Selection(registers=config.recorder.registers).unmatched(layouts):
             yield f"recorder.registers: {text}"
 

@@ -6,7 +6,7 @@ import hashlib
 import subprocess
 import sys
 from collections.abc import Mapping
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
 
@@ -15,7 +15,6 @@ from shmio.config.faults import Faults
 from shmio.config.read import unknown_option
 from shmio.connectors import registry
 from shmio.connectors.base import Computed, Connector, Mirrored, Replayed
-from shmio.connectors.models.simulation import Answer, Request, Simulation
 from shmio.errors import ConfigError, PathError, RecordingError, RemoteError, ShmioError, ValueRangeError
 from shmio.fabric.connection import Access
 from shmio.fabric.place import is_place, parse_place
@@ -28,6 +27,9 @@ from shmio.local.replays import date_ns
 from shmio.plan.layouts import LayoutFiles
 from shmio.plan.replay import Recordings
 from shmio.wording import near, unknown
+
+if TYPE_CHECKING:
+    from shmio.connectors.models.simulation import Simulation
 
 NEEDED: Final = "this key is needed"
 PATIENCE_S: Final = 60.0
@@ -263,6 +265,8 @@ def _mirrored(key: str, source: Source, config: Config, files: LayoutFiles) -> L
 
 def _model(key: str, source: Source, config: Config, files: LayoutFiles) -> tuple[Layout, tuple[str, ...]]:
     """Return the layout of a simulation's block, from files or from its model, and the paths of its inputs."""
+    from shmio.connectors.models.simulation import Simulation  # noqa: PLC0415  loads numpy
+
     source.options["folder"] = str(config.path(source.options["folder"]))
     layout = None if source.layout is None else files.get(key, source, None)
     return describe(key, msgspec.convert(source.options, Simulation.Options), layout)
@@ -285,6 +289,8 @@ def describe(
         ConfigError: The model cannot be imported or described; the message begins with ``key``.
 
     """
+    from shmio.connectors.models.simulation import Answer, Request  # noqa: PLC0415  loads numpy
+
     request = Request(options, None if layout is None else layout.to_json().decode())
     command = [sys.executable, "-m", "shmio.connectors.models.simulation"]
     try:

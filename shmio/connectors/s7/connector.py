@@ -12,7 +12,6 @@ from shmio.connectors.s7.blocks import BlockRead, BlockWrite, SizeProbe, waves
 from shmio.connectors.s7.explain import OUT_OF_RANGE, RefusedError, explain_size
 from shmio.connectors.s7.request_count import NOTE, by_pdu_size
 from shmio.connectors.s7.session import MAX_DEPTH, REGISTER_OPTIONS, Read, S7Options, S7Session
-from shmio.connectors.s7.table import S7TableConnector
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.model import Layout
 from shmio.layout.values.write import Write
@@ -87,6 +86,8 @@ class S7Connector(S7Client, Connector):
         """Return this class, or the class of connectors for tag tables if registers have addresses."""
         if not any(register.address for register in layout.registers):
             return cls
+        from shmio.connectors.s7.table import S7TableConnector  # noqa: PLC0415  data blocks do not need it
+
         return S7TableConnector
 
     def __init__(self, options: S7Options, layout: Layout) -> None:
