@@ -28,6 +28,8 @@ _HEAD = """
 name = "{name}"
 clock = "{clock}"
 {settings}
+"""
+_GRPC = """
 [grpc]
 listen = ["{grpc}"]
 """
@@ -110,19 +112,21 @@ def started(
     clock: str = "wall",
     settings: str = "",
     until: State = State.RUNNING,
+    endpoint: bool = True,
 ) -> Iterator[Instance]:
     """Run an instance with these sources until the block ends.
 
     ``more`` holds further sections of the configuration, and ``settings`` further keys of ``[instance]``. The instance
-    is ready when the supervisor is in the state ``until``.
+    is ready when the supervisor is in the state ``until``. Without ``endpoint``, it has no gRPC endpoint.
     """
-    name = f"bench-{os.getpid()}"
+    name = f"bench-{os.getpid()}{'' if endpoint else '-alone'}"
     with ExitStack() as stack:
         grpc = stack.enter_context(reserved_port())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         config = folder / "supervisor.toml"
         parts = [
-            _HEAD.format(name=name, grpc=grpc, clock=clock, settings=settings),
+            _HEAD.format(name=name, clock=clock, settings=settings),
+            _GRPC.format(grpc=grpc) if endpoint else "",
             *(source.text() for source in sources),
             more,
         ]

@@ -2,8 +2,9 @@
 
 Each client steps, waits for the answer and for everything that it has subscribed to. Model, endpoint and client are
 separate processes. The clients take turns; while one steps, no other client has subscriptions. The bare server has no
-model, and computes nothing: it sends the same client the same prepared messages. Its figure is the limit, and shows
-the cost of the client itself.
+model, and computes nothing: it sends the same client the same prepared messages. Its figure shows the cost of the
+client itself. The chain is a bare server that also steps the model's process in an instance without an endpoint: its
+figure is the limit for an endpoint whose own work costs nothing.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from shmio import attach
 
 OURS = "v2, 100 topics in one stream"
 BARE = "a bare server: {}"
+CHAIN = "the chain: {}"
 NATIVE = "shmio.v1, 100 registers in one update"
 LOCAL = "a program on the host, no subscriber"
 MODEL = f"""
@@ -66,10 +68,13 @@ def main() -> None:
         client = stack.enter_context(Child("stepping.py"))
         target = str(running.grpc)
         contenders = {name: remote(client, target, kind, duration_s) for name, kind in CONTENDERS.items()}
+        alone = stack.enter_context(started([], more=MODEL, clock="stepped", endpoint=False))
         for kinds, messages in _ready(target).items():
             server = stack.enter_context(Child("bare_steps.py", messages.to_json()))
+            chain = stack.enter_context(Child("bare_steps.py", messages.to_json(), alone.segment.instance))
             contenders |= {
-                BARE.format(name): remote(client, server.hello, kind, duration_s)
+                title.format(name): remote(client, process.hello, kind, duration_s)
+                for title, process in ((BARE, server), (CHAIN, chain))
                 for name, kind in CONTENDERS.items()
                 if kind in kinds
             }
@@ -79,13 +84,13 @@ def main() -> None:
     for name in (NATIVE, LOCAL):
         keep(f"a model with 100 registers: {name}", statistics.median(samples[name]), "steps/s", "more")
     rows = [
-        [name, f"{median_ratio(samples[name], samples[bare]):.2f}"]
+        [name, *(f"{median_ratio(samples[one], samples[bare]):.2f}" for one in (name, CHAIN.format(name)))]
         for name in CONTENDERS
         if (bare := BARE.format(name)) in samples
     ]
-    for name, ratio in rows:
+    for name, ratio, _ in rows:
         keep(f"{name}: rate relative to a bare server", float(ratio), "ratio", "more")
-    table(["beside a bare server with the same client", "of its rate"], rows)
+    table(["beside a bare server with the same client", "of its rate", "the chain"], rows)
 
 
 def _ready(target: str) -> dict[tuple[str, ...], ready.Ready]:
