@@ -1,12 +1,14 @@
 """Steps for a second of CPU time in the laboratory, beside the bare runner of the same model.
 
-The laboratory publishes each step, injects, judges and records. The bare runner only computes. All run in this
-process, in turns.
+The laboratory publishes each step, injects, judges and records. The bare runner only computes. The loop by hand does
+the same work as the laboratory, but for exactly this campaign: it can do nothing else, and checks nothing. All run in
+this process, in turns.
 """
 
 from __future__ import annotations
 
 import statistics
+import struct
 import tempfile
 import time
 from collections.abc import Callable
@@ -18,10 +20,16 @@ from typing import Any
 import msgspec
 from common import DB201, HERE, begin, db201, interleave, keep, median_ratio, table
 
-from shmio.campaigns.live import Plan
+from shmio.campaigns.live import MAX_STEPS, Plan, frames_of
 from shmio.config import Declaration, Expectation
+from shmio.injection.draw import SeededRandom
+from shmio.judging.judge import Judge
 from shmio.lab import Laboratory, prepare_laboratory
 from shmio.layout.model import Layout
+from shmio.layout.topic import find
+from shmio.recording.writer import Writer
+from shmio.segment import Block, Provenance, Quality, Segment
+from shmio.segment.block import Layouts
 from shmio.simulation import ModelRunner
 from shmio.simulation.loading import load
 
@@ -41,13 +49,19 @@ BARE = "the bare runner"
 
 @dataclass(frozen=True)
 class Cell:
-    """A model, a register to inject into, and a condition that becomes true early."""
+    """A model, a register to inject into, and a condition that becomes true early: ``sensor`` is over ``limit``."""
 
     model: str
     keys: str
     layout: Layout | None
     target: str
-    condition: str
+    sensor: str
+    limit: float
+
+    @property
+    def condition(self) -> str:
+        """The text of the condition."""
+        return f"{self.sensor} > {self.limit}"
 
     def prepare(self, folder: Path) -> Callable[[], Laboratory]:
         """Return a function that creates a laboratory."""
@@ -76,14 +90,15 @@ class Cell:
 
 CELLS = {
     "100 registers and an array of 100": Cell(
-        "counting:Counting", f'folder = "{HERE}"\n', None, "cell/values/r00", "cell/values/r01 > 100"
+        "counting:Counting", f'folder = "{HERE}"\n', None, "cell/values/r00", "cell/values/r01", 100
     ),
     "the A50 cell": Cell(
         "shmio.simulation.a50:A50Cell",
         f'layout = "{DB201}"\n',
         db201(),
         "cell/Robot_800/Axs1_Pos",
-        "cell/Robot_800/Axs1_Pos > 10",
+        "cell/Robot_800/Axs1_Pos",
+        10,
     ),
 }
 
@@ -127,6 +142,62 @@ def laboratory(
     return sample
 
 
+def by_hand(cell: Cell, folder: Path, steps: int) -> Callable[[], float]:
+    """Make a sampler of a loop that was written for one campaign, with the same parts as the laboratory."""
+    cell.prepare(folder)
+    plan = prepare_laboratory(folder / "supervisor.toml")
+    recording = folder / "by hand.mem"
+
+    def sample() -> float:
+        runner = ModelRunner(load(cell.model, HERE), cell.layout)
+        with Segment.private(plan.instance, plan.blocks, plan.processes, mode=plan.mode) as segment:
+            block = segment.writer("cell").block
+            begun_s = time.process_time()
+            with recording.open("wb") as file:
+                judge = Judge(cell.expectations(), Layouts(segment.blocks), {"cell": block.stale_ns})
+                writer = Writer(file, {})
+                channels = writer.open_block(block, 1, 0, 0)
+                step = _injected(cell, runner, block)
+                for first in range(1, steps + 1, MAX_STEPS):
+                    numbers = range(first, min(first + MAX_STEPS, steps + 1))
+                    for number in numbers:
+                        step(number)
+                    frames = [frame for number in numbers if (frame := block.read(number)) is not None]
+                    judge.add("cell", frames_of(frames, block.layout.size, raws=True))
+                    judge.turn()
+                    for frame in frames:
+                        writer.frame(channels, frame, frame.clock_ns)
+                judge.finish()
+                writer.finish()
+            taken_s = time.process_time() - begun_s
+        recording.unlink()
+        return steps / taken_s
+
+    return sample
+
+
+def _injected(cell: Cell, runner: ModelRunner, block: Block) -> Callable[[int], None]:
+    """Return a function that computes a step, injects into it, and publishes it."""
+    target, sensor = (find(block.layout, path.removeprefix("cell/")) for path in (cell.target, cell.sensor))
+    order = ">" if block.layout.byte_order == "big" else "<"
+    value, sensed = (struct.Struct(order + {"REAL": "f", "LREAL": "d"}[one.type]) for one in (target, sensor))
+    dt_ns, random = round(STEP_S * 1e9), SeededRandom(1, "noise")
+    good, simulated, publish = Quality.GOOD, Provenance.SIMULATED, block.ring.publish
+
+    def step(number: int) -> None:
+        time_ns = number * dt_ns
+        raw = runner.step(time_ns, dt_ns)
+        image = bytearray(raw)
+        (seen,) = value.unpack_from(raw, target.offset)
+        seen += (2 * random.one_uniform(1, number) - 1) * 0.1
+        if sensed.unpack_from(raw, sensor.offset)[0] > cell.limit:
+            seen += 1
+        value.pack_into(image, target.offset, seen)
+        publish(raw, image, number, time_ns, time_ns, time_ns, good, simulated, 0, 0, b"")
+
+    return step
+
+
 def main() -> None:
     quick = begin("The laboratory: steps for a second of CPU time")
     steps, rounds = (100, 1) if quick else (1_500, 9)
@@ -139,6 +210,7 @@ def main() -> None:
                 "with 2 injections": laboratory(cell, folder, steps, inject=True),
                 "with 2 injections, 3 expectations": laboratory(cell, folder, steps, inject=True, judge=True),
                 "the same, and a recording": laboratory(cell, folder, steps, inject=True, judge=True, record=True),
+                "the same, a loop by hand": by_hand(cell, folder, steps),
             }
             samples = interleave(contenders, rounds)
         rows = [
