@@ -6,51 +6,67 @@
 from __future__ import annotations
 
 import asyncio
+import heapq
 import logging
-from collections.abc import Iterator
-from datetime import UTC, datetime
+import os
+import time
+from collections.abc import AsyncIterator, Iterator, Mapping
+from itertools import chain, count
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from shmio.errors import RecordingError, RemoteError
 from shmio.fabric.connection import INSTALL, connect
-from shmio.fabric.messages import Entry, Header, decode_entries, decode_header
-from shmio.fabric.names import CellName, source_of
+from shmio.fabric.entries import SourceEntries
+from shmio.fabric.messages import Header, decode_header
+from shmio.fabric.names import ROOT, CellName, source_of
 from shmio.fabric.place import Place
-from shmio.fabric.registry import Registry
+from shmio.fabric.registry import Registry, SourceEntry
 from shmio.layout.model import Layout
 from shmio.libraries import library
-from shmio.recording.format.encoding import Gap
-from shmio.recording.reading.part import DumpBlock
-from shmio.recording.rewriting import new_file
-from shmio.recording.writer import Channels, Writer
+from shmio.recording.reading.part import MAX_NS, Entry
+from shmio.recording.reading.reader import Item
+from shmio.recording.rewriting import Rewriter, new_file
 from shmio.segment import Event, Frame
 from shmio.version import __version__
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
+    from nats.aio.msg import Msg
 
-MAX_BYTES: Final = 1 << 30
-"""Maximum size of the messages in a span: they are sorted in memory."""
 _IDLE_S: Final = 5.0
-_BATCH: Final = 500
-_S: Final = 1_000_000_000
+_BATCH: Final = 64
+"""Number of messages that are asked for at once. They may have 1 MB each."""
+_MARGIN_NS: Final = 5_000_000_000
+"""A live message is made at most this long after its entries, and stored at most this long after others, in ns."""
+_SEPARATOR: Final = "~"
+"""Separates the parts of a cell's name in the name of its stream; parts cannot contain it."""
 
 log = logging.getLogger("shmio.fabric")
 
 
-class _Piece(NamedTuple):
-    """A frame, event or gap of a source, with its log time."""
+def stream_of(cell: CellName) -> str:
+    """Return the name of the stream that keeps the history of a cell."""
+    return _SEPARATOR.join((ROOT, *cell))
 
-    log_ns: int
-    order: int
-    source: str
-    layout: bytes
-    entry: Entry
+
+def cell_of(stream: str) -> CellName | None:
+    """Return the cell whose history a stream keeps; None if it is another stream."""
+    root, *parts = stream.split(_SEPARATOR)
+    return CellName(*parts) if root == ROOT and len(parts) == 3 else None
+
+
+def subjects_of(cell: CellName) -> list[str]:
+    """Return the subjects of the messages that a cell's stream keeps."""
+    return [cell.live("*"), cell.late("*")]
 
 
 def fetch(place: Place, file: Path, begin_ns: int | None = None, end_ns: int | None = None) -> int:
     """Write a span of a cell's history to a new recording.
+
+    The messages are sorted in a temporary file beside the recording, so the span may be larger than
+    the memory.
 
     Args:
         place: The cell.
@@ -62,150 +78,218 @@ def fetch(place: Place, file: Path, begin_ns: int | None = None, end_ns: int | N
         The number of frames.
 
     Raises:
-        RecordingError: There is no history in this span, the span is too large, or the file cannot
-            be written.
+        RecordingError: There is no history in this span, or the file exists already.
         RemoteError: No server can be reached, or it does not keep the cell's history.
+        OSError: The file cannot be written.
 
     """
-    pieces, layouts, blocks = asyncio.run(_read(place, begin_ns, end_ns))
-    if not pieces:
-        raise RecordingError(f"{place.cell}: the fabric has no history in that time")
-    about = {
-        "instance": place.cell.cell,
-        "cell": str(place.cell),
+    begin, end = begin_ns or 0, MAX_NS if end_ns is None else end_ns
+    with new_file(file) as stream, _Spool(file.parent) as spool:
+        layouts, known = asyncio.run(_read(place, spool, begin, end))
+        numbers = count(1)
+        sources = [SourceEntries(source, layouts, known.get(source), numbers) for source in spool.sources]
+        spans = [_span(source, spool, begin, end) for source in sources]
+        entries = heapq.merge(*spans, key=lambda entry: entry.time_ns)
+        first = next(entries, None)
+        if first is None:
+            raise RecordingError(f"{place.cell}: the fabric has no history in that time")
+        work = Rewriter(stream, _about(place.cell, first), whole=True)
+        for entry in chain((first,), entries):
+            work.add(entry)
+        work.finish()
+    return work.counts["frames"]
+
+
+def _about(cell: CellName, first: Entry[Item]) -> dict[str, str]:
+    """Return the metadata of the recording."""
+    started_ns = first.time_ns - first.item.clock_ns if isinstance(first.item, Frame | Event) else first.time_ns
+    return {
+        "instance": cell.cell,
+        "cell": str(cell),
+        "mode": "live",
+        "started_utc_ns": str(max(0, started_ns)),
         "version": __version__,
         "recorder": "fabric",
-        "mode": "live",
+        "recording_utc_ns": str(time.time_ns()),
+        "recording_ns": str(first.time_ns),
     }
-    frames = 0
-    with new_file(file) as stream:
-        writer = Writer(stream, about)
-        opened: dict[tuple[str, bytes], Channels] = {}
-        for layout in layouts.values():
-            writer.attach_layout(layout, pieces[0].log_ns)
-        for piece in pieces:
-            key = piece.source, piece.layout
-            if isinstance(piece.entry, Gap):
-                writer.gap(piece.entry, piece.log_ns)
-                continue
-            if key not in opened:
-                block = blocks[key]
-                number, event = _before(piece.entry)
-                opened[key] = writer.open_block(block, block.section, number, event)
-            if isinstance(piece.entry, Frame):
-                frames += 1
-                writer.frame(opened[key], piece.entry, piece.log_ns)
-            else:
-                writer.event(opened[key], piece.entry, piece.log_ns)
-        writer.finish()
-    return frames
 
 
-def _before(entry: Frame | Event) -> tuple[int, int]:
-    """Return the numbers of the frame and of the event before an entry."""
-    return (entry.number - 1, entry.event) if isinstance(entry, Frame) else (entry.frame, entry.number - 1)
+class _Position(NamedTuple):
+    """Where a message is in the spool, and when it was made."""
+
+    at: int
+    size: int
+    made_ns: int
+
+
+class _Spool:
+    """The messages of a span, in a temporary file; only their positions are in memory."""
+
+    def __init__(self, folder: Path) -> None:
+        try:
+            self._file = TemporaryFile(dir=folder)  # noqa: SIM115  closed by __exit__
+        except OSError as error:
+            error.filename = str(folder)
+            raise
+        self._end = 0
+        self._positions: dict[str, dict[int, dict[int, _Position]]] = {}
+
+    def add(self, source: str, header: Header, data: bytes) -> None:
+        """Store a message, unless it is stored already."""
+        numbers = self._positions.setdefault(source, {}).setdefault(header.stream, {})
+        if header.number not in numbers:
+            self._file.write(data)
+            numbers[header.number] = _Position(self._end, len(data), header.made_ns)
+            self._end += len(data)
+
+    @property
+    def sources(self) -> list[str]:
+        """The names of the sources."""
+        return sorted(self._positions)
+
+    def messages(self, source: str) -> Iterator[bytes]:
+        """Yield the messages of a source in the order in which its uplink made them."""
+        self._file.flush()
+        for numbers in sorted(self._positions[source].values(), key=lambda numbers: numbers[min(numbers)].made_ns):
+            for number in sorted(numbers):
+                position = numbers[number]
+                yield os.pread(self._file.fileno(), position.size, position.at)
+
+    def __enter__(self) -> _Spool:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+
+def _span(entries: SourceEntries, spool: _Spool, begin_ns: int, end_ns: int) -> Iterator[Entry[Item]]:
+    for data in spool.messages(entries.source):
+        for entry in entries.of(data):
+            if begin_ns <= entry.time_ns <= end_ns:
+                yield entry
 
 
 async def _read(
-    place: Place, begin_ns: int | None, end_ns: int | None
-) -> tuple[list[_Piece], dict[bytes, Layout], dict[tuple[str, bytes], DumpBlock]]:
+    place: Place, spool: _Spool, begin_ns: int, end_ns: int
+) -> tuple[dict[bytes, Layout], Mapping[str, SourceEntry]]:
+    """Fill the spool; return the layouts of its messages, and what the registry says of the sources."""
     client = await connect(place.access, "shmio history", patient=False)
+    heads: set[bytes] = set()
+    malformed = 0
     try:
-        received = [one async for one in _messages(client, place.cell, begin_ns, end_ns)]
-        registry = await Registry.open(client)
-        seen = await registry.find(place.cell)
-        known = {} if seen is None else {source.name: source for source in seen.entry.sources}
-        layouts: dict[bytes, Layout] = {}
-        blocks: dict[tuple[str, bytes], DumpBlock] = {}
-        for source, header, _ in received:
-            key = source, header.layout
-            if key in blocks:
+        async for message in _messages(client, place.cell, begin_ns, end_ns):
+            try:
+                header = decode_header(message.data)
+            except ValueError:
+                malformed += 1
                 continue
-            if header.layout not in layouts:
-                layouts[header.layout] = await registry.layout_like(header.layout)
-            layout, entry = layouts[header.layout], known.get(source)
-            period_ns, stale_ns = (20_000_000, 500_000_000) if entry is None else (entry.period_ns, entry.stale_ns)
-            blocks[key] = DumpBlock(source, len(blocks) + 1, layout, layout.hash.hex(), period_ns, stale_ns)
+            heads.add(header.layout)
+            spool.add(source_of(message.subject.split(".")[4]), header, message.data)
+        registry = await Registry.open(client)
+        layouts = {head: await registry.layout_like(head) for head in heads}
+        seen = await registry.find(place.cell)
     except (TimeoutError, library("nats.errors", INSTALL).Error) as error:
         raise RemoteError(f"{place.access}: {error or 'the server does not answer'}") from None
     finally:
         await client.close()
-    pieces = sorted(_pieces(received, begin_ns, end_ns), key=lambda piece: piece[:3])
-    return pieces, layouts, blocks
+    if malformed:
+        log.warning("%s: %d messages of the history are malformed and left out", place.cell, malformed)
+    return layouts, {} if seen is None else {source.name: source for source in seen.entry.sources}
 
 
-async def _messages(client: Client, cell: CellName, begin_ns: int | None, end_ns: int | None) -> Any:
-    """Yield source, header and bytes of each message of a span, in the order in which the server stored them.
+async def _messages(client: Client, cell: CellName, begin_ns: int, end_ns: int) -> AsyncIterator[Msg]:
+    """Yield the messages of a span: first the live ones, then the late ones.
 
-    Messages that were published late are stored after the time of their frames, so the stream is
-    read to its end.
+    The server's clock and the owner's may differ. The owner's times of live messages increase, so
+    the span is found by them. Late messages are stored at any time after the time of their entries.
     """
     errors = library("nats.js.errors", INSTALL)
     nats_errors = library("nats.errors", INSTALL)
-    api = library("nats.js.api", INSTALL)
     stream = client.jetstream()
-    config: dict[str, Any] = {"deliver_policy": api.DeliverPolicy.ALL}
-    if begin_ns is not None:
-        start = datetime.fromtimestamp(begin_ns // _S, UTC).isoformat()
-        config = {"deliver_policy": api.DeliverPolicy.BY_START_TIME, "opt_start_time": start}
-    config |= {"ack_policy": api.AckPolicy.NONE, "inactive_threshold": 60.0}
     try:
-        reader = await stream.pull_subscribe(
-            f"{cell.subject}.*.*", stream=cell.history, config=api.ConsumerConfig(**config)
-        )
+        state = (await stream.stream_info(stream_of(cell))).state
     except errors.NotFoundError:
         raise RemoteError(
             f"the fabric keeps no history of {cell}; add [fabric.history] to the configuration of that cell"
         ) from None
-    left, size = (await reader.consumer_info()).num_pending, 0
+    except (errors.ServiceUnavailableError, nats_errors.NoRespondersError):
+        raise RemoteError("the NATS server has no JetStream, and so no history; start it with -js") from None
+    if not state.messages:
+        return
+    first, last = max(1, state.first_seq), state.last_seq
+    if begin_ns > _MARGIN_NS:
+        first = await _find(stream, cell, begin_ns - _MARGIN_NS, first, last + 1)
+    after = last + 1 if end_ns >= MAX_NS - _MARGIN_NS else await _find(
+        stream, cell, end_ns + _MARGIN_NS, first, last + 1
+    )
+    for subject, end in ((cell.live("*"), after), (cell.late("*"), last + 1)):
+        async for message in _range(stream, cell, subject, first, end):
+            yield message
+
+
+async def _find(stream: Any, cell: CellName, moment_ns: int, first: int, end: int) -> int:
+    """Return the sequence number of the first live message that was made at or after a time; ``end`` if there is none."""
+    errors = library("nats.js.errors", INSTALL)
+    low, high = first, end
+    while low < high:
+        middle = at = (low + high) // 2
+        made_ns = None
+        while made_ns is None and at < high:
+            try:
+                found = await stream.get_msg(stream_of(cell), seq=at, subject=cell.live("*"), next=True)
+            except errors.NotFoundError:
+                break
+            at = found.seq + 1
+            try:
+                made_ns = decode_header(found.data or b"").made_ns
+            except ValueError:
+                continue  # damaged: the next one says the time
+        if made_ns is None or made_ns >= moment_ns:
+            high = middle
+        else:
+            low = at
+    return low
+
+
+async def _range(stream: Any, cell: CellName, subject: str, first: int, end: int) -> AsyncIterator[Msg]:
+    """Yield the messages of a subject from one sequence number to the one before another.
+
+    Raises:
+        RemoteError: The connection was lost, so messages are missing.
+
+    """
+    nats_errors = library("nats.errors", INSTALL)
+    api = library("nats.js.api", INSTALL)
+    if first >= end:
+        return
+    config = api.ConsumerConfig(
+        deliver_policy=api.DeliverPolicy.BY_START_SEQUENCE,
+        opt_start_seq=first,
+        ack_policy=api.AckPolicy.NONE,
+        inactive_threshold=60.0,
+    )
+    reader = await stream.pull_subscribe(subject, stream=stream_of(cell), config=config)
+    left, received = (await reader.consumer_info()).num_pending, 0
     try:
         while left:
             try:
                 batch = await reader.fetch(min(left, _BATCH), timeout=_IDLE_S)
             except nats_errors.TimeoutError:
-                return
+                info = await reader.consumer_info()
+                if info.num_pending or info.delivered.consumer_seq != received:
+                    raise RemoteError(
+                        f"the server has stopped sending the history of {cell}; try it again"
+                    ) from None
+                return  # its limits removed the rest meanwhile
             for message in batch:
-                left -= 1
-                try:
-                    header = decode_header(message.data)
-                except ValueError:
-                    continue
-                if end_ns is not None and header.made_ns > end_ns + _S:
-                    continue
-                size += len(message.data)
-                if size > MAX_BYTES:
-                    raise RecordingError(
-                        f"the history of {cell} in that time is larger than 1 GB; choose a shorter time"
-                    )
-                yield source_of(message.subject.split(".")[4]), header, message.data
+                place = message.metadata.sequence
+                received += 1
+                if place.consumer != received:
+                    raise RemoteError(f"the connection was lost while reading the history of {cell}; try it again")
+                if place.stream >= end:
+                    return
+                left = message.metadata.num_pending
+                yield message
     finally:
         await reader.unsubscribe()
-
-
-def _pieces(received: list[tuple[str, Header, bytes]], begin_ns: int | None, end_ns: int | None) -> Iterator[_Piece]:
-    """Yield all entries once, with their log times.
-
-    The log time is the owner's UTC time: the first message of an uplink relates it to the times of
-    the entries.
-    """
-    offsets: dict[tuple[str, int], int] = {}
-    seen: set[tuple[str, int, int]] = set()
-    for source, header, data in sorted(received, key=lambda one: (one[0], one[1].stream, one[1].number)):
-        if (source, header.stream, header.number) in seen:
-            continue
-        seen.add((source, header.stream, header.number))
-        try:
-            entries = list(decode_entries(data))
-        except ValueError as error:
-            log.warning("a message of %s is malformed: %s", source, error)
-            continue
-        times = [entry.publish_ns for entry in entries if not isinstance(entry, Gap)]
-        if not times:
-            continue
-        offset_ns = offsets.setdefault((source, header.stream), header.made_ns - times[-1])
-        at_ns = times[0]
-        for order, entry in enumerate(entries):
-            at_ns = at_ns if isinstance(entry, Gap) else max(at_ns, entry.publish_ns)
-            log_ns = at_ns + offset_ns
-            if (begin_ns or 0) <= log_ns and (end_ns is None or log_ns <= end_ns):
-                yield _Piece(log_ns, header.number * 65_536 + order, source, header.layout, entry)

@@ -34,7 +34,7 @@ MAX_ENTRY_BYTES: Final = MAX_MESSAGE_BYTES - 4096
 PREFERRED_BYTES: Final = 1 << 18
 """A message is ended when it has this many bytes."""
 
-_HEADER: Final = struct.Struct("<BBHIQQ8sqQ")
+_HEADER: Final = struct.Struct("<BBHIQQ8sqqQ")
 _ENTRY: Final = struct.Struct("<BI")
 _AGE_AT: Final = _HEADER.size - 8
 _FRAME: Final = 1
@@ -54,6 +54,9 @@ class Header(NamedTuple):
         made_ns: UTC time on the owner's host at which the uplink made the message, in ns since 1970.
         age_ns: Time in ns from ``made_ns`` until the message was sent. For a message that is
             published as soon as it is made, this is 0.
+        zero_ns: UTC time in ns since 1970 at which the owner's CLOCK_MONOTONIC was 0. Added to the
+            publish time of a frame or event, it gives its log time in recordings. Each start of the
+            owner has another.
 
     """
 
@@ -63,6 +66,7 @@ class Header(NamedTuple):
     layout: bytes
     made_ns: int
     age_ns: int = 0
+    zero_ns: int = 0
 
 
 Entry = Frame | Event | Gap
@@ -71,8 +75,12 @@ Entry = Frame | Event | Gap
 def encode(header: Header, entries: Iterable[Entry]) -> bytearray:
     """Encode a message. :func:`with_age` changes its age later."""
     left_out = min(header.left_out, 0xFFFFFFFF)
-    head = VERSION, 0, 0, left_out, header.stream, header.number, header.layout, header.made_ns, header.age_ns
-    data = bytearray(_HEADER.pack(*head))
+    data = bytearray(
+        _HEADER.pack(
+            VERSION, 0, 0, left_out, header.stream, header.number, header.layout, header.made_ns, header.zero_ns,
+            header.age_ns,
+        )
+    )  # fmt: skip
     for entry in entries:
         if isinstance(entry, Frame):
             kind, content = _FRAME, encode_frame(entry)
@@ -100,12 +108,12 @@ def decode_header(data: bytes) -> Header:
     """
     if len(data) < _HEADER.size:
         raise ValueError("the message is shorter than its header")
-    version, _, _, left_out, stream, number, layout, made_ns, age_ns = _HEADER.unpack_from(data)
+    version, _, _, left_out, stream, number, layout, made_ns, zero_ns, age_ns = _HEADER.unpack_from(data)
     if version != VERSION:
         raise ValueError(f"the message has version {version}, but this version of shmio reads only {VERSION}")
     if not stream or not number:
         raise ValueError("the message has no number")
-    return Header(left_out, stream, number, layout, made_ns, age_ns)
+    return Header(left_out, stream, number, layout, made_ns, age_ns, zero_ns)
 
 
 def decode_entries(data: bytes) -> Iterator[Entry]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -44,28 +44,26 @@ class _Track:
 class Rewriter:
     """Writes entries to a new file as a recorder does, with gaps for missing frames and events."""
 
-    def __init__(self, stream: IO[bytes], dump: Dump, made: str, *, whole: bool) -> None:
-        """Begin the file. The arguments are as for :func:`rewrite`."""
+    def __init__(self, stream: IO[bytes], about: Mapping[str, str], *, whole: bool) -> None:
+        """Begin the file. ``about`` is the metadata about the instance; for ``whole``, see :func:`rewrite`."""
         self._whole = whole
-        about = {**dump.about, "made_by": made, "made_version": __version__}
         self._writer = Writer(stream, about)
-        self._dump = dump
         self._tracks: dict[DumpBlock, _Track] = {}
         self._layouts: set[bytes] = set()
         self.counts: dict[str, int] = {"frames": 0, "events": 0}
         self.damaged = 0
         """Number of frames and events that could not be read; the new file has gaps for them."""
 
-    def attach(self) -> None:
-        """Copy all intact attachments except layouts, which are written with their blocks."""
+    def attach(self, dump: Dump) -> None:
+        """Copy all intact attachments of a recording except layouts, which are written with their blocks."""
         seen: set[str] = set()
-        for reader in self._dump.readers:
+        for reader in dump.readers:
             for name in reader.attachments:
                 if name in seen or name.startswith("layouts/"):
                     continue
                 with suppress(RecordingError):
                     data = reader.attachment(name, MAX_ATTACHMENT_BYTES)
-                    self._writer.attach(name, _TYPES.get(Path(name).suffix, TEXT), data, self._dump.begin_ns)
+                    self._writer.attach(name, _TYPES.get(Path(name).suffix, TEXT), data, dump.begin_ns)
                     seen.add(name)
 
     def add(self, entry: Entry[Item]) -> None:
@@ -198,8 +196,8 @@ def rewrite(
         OSError: The file cannot be written.
     """
     with new_file(path) as stream:
-        work = Rewriter(stream, dump, made, whole=whole)
-        work.attach()
+        work = Rewriter(stream, {**dump.about, "made_by": made, "made_version": __version__}, whole=whole)
+        work.attach(dump)
         for entry in entries:
             work.add(entry)
             progress(entry.time_ns - dump.begin_ns)

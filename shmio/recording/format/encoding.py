@@ -76,7 +76,7 @@ u16 data size, u16 text size; then data, text (UTF-8)."""
 GAP_SCHEMA: Final = b"""{"type": "object", "properties": {"source": {"type": "string"}, "block": {"type": "integer"}, \
 "what": {"enum": ["frames", "events"]}, "first": {"type": "integer"}, "last": {"type": "integer"}, \
 "count": {"type": "integer"}, "reason": {"enum": ["overtaken", "not running", "elsewhere", \
-"no room", "unsure", "damaged"]}, \
+"no room", "unsure", "damaged", "left out"]}, \
 "after_ns": {"type": "integer"}, "before_ns": {"type": "integer"}}}"""
 
 
@@ -108,6 +108,8 @@ class Reason(StrEnum):
     """The entries were written to the previous file, but may be lost, because its fsync failed."""
     DAMAGED = "damaged"
     """The file was made from another recording in which these entries could not be read."""
+    LEFT_OUT = "left out"
+    """The file was made from the history of a fabric. A rule of the cell's uplink leaves the entries out."""
 
 
 class Gap(msgspec.Struct, frozen=True):

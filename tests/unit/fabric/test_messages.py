@@ -28,7 +28,7 @@ FRAME = Frame(
 )  # fmt: skip
 EVENT = Event(4, 7, 7, 70, 1_000, 900, 1_700_000_000, 3, Quality.GOOD, 5, 99, 1, 2, 8, 0, 2, b"\1\2", "written", 12)
 GAP = Gap("cell", 1, "frames", 3, 6, 4, Reason.OVERTAKEN)
-HEADER = Header(3, 1 << 60, 12, b"abcdefgh", 1_700_000_000_000, 5)
+HEADER = Header(3, 1 << 60, 12, b"abcdefgh", 1_700_000_000_000, 5, -1_600_000_000_000)
 
 
 def test_a_message_keeps_all_entries_in_order() -> None:
