@@ -9,6 +9,7 @@ from statistics import median
 from typing import Final
 
 from shmio.errors import RecordingError
+from shmio.fabric.messages import Entry as FabricEntry
 from shmio.fabric.messages import Header, decode_entries, decode_header
 from shmio.fabric.registry import SourceEntry
 from shmio.layout.model import Layout
@@ -90,22 +91,24 @@ class SourceEntries:
             return Reason.NOT_RUNNING
         return Reason.LEFT_OUT if header.number == before.number + 1 else Reason.NO_ROOM
 
-    def _choose_block(self, header: Header, layout: Layout, entry: Item, entries: list[Frame | Event | Gap]) -> None:
+    def _choose_block(self, header: Header, layout: Layout, entry: FabricEntry, entries: list[FabricEntry]) -> None:
         """Begin another block if the layout changes, or if numbers begin again: after a restart or a reload."""
         what, first = (entry.what, entry.first) if isinstance(entry, Gap) else (_what(entry), entry.number)
-        before, block = self._header, self._block
-        if block is not None and before is not None and before.layout == header.layout:
-            if before.zero_ns == header.zero_ns and first > self._last.get(what, 0):
-                return
+        before = self._header
+        same = before is not None and (before.layout, before.zero_ns) == (header.layout, header.zero_ns)
+        if self._block is not None and same and first > self._last.get(what, 0):
+            return
         self._blocks += 1
         if self._blocks > MAX_BLOCKS:
-            raise RecordingError(f"{self.source}: the history has more than {MAX_BLOCKS} restarts; choose a shorter time")
+            raise RecordingError(
+                f"{self.source}: the history has more than {MAX_BLOCKS} restarts; choose a shorter time"
+            )
         period_ns, stale_ns = self._rate(entries)
         digest = layout.hash.hex()
         self._block = DumpBlock(self.source, next(self._sections), layout, digest, period_ns, stale_ns)
         self._last = {}
 
-    def _rate(self, entries: list[Frame | Event | Gap]) -> tuple[int, int]:
+    def _rate(self, entries: list[FabricEntry]) -> tuple[int, int]:
         """Return the source's period and the age at which its frames are stale, in ns."""
         if self._known is not None:
             return self._known.period_ns, self._known.stale_ns
@@ -118,7 +121,7 @@ class SourceEntries:
         period_ns = round(median(periods)) if periods else _PERIOD_NS
         return max(1, period_ns), max(_STALE_NS, 3 * period_ns)
 
-    def _entries(self, header: Header, entry: Frame | Event | Gap, reason: Reason) -> Iterator[Entry[Item]]:
+    def _entries(self, header: Header, entry: FabricEntry, reason: Reason) -> Iterator[Entry[Item]]:
         if isinstance(entry, Gap):
             if (last := self._last.get(entry.what)) is not None and entry.first > last + 1:
                 yield self._gap(entry.what, last + 1, entry.first - 1, reason)

@@ -220,8 +220,8 @@ async def _messages(client: Client, cell: CellName, begin_ns: int, end_ns: int) 
     first, last = max(1, state.first_seq), state.last_seq
     if begin_ns > _MARGIN_NS:
         first = await _find(stream, cell, begin_ns - _MARGIN_NS, first, last + 1)
-    after = last + 1 if end_ns >= MAX_NS - _MARGIN_NS else await _find(
-        stream, cell, end_ns + _MARGIN_NS, first, last + 1
+    after = (
+        last + 1 if end_ns >= MAX_NS - _MARGIN_NS else await _find(stream, cell, end_ns + _MARGIN_NS, first, last + 1)
     )
     for subject, end in ((cell.live("*"), after), (cell.late("*"), last + 1)):
         async for message in _range(stream, cell, subject, first, end):
@@ -229,7 +229,7 @@ async def _messages(client: Client, cell: CellName, begin_ns: int, end_ns: int) 
 
 
 async def _find(stream: Any, cell: CellName, moment_ns: int, first: int, end: int) -> int:
-    """Return the sequence number of the first live message that was made at or after a time; ``end`` if there is none."""
+    """Return the number of the first live message that was made at or after a time; ``end`` if there is none."""
     errors = library("nats.js.errors", INSTALL)
     low, high = first, end
     while low < high:
@@ -278,9 +278,7 @@ async def _range(stream: Any, cell: CellName, subject: str, first: int, end: int
             except nats_errors.TimeoutError:
                 info = await reader.consumer_info()
                 if info.num_pending or info.delivered.consumer_seq != received:
-                    raise RemoteError(
-                        f"the server has stopped sending the history of {cell}; try it again"
-                    ) from None
+                    raise RemoteError(f"the server has stopped sending the history of {cell}; try it again") from None
                 return  # its limits removed the rest meanwhile
             for message in batch:
                 place = message.metadata.sequence

@@ -177,10 +177,16 @@ class ParquetTable:
             self._writer = self._parquet.ParquetWriter(self._stream, table.schema, compression="zstd")
         self._waiting.append(table)
         self.rows += len(columns.time_ns)
-        if sum(waiting.nbytes for waiting in self._waiting) >= GROUP_BYTES:
-            self._write_group()
+        if self.waiting_bytes >= GROUP_BYTES:
+            self.flush()
 
-    def _write_group(self) -> None:
+    @property
+    def waiting_bytes(self) -> int:
+        """Size in memory of the rows that are not written to the stream yet."""
+        return sum(int(waiting.nbytes) for waiting in self._waiting)
+
+    def flush(self) -> None:
+        """Write all rows so far to the stream, as a row group."""
         if self._waiting:
             self._writer.write_table(self._arrow.concat_tables(self._waiting))
             self._waiting = []
@@ -188,7 +194,7 @@ class ParquetTable:
     def close(self) -> None:
         """Write the last row group and the footer."""
         if self._writer is not None:
-            self._write_group()
+            self.flush()
             self._writer.close()
 
 

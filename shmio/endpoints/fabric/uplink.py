@@ -196,7 +196,7 @@ class Uplink:
     def _log_time(self, monotonic_ns: int) -> int:
         """Convert CLOCK_MONOTONIC to UTC, as the start of the instance had it: changes of the clock have no effect."""
         head = self._segment.header
-        return max(0, head.started_utc_ns + monotonic_ns - head.started_ns)
+        return head.started_utc_ns + monotonic_ns - head.started_ns
 
     def _wake(self, feed: Feed, relay: Relay) -> None:
         relay.acknowledge()
@@ -214,7 +214,8 @@ class Uplink:
         for batch in batches:
             now_ns = time.monotonic_ns()
             number = row.last + 1
-            header = Header(batch.left_out, row.stream, number, feed.digest[:8], self._log_time(now_ns))
+            times = self._log_time(now_ns), 0, self._log_time(0)
+            header = Header(batch.left_out, row.stream, number, feed.digest[:8], *times)
             self.backlog.put(row, Kept(number, encode(header, batch.entries), now_ns))
         if batches:
             self.publisher.wake()
