@@ -16,7 +16,7 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from shmio.errors import RecordingError, RemoteError
+from shmio.errors import ConfigError, RecordingError, RemoteError
 from shmio.fabric.connection import INSTALL, connect
 from shmio.fabric.entries import SourceEntries
 from shmio.fabric.messages import Header, decode_header
@@ -54,7 +54,10 @@ def stream_of(cell: CellName) -> str:
 def cell_of(stream: str) -> CellName | None:
     """Return the cell whose history a stream keeps; None if it is another stream."""
     root, *parts = stream.split(_SEPARATOR)
-    return CellName(*parts) if root == ROOT and len(parts) == 3 else None
+    try:
+        return CellName.parse(".".join(parts)) if root == ROOT else None
+    except ConfigError:
+        return None
 
 
 def subjects_of(cell: CellName) -> list[str]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import urlsplit
 
 from shmio.errors import ConfigError, RecordingError
-from shmio.fabric.connection import Access
 from shmio.fabric.names import CellName
+
+if TYPE_CHECKING:
+    from shmio.fabric.connection import Access
 
 
 class Place(NamedTuple):
@@ -29,6 +31,8 @@ def parse_place(text: str, credentials: str | None = None) -> Place:
         RecordingError: The text is not such a URL.
 
     """
+    from shmio.fabric.connection import Access  # noqa: PLC0415  commands for files do without it
+
     parts = urlsplit(text)
     try:
         cell = CellName.parse(parts.path.strip("/"))

@@ -13,7 +13,7 @@ from mcap.opcode import Opcode
 
 from shmio.errors import RecordingError
 from shmio.model.values import Provenance
-from shmio.recording.format.encoding import Channel, decode_frame, restore
+from shmio.recording.format.encoding import Channel, decode_frame, encode_frame, restore
 from shmio.segment.block import Frame
 
 HEAD: Final = np.dtype(
@@ -151,6 +151,11 @@ def frames(data: bytes, channel: Channel, size: int, from_ns: int, to_ns: int) -
                 found.append((log_ns, _frame(piece, size)))
         at = following
     return found
+
+
+def record(frame: Frame) -> bytes:
+    """Return the record of a frame in a batch: its header, and the image that readers saw."""
+    return encode_frame(frame)[: HEAD.itemsize] + frame.image
 
 
 def _frame(piece: bytes, size: int) -> Frame:
