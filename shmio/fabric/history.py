@@ -16,11 +16,11 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from shmio.errors import ConfigError, RecordingError, RemoteError
+from shmio.errors import RecordingError, RemoteError
 from shmio.fabric.connection import INSTALL, connect
 from shmio.fabric.entries import SourceEntries
 from shmio.fabric.messages import Header, decode_header
-from shmio.fabric.names import ROOT, CellName, source_of
+from shmio.fabric.names import CellName, source_of
 from shmio.fabric.place import Place
 from shmio.fabric.registry import Registry, SourceEntry
 from shmio.layout.model import Layout
@@ -40,29 +40,8 @@ _BATCH: Final = 64
 """Number of messages that are asked for at once. They may have 1 MB each."""
 _MARGIN_NS: Final = 5_000_000_000
 """A live message is made at most this long after its entries, and stored at most this long after others, in ns."""
-_SEPARATOR: Final = "~"
-"""Separates the parts of a cell's name in the name of its stream; parts cannot contain it."""
 
 log = logging.getLogger("shmio.fabric")
-
-
-def stream_of(cell: CellName) -> str:
-    """Return the name of the stream that keeps the history of a cell."""
-    return _SEPARATOR.join((ROOT, *cell))
-
-
-def cell_of(stream: str) -> CellName | None:
-    """Return the cell whose history a stream keeps; None if it is another stream."""
-    root, *parts = stream.split(_SEPARATOR)
-    try:
-        return CellName.parse(".".join(parts)) if root == ROOT else None
-    except ConfigError:
-        return None
-
-
-def subjects_of(cell: CellName) -> list[str]:
-    """Return the subjects of the messages that a cell's stream keeps."""
-    return [cell.live("*"), cell.late("*")]
 
 
 def fetch(place: Place, file: Path, begin_ns: int | None = None, end_ns: int | None = None) -> int:
@@ -211,7 +190,7 @@ async def _messages(client: Client, cell: CellName, begin_ns: int, end_ns: int) 
     nats_errors = library("nats.errors", INSTALL)
     stream = client.jetstream()
     try:
-        state = (await stream.stream_info(stream_of(cell))).state
+        state = (await stream.stream_info(cell.history)).state
     except errors.NotFoundError:
         raise RemoteError(
             f"the fabric keeps no history of {cell}; add [fabric.history] to the configuration of that cell"
@@ -240,7 +219,7 @@ async def _find(stream: Any, cell: CellName, moment_ns: int, first: int, end: in
         made_ns = None
         while made_ns is None and at < high:
             try:
-                found = await stream.get_msg(stream_of(cell), seq=at, subject=cell.live("*"), next=True)
+                found = await stream.get_msg(cell.history, seq=at, subject=cell.live("*"), next=True)
             except errors.NotFoundError:
                 break
             at = found.seq + 1
@@ -272,7 +251,7 @@ async def _range(stream: Any, cell: CellName, subject: str, first: int, end: int
         ack_policy=api.AckPolicy.NONE,
         inactive_threshold=60.0,
     )
-    reader = await stream.pull_subscribe(subject, stream=stream_of(cell), config=config)
+    reader = await stream.pull_subscribe(subject, stream=cell.history, config=config)
     left, received = (await reader.consumer_info()).num_pending, 0
     try:
         while left:

@@ -9,6 +9,8 @@ from shmio.errors import ConfigError
 
 ROOT: Final = "shmio"
 """First token of all subjects of the fabric."""
+_SEPARATOR: Final = "~"
+"""Separates the parts of a cell's name in the name of a stream. The parts cannot contain it."""
 _PART: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,39}\Z")
 
 
@@ -51,7 +53,16 @@ class CellName(NamedTuple):
     @property
     def history(self) -> str:
         """The name of the JetStream stream that keeps what the cell has published."""
-        return "-".join((ROOT, *self))
+        return _SEPARATOR.join((ROOT, *self))
+
+    @classmethod
+    def of_history(cls, stream: str) -> CellName | None:
+        """Return the cell whose history a stream keeps; None if it is another stream."""
+        root, *parts = stream.split(_SEPARATOR)
+        try:
+            return cls.parse(".".join(parts)) if root == ROOT else None
+        except ConfigError:
+            return None
 
     def live(self, source: str) -> str:
         """Return the subject of a source's new frames and events."""

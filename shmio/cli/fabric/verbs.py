@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from shmio.cli.common import add_json, add_verbs, at_least, load
+from shmio.cli.common import add_json, add_verbs, at_least, load, seconds
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,6 +28,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     fleet("status", "Print the state of a cell and of its sources.", "print one JSON object").add_argument(
         "cell", metavar="CELL", help="name of the cell, such as plant1.line3.a50"
+    )
+    _add_archive(
+        fleet("archive", "Write the histories of cells to Parquet files, until it is stopped.", "print JSON lines")
     )
     _add_server_config(
         verb("server-config", "Write the configuration of NATS servers, and a seed for each cell and viewer.")
@@ -56,6 +59,16 @@ def _server_options() -> argparse.ArgumentParser:
     parser.add_argument("-c", dest="config", type=Path, metavar="FILE", help="use [fabric] of this supervisor.toml")
     parser.add_argument("--instance", metavar="NAME", help="use [fabric] of a running instance (default: the only one)")
     return parser
+
+
+def _add_archive(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("-o", dest="output", type=Path, required=True, metavar="DIR", help="the folder of the archive")
+    text = "archive only these cells, such as 'plant1.*.*'; repeatable"
+    parser.add_argument("--cell", dest="cells", action="append", metavar="PATTERN", help=text)
+    text = "close the files of a cell when one of them has this size (default: 128)"
+    parser.add_argument("--close-mb", type=at_least(1), default=128, metavar="MB", help=text)
+    text = "close the files of a cell when they have this age (default: 600)"
+    parser.add_argument("--close-after", type=seconds, default=600.0, metavar="SECONDS", help=text)
 
 
 def _add_server_config(parser: argparse.ArgumentParser) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -314,7 +315,10 @@ class _OpenFile:
 
     def discard(self) -> None:
         """Remove the file."""
-        self._stream.close()
+        with suppress(OSError):  # the disk may be full
+            self._table.close()
+        with suppress(OSError):
+            self._stream.close()
         _part(self.path).unlink(missing_ok=True)
 
 

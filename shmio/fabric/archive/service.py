@@ -24,7 +24,6 @@ from shmio.errors import RemoteError
 from shmio.fabric.archive.cell_files import CellFiles, ClosedFile
 from shmio.fabric.archive.folder import ArchiveFolder
 from shmio.fabric.connection import INSTALL, Access, connect
-from shmio.fabric.history import cell_of, stream_of
 from shmio.fabric.messages import decode_header
 from shmio.fabric.names import ROOT, CellName, source_of
 from shmio.fabric.registry import Registry
@@ -177,7 +176,7 @@ class Archive:
             answer = await client.request("$JS.API.STREAM.NAMES", request, timeout=5.0)
             page = msgspec.json.decode(answer.data, type=_StreamNames)
             names = page.streams or []
-            found += [cell for cell in map(cell_of, names) if cell is not None]
+            found += [cell for cell in map(CellName.of_history, names) if cell is not None]
             offset += len(names)
             if not names or offset >= page.total:
                 break
@@ -204,7 +203,7 @@ class Archive:
 
     async def _exists(self, client: Client, cell: CellName) -> bool:
         try:
-            await client.jetstream().stream_info(stream_of(cell))
+            await client.jetstream().stream_info(cell.history)
         except self._stream_errors.NotFoundError:
             return False
         except (self._errors.Error, TimeoutError):
@@ -283,7 +282,7 @@ class _CellReader:
     async def _consumer(self) -> Any:
         """Create the durable consumer anew, so that it begins after the last message."""
         archive, stream = self._archive, self._client.jetstream()
-        name = stream_of(self._cell)
+        name = self._cell.history
         info = await stream.stream_info(name)
         await archive._work(partial(self._files.begin, info.created or _ANY_TIME, info.state.last_seq))
         first = self._files.received + 1

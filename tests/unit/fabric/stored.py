@@ -5,15 +5,15 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Coroutine, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import nats
 from nats.aio.client import Client
+from nats.js.errors import NotFoundError
 
 from shmio.fabric.connection import Access
-from shmio.fabric.history import stream_of, subjects_of
 from shmio.fabric.messages import Header, encode
 from shmio.fabric.names import CellName
 from shmio.fabric.place import Place
@@ -51,7 +51,9 @@ class History:
         """Create the stream and the registry with some layouts."""
 
         async def work(client: Client) -> None:
-            await client.jetstream().add_stream(name=stream_of(self.cell), subjects=subjects_of(self.cell))
+            await client.jetstream().add_stream(
+                name=self.cell.history, subjects=[self.cell.live("*"), self.cell.late("*")]
+            )
             registry = await Registry.open(client)
             for layout in layouts or (LAYOUT,):
                 await registry.put_layout(layout)
@@ -67,6 +69,38 @@ class History:
                 await asyncio.gather(*(stream.publish(one.subject, one.data) for one in messages[first : first + 200]))
 
         self.run(work)
+
+    def last(self) -> int:
+        """Return the number of the last message in the stream."""
+
+        async def work(client: Client) -> int:
+            return (await client.jetstream().stream_info(self.cell.history)).state.last_seq
+
+        return int(self.run(work))
+
+    def delivered(self, folder: Path) -> int:
+        """Return the number of the last message that the archive in a folder has received."""
+        file = folder / ".archive"
+
+        async def work(client: Client) -> int:
+            name = f"archive-{file.read_text()}"
+            with suppress(NotFoundError):
+                info = await client.jetstream().consumer_info(self.cell.history, name)
+                return info.delivered.stream_seq if info.delivered is not None else 0
+            return 0
+
+        return int(self.run(work)) if file.exists() and file.read_text() else 0
+
+    def forget(self, folder: Path) -> None:
+        """Delete what the server knows of the archive in a folder."""
+        file = folder / ".archive"
+
+        async def work(client: Client) -> None:
+            with suppress(NotFoundError):
+                await client.jetstream().delete_consumer(self.cell.history, f"archive-{file.read_text()}")
+
+        if file.exists():
+            self.run(work)
 
     def run(self, work: Any) -> Any:
         async def connected() -> Any:

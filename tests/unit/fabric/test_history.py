@@ -11,7 +11,7 @@ import pytest
 
 from shmio.cli.dump import main
 from shmio.errors import RecordingError, RemoteError
-from shmio.fabric.history import cell_of, fetch, stream_of
+from shmio.fabric.history import fetch
 from shmio.fabric.messages import decode_entries, encode
 from shmio.fabric.names import CellName
 from shmio.recording.check import check
@@ -45,9 +45,9 @@ def diff(one: Path, other: Path, capsys: pytest.CaptureFixture[str], *options: s
 
 def test_names_of_streams_differ_for_all_cells() -> None:
     names = [CellName("a-b", "c", "d"), CellName("a", "b-c", "d"), CellName("a_b", "c", "d")]
-    assert len({stream_of(name) for name in names}) == 3
-    assert [cell_of(stream_of(name)) for name in names] == names
-    assert cell_of("KV_shmio_cells") is None
+    assert len({name.history for name in names}) == 3
+    assert [CellName.of_history(name.history) for name in names] == names
+    assert CellName.of_history("KV_shmio_cells") is None
 
 
 def test_a_span_equals_the_cells_own_recording(
