@@ -88,6 +88,8 @@ START_PROCESSES = (
     "tests/unit/endpoints/mqtt/broker/",
     "tests/unit/endpoints/web/test_uploads.py",
     "tests/unit/endpoints/web/test_dropped.py::test_page_",
+    "tests/unit/fabric/archive/test_archive.py",
+    "tests/unit/fabric/test_history.py",
     "tests/unit/falsification/test_pool.py",
     "tests/unit/lab/",
     "tests/unit/plan/test_emulated_programs.py",

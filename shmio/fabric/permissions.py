@@ -42,7 +42,7 @@ def viewer_permissions(key: str) -> Permissions:
 
 
 def history_reader_permissions(key: str, streams: tuple[str, ...]) -> Permissions:
-    """Return what a viewer may do who also reads the histories of cells.
+    """Return what a viewer may do who also reads and archives the histories of cells.
 
     Args:
         key: The user's public NKey.
@@ -51,12 +51,14 @@ def history_reader_permissions(key: str, streams: tuple[str, ...]) -> Permission
     """
     requests = (
         "STREAM.INFO.{}",
+        "STREAM.MSG.GET.{}",
         "CONSUMER.CREATE.{}.>",
         "CONSUMER.INFO.{}.*",
         "CONSUMER.MSG.NEXT.{}.*",
-        ("CONSUMER.DELETE.{}.*"),
+        "CONSUMER.DELETE.{}.*",
     )
-    more = tuple(f"$JS.API.{request.format(stream)}" for stream in streams for request in requests)
+    more = ("$JS.API.STREAM.NAMES", *(f"$JS.ACK.{stream}.>" for stream in streams))
+    more += tuple(f"$JS.API.{request.format(stream)}" for stream in streams for request in requests)
     viewer = viewer_permissions(key)
     return Permissions(viewer.publish + more, viewer.subscribe)
 

@@ -82,7 +82,8 @@ def rows(folder: Path, source: str = "cell", cell: CellName = CELL) -> list[tupl
     if not files:
         return []
     table = polars.concat([polars.read_parquet(file) for file in files], how="diagonal_relaxed")
-    return table.sort("time").select("number", "count").rows()
+    found: list[tuple[Any, ...]] = table.sort("time").select("number", "count").rows()
+    return found
 
 
 def read_to_end(folder: Path, *histories: History) -> Running:
@@ -145,7 +146,7 @@ def test_a_killed_archive_loses_nothing_and_writes_nothing_twice(
             published += 100
             history.publish(*uplink.messages())
             if turn % 2:
-                until(lambda: list(folder.rglob("*.part")), "an open file")
+                until(lambda: any(folder.rglob("*.part")), "an open file")
             work.stop(signal.SIGKILL)
     read_to_end(folder, history)
     assert rows(folder) == [(number, (number - 1) & 0x7FFF) for number in range(1, published + 1)]
@@ -211,7 +212,7 @@ def test_a_second_archive_in_a_folder_is_refused(
 ) -> None:
     folder = tmp_path / "archive"
     with running(history, folder) as work:
-        until(lambda: (folder / ".archive").exists() and (folder / ".archive").read_text(), "the lock")
+        until(lambda: (folder / ".archive").exists() and bool((folder / ".archive").read_text()), "the lock")
         assert main(["fabric", "archive", "--server", history.url, "-o", str(folder)]) == 1
         assert "another" in capsys.readouterr().err
         assert work.stop() == 0
