@@ -29,6 +29,11 @@ BEGIN_NS: Final = 1_000_000_000
 """Time in ns after which the owner no longer begins a write."""
 ANSWER_S: Final = 2.0
 """Longest wait for the outcome of a write, in s."""
+CATCH_UP_S: Final = 0.8
+"""Shortest time in s in which the mirror publishes as many frames as the ring holds.
+
+After an outage, many frames come at once. Readers such as the recorder must be able to follow.
+"""
 REPORT_NS: Final = 10_000_000_000
 """Shortest time in ns between two reports of malformed messages."""
 _LEFT_OUT: Final = frozenset({EventKind.STARTED, EventKind.STOPPED, EventKind.QUALITY})
@@ -93,6 +98,9 @@ class MirrorLoop:
         self.counters = Counters()
         self._order = MessageOrder()
         self._inbox: deque[Received | Missing] = deque()
+        self._ready: deque[Received | Lost] = deque()
+        ring = writer.block.ring
+        self._pace = _Pace(max(ring.slot_count / CATCH_UP_S, 6e9 / writer.block.period_ns), ring.slot_count / 8)
         self._link = connect(self._receive, self._answered)
         self._reply: Future[CommandReply] | None = None
         self._last_ns = clock.now_ns()  # when the last frame was published
@@ -149,9 +157,11 @@ class MirrorLoop:
             found = (
                 self._order.answered(one, self._clock.now_ns()) if isinstance(one, Missing) else self._order.add(one)
             )
-            self._deliver(found)
+            self._ready += found
         now_ns = self._clock.now_ns()
-        self._deliver(self._order.expired(now_ns))
+        self._ready += self._order.expired(now_ns)
+        while self._ready and self._pace.wait_ns(self._clock.now_ns()) == 0:
+            self._deliver(self._ready.popleft())
         if (missing := self._order.missing(now_ns)) is not None and self._link.connected:
             self._link.request(missing)
         self._confirm()
@@ -172,29 +182,28 @@ class MirrorLoop:
         elif self._link.problem and self._bad and self._link.problem != self.note and self._cycle is None:
             self._fail(self._link.problem)
         wait_ns = 500_000_000 if self._bad else max(1_000_000, due_ns - now_ns)
+        if self._ready:
+            wait_ns = min(wait_ns, max(1_000_000, self._pace.wait_ns(now_ns)))
         patience_ns = self._order.patience_ns(now_ns)
         return wait_ns if patience_ns is None else min(wait_ns, patience_ns)
 
     # ---- frames and events ---------------------------------------------------------------------------------------
 
-    def _deliver(self, found: Iterable[Received | Lost]) -> None:
-        for one in found:
-            if isinstance(one, Lost):
-                log.warning(
-                    "%s no longer has %s, which this host has not received",
-                    self._mirror, counted(one.last - one.first + 1, "message"),
-                )  # fmt: skip
-                continue
-            if one.header.layout != self._layout:
-                self._refuse_layout()
-                continue
-            late_ns = one.header.age_ns + (self._clock.now_ns() - one.at_ns)
-            self._left_out += one.header.left_out
-            try:
-                for entry in decode_entries(one.data):
-                    self._publish(entry, late_ns)
-            except ValueError as error:
-                self._report(error)
+    def _deliver(self, one: Received | Lost) -> None:
+        if isinstance(one, Lost):
+            what = counted(one.last - one.first + 1, "message")
+            log.warning("%s no longer has %s, which this host has not received", self._mirror, what)
+            return
+        if one.header.layout != self._layout:
+            self._refuse_layout()
+            return
+        late_ns = one.header.age_ns + (self._clock.now_ns() - one.at_ns)
+        self._left_out += one.header.left_out
+        try:
+            for entry in decode_entries(one.data):
+                self._publish(entry, late_ns)
+        except ValueError as error:
+            self._report(error)
 
     def _publish(self, entry: Entry, late_ns: int) -> None:
         if isinstance(entry, Frame):
@@ -228,6 +237,7 @@ class MirrorLoop:
             frame.effective,
         )  # fmt: skip
         self._output.publish(image)
+        self._pace.spend(now_ns)
         self.counters.polls += 1
         self.counters.round_trip_us = late_ns // 1000
         if not self._open and not self._bad:
@@ -319,6 +329,28 @@ class MirrorLoop:
             reason = next(filter(None, reply.result().reasons), "no answer came")
             raise UnconfirmedError(reason, found)
         return cast(Sequence[str], found)
+
+
+class _Pace:
+    """Limits the rate of frames: a token bucket."""
+
+    def __init__(self, rate_hz: float, burst: float) -> None:
+        self._rate, self._burst = rate_hz / 1e9, max(1.0, burst)
+        self._tokens, self._at_ns = self._burst, 0
+
+    def _refill(self, now_ns: int) -> None:
+        self._tokens = min(self._burst, self._tokens + (now_ns - self._at_ns) * self._rate)
+        self._at_ns = now_ns
+
+    def wait_ns(self, now_ns: int) -> int:
+        """Return the time in ns until the next frame may be published; 0 if it may be now."""
+        self._refill(now_ns)
+        return 0 if self._tokens > 0 else 1 + int(-self._tokens / self._rate)
+
+    def spend(self, now_ns: int) -> None:
+        """Count a published frame."""
+        self._refill(now_ns)
+        self._tokens -= 1
 
 
 def _outcome(kind: OutcomeKind, reason: str) -> str | LostWrite:

@@ -180,6 +180,19 @@ def test_frames_keep_what_the_owner_published(mirroring: Mirroring) -> None:
     assert first.delay_us >= 250
 
 
+def test_readers_can_follow_what_comes_after_an_outage(mirroring: Mirroring) -> None:
+    """The ring holds fewer frames than an outage brings; a reader that wakes up each 0.1 s misses none."""
+    count = 3 * mirroring.block.ring.slot_count
+    for first in range(7, 7 + count, 50):
+        mirroring.send(*(frame(number, 1) for number in range(first, min(first + 50, 7 + count))), age_ns=30 * S)
+    cycles = [mirroring.next().cycle]
+    while cycles[-1] < 1006 + count:
+        assert mirroring.cursor.behind < mirroring.block.ring.slot_count // 2
+        cycles.append(mirroring.next().cycle)
+    assert cycles == list(range(1007, 1007 + count))
+    assert mirroring.cursor.missed == 0
+
+
 def test_late_frames_are_stale_but_keep_their_quality(mirroring: Mirroring) -> None:
     mirroring.send(frame(7, 1), age_ns=30 * S)
     late = mirroring.next()
