@@ -94,9 +94,8 @@ class SeededRandom:
         known, first, numbers = self._batches.get(purpose, _NO_BATCH)
         if known == run and 0 <= place - first < BATCH:
             return numbers[place - first]
-        base = _mix(self._key + run & _MASK) + _GOLDEN & _MASK
-        words: Words = np.arange(place, place + BATCH, dtype=np.uint64) + np.uint64(base)
-        words = _mix_all(words)
+        base = _mix(self._key + run & _MASK) + place + _GOLDEN & _MASK
+        words = _mix_all(np.arange(BATCH, dtype=np.uint64) + np.uint64(base))
         for part in (purpose, 0):
             words = _mix_all(words + np.uint64(part + _GOLDEN))
         numbers = ((words >> np.uint64(11)).astype(np.float64) * 2.0**-53).tolist()
