@@ -9,11 +9,12 @@ import json
 import math
 import os
 import re
+import shutil
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from types import FrameType, MappingProxyType
@@ -227,6 +228,25 @@ def room(options: argparse.Namespace) -> int | None:
     There is no limit with ``--full``, or if standard output is not a terminal.
     """
     return None if options.full or not sys.stdout.isatty() else SHOWN_CHARACTERS
+
+
+def draw(lines: Sequence[str], drawn: int, remedy: str = "; enlarge the window") -> int:
+    """Show lines on the terminal in the place of those that were drawn before, and return their number.
+
+    Args:
+        lines: The lines. If there are more than the window has, the last one says how many are left
+            out, and then ``remedy``.
+        drawn: What the previous call has returned; 0 for the first call.
+        remedy: How to see all lines.
+    """
+    rows = shutil.get_terminal_size().lines
+    if len(lines) >= rows:
+        lines = [*lines[: max(rows - 2, 0)], f"… and {len(lines) - rows + 2} more lines{remedy}"]
+    up = f"\x1b[{drawn}F" if drawn else ""
+    text = "".join(f"{line}\x1b[K\n" for line in lines)
+    sys.stdout.write(f"{up}\x1b[?7l{text}\x1b[J\x1b[?7h")  # the terminal cuts long lines
+    sys.stdout.flush()
+    return len(lines)
 
 
 def dumps(value: Any, indent: int | None = None) -> str:

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from shmio import garbage
-from shmio.cli.common import add_full, at_least, dumps, ended_by_interrupt, room, seconds
+from shmio.cli.common import add_full, at_least, draw, dumps, ended_by_interrupt, room, seconds
 from shmio.errors import NotRunningError, PathError
 from shmio.layout.glob import choose
 from shmio.layout.model import Register
@@ -77,13 +77,13 @@ def get_arguments(parser: argparse.ArgumentParser) -> None:
 def get(cell: Cell, options: argparse.Namespace) -> int:
     """Print the present values. All values of a source are from the same frame."""
     found = cell.get(*options.patterns)
-    _load_numpy(found)
+    load_numpy(found)
     if options.json:
-        print(dumps({one.path: _object(one) for one in found}))
+        print(dumps({one.path: object_of(one) for one in found}))
         return 0
     width = _width(found)
     for one in found:
-        print(_line(one, width, room(options)))
+        print(line_of(one, width, room(options)))
     return 0
 
 
@@ -116,13 +116,13 @@ def watch(cell: Cell, options: argparse.Namespace) -> int:
     width = printed = 0
     for batch in batches:
         if not printed:
-            _load_numpy(batch)
+            load_numpy(batch)
         width = max(width, _width(batch))
         for one in batch:
             if options.json:
-                line = dumps({"path": one.path, **_object(one)})
+                line = dumps({"path": one.path, **object_of(one)})
             else:
-                line = f"{_clock(one)}  {_line(one, width, room(options))}"
+                line = f"{clock(one)}  {line_of(one, width, room(options))}"
             print(line, flush=True)
             printed += 1
             if printed == options.count:
@@ -134,23 +134,16 @@ def _table(cell: Cell, options: argparse.Namespace) -> int:
     """Show a line for each register, and update the lines in place."""
     drawn = 0
     for read in _rounds(cell, options.patterns, options.every_s or TABLE_EVERY_S):
-        columns, rows = shutil.get_terminal_size()
+        columns = shutil.get_terminal_size().columns
         if not drawn:
-            _load_numpy(read)
+            load_numpy(read)
         width, limit = _width(read), room(options)
         if limit is not None:
             limit = min(limit, columns - CLOCK_CHARACTERS - width - 4)
-        lines = [f"{_clock(one)}  {_line(one, width, limit)}" for one in read]
+        lines = [f"{clock(one)}  {line_of(one, width, limit)}" for one in read]
         if options.full:
             lines = [line[at : at + columns] for line in lines for at in range(0, len(line), columns)]
-        if len(lines) >= rows:
-            more = f"… and {len(lines) - rows + 2} more lines; enlarge the window, or use --lines"
-            lines = [*lines[: max(rows - 2, 0)], more]
-        up = f"\x1b[{drawn}F" if drawn else ""
-        text = "".join(f"{line}\x1b[K\n" for line in lines)
-        sys.stdout.write(f"{up}\x1b[?7l{text}\x1b[J\x1b[?7h")  # the terminal cuts long lines
-        sys.stdout.flush()
-        drawn = len(lines)
+        drawn = draw(lines, drawn, "; enlarge the window, or use --lines")
     return 0
 
 
@@ -196,7 +189,7 @@ def _rounds(cell: Cell, patterns: Sequence[str], every_s: float) -> Iterator[Seq
             raise NotRunningError(f"{error}: a reload removed it") from None
 
 
-def _load_numpy(readings: Sequence[Reading]) -> None:
+def load_numpy(readings: Sequence[Reading]) -> None:
     """Import numpy, which formats REAL values.
 
     During the import, Ctrl-C ends the process at once.
@@ -211,7 +204,7 @@ def _width(readings: Sequence[Reading]) -> int:
     return max((len(one.path) for one in readings), default=0)
 
 
-def _clock(reading: Reading) -> str:
+def clock(reading: Reading) -> str:
     """Return the time of a value as text; the present time if the value is bad."""
     if reading.quality is Quality.BAD:
         when = datetime.now(UTC)
@@ -222,7 +215,7 @@ def _clock(reading: Reading) -> str:
     return when.astimezone().strftime("%H:%M:%S.%f")[:-3]
 
 
-def _object(reading: Reading) -> dict[str, Any]:
+def object_of(reading: Reading) -> dict[str, Any]:
     """Return a reading as the object that ``get --json`` and ``watch --json`` print."""
     return {
         "value": json_value(reading.value, reading.register.element),
@@ -234,7 +227,7 @@ def _object(reading: Reading) -> dict[str, Any]:
     }
 
 
-def _line(reading: Reading, width: int, limit: int | None) -> str:
+def line_of(reading: Reading, width: int, limit: int | None) -> str:
     """Return a reading as a line of text.
 
     The line has the quality if it is not good, and says whether the value is injected.

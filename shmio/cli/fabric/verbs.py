@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from shmio.cli.common import add_full, add_json, add_verbs, at_least, load, seconds
+
 from shmio.cli.common import add_json, add_verbs, at_least, load, seconds
 
 
@@ -29,6 +31,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     fleet("status", "Print the state of a cell and of its sources.", "print one JSON object").add_argument(
         "cell", metavar="CELL", help="name of the cell, such as plant1.line3.a50"
     )
+    watch = fleet("watch", "Print registers of any cells whenever they change.", "print a JSON object for each change")
+    watch.add_argument(
+        "watched", nargs="+", metavar="PATTERN", help="cell and path, such as 'plant1.*.*/cell/Outputs/13'"
+    )
+    watch.add_argument("-n", dest="count", type=at_least(1), metavar="N", help="stop after N lines")
+    add_full(watch)
+    top = fleet("top", "Print rate, size, lag and quality of each source, again and again.", "print JSON lines")
+    top.add_argument(
+        "--every", dest="every_s", type=seconds, default=1.0, metavar="SECONDS", help="the interval (default: 1)"
+    )
+    top.add_argument("-n", dest="count", type=at_least(1), metavar="N", help="stop after N intervals")
+
     _add_archive(
         fleet("archive", "Write the histories of cells to Parquet files, until it is stopped.", "print JSON lines")
     )
