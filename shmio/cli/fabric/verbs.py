@@ -7,8 +7,6 @@ from pathlib import Path
 
 from shmio.cli.common import add_full, add_json, add_verbs, at_least, load, seconds
 
-from shmio.cli.common import add_json, add_verbs, at_least, load, seconds
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the verbs to the parser of ``shmio fabric``."""
