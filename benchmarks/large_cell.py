@@ -76,12 +76,14 @@ print(time.perf_counter() - begin)
 """
 
 
+PLAIN = {name: os.environ[name] for name in os.environ if not name.startswith("PYTHON")}
+"""The environment of a user's shell: what a command prints is buffered, and Python keeps the code that it compiles."""
+
+
 def timed(*command: str | Path, cwd: Path) -> float:
     """Run a command, and return the s until it ended."""
-    # As in a user's shell: what a command prints is buffered, and Python keeps the code that it has compiled.
-    plain = {name: os.environ[name] for name in os.environ if not name.startswith("PYTHON")}
     begin_s = time.monotonic()
-    subprocess.run(command, cwd=cwd, env=plain, stdout=subprocess.DEVNULL, check=True)
+    subprocess.run(command, cwd=cwd, env=PLAIN, stdout=subprocess.DEVNULL, check=True)
     return time.monotonic() - begin_s
 
 
@@ -94,7 +96,7 @@ def measure(cell: Cell) -> dict[str, float]:
     try:
         time.sleep(3)  # the bridge publishes each register once
         program = ATTACH.format(name=cell.instance, path=PATH)
-        attach = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+        attach = subprocess.run([sys.executable, "-c", program], env=PLAIN, capture_output=True, text=True, check=True)
         get_s = timed(BIN / "shmio", "get", PATH, cwd=cell.folder)
         list_s = timed(BIN / "shmio", "list", cwd=cell.folder)
     finally:
