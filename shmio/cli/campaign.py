@@ -99,6 +99,7 @@ def _parser() -> argparse.ArgumentParser:
     _reports(live)
     add_json(live)
     _falsify(verb("falsify", "search the ranges of a campaign for values at which an expectation fails"))
+    _worker(verb("worker", "run the trials of searches on other hosts (falsify --farm)"))
     return parser
 
 
@@ -114,7 +115,13 @@ def _falsify(verb: argparse.ArgumentParser) -> None:
         default="tpe",
         help="the strategy (default: tpe); tpe and cmaes need optuna",
     )
-    verb.add_argument("--jobs", type=at_least(1), default=1, metavar="N", help="trials at once (default: 1)")
+    verb.add_argument(
+        "--jobs",
+        type=at_least(1),
+        default=1,
+        metavar="N",
+        help="trials at once (default: 1); with --farm, on all workers together",
+    )
     verb.add_argument("--seed", type=seed_number, metavar="N", help="the same seed gives the same trials (default: 0)")
     verb.add_argument("--all", action="store_true", help="go on after the first failure")
     verb.add_argument("--resume", action="store_true", help="continue an interrupted search")
@@ -132,7 +139,36 @@ def _falsify(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--shrink", type=at_least(0), default=100, metavar="N", help="runs to shrink a case (default: 100)"
     )
+    verb.add_argument("--farm", metavar="URL", help="run the trials on the workers at this NATS server")
+    verb.add_argument(
+        "--send",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="PATH",
+        help="a file or folder that the models need on the workers, besides their Python files",
+    )
+    _access(verb)
     add_json(verb)
+
+
+def _worker(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument(
+        "--farm", required=True, metavar="URL", help="the NATS server, such as nats://host:4222; several with commas"
+    )
+    verb.add_argument("--jobs", type=at_least(1), default=1, metavar="N", help="trials at once (default: 1)")
+    _access(verb)
+
+
+def _access(verb: argparse.ArgumentParser) -> None:
+    """Add the options for the connection to a NATS server."""
+    verb.add_argument(
+        "--credentials", metavar="FILE", help="a .creds file, or the seed of an NKey, for the NATS server"
+    )
+    verb.add_argument("--ca", metavar="FILE", help="the authority of the NATS server's certificate (PEM)")
+    verb.add_argument("--cert", metavar="FILE", help="the certificate to show to the NATS server (PEM)")
+    verb.add_argument("--key", metavar="FILE", help="its key (PEM)")
+    verb.add_argument("--insecure", action="store_true", help="allow a NATS server on another host in plain text")
 
 
 def _settings(verb: argparse.ArgumentParser) -> None:

@@ -16,7 +16,7 @@ from typing import Any, Final
 from shmio.config.ranges import Point, Space
 from shmio.errors import ConfigError, ModelError
 from shmio.falsification.journal import Journal, Line
-from shmio.falsification.pool import Pool
+from shmio.falsification.pool import TrialPool
 from shmio.falsification.search import Search
 from shmio.falsification.shrink import Case, Shrinker
 from shmio.falsification.trial import Result, Status, Task
@@ -92,7 +92,7 @@ class Falsifier:
         self,
         space: Space,
         search: Search,
-        pool: Pool,
+        pool: TrialPool,
         journal: Journal,
         over: threading.Event,
         *,

@@ -10,7 +10,7 @@ import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Final, Self, cast
+from typing import IO, Final, Protocol, Self, cast
 
 import msgspec
 
@@ -40,10 +40,36 @@ class _Process:
     answer: bytearray = field(default_factory=bytearray)
 
 
+class TrialPool(Protocol):
+    """Runs trials, several at once, for a search."""
+
+    @property
+    def jobs(self) -> int:
+        """Maximum number of trials at once."""
+        ...
+
+    @property
+    def idle(self) -> int:
+        """Number of trials that can be submitted now."""
+        ...
+
+    def submit(self, task: Task) -> None:
+        """Start a trial. There must be an idle place."""
+        ...
+
+    def wait(self, timeout_s: float) -> list[Result]:
+        """Wait for results, for at most ``timeout_s`` seconds. Return the results that have arrived."""
+        ...
+
+    def cancel(self) -> None:
+        """End the trials that are running, without results."""
+        ...
+
+
 class Pool:
     """A pool of processes that run trials. A process that ends or takes too long is replaced for the next trial."""
 
-    def __init__(self, config: Path, folder: Path, jobs: int, limit_s: float) -> None:
+    def __init__(self, config: Path, folder: Path, jobs: int, limit_s: float, home: Path | None = None) -> None:
         """Create the pool. Processes start when they are needed.
 
         Args:
@@ -51,10 +77,11 @@ class Pool:
             folder: Folder of the campaign file.
             jobs: Maximum number of trials at once.
             limit_s: Maximum duration of a trial, in s of real time.
+            home: Current folder of the processes; None: that of this process.
 
         """
         self.jobs = jobs
-        self._config, self._folder, self._limit_s = config, folder, limit_s
+        self._config, self._folder, self._limit_s, self._home = config, folder, limit_s, home
         self._processes: list[_Process] = []
         self._selector = selectors.DefaultSelector()
 
@@ -123,6 +150,7 @@ class Pool:
         command = [sys.executable, "-m", "shmio.falsification.worker", str(os.getpid()), str(self._config)]
         popen = subprocess.Popen(
             [*command, str(self._folder)],
+            cwd=self._home,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,

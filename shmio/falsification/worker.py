@@ -26,7 +26,8 @@ def main() -> None:
     """
     if not end_with_parent(int(sys.argv[1])):
         return
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, too, which decides
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # they reach the parent, too, which decides
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what models print must not get into the answers
     instance, folder = prepare_laboratory(Path(sys.argv[2])), Path(sys.argv[3])

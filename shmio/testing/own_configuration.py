@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
-import json
 import re
 import secrets
 from collections.abc import Iterator
@@ -13,6 +11,7 @@ from typing import Any, Final
 
 from shmio.config import Address
 from shmio.config.read import read_tables
+from shmio.config.toml import toml_file
 from shmio.connectors import registry
 from shmio.connectors.base import Computed, Replayed
 from shmio.emulators.ports import reserved_port
@@ -63,7 +62,7 @@ class OwnConfiguration:
             _redirect(source, ports)
         self.file = folder / FILE
         """The file of the copy."""
-        self.file.write_text("".join(f"{_key(key)} = {_toml(value)}\n" for key, value in tables.items()))
+        self.file.write_text(toml_file(tables))
 
 
 def _all_computed(tables: dict[str, Any]) -> bool:
@@ -128,25 +127,3 @@ def _redirect(source: dict[str, Any], ports: dict[str, Address]) -> None:
     new = ports.get(str(_address(f"{source.get('host')}:{source.get('port')}")))
     if new is not None:
         source["host"], source["port"] = new.host, new.port
-
-
-# -- TOML --------------------------------------------------------------------------------------------------------------
-
-
-def _key(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def _toml(value: object) -> str:
-    """Return a value as TOML in one line."""
-    if isinstance(value, str):
-        return _key(value)
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{_key(key)} = {_toml(inner)}" for key, inner in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_toml, value)) + "]"
-    if isinstance(value, datetime.date | datetime.time):
-        return value.isoformat()
-    return repr(value)  # numbers, inf and nan included

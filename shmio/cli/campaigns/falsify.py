@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from shmio.campaigns.digests import of_configuration, of_file, of_layouts
 from shmio.cli.campaigns.run import configuration_of, duration_of
@@ -31,7 +31,12 @@ from shmio.plan.processes import Plan
 from shmio.version import __version__
 from shmio.wording import printable
 
+if TYPE_CHECKING:
+    from shmio.falsification.farm.pool import FarmPool
+
 MAX_JOBS: Final = 64
+MAX_FARM_JOBS: Final = 1024
+SHOWN_FILES: Final = 10
 EACH_S: Final = 0.2
 """Interval in s at which the progress line on a terminal is updated."""
 LINES_S: Final = 10.0
@@ -51,8 +56,11 @@ def falsify(arguments: argparse.Namespace) -> int:
     file: Path = arguments.campaign
     if arguments.trials > MAX_TRIALS:
         raise ConfigError(f"--trials {arguments.trials}: at most {MAX_TRIALS} are possible")
-    if arguments.jobs > MAX_JOBS:
-        raise ConfigError(f"--jobs {arguments.jobs}: at most {MAX_JOBS} are possible")
+    most = MAX_JOBS if arguments.farm is None else MAX_FARM_JOBS
+    if arguments.jobs > most:
+        raise ConfigError(f"--jobs {arguments.jobs}: at most {most} are possible")
+    if arguments.send and arguments.farm is None:
+        raise ConfigError("--send: this option is only for --farm")
     read = CampaignFile(file)
     settings = read_settings(arguments.settings)
     try:
@@ -106,10 +114,11 @@ class _Command:
         self._duration_s: float = tables["duration_s"]
         self._step_s: float = tables["step_ms"] / 1000
         self._progress = _Progress(arguments.trials, silent=arguments.json)
+        self._farm: FarmPool | None = None
 
     def run(self) -> int:
         """Search, and return the exit status."""
-        arguments, campaign = self._arguments, self._arguments.campaign
+        arguments = self._arguments
         seed = arguments.seed or 0
         search = begin_search(arguments.search, self._space, seed, arguments.trials, arguments.jobs)
         grid = search.counts if isinstance(search, GridSearch) else None
@@ -120,7 +129,7 @@ class _Command:
         trials = min(arguments.trials, math.prod(grid)) if grid else arguments.trials
         with (
             Journal(self._output, beginning, resume=arguments.resume) as self._journal,
-            Pool(self._config, campaign.parent, arguments.jobs, arguments.limit) as pool,
+            self._pool() as pool,
         ):
             falsifier = Falsifier(
                 self._space, search, pool, self._journal, self._over,
@@ -136,6 +145,39 @@ class _Command:
             finally:
                 self._progress.clear()
         return self._finish()
+
+    def _pool(self) -> Pool | FarmPool:
+        """Return what runs the trials: processes of this host, or a farm."""
+        arguments, campaign = self._arguments, self._arguments.campaign
+        if arguments.farm is None:
+            return Pool(self._config, campaign.parent, arguments.jobs, arguments.limit)
+        from shmio.cli.campaigns.farm import access_of  # noqa: PLC0415  only with a farm
+        from shmio.falsification.farm.bundle import make_bundle  # noqa: PLC0415
+        from shmio.falsification.farm.environment import environment_of  # noqa: PLC0415
+        from shmio.falsification.farm.pool import FarmPool  # noqa: PLC0415
+
+        access = access_of(arguments)
+        bundle = make_bundle(self._config, campaign, self._space.at({}), arguments.send)
+        names = [*bundle.sizes]
+        shown = ", ".join(names[:SHOWN_FILES]) + (f" and {len(names) - SHOWN_FILES} more" * (len(names) > SHOWN_FILES))
+        self._tell(
+            f"farm {access}: the workers get {len(names)} files of {bundle.root}, {sum(bundle.sizes.values())} bytes: "
+            f"{shown}"
+        )
+        self._farm = FarmPool(
+            access, bundle, environment_of(bundle), campaign.name, arguments.jobs, arguments.limit, self._tell
+        )
+        return self._farm
+
+    @property
+    def _workers(self) -> int | None:
+        """Number of workers of the farm; None without a farm."""
+        return None if self._farm is None else self._farm.workers
+
+    def _tell(self, line: str) -> None:
+        """Print a line about the farm."""
+        self._progress.clear()
+        say(line, sys.stderr)
 
     def _files(self) -> dict[str, str]:
         """Return the digests of what else the trials depend on."""
@@ -172,7 +214,7 @@ class _Command:
             say(f"the ranges have only {size:.0f} points: --search grid tries each of them once", sys.stderr)
 
     def _on_trial(self, _point: Point, _result: Result, best: bool) -> None:
-        self._progress.at(self._falsifier, best=best)
+        self._progress.at(self._falsifier, best=best, workers=self._workers)
 
     def _on_failure(self, failure: Failure) -> None:
         """Store a shrunk case, unless it is stored already."""
@@ -271,8 +313,8 @@ class _Progress:
         taken_s = max(time.monotonic() - self._begun_s - falsifier.shrinking_s, 1e-9)
         return (tally.done - self._before) / taken_s, (tally.simulated_s - self._simulated_s) / taken_s
 
-    def at(self, falsifier: Falsifier, *, best: bool) -> None:
-        """Show the progress, if it is time to."""
+    def at(self, falsifier: Falsifier, *, best: bool, workers: int | None) -> None:
+        """Show the progress, if it is time to. ``workers`` is the number of workers of the farm, if any."""
         now_s = time.monotonic()
         if self._silent or (now_s < self._next_s and (self._terminal or not best)):
             return
@@ -284,6 +326,8 @@ class _Progress:
             text += f", least robustness {tally.best.robustness:.6g} (trial {tally.best.number})"
         if tally.failed:
             text += f", {tally.failed} failed"
+        if workers is not None:
+            text += f", {workers} worker" + "s" * (workers != 1)
         if not self._terminal:
             say(text, sys.stderr)
             return

@@ -1,0 +1,212 @@
+"""What a search and its workers exchange: subjects, messages, the work queue, and the store of bundles.
+
+A search offers its trials each ``BEAT_S`` on one subject, until it is over, and each worker answers
+with its state. These messages are not stored: who is silent is gone. Tasks and results are messages
+of a JetStream stream with the retention of a work queue. A worker acknowledges a task after the
+server has stored the result. The server delivers a task again if it hears nothing for ``ACK_WAIT_S``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Annotated, Final, TypeVar
+
+import msgspec
+
+from shmio.errors import RemoteError
+from shmio.fabric.connection import INSTALL, RETRY_S
+from shmio.libraries import library
+
+if TYPE_CHECKING:
+    from nats.aio.client import Client
+    from nats.js import JetStreamContext
+    from nats.js.object_store import ObjectStore
+
+NAME: Final = "shmio_farm"
+"""Name of the stream and of the object store, and first token of all subjects."""
+OFFERS: Final = f"{NAME}.offer"
+BEAT_S: Final = 1.0
+"""Interval in s between two offers of a search, two answers of a worker, and two signs of life of a task."""
+SILENT_S: Final = 5.0
+"""Silence in s after which a worker counts as gone."""
+OVER_S: Final = 15.0
+"""Silence in s after which a search counts as over."""
+ACK_WAIT_S: Final = 5.0
+POLL_S: Final = 2.0
+"""Maximum time in s that a request for messages waits at the server."""
+KEPT_S: Final = 86_400.0
+"""Time in s that the server keeps what a search that was killed has left there."""
+MAX_DELIVERIES: Final = 10
+"""How often a task may be delivered until it counts as an error: perhaps it kills its workers."""
+
+_Id = Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{16}\Z")]
+_Text = Annotated[str, msgspec.Meta(max_length=4096)]
+_Result = TypeVar("_Result")
+
+
+class Offer(msgspec.Struct, frozen=True):
+    """An offer of a search.
+
+    Attributes:
+        search: Id of the search.
+        host: Name of its host.
+        campaign: Name of the campaign file.
+        digest: Digest of its bundle.
+        root: Folder of the bundle's files on the host, which replaces the worker's folder in messages.
+        config: Path of the configuration in the bundle.
+        folder: Path of the campaign's folder in the bundle.
+        limit_s: Maximum duration of a trial in s.
+        environment: Versions that a worker must have.
+        first: The least number of a task whose result still matters.
+        over: True in the last offer.
+
+    """
+
+    search: _Id
+    host: _Text
+    campaign: _Text
+    digest: Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{64}\Z")]
+    root: _Text
+    config: _Text
+    folder: _Text
+    limit_s: Annotated[float, msgspec.Meta(gt=0, le=86_400)]
+    environment: Annotated[dict[_Text, _Text], msgspec.Meta(max_length=1000)]
+    first: int = 0
+    over: bool = False
+
+
+class Presence(msgspec.Struct, frozen=True):
+    """A worker's answer to a search.
+
+    Attributes:
+        worker: Id of the worker.
+        host: Name of its host.
+        pid: Id of its process.
+        jobs: Number of trials that it runs at once; 0 if it leaves.
+        problem: Why it does not serve the search; empty if it does.
+
+    """
+
+    worker: _Id
+    host: _Text
+    pid: int
+    jobs: int
+    problem: _Text = ""
+
+
+def host_name() -> str:
+    """Return the name of this host."""
+    return socket.gethostname()
+
+
+def tasks_of(search: str) -> str:
+    """Return the subject of a search's tasks."""
+    return f"{NAME}.task.{search}"
+
+
+def results_of(search: str) -> str:
+    """Return the subject of a search's results."""
+    return f"{NAME}.result.{search}"
+
+
+def workers_of(search: str) -> str:
+    """Return the subject of the answers of a search's workers."""
+    return f"{NAME}.worker.{search}"
+
+
+def task_consumer(search: str) -> str:
+    """Return the name of the consumer from which the workers take a search's tasks."""
+    return f"task-{search}"
+
+
+def result_consumer(search: str) -> str:
+    """Return the name of the consumer from which a search takes its results."""
+    return f"result-{search}"
+
+
+async def contact(client: Client) -> None:
+    """Check that the server has JetStream and gives access to the queue. Create the queue if it is missing.
+
+    Raises:
+        RemoteError: It does not.
+
+    """
+    errors, js = library("nats.errors", INSTALL), library("nats.js.errors", INSTALL)
+    try:
+        await open_queue(client)
+    except js.ServiceUnavailableError:
+        raise RemoteError(
+            "the NATS server has no JetStream; start it with -js, or set jetstream in its configuration"
+        ) from None
+    except js.APIError as error:
+        raise RemoteError(f"the NATS server refuses access to {NAME}: {error.description or error}") from None
+    except (errors.Error, OSError):
+        raise RemoteError(
+            f"the NATS server does not answer about its stream {NAME}; does it let this user publish to $JS.API.>, "
+            f"$JS.ACK.> and {NAME}.>, and subscribe to _INBOX.> and {NAME}.>?"
+        ) from None
+
+
+async def open_queue(client: Client) -> bool:
+    """Create the stream, unless it exists; return whether it is new."""
+    api, errors, stream = library("nats.js.api", INSTALL), library("nats.js.errors", INSTALL), client.jetstream()
+    try:
+        await stream.stream_info(NAME)
+    except errors.NotFoundError:
+        await stream.add_stream(
+            name=NAME,
+            subjects=[tasks_of("*"), results_of("*")],
+            retention=api.RetentionPolicy.WORK_QUEUE,
+            max_age=KEPT_S,
+        )
+        return True
+    return False
+
+
+async def open_consumer(client: Client, name: str, subject: str) -> None:
+    """Create a consumer, unless it exists."""
+    api, errors, stream = library("nats.js.api", INSTALL), library("nats.js.errors", INSTALL), client.jetstream()
+    try:
+        await stream.consumer_info(NAME, name)
+    except errors.NotFoundError:
+        await stream.add_consumer(
+            NAME,
+            durable_name=name,
+            filter_subject=subject,
+            ack_policy=api.AckPolicy.EXPLICIT,
+            ack_wait=ACK_WAIT_S,
+            max_ack_pending=-1,
+            inactive_threshold=KEPT_S,
+        )
+
+
+async def open_store(client: Client) -> ObjectStore:
+    """Open the store of bundles, and create it if it does not exist."""
+    errors, stream = library("nats.js.errors", INSTALL), client.jetstream()
+    try:
+        return await stream.object_store(NAME)
+    except errors.NotFoundError:
+        return await stream.create_object_store(NAME, ttl=KEPT_S)
+
+
+async def insist(client: Client, call: Callable[[JetStreamContext], Awaitable[_Result]]) -> _Result:
+    """Call JetStream, and try again as long as the server is away.
+
+    Raises:
+        RemoteError: The server refuses, or the connection was closed for ever.
+
+    """
+    errors, js = library("nats.errors", INSTALL), library("nats.js.errors", INSTALL)
+    while True:
+        try:
+            return await call(client.jetstream())
+        except js.ServiceUnavailableError:
+            pass
+        except js.APIError as error:
+            raise RemoteError(f"the NATS server refuses access to {NAME}: {error.description or error}") from None
+        except (errors.Error, OSError):  # a time-out is an OSError
+            if client.is_closed:
+                raise RemoteError("the connection to the NATS server was closed") from None
+        await asyncio.sleep(RETRY_S)
