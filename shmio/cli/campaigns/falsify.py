@@ -128,8 +128,8 @@ class _Command:
         )  # fmt: skip
         trials = min(arguments.trials, math.prod(grid)) if grid else arguments.trials
         with (
-            Journal(self._output, beginning, resume=arguments.resume) as self._journal,
             self._pool() as pool,
+            Journal(self._output, beginning, resume=arguments.resume) as self._journal,
         ):
             falsifier = Falsifier(
                 self._space, search, pool, self._journal, self._over,
@@ -164,9 +164,10 @@ class _Command:
             f"farm {access}: the workers get {len(names)} files of {bundle.root}, {sum(bundle.sizes.values())} bytes: "
             f"{shown}"
         )
-        self._farm = FarmPool(
-            access, bundle, environment_of(bundle), campaign.name, arguments.jobs, arguments.limit, self._tell
-        )
+        environment, problem = environment_of(bundle)
+        if problem:
+            self._tell(f"farm: the models do not start from these files alone; is one missing (--send)? {problem}")
+        self._farm = FarmPool(access, bundle, environment, campaign.name, arguments.jobs, arguments.limit, self._tell)
         return self._farm
 
     @property

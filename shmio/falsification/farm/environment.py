@@ -7,17 +7,15 @@ the models for that in a fresh process, so that only the packages that trials im
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import platform
 import subprocess
 import sys
 import tempfile
-from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, packages_distributions, version
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 
@@ -45,8 +43,15 @@ def own() -> dict[str, str]:
     return dict(zip(_BESIDES, values, strict=True))
 
 
-def environment_of(bundle: Bundle) -> dict[str, str]:
-    """Return the environment of trials, versions by name, and check that the bundle has all files to start with.
+class Survey(NamedTuple):
+    """The environment of trials, and why the models do not start from the files of a bundle; empty if they do."""
+
+    environment: dict[str, str]
+    problem: str
+
+
+def environment_of(bundle: Bundle) -> Survey:
+    """Return the environment of trials, and check that a bundle has all files to load the models.
 
     Raises:
         ConfigError: A file is missing.
@@ -57,21 +62,20 @@ def environment_of(bundle: Bundle) -> dict[str, str]:
         return _load(Path(folder) / "files" / bundle.config)
 
 
-def _load(config: Path) -> dict[str, str]:
-    """Load the models of a configuration in a process of their own, and return its environment."""
+def _load(config: Path) -> Survey:
+    """Load the models of a configuration in a process of their own."""
     command = [sys.executable, "-m", "shmio.falsification.farm.environment", str(config)]
     try:
         done = subprocess.run(command, cwd=config.parent, capture_output=True, timeout=START_S, check=False)
     except subprocess.TimeoutExpired:
         raise ConfigError(f"{config}: loading the models takes more than {START_S:g} s") from None
     try:
-        found: dict[str, str] = msgspec.json.decode(done.stdout, type=dict[str, str])
+        return msgspec.json.decode(done.stdout, type=Survey)
     except msgspec.MsgspecError:
         last = done.stderr.decode(errors="replace").strip() or f"its process ended with status {done.returncode}"
         raise ConfigError(
             f"--farm: the files for the workers are not complete; name what is missing with --send: {last}"
         ) from None
-    return found
 
 
 def differences(wanted: dict[str, str], host: str) -> list[str]:
@@ -109,16 +113,20 @@ def _packages() -> dict[str, str]:
 
 def main() -> int:
     """Print the environment of the configuration that is named by the only argument."""
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what models print must not get into the answer
     try:
         instance = prepare_laboratory(Path(sys.argv[1]))
     except ShmioError as error:
         sys.stderr.write(f"{error}\n")
         return 1
-    with suppress(ShmioError), Laboratory(instance):  # perhaps the models need the campaign's parameters
-        pass
-    answers.write(json.dumps(own() | _packages()))
+    problem = ""
+    try:
+        with Laboratory(instance) as lab, lab.attach() as cell:
+            cell.step(0.001)
+    except ShmioError as error:  # perhaps only because the models need the campaign's parameters
+        problem = str(error)
+    answers.write(msgspec.json.encode(Survey(own() | _packages(), problem)))
     answers.close()
     return 0
 

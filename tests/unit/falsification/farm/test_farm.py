@@ -1,0 +1,340 @@
+"""A search whose trials run on workers: same results as without them, whatever happens to workers and server."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import nats
+import pytest
+
+from shmio.cli.campaign import main
+from shmio.errors import ConfigError, RemoteError
+from shmio.fabric.connection import Access
+from shmio.falsification.farm.bundle import Bundle, make_bundle
+from shmio.falsification.farm.environment import environment_of, own
+from shmio.falsification.farm.pool import FarmPool
+from shmio.falsification.trial import Result, Task
+from tests.nats_server import NatsServer, nats_server
+
+CONFIG = """
+[instance]
+name = "farm-test"
+clock = "stepped"
+
+[[source]]
+name = "lift"
+connector = "simulation"
+model = "farm_lift:Lift"
+period_ms = 20
+"""
+MODEL = """
+import os
+import time
+from pathlib import Path
+
+from farm_parts.rope import LENGTH
+from shmio.simulation import Input, Model, Output, Parameter
+
+class Lift(Model):
+    speed = Input("LREAL", initial=1.0)
+    height = Output("LREAL")
+    gain = Parameter("LREAL", initial=1.0)
+    wait = Parameter("LREAL", initial=0.0)
+
+    def start(self):
+        self.data = (Path(__file__).parent / "gain.txt").read_text()
+
+    def step(self, time_s, dt_s):
+        self.height += float(self.data) * LENGTH * self.gain * self.speed * dt_s
+        if self.wait > 0 and time_s > 0.05:
+            here = Path({place!r})
+            (here / f"waits-{{os.getpid()}}").touch()
+            while not (here / "go").exists():
+                time.sleep(0.01)
+        if self.gain > 1.45:
+            raise ValueError("too fast")
+"""
+CAMPAIGN = """
+config = "supervisor.toml"
+duration_s = 0.4
+
+[parameters.lift]
+gain = { from = 0.5, to = 1.5 }
+
+[[injection]]
+name = "push"
+target = "lift/height"
+operation = "offset"
+value = { from = 2, to = 4.9 }
+start_s = { from = 0, to = 0.3, step = 0.02 }
+for_s = 0.1
+
+[[expect]]
+name = "low"
+always = "lift/height < 5"
+"""
+TRIAL = {
+    "duration_s": 0.2,
+    "step_ms": 20.0,
+    "expect": [{"name": "low", "always": "lift/height < 0.5"}],
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    folder = tmp_path / "cell"
+    (folder / "farm_parts").mkdir(parents=True)
+    for name, text in (
+        ("farm_parts/rope.py", "LENGTH = 1.0"),
+        ("farm_lift.py", MODEL.format(place=str(tmp_path))),
+        ("gain.txt", "1.0"),
+        ("supervisor.toml", CONFIG),
+        ("campaign.toml", CAMPAIGN),
+    ):
+        (folder / name).write_text(text)
+    return folder
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[NatsServer]:
+    with nats_server(tmp_path / "nats") as found:
+        yield found
+
+
+@contextmanager
+def worker(server: NatsServer) -> Iterator[subprocess.Popen[str]]:
+    """Run a worker that is connected."""
+    command = [sys.executable, "-m", "shmio.cli.campaign", "worker", "--farm", server.url]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as one:
+        try:
+            until(one, "waiting for searches")
+            yield one
+        finally:
+            one.terminate()
+
+
+def until(process: subprocess.Popen[str], text: str) -> str:
+    """Read standard error until a line has a text, and return the line."""
+    assert process.stderr is not None
+    seen = []
+    for line in process.stderr:
+        seen.append(line)
+        if text in line:
+            return line
+    raise AssertionError("".join(seen))
+
+
+def pool(server: NatsServer, bundle: Bundle, told: list[str], **environment: str) -> FarmPool:
+    return FarmPool(Access((server.url,)), bundle, own() | environment, "campaign.toml", 2, 60, told.append)
+
+
+@pytest.fixture
+def bundle(folder: Path) -> Bundle:
+    return make_bundle(folder / "supervisor.toml", folder / "campaign.toml", TRIAL, [folder / "gain.txt"])
+
+
+def task(number: int, **parameters: float) -> Task:
+    return Task(number, {**TRIAL, "parameters": {"lift": parameters}})
+
+
+def results(farm: FarmPool, count: int) -> dict[int, Result]:
+    found: list[Result] = []
+    while len(found) < count:
+        found += farm.wait(1)
+    return {one.number: one for one in found}
+
+
+def waiting(folder: Path, count: int) -> list[int]:
+    """Wait until some trials wait for the file that lets them go on; return the ids of their processes."""
+    while len(found := list(folder.parent.glob("waits-*"))) < count:
+        time.sleep(0.01)  # another process creates them
+    return [int(one.name.partition("-")[2]) for one in found]
+
+
+def parent(pid: int) -> int:
+    return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+
+
+def journal(folder: Path) -> list[Any]:
+    """Return the lines of a search without the times that trials took."""
+    lines = [json.loads(line) for line in (folder / "trials.jsonl").read_text().splitlines()]
+    for one in lines:
+        if one.get("result"):
+            del one["result"]["taken_s"]
+    return lines
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return the campaigns of all cases. Each has the digest of its recording, which also has the host's clocks."""
+    return {file.parent.name: file.read_bytes() for file in folder.glob("case-*/campaign.toml")}
+
+
+def test_a_farm_gives_the_same_journal_and_cases_although_a_worker_is_killed(
+    folder: Path, server: NatsServer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(folder)
+    words = [
+        "falsify",
+        "campaign.toml",
+        "--all",
+        "--jobs",
+        "2",
+        "--seed",
+        "4",
+        "--shrink",
+        "1",
+        "-o",
+        "out",
+        "--trials",
+    ]
+    assert main([*words, "8"]) == 1
+    (folder / "out").rename(folder / "local")
+    farm = ["--farm", server.url, "--send", "gain.txt"]
+    with worker(server) as first, worker(server):
+        assert main([*words, "3", *farm]) == 3
+        whole = [sys.executable, "-m", "shmio.cli.campaign", *words, "8", *farm, "--resume"]
+        with subprocess.Popen(whole, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as search:
+            assert "2 workers" in until(search, " of 8 trials")
+            first.kill()
+            _, said = search.communicate()
+        assert search.returncode == 1, said
+    assert journal(folder / "out") == journal(folder / "local")
+    assert contents(folder / "local").keys() == {"case-001"}
+    assert contents(folder / "out") == contents(folder / "local")
+    assert any("too fast (farm_lift.py" in str(line) for line in journal(folder / "out")), "errors are equal, too"
+    assert "the workers get 4 files" in capsys.readouterr().err
+
+
+def test_the_trial_of_a_dead_worker_is_repeated_and_counts_once(
+    folder: Path, server: NatsServer, bundle: Bundle
+) -> None:
+    told: list[str] = []
+    with worker(server) as first, pool(server, bundle, told) as farm:
+        farm.submit(task(7, wait=1))
+        (running,) = waiting(folder, 1)
+        assert parent(running) == first.pid
+        farm.submit(task(8))
+        assert farm.idle == 0
+        first.kill()
+        with worker(server) as second:
+            ((folder.parent) / f"waits-{running}").unlink()
+            assert results(farm, 1)[8].status == "passed", "the second worker has one place, and takes what is free"
+            again = waiting(folder, 1)
+            assert parent(again[0]) == second.pid
+            (folder.parent / "go").touch()
+            found = results(farm, 1)
+            assert found[7].status == "passed"
+            assert found[7].simulated_s == pytest.approx(0.2)
+            assert farm.wait(0.5) == []
+            assert farm.idle == 2
+    assert not Path(f"/proc/{running}").exists(), "it ended with its worker"
+    assert told == []
+
+
+def test_a_search_survives_a_new_start_of_the_server_and_can_cancel(
+    folder: Path, server: NatsServer, bundle: Bundle
+) -> None:
+    told: list[str] = []
+    with worker(server) as one:
+        with pool(server, bundle, told) as farm:
+            farm.submit(task(1, wait=1))
+            farm.submit(task(2))
+            waiting(folder, 1)
+            server.stop(signal.SIGKILL)
+            (folder.parent / "go").touch()
+            until(one, "connection is lost")
+            server.start()
+            assert {number: one.status for number, one in results(farm, 2).items()} == {1: "passed", 2: "passed"}
+            assert any("connection is lost" in line for line in told)
+            (folder.parent / "go").unlink()
+            for old in folder.parent.glob("waits-*"):
+                old.unlink()
+            farm.submit(task(3, wait=1))
+            farm.submit(task(4, wait=1))
+            (pid,) = waiting(folder, 1)
+            farm.cancel()
+            assert farm.idle == 2
+            farm.submit(task(5))
+            assert results(farm, 1).keys() == {5}
+            assert not Path(f"/proc/{pid}").exists()
+        until(one, "is over: 3 trials")
+
+
+def test_workers_that_are_missing_or_different_are_named(
+    server: NatsServer, bundle: Bundle, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told: list[str] = []
+
+    def look(farm: FarmPool, text: str) -> None:
+        while not any(re.search(text, line) for line in told):
+            assert farm.wait(0.1) == []
+
+    with pool(server, bundle, told) as farm:
+        look(farm, f"no worker; start one .* shmio-campaign worker --farm {server.url}")
+        assert farm.workers == 0
+    with worker(server) as one, pool(server, bundle, told, msgspec="0.1", nothing="3") as farm:
+        farm.submit(task(1))
+        look(farm, rf"pid {one.pid}.*msgspec is 0\.\d+\.\d+ here, but 0\.1 on .*; nothing is not installed here, but 3")
+        until(one, "msgspec is")
+        assert farm.workers == 0
+    with worker(server) as one, pool(server, bundle, told, shmio="0.0.1 (code 1)") as farm:
+        look(farm, r"shmio is .*code .* here, but 0\.0\.1")
+    server.stop()
+    with pytest.raises(RemoteError, match="no NATS server can be reached"), pool(server, bundle, told):
+        pass
+    for words, error in (
+        (["--farm", "nats://192.0.2.1:4222"], "plain text"),
+        (["--farm", "http://127.0.0.1"], "not a NATS server"),
+        (["--farm", "nats://u:p@127.0.0.1"], "--credentials"),
+        (["--send", "gain.txt"], "only for --farm"),
+    ):
+        assert main(["falsify", str(folder / "campaign.toml"), "-o", str(folder / "out"), *words]) == 2
+        assert error in capsys.readouterr().err
+    assert not (folder / "out").exists(), "the next attempt needs no --resume"
+
+
+def test_files_that_the_models_need_are_named_before_the_search(folder: Path) -> None:
+    def problem(*more: Path) -> str:
+        return environment_of(make_bundle(folder / "supervisor.toml", folder / "campaign.toml", TRIAL, more))[1]
+
+    assert "gain.txt" in problem()
+    assert problem(folder / "gain.txt") == ""
+    (folder / "farm_parts").rename(folder / ".farm_parts")
+    (folder / "farm_parts").symlink_to(".farm_parts")
+    with pytest.raises(ConfigError, match=r"--send.*farm_parts"):
+        problem(folder / "gain.txt")
+
+
+async def publish(url: str, subject: str, *messages: bytes) -> None:
+    client = await nats.connect(url)
+    for message in messages:
+        await client.publish(subject, message)
+    await client.drain()
+
+
+def test_hostile_messages_do_not_stop_a_worker(server: NatsServer, bundle: Bundle) -> None:
+    """Offers are checked, and a bundle must have its digest."""
+    good = {
+        "search": "0" * 16, "host": "h", "campaign": "c", "digest": "0" * 64, "root": "/", "config": "../../etc/x",
+        "folder": ".", "limit_s": 1.0, "environment": {},
+    }  # fmt: skip
+    bad: list[Any] = [None, [], {**good, "search": "../../x"}, {**good, "digest": 1}, {**good, "limit_s": -1}]
+    with worker(server) as one:
+        offers = [json.dumps(offer).encode() for offer in [*bad, good]]
+        asyncio.run(publish(server.url, "shmio_farm.offer", b"\xff", *offers))
+        assert "its files cannot be fetched" in until(one, "is not served")
+        with pool(server, bundle, []) as farm:
+            farm.submit(task(1))
+            assert results(farm, 1)[1].status == "passed"
+        one.send_signal(signal.SIGINT)
+        assert one.wait() == 0
