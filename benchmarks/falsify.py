@@ -1,4 +1,4 @@
-"""Trials a second of shmio-campaign falsify, and how many of them the strategies need.
+"""Trials a second of shmio-campaign falsify, alone and with a farm, and how many of them the strategies need.
 
 The campaign is that of examples/falsify, whose interlock fails if two signals come within 40 ms. Speed is measured
 with the command itself, without shrinking. The strategies are compared with the model of the gate alone, driven by the
@@ -12,6 +12,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Final, cast
 
@@ -25,6 +26,7 @@ from shmio.lab import prepare_laboratory
 from shmio.layout.values.codec import codec
 from shmio.simulation import ModelRunner
 from shmio.simulation.loading import load
+from tests.nats_server import nats_server
 
 EXAMPLE: Final = ROOT / "examples/falsify"
 STEP_S: Final = 0.02
@@ -71,12 +73,12 @@ def needed(read: CampaignFile, name: SearchName, seed: int, trials: int) -> int 
     return None
 
 
-def speed(jobs: int, trials: int) -> list[str]:
+def speed(jobs: int, trials: int, *options: str) -> list[str]:
     """Run the command, and return trials a second and the factor over real time."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "shmio.cli.campaign", "falsify", str(EXAMPLE / "campaign.toml"), "--json"]
         command += ["--search", "random", "--trials", str(trials), "--jobs", str(jobs), "--all", "--shrink", "0"]
-        command += ["-o", str(Path(folder) / "out")]
+        command += ["-o", str(Path(folder) / "out"), *options]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     if not done.stdout:
         raise SystemExit(done.stderr)
@@ -84,10 +86,24 @@ def speed(jobs: int, trials: int) -> list[str]:
     return [f"{found['trials_per_s']:.2f}", f"{found['times_real_time']:.0f}"]
 
 
+def farm_speed(workers: int, trials: int) -> list[str]:
+    """Run the command with a farm on this host, whose workers run one trial at a time."""
+    command = [sys.executable, "-m", "shmio.cli.campaign", "worker", "--farm"]
+    with tempfile.TemporaryDirectory() as folder, nats_server(Path(folder)) as server, ExitStack() as stack:
+        for _ in range(workers):
+            one = stack.enter_context(subprocess.Popen([*command, server.url], stderr=subprocess.PIPE, text=True))
+            stack.callback(one.terminate)
+            assert one.stderr is not None
+            assert "waiting for searches" in one.stderr.readline()
+        return speed(workers, trials, "--farm", server.url)
+
+
 def main() -> None:
     quick = begin("Falsification: trials a second, and trials until the planted fault is found")
     trials, seeds = (10, 1) if quick else (200, 10)
     table(["jobs", "trials/s", "times real time"], [[str(jobs), *speed(jobs, 2 if quick else 40)] for jobs in (1, 2)])
+    rows = [[str(workers), *farm_speed(workers, 2 if quick else 40)] for workers in (1, 2)]
+    table(["workers of a farm", "trials/s", "times real time"], rows)
     read = CampaignFile(EXAMPLE / "campaign.toml")
     point = {"late-valve.delay_ms": 4980, "late-task.delay_ms": 20, "noise.value": 1}
     assert robustness(point) == in_laboratory(read, point), (robustness(point), in_laboratory(read, point))

@@ -166,7 +166,7 @@ def _access(verb: argparse.ArgumentParser) -> None:
         "--credentials", metavar="FILE", help="a .creds file, or the seed of an NKey, for the NATS server"
     )
     verb.add_argument("--ca", metavar="FILE", help="the authority of the NATS server's certificate (PEM)")
-    verb.add_argument("--cert", metavar="FILE", help="the certificate to show to the NATS server (PEM)")
+    verb.add_argument("--certificate", metavar="FILE", help="the certificate to show to the NATS server (PEM)")
     verb.add_argument("--key", metavar="FILE", help="its key (PEM)")
     verb.add_argument("--insecure", action="store_true", help="allow a NATS server on another host in plain text")
 

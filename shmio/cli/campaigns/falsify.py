@@ -262,7 +262,7 @@ class _Command:
                 },
                 "unclear": None if unclear is None else {"trial": unclear.number, "reason": _reason(unclear)},
                 "trials_per_s": speed, "times_real_time": factor, "folder": str(self._output),
-                "problems": self._problems,
+                "problems": self._problems, **({} if self._farm is None else {"workers": self._workers}),
             })  # fmt: skip
             return status
         counts = ", ".join(f"{count} {name}" for name, count in tally.counts.items()) or "none"

@@ -22,9 +22,9 @@ def access_of(arguments: argparse.Namespace) -> Access:
         ConfigError: An address is invalid, or shmio would send plain text over the network.
 
     """
-    ca, certificate, key = arguments.ca, arguments.cert, arguments.key
+    ca, certificate, key = arguments.ca, arguments.certificate, arguments.key
     if (certificate is None) != (key is None):
-        raise ConfigError("--cert, --key: give both or neither")
+        raise ConfigError("--certificate, --key: give both or neither")
     tls = MqttTls(ca=ca, certificate=certificate, key=key) if ca or certificate else None
     servers = tuple(arguments.farm.split(","))
     for url in servers:
