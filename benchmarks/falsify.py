@@ -26,6 +26,8 @@ from shmio.lab import prepare_laboratory
 from shmio.layout.values.codec import codec
 from shmio.simulation import ModelRunner
 from shmio.simulation.loading import load
+
+sys.path.insert(0, str(ROOT))
 from tests.nats_server import nats_server
 
 EXAMPLE: Final = ROOT / "examples/falsify"

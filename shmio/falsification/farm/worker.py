@@ -162,6 +162,8 @@ class Worker:
             await self._client.subscribe(OFFERS, cb=self._hear)
             self._tell(f"connected to {self._access}: {self._jobs} trials at once; waiting for searches")
             while not stop.is_set():
+                if self._client.is_closed:
+                    raise RemoteError(f"{self._access}: the server closed the connection, and refuses another one")
                 await self._beat()
                 with suppress(TimeoutError):
                     await asyncio.wait_for(stop.wait(), BEAT_S)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import re
 import signal
 import subprocess
@@ -14,7 +15,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import nats
+import nkeys  # type: ignore[import-untyped]
 import pytest
 
 from shmio.cli.campaign import main
@@ -83,6 +86,9 @@ for_s = 0.1
 name = "low"
 always = "lift/height < 5"
 """
+PUBLISH = ["shmio_farm.>", "$JS.API.>", "$JS.ACK.>", "$O.shmio_farm.>"]
+SUBSCRIBE = ["shmio_farm.>", "_INBOX.>"]
+"""What docs/how-to/find-a-failing-alteration.md lets a user of a farm do."""
 TRIAL = {
     "duration_s": 0.2,
     "step_ms": 20.0,
@@ -112,9 +118,9 @@ def server(tmp_path: Path) -> Iterator[NatsServer]:
 
 
 @contextmanager
-def worker(server: NatsServer) -> Iterator[subprocess.Popen[str]]:
+def worker(server: NatsServer, *options: str) -> Iterator[subprocess.Popen[str]]:
     """Run a worker that is connected."""
-    command = [sys.executable, "-m", "shmio.cli.campaign", "worker", "--farm", server.url]
+    command = [sys.executable, "-m", "shmio.cli.campaign", "worker", "--farm", server.url, *options]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as one:
         try:
             until(one, "waiting for searches")
@@ -134,8 +140,12 @@ def until(process: subprocess.Popen[str], text: str) -> str:
     raise AssertionError("".join(seen))
 
 
-def pool(server: NatsServer, bundle: Bundle, told: list[str], **environment: str) -> FarmPool:
-    return FarmPool(Access((server.url,)), bundle, own() | environment, "campaign.toml", 2, 60, told.append)
+def pool(
+    server: NatsServer, bundle: Bundle, told: list[str], credentials: str | None = None, **environment: str
+) -> FarmPool:
+    return FarmPool(
+        Access((server.url,), credentials=credentials), bundle, own() | environment, "campaign.toml", 2, 60, told.append
+    )
 
 
 @pytest.fixture
@@ -183,27 +193,15 @@ def test_a_farm_gives_the_same_journal_and_cases_although_a_worker_is_killed(
     folder: Path, server: NatsServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(folder)
-    words = [
-        "falsify",
-        "campaign.toml",
-        "--all",
-        "--jobs",
-        "2",
-        "--seed",
-        "4",
-        "--shrink",
-        "1",
-        "-o",
-        "out",
-        "--trials",
-    ]
-    assert main([*words, "8"]) == 1
+    words = ["falsify", "campaign.toml", "--search", "random", "--seed", "334", "--all", "--jobs", "2"]
+    words += ["--trials", "6", "--shrink", "1", "-o", "out"]
+    assert main(words) == 1
     (folder / "out").rename(folder / "local")
     with worker(server) as first, worker(server):
-        whole = [sys.executable, "-m", "shmio.cli.campaign", *words, "8", "--farm", server.url, "--send", "gain.txt"]
+        whole = [sys.executable, "-m", "shmio.cli.campaign", *words, "--farm", server.url, "--send", "gain.txt"]
         with subprocess.Popen(whole, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as search:
             until(search, "the workers get 4 files")
-            assert "2 workers" in until(search, " of 8 trials")
+            assert "2 workers" in until(search, " of 6 trials")
             first.kill()
             _, said = search.communicate()
         assert search.returncode == 1, said
@@ -213,27 +211,40 @@ def test_a_farm_gives_the_same_journal_and_cases_although_a_worker_is_killed(
     assert any("too fast (farm_lift.py" in str(line) for line in journal(folder / "out")), "errors are equal, too"
 
 
-def test_the_trial_of_a_dead_worker_is_repeated_and_counts_once(
-    folder: Path, server: NatsServer, bundle: Bundle
+@pytest.fixture
+def credentials(tmp_path: Path) -> tuple[str, str]:
+    """Return a file with the seed of a user, and the user's public key."""
+    file = tmp_path / "farm.nk"
+    seed = nkeys.encode_seed(os.urandom(32), nkeys.PREFIX_BYTE_USER)
+    file.write_bytes(seed)
+    return str(file), nkeys.from_seed(bytearray(seed)).public_key.decode()
+
+
+def test_the_trial_of_a_dead_worker_is_repeated_although_users_may_do_only_what_is_needed(
+    folder: Path, tmp_path: Path, bundle: Bundle, credentials: tuple[str, str]
 ) -> None:
     told: list[str] = []
-    with worker(server) as first, pool(server, bundle, told) as farm:
+    seed, key = credentials
+    user = {"nkey": key, "permissions": {"publish": PUBLISH, "subscribe": SUBSCRIBE}}
+    with (
+        nats_server(tmp_path / "nats", authorization={"users": [user]}) as server,
+        worker(server, "--credentials", seed) as first,
+        pool(server, bundle, told, seed) as farm,
+    ):
         farm.submit(task(7, wait=1))
         (running,) = waiting(folder, 1)
         assert parent(running) == first.pid
         farm.submit(task(8))
         assert farm.idle == 0
         first.kill()
-        with worker(server) as second:
-            ((folder.parent) / f"waits-{running}").unlink()
-            assert results(farm, 1)[8].status == "passed", "the second worker has one place, and takes what is free"
-            again = waiting(folder, 1)
-            assert parent(again[0]) == second.pid
+        with worker(server, "--credentials", seed) as second:
+            (folder.parent / f"waits-{running}").unlink()
+            (again,) = waiting(folder, 1)
+            assert parent(again) == second.pid
             (folder.parent / "go").touch()
-            found = results(farm, 1)
-            assert found[7].status == "passed"
+            found = results(farm, 2)
+            assert {number: one.status for number, one in found.items()} == {7: "passed", 8: "passed"}
             assert found[7].simulated_s == pytest.approx(0.2)
-            assert farm.wait(0.5) == []
             assert farm.idle == 2
     assert not Path(f"/proc/{running}").exists(), "it ended with its worker"
     assert told == []
@@ -318,6 +329,35 @@ async def publish(url: str, subject: str, *messages: bytes) -> None:
     for message in messages:
         await client.publish(subject, message)
     await client.drain()
+
+
+async def heard(url: str, subject: str) -> bytes:
+    client = await nats.connect(url)
+    subscription = await client.subscribe(subject)
+    message = await subscription.next_msg(timeout=30)
+    await client.close()
+    return message.data
+
+
+def test_a_result_that_comes_again_does_not_count_again(server: NatsServer, bundle: Bundle) -> None:
+    with pool(server, bundle, []) as farm:
+        search = json.loads(asyncio.run(heard(server.url, "shmio_farm.offer")))["search"]
+
+        def answer(*numbers: int) -> None:
+            results = [msgspec.json.encode(Result(number, "passed")) for number in numbers]
+            asyncio.run(publish(server.url, f"shmio_farm.result.{search}", b"{}", *results))
+
+        farm.submit(task(7))
+        answer(0, 0, 1)
+        assert results(farm, 1).keys() == {7}
+        farm.submit(task(8))
+        farm.submit(task(9))
+        answer(0, 2, 2)
+        assert results(farm, 1).keys() == {9}
+        answer(0, 1)
+        assert results(farm, 1).keys() == {8}
+        assert farm.wait(0.1) == []
+        assert farm.idle == 2
 
 
 def test_hostile_messages_do_not_stop_a_worker(server: NatsServer, bundle: Bundle) -> None:
