@@ -79,22 +79,33 @@ def _check_external(fabric: Fabric) -> None:
         raise ConfigError('fabric.listen: this key is only for server = "embedded"; remove it')
     for index, url in enumerate(fabric.servers):
         key = "fabric.server" if isinstance(fabric.server, str) else f"fabric.server[{index}]"
-        address = _server(key, url)
+        address = server_address(key, url, "in fabric.credentials", ', or "embedded"')
         if not (address.loopback or fabric.tls or fabric.insecure or url.startswith("tls:")):
             raise ConfigError(f"{key}: shmio would send plain text over the network to {address}; {_REMEDY}")
 
 
-def _server(key: str, url: str) -> Address:
-    """Return the address in the URL of a server."""
+def server_address(key: str, url: str, credentials: str, others: str = "") -> Address:
+    """Return the address in the URL of a server.
+
+    Args:
+        key: Where the URL is, for messages.
+        url: The URL.
+        credentials: Where to name a file with credentials, for messages.
+        others: What may take the place of a URL, for messages.
+
+    Raises:
+        ConfigError: It is not such a URL, or it has a password.
+
+    """
     try:
         parts = urlsplit(url)
         port = parts.port or PORT
     except ValueError:
         parts, port = urlsplit(""), 0
     if parts.scheme not in SCHEMES or not parts.hostname or parts.path.strip("/") or parts.query or parts.fragment:
-        raise ConfigError(f'{key}: {url!r} is not a NATS server; write nats://host:{PORT}, tls://host, or "embedded"')
+        raise ConfigError(f"{key}: {url!r} is not a NATS server; write nats://host:{PORT}, tls://host{others}")
     if parts.password or parts.username:
-        raise ConfigError(f"{key}: a URL with a password is visible to others; name a file in fabric.credentials")
+        raise ConfigError(f"{key}: a URL with a password is visible to others; name a file {credentials}")
     return Address(parts.hostname, port)
 
 

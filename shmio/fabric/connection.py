@@ -41,6 +41,7 @@ class Access(msgspec.Struct, frozen=True):
             NKey; None: without authentication.
         pinned: PEM file with the certificate of the instance's own server, the only one to trust;
             None: an authority must have issued the server's certificate.
+        options: True if options of a command name the files, instead of keys of ``[fabric]``.
 
     """
 
@@ -48,6 +49,7 @@ class Access(msgspec.Struct, frozen=True):
     tls: MqttTls | None = None
     credentials: str | None = None
     pinned: str | None = None
+    options: bool = False
 
     @classmethod
     def of(cls, fabric: Fabric) -> Access:
@@ -64,6 +66,10 @@ class Access(msgspec.Struct, frozen=True):
 
     def __str__(self) -> str:
         return ", ".join(self.servers)
+
+    def key(self, name: str) -> str:
+        """Return the option or key with this name, for messages."""
+        return f"--{name}" if self.options else f"fabric.{name}"
 
 
 async def connect(
@@ -151,7 +157,7 @@ def _tls(access: Access) -> dict[str, Any]:
     if access.pinned is not None:
         return {"tls": _pinned(access)}
     if access.tls is not None:
-        return {"tls": client_context(access.tls, "fabric.tls.")}
+        return {"tls": client_context(access.tls, access.key("" if access.options else "tls."))}
     if any(server.startswith("tls://") for server in access.servers):
         return {"tls": ssl.create_default_context()}
     return {}
@@ -185,14 +191,14 @@ def read_credentials(access: Access) -> dict[str, Any]:
         text = Path(access.credentials).read_text(encoding="ascii")
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "the file is not text"
-        raise ConfigError(f"fabric.credentials: {access.credentials}: {why}") from None
+        raise ConfigError(f"{access.key('credentials')}: {access.credentials}: {why}") from None
     if "BEGIN NATS USER JWT" in text:
         return {"user_credentials": access.credentials}
     seed = text.strip()
     if not seed.startswith("SU"):
         raise ConfigError(
-            f"fabric.credentials: {access.credentials} is neither a .creds file nor the seed of a user's NKey, which "
-            "begins with SU"
+            f"{access.key('credentials')}: {access.credentials} is neither a .creds file nor the seed of a user's "
+            "NKey, which begins with SU"
         )
     return {"nkeys_seed_str": seed, "inbox_prefix": inbox_prefix(public_key(seed, access.credentials))}
 
@@ -222,7 +228,7 @@ def inbox_prefix(key: str) -> str:
 
 def _refused(access: Access) -> str:
     if access.credentials is None:
-        return "the server asks for credentials; name the file with this host's seed in fabric.credentials"
+        return f"the server asks for credentials; name the file with this host's seed in {access.key('credentials')}"
     return f"the server does not know the credentials in {access.credentials}, or has removed them"
 
 

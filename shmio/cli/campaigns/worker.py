@@ -11,7 +11,6 @@ from shmio.cli.campaigns.farm import access_of
 from shmio.cli.common import say
 from shmio.errors import ConfigError
 from shmio.falsification.farm.worker import Worker, work_folder
-from shmio.logs import printable
 
 MAX_JOBS = 256
 
@@ -29,7 +28,7 @@ def worker(arguments: argparse.Namespace) -> int:
     if arguments.jobs > MAX_JOBS:
         raise ConfigError(f"--jobs {arguments.jobs}: at most {MAX_JOBS} are possible")
     with work_folder() as folder:
-        asyncio.run(_serve(Worker(access, arguments.jobs, folder, lambda line: say(printable(line), sys.stderr))))
+        asyncio.run(_serve(Worker(access, arguments.jobs, folder, lambda line: say(line, sys.stderr))))
     return 0
 
 

@@ -279,9 +279,7 @@ def test_a_search_survives_a_new_start_of_the_server_and_can_cancel(
         until(one, "is over: 3 trials")
 
 
-def test_workers_that_are_missing_or_different_are_named(
-    server: NatsServer, bundle: Bundle, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_workers_that_are_missing_or_different_are_named(server: NatsServer, bundle: Bundle) -> None:
     told: list[str] = []
 
     def look(farm: FarmPool, text: str) -> None:
@@ -301,13 +299,21 @@ def test_workers_that_are_missing_or_different_are_named(
     server.stop()
     with pytest.raises(RemoteError, match="no NATS server can be reached"), pool(server, bundle, told):
         pass
+
+
+def test_wrong_options_are_named_before_the_search(
+    server: NatsServer, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(folder)
     for words, error in (
         (["--farm", "nats://192.0.2.1:4222"], "plain text"),
         (["--farm", "http://127.0.0.1"], "not a NATS server"),
         (["--farm", "nats://u:p@127.0.0.1"], "--credentials"),
         (["--send", "gain.txt"], "only for --farm"),
+        (["--farm", server.url, "--send=gain.txt", "--credentials", "farm.nk"], "--credentials: farm.nk: No such file"),
+        (["--farm", server.url, "--send=gain.txt", "--ca", "farm.pem"], "--ca: farm.pem"),
     ):
-        assert main(["falsify", str(folder / "campaign.toml"), "-o", str(folder / "out"), *words]) == 2
+        assert main(["falsify", "campaign.toml", "-o", "out", *words]) == 2
         assert error in capsys.readouterr().err
     assert not (folder / "out").exists(), "the next attempt needs no --resume"
 
