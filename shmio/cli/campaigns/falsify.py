@@ -151,12 +151,12 @@ class _Command:
         arguments, campaign = self._arguments, self._arguments.campaign
         if arguments.farm is None:
             return Pool(self._config, campaign.parent, arguments.jobs, arguments.limit)
-        from shmio.cli.campaigns.farm import access_of  # noqa: PLC0415  only with a farm
+        from shmio.cli.campaigns.farm import farm_of  # noqa: PLC0415  only with a farm
         from shmio.falsification.farm.bundle import make_bundle  # noqa: PLC0415
         from shmio.falsification.farm.environment import environment_of  # noqa: PLC0415
         from shmio.falsification.farm.pool import FarmPool  # noqa: PLC0415
 
-        access = access_of(arguments)
+        access = farm_of(arguments)
         bundle = make_bundle(self._config, campaign, self._space.at({}), arguments.send)
         names = [*bundle.sizes]
         shown = ", ".join(names[:SHOWN_FILES]) + (f" and {len(names) - SHOWN_FILES} more" * (len(names) > SHOWN_FILES))

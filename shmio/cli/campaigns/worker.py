@@ -7,7 +7,7 @@ import asyncio
 import signal
 import sys
 
-from shmio.cli.campaigns.farm import access_of
+from shmio.cli.campaigns.farm import farm_of
 from shmio.cli.common import say
 from shmio.errors import ConfigError
 from shmio.falsification.farm.worker import Worker, work_folder
@@ -24,7 +24,7 @@ def worker(arguments: argparse.Namespace) -> int:
         RemoteError: The server refuses access.
 
     """
-    access = access_of(arguments)
+    access = farm_of(arguments)
     if arguments.jobs > MAX_JOBS:
         raise ConfigError(f"--jobs {arguments.jobs}: at most {MAX_JOBS} are possible")
     with work_folder() as folder:

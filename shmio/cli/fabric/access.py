@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from typing import TYPE_CHECKING, Any
 
 from shmio.cli.common import ended_by_interrupt
 from shmio.cli.target import target
-from shmio.config.fabric import SCHEMES
+from shmio.config.fabric import server_address
 from shmio.config.model import MqttTls
 from shmio.config.read import load
 from shmio.errors import ConfigError, ControlError, NotRunningError
@@ -37,13 +37,27 @@ def access(options: argparse.Namespace) -> Access:
         return _configured(options)
     if options.config is not None or options.instance is not None:
         raise ConfigError("--server already names the fabric; remove -c and --instance")
-    for url in options.server:
-        if not url.startswith(tuple(f"{scheme}://" for scheme in SCHEMES)):
-            raise ConfigError(f"--server: {url!r} is not a NATS server; write nats://HOST:4222 or tls://HOST:4222")
+    return access_of("--server", options.server, options)
+
+
+def access_of(key: str, servers: Sequence[str], options: argparse.Namespace) -> Access:
+    """Return the access to servers by ``--credentials``, ``--ca``, ``--certificate`` and ``--key``.
+
+    Args:
+        key: The option that names the servers, for messages.
+        servers: Their URLs.
+        options: The options of the command.
+
+    Raises:
+        ConfigError: A URL is wrong, or the options do not fit together.
+
+    """
+    for url in servers:
+        server_address(key, url, "with --credentials")
     if (options.certificate is None) != (options.key is None):
         raise ConfigError("--certificate: give both --certificate and --key, or neither")
     tls = MqttTls(options.ca, options.certificate, options.key) if options.ca or options.certificate else None
-    return Access(tuple(options.server), tls, options.credentials)
+    return Access(tuple(servers), tls, options.credentials, options=True)
 
 
 def _configured(options: argparse.Namespace) -> Access:

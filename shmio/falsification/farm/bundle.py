@@ -220,10 +220,7 @@ def unpack(data: bytes, place: Path) -> int:
         raise RemoteError(f"the bundle has {len(files)} files, more than {MAX_FILES}")
     place.mkdir(mode=0o700)
     for path, one in files.items():
-        parts = PurePosixPath(path).parts
-        if not parts or "\0" in path or path != "/".join(parts) or any(part in ("..", "/", ".") for part in parts):
-            raise RemoteError(f"the bundle has a file with the path {path!r:.200}, which is not inside its folder")
-        file = place.joinpath(*parts)
+        file = place_in(place, path)
         try:
             file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             with open(file, "xb", opener=_private) as stream:
@@ -231,6 +228,19 @@ def unpack(data: bytes, place: Path) -> int:
         except OSError as error:
             raise RemoteError(f"{file}: {error.strerror}: the bundle of files cannot be unpacked") from None
     return len(files)
+
+
+def place_in(folder: Path, path: str) -> Path:
+    """Return the place of a path inside a folder. The path ``.`` is the folder itself.
+
+    Raises:
+        RemoteError: The path is not in its shortest form, or leads out of the folder.
+
+    """
+    parts = PurePosixPath(path).parts
+    if "\0" in path or path != ("/".join(parts) or ".") or any(part in ("..", "/") for part in parts):
+        raise RemoteError(f"the bundle has the path {path!r:.200}, which does not lead into its folder")
+    return folder.joinpath(*parts)
 
 
 def _private(path: str, flags: int) -> int:

@@ -15,7 +15,7 @@ import msgspec
 from msgspec.structs import replace
 
 from shmio.errors import RemoteError, ShmioError
-from shmio.fabric.connection import INSTALL, Access, connect
+from shmio.fabric.connection import INSTALL, Access, call_once, connect
 from shmio.falsification.farm.bundle import Bundle
 from shmio.falsification.farm.exchange import (
     BEAT_S,
@@ -233,9 +233,8 @@ class FarmPool:
             self._found.put(RemoteError(f"{self._access}: {type(error).__name__}: {error}"))
 
     async def _begin(self) -> None:
-        await (await connect(self._access, "shmio-campaign falsify", patient=False)).close()  # fails at once
+        await call_once(self._access, contact)  # fails at once, while the other connection would wait for a server
         self._client = await connect(self._access, "shmio-campaign falsify", lost=self._lost)
-        await contact(self._client)
         await self._provide()
         search = self._offer.search
         await self._client.subscribe(workers_of(search), cb=self._answered)

@@ -26,8 +26,8 @@ import msgspec
 from msgspec.structs import replace
 
 from shmio.errors import RemoteError, ShmioError
-from shmio.fabric.connection import INSTALL, Access, connect
-from shmio.falsification.farm.bundle import MAX_BYTES, unpack
+from shmio.fabric.connection import INSTALL, Access, call_once, connect
+from shmio.falsification.farm.bundle import MAX_BYTES, place_in, unpack
 from shmio.falsification.farm.environment import differences
 from shmio.falsification.farm.exchange import (
     BEAT_S,
@@ -93,8 +93,8 @@ class _Slot:
         pool = self._pools.get(search.offer.search)
         if pool is None:
             offer = search.offer
-            config = search.place / offer.config
-            pool = Pool(config, search.place / offer.folder, 1, offer.limit_s, config.parent)
+            config = place_in(search.place, offer.config)
+            pool = Pool(config, place_in(search.place, offer.folder), 1, offer.limit_s, config.parent)
             self._pools[offer.search] = pool
         pool.submit(task)
         while not (found := pool.wait(LOOK_S)):
@@ -145,7 +145,7 @@ class Worker:
 
         """
         try:
-            await (await connect(self._access, "shmio-campaign worker", patient=False)).close()
+            await call_once(self._access, contact)
         except RemoteError as error:
             self._tell(f"{error}; trying again")
         waiting = asyncio.create_task(connect(self._access, "shmio-campaign worker", lost=self._lost, back=self._back))
@@ -160,6 +160,7 @@ class Worker:
             for slot in self._all:
                 self._slots.put_nowait(slot)
             await self._client.subscribe(OFFERS, cb=self._hear)
+            await self._client.flush()
             self._tell(f"connected to {self._access}: {self._jobs} trials at once; waiting for searches")
             while not stop.is_set():
                 if self._client.is_closed:
@@ -267,6 +268,8 @@ class Worker:
             raise RemoteError(f"its files cannot be fetched: {error or type(error).__name__}") from None
         if data.digest != search.offer.digest:
             raise RemoteError("its files are damaged: their digest is wrong")
+        for path in (search.offer.config, search.offer.folder):
+            place_in(search.place, path)  # checks them
         await asyncio.to_thread(shutil.rmtree, search.place, ignore_errors=True)
         return await asyncio.to_thread(unpack, bytes(data.content), search.place)
 

@@ -19,6 +19,7 @@ import msgspec
 import nats
 import nkeys  # type: ignore[import-untyped]
 import pytest
+from msgspec.structs import replace
 
 from shmio.cli.campaign import main
 from shmio.errors import ConfigError, RemoteError
@@ -380,5 +381,8 @@ def test_hostile_messages_do_not_stop_a_worker(server: NatsServer, bundle: Bundl
         with pool(server, bundle, []) as farm:
             farm.submit(task(1))
             assert results(farm, 1)[1].status == "passed"
+        outside = replace(bundle, config="../../etc/passwd")
+        with pool(server, outside, []):
+            assert "does not lead into its folder" in until(one, "is not served")
         one.send_signal(signal.SIGINT)
         assert one.wait() == 0
