@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from shmio.campaigns.digests import of_configuration, of_file, of_layouts
+from shmio.cli.campaigns.farm import farm_of
 from shmio.cli.campaigns.run import configuration_of, duration_of
 from shmio.cli.common import say, say_json, stop_on_signals
 from shmio.config.campaign import Campaign, CampaignFile, campaign_of, read_settings
@@ -61,6 +62,8 @@ def falsify(arguments: argparse.Namespace) -> int:
         raise ConfigError(f"--jobs {arguments.jobs}: at most {most} are possible")
     if arguments.send and arguments.farm is None:
         raise ConfigError("--send: this option is only for --farm")
+    if arguments.farm is not None:
+        farm_of(arguments)  # a wrong option is named at once
     read = CampaignFile(file)
     settings = read_settings(arguments.settings)
     try:
@@ -151,8 +154,7 @@ class _Command:
         arguments, campaign = self._arguments, self._arguments.campaign
         if arguments.farm is None:
             return Pool(self._config, campaign.parent, arguments.jobs, arguments.limit)
-        from shmio.cli.campaigns.farm import farm_of  # noqa: PLC0415  only with a farm
-        from shmio.falsification.farm.bundle import make_bundle  # noqa: PLC0415
+        from shmio.falsification.farm.bundle import make_bundle  # noqa: PLC0415  only with a farm
         from shmio.falsification.farm.environment import environment_of  # noqa: PLC0415
         from shmio.falsification.farm.pool import FarmPool  # noqa: PLC0415
 
