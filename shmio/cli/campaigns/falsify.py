@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from shmio.campaigns.digests import of_configuration, of_file, of_layouts
-from shmio.cli.campaigns.farm import farm_of
 from shmio.cli.campaigns.run import configuration_of, duration_of
 from shmio.cli.common import say, say_json, stop_on_signals
 from shmio.config.campaign import Campaign, CampaignFile, campaign_of, read_settings
@@ -33,6 +32,7 @@ from shmio.version import __version__
 from shmio.wording import printable
 
 if TYPE_CHECKING:
+    from shmio.fabric.connection import Access
     from shmio.falsification.farm.pool import FarmPool
 
 MAX_JOBS: Final = 64
@@ -62,8 +62,11 @@ def falsify(arguments: argparse.Namespace) -> int:
         raise ConfigError(f"--jobs {arguments.jobs}: at most {most} are possible")
     if arguments.send and arguments.farm is None:
         raise ConfigError("--send: this option is only for --farm")
+    access = None
     if arguments.farm is not None:
-        farm_of(arguments)  # a wrong option is named at once
+        from shmio.cli.campaigns.farm import farm_of  # noqa: PLC0415  only with a farm
+
+        access = farm_of(arguments)
     read = CampaignFile(file)
     settings = read_settings(arguments.settings)
     try:
@@ -82,7 +85,7 @@ def falsify(arguments: argparse.Namespace) -> int:
     space = Space(_complete(tables, arguments, campaign, instance))
     output = arguments.output or Path(f"{file.stem}-falsify")
     with stop_on_signals() as over:
-        return _Command(arguments, space, config, instance, output, over).run()
+        return _Command(arguments, space, config, instance, output, over, access).run()
 
 
 def _complete(
@@ -108,7 +111,9 @@ class _Command:
         instance: Plan,
         output: Path,
         over: threading.Event,
+        access: Access | None,
     ) -> None:
+        self._access = access
         self._arguments, self._space, self._config, self._over = arguments, space, config, over
         self._instance, self._output = instance, output
         self._cases: list[Line] = []
@@ -152,13 +157,13 @@ class _Command:
     def _pool(self) -> Pool | FarmPool:
         """Return what runs the trials: processes of this host, or a farm."""
         arguments, campaign = self._arguments, self._arguments.campaign
-        if arguments.farm is None:
+        access = self._access
+        if access is None:
             return Pool(self._config, campaign.parent, arguments.jobs, arguments.limit)
         from shmio.falsification.farm.bundle import make_bundle  # noqa: PLC0415  only with a farm
         from shmio.falsification.farm.environment import environment_of  # noqa: PLC0415
         from shmio.falsification.farm.pool import FarmPool  # noqa: PLC0415
 
-        access = farm_of(arguments)
         bundle = make_bundle(self._config, campaign, self._space.at({}), arguments.send)
         names = [*bundle.sizes]
         shown = ", ".join(names[:SHOWN_FILES]) + (f" and {len(names) - SHOWN_FILES} more" * (len(names) > SHOWN_FILES))
