@@ -43,8 +43,6 @@ def check_fabric(config: Config) -> None:
         for key in ("rule", "allow", "history"):
             if getattr(fabric, key):
                 raise ConfigError(f"fabric.{key}: this section needs fabric.cell, the name under which to publish")
-    if fabric.history:
-        raise ConfigError("fabric.history: this version does not have this section yet; remove it")
     for index, one in enumerate(fabric.allow):
         _check_allow(f"fabric.allow[{index}]", one)
     for index, rule in enumerate(fabric.rule):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Final
 
 from shmio.fabric.names import CellName
@@ -91,6 +91,10 @@ class Row:
         self.late.extend(self.between(self.next, self.last - 1))
         self.next = max(self.next, self.last)
 
+    def resend(self, numbers: Iterable[int]) -> None:
+        """Send messages again, as late."""
+        self.late = deque(sorted({*self.late, *numbers}))
+
     def begin_again(self) -> None:
         """After a lost connection, send all messages again that the server has not confirmed.
 
@@ -113,12 +117,20 @@ class Row:
 class Backlog:
     """The rows of all sources. If they need too much memory, the oldest message of all rows is dropped."""
 
-    def __init__(self, most_bytes: int) -> None:
+    def __init__(self, most_bytes: int, *, until_confirmed: bool = False) -> None:
+        """Create the backlog.
+
+        Args:
+            most_bytes: Maximum size.
+            until_confirmed: Whether a message that was sent and is not confirmed counts as dropped.
+
+        """
         self.rows: dict[str, Row] = {}
         self.bytes = 0
         self.dropped = 0
         """Number of messages that were dropped before the server had them."""
         self._most = most_bytes
+        self._until_confirmed = until_confirmed
 
     def put(self, row: Row, message: Kept) -> None:
         """Append a message to a row, and drop the oldest messages until the rest fits."""
@@ -127,7 +139,7 @@ class Backlog:
         while self.bytes > self._most and (rows := [one for one in self.rows.values() if one.droppable]):
             dropped = min(rows, key=_made).drop()
             self.bytes -= dropped.size
-            self.dropped += not dropped.sent
+            self.dropped += not (dropped.confirmed or (dropped.sent and not self._until_confirmed))
 
     def remove(self, source: str) -> None:
         """Remove the row of a source."""

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import msgspec
 
 from shmio.endpoints.fabric.backlog import Backlog, Kept, Row
+from shmio.endpoints.fabric.history import History
 from shmio.fabric.connection import INSTALL
 from shmio.fabric.messages import MissingRequest, with_age
 from shmio.libraries import library
@@ -38,12 +39,17 @@ class _Sent(NamedTuple):
 
     place: int
     kept: Kept
+    size: int
 
 
 class Publisher:
     """Sends the messages of a backlog. Use it only in the event loop's thread."""
 
-    def __init__(self, backlog: Backlog) -> None:
+    def __init__(self, backlog: Backlog, history: History | None = None) -> None:
+        """Create the publisher. With a history, a message is confirmed when the servers have stored it."""
+        self._history = history
+        if history is not None:
+            history.wake = self.wake
         self.sent = 0
         """Number of messages that were sent."""
         self.sent_bytes = 0
@@ -93,9 +99,14 @@ class Publisher:
         """Wait until the server has all messages, at most for a time in s."""
         with suppress(TimeoutError):
             async with asyncio.timeout(timeout_s):
-                while self.up and (self._backlog.waiting or self._unconfirmed):
+                while self.up and (self._backlog.waiting or self._unconfirmed or self._stores):
                     self._hurry.set()
                     await asyncio.sleep(0.01)
+
+    @property
+    def _stores(self) -> bool:
+        """True if servers are storing messages."""
+        return self._history is not None and self._history.waiting and not self._history.problem
 
     # ---- sending -----------------------------------------------------------------------------------------------------
 
@@ -117,7 +128,7 @@ class Publisher:
                 kept = row.find(row.next)
                 row.next += 1
                 if kept is not None:
-                    await self._send(client, row.live, kept)
+                    await self._send(client, row.live, row, kept)
 
     async def _send_late(self, client: Client) -> None:
         """Send late messages, the oldest of all rows first, as long as they leave room for new ones."""
@@ -134,16 +145,30 @@ class Publisher:
             row, kept = oldest
             row.late.popleft()
             self.late += 1
-            await self._send(client, row.late_subject, kept)
+            await self._send(client, row.late_subject, row, kept)
 
-    async def _send(self, client: Client, subject: str, kept: Kept) -> None:
+    async def _send(self, client: Client, subject: str, row: Row, kept: Kept) -> None:
         data = aged(kept)
-        await client.publish(subject, data)
+        try:
+            if self._history is None:
+                await client.publish(subject, data)
+            else:
+                await self._history.publish(client, subject, data, row, kept.number)
+        except self._errors.MaxPayloadError:
+            log.warning(
+                "source %s: the server refuses a message of %d bytes; raise its max_payload to 1 MB, or publish fewer "
+                "registers",
+                row.source,
+                len(data),
+            )
+            kept.sent = kept.confirmed = True
+            self._backlog.dropped += 1
+            return
         kept.sent = True
         self.sent += 1
         self.sent_bytes += len(data)
         self._place += 1
-        self._unconfirmed.append(_Sent(self._place, kept))
+        self._unconfirmed.append(_Sent(self._place, kept, kept.size))
         self._unconfirmed_bytes += kept.size
         self._asked.set()
         if self._unconfirmed_bytes >= LATE_BYTES // 2:
@@ -168,9 +193,10 @@ class Publisher:
 
     def _confirm(self, place: int) -> None:
         while self._unconfirmed and self._unconfirmed[0].place <= place:
-            kept = self._unconfirmed.popleft().kept
-            kept.confirmed = True
-            self._unconfirmed_bytes -= kept.size
+            _, kept, size = self._unconfirmed.popleft()
+            if self._history is None:
+                kept.confirmed = True
+            self._unconfirmed_bytes -= size
         if self._backlog.waiting:
             self._due.set()
 

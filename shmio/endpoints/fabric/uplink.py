@@ -18,6 +18,7 @@ from shmio.config.model import FabricAllow, FabricHistory, FabricRule
 from shmio.endpoints.fabric.backlog import Backlog, Kept, Row
 from shmio.endpoints.fabric.commands import CommandReceiver
 from shmio.endpoints.fabric.feed import Feed, rule_for
+from shmio.endpoints.fabric.history import History
 from shmio.endpoints.fabric.publisher import Publisher
 from shmio.errors import ConfigError, ConflictError, RemoteError, SegmentError
 from shmio.fabric.connection import INSTALL, Access, connect
@@ -77,8 +78,10 @@ class Uplink:
 
     def __init__(self, segment: Segment, slot: ProcessSlot, settings: UplinkSettings) -> None:
         self.cell = CellName.parse(settings.cell)
-        self.backlog = Backlog(round(settings.backlog_mb * 1e6))
-        self.publisher = Publisher(self.backlog)
+        kept = settings.history
+        self.backlog = Backlog(round(settings.backlog_mb * 1e6), until_confirmed=kept is not None)
+        self._history = None if kept is None else History(self.cell, kept)
+        self.publisher = Publisher(self.backlog, self._history)
         self.problem = ""
         """The present problem; empty if there is none."""
         self.connects = 0
@@ -272,6 +275,9 @@ class Uplink:
                 return False
         else:
             self.problem = ""
+        if self._history is not None:
+            with suppress(self._errors.Error):  # the connection is lost again
+                await self._history.begin(client)
         if self._connected.is_set():
             self.publisher.begin(client)
         return True
@@ -293,7 +299,10 @@ class Uplink:
                 if self.publisher.up:
                     self._complain(error)
             else:
-                self.problem = ""
+                self.problem = "" if self._history is None else self._history.problem
+            if self._history is not None and self.publisher.up:
+                with suppress(self._errors.Error):
+                    await self._history.check()
 
     def _complain(self, error: Exception) -> None:
         why = str(error) or type(error).__name__
