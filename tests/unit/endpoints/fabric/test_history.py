@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import signal
+from pathlib import Path
 
 import nats
 import pytest
@@ -12,9 +13,14 @@ from nats.js.errors import NotFoundError
 
 from shmio.config.model import FabricHistory
 from shmio.endpoints.fabric import history
+from shmio.fabric.connection import Access
+from shmio.fabric.history import fetch
+from shmio.fabric.names import CellName
+from shmio.fabric.place import Place
 from shmio.segment import Segment
 from tests.nats_server import NatsServer
-from tests.unit.endpoints.fabric.harness import Got, decoded, in_loop, publish, until, uplink
+from tests.unit.endpoints.fabric.harness import CELL, Got, decoded, in_loop, publish, until, uplink
+from tests.unit.recorder.harness import numbers
 
 STREAM = "shmio~plant1~line3~a50"
 KEEP = FabricHistory(keep_days=2.0, keep_mb=5.0)
@@ -34,7 +40,7 @@ async def _stored(url: str) -> list[Got]:
 
 
 @in_loop
-async def test_the_server_keeps_what_was_published(segment: Segment, server: NatsServer) -> None:
+async def test_the_server_keeps_what_was_published(segment: Segment, server: NatsServer, tmp_path: Path) -> None:
     writer = segment.writer("cell")
     async with uplink(segment, server.url, history=KEEP) as found:
         await until(lambda: found.publisher.up)
@@ -43,6 +49,10 @@ async def test_the_server_keeps_what_was_published(segment: Segment, server: Nat
         await until(lambda: found._feeds["cell"].last == 30)
     got = await _stored(server.url)
     assert [count for one in got for count in one.counts] == list(range(1, 31))
+    recording = tmp_path / "history.mem"
+    place = Place(Access((server.url,)), CellName.parse(CELL))
+    assert await asyncio.to_thread(fetch, place, recording) == 30
+    assert numbers(recording) == list(range(1, 31))
     client = await nats.connect(server.url)
     info = await client.jetstream().stream_info(STREAM)
     assert (info.config.max_age, info.config.max_bytes) == (2 * 86_400, 5_000_000)
