@@ -10,6 +10,7 @@ from contextlib import suppress
 from typing import Final
 
 from nats.aio.client import PING_PROTO, Client, Srv
+from nats.errors import ConnectionReconnectingError
 
 CLOSE_S: Final = 1.0
 
@@ -22,10 +23,21 @@ class FabricClient(Client):
     waited, as if it were new.
     """
 
+    async def confirm(self) -> None:
+        """Wait until the server has all that was sent so far. If the connection is lost meanwhile, wait for ever.
+
+        The library's ``flush`` returns at once if the connection was just lost.
+
+        Raises:
+            nats.errors.Error: There is no connection.
+
+        """
+        answer: asyncio.Future[bool] = asyncio.get_running_loop().create_future()
+        await self._send_ping(answer)
+        await asyncio.shield(answer)
+
     async def _process_op_err(self, e: Exception) -> None:
         if self.is_connected or self.is_connecting:
-            self._pending = []
-            self._pending_data_size = 0
             self._abort()
         await super()._process_op_err(e)
 
@@ -35,6 +47,8 @@ class FabricClient(Client):
 
     async def _send_ping(self, future: asyncio.Future[bool] | None = None) -> None:
         """Send a ping behind all that waits to be sent: the library's ping overtakes it, so flush() ends too soon."""
+        if not self.is_connected:  # a ping of an old connection on a new one would confirm too much
+            raise ConnectionReconnectingError
         self._pongs.append(asyncio.Future() if future is None else future)
         await self._send_command(PING_PROTO)
         await self._flush_pending()
@@ -47,6 +61,8 @@ class FabricClient(Client):
                 await self.close()
 
     def _abort(self) -> None:
+        self._pending = []
+        self._pending_data_size = 0
         writer = getattr(self._transport, "_io_writer", None)
         if isinstance(writer, asyncio.StreamWriter):
             writer.transport.abort()

@@ -17,7 +17,7 @@ from shmio.errors import ConfigError, RemoteError
 from shmio.libraries import library
 
 if TYPE_CHECKING:
-    from nats.aio.client import Client
+    from shmio.fabric.client import FabricClient
 
 INSTALL: Final = "pip install 'shmio[fabric]'"
 CONNECT_S: Final = 5.0
@@ -79,7 +79,7 @@ async def connect(
     patient: bool = True,
     lost: Callable[[], Awaitable[None]] | None = None,
     back: Callable[[], Awaitable[None]] | None = None,
-) -> Client:
+) -> FabricClient:
     """Connect to the first server that answers.
 
     The connection is restored by itself when it is lost. While it is lost, publishing raises
@@ -137,7 +137,7 @@ async def connect(
     return client
 
 
-async def call_once(access: Access, work: Callable[[Client], Coroutine[Any, Any, Any]]) -> Any:
+async def call_once(access: Access, work: Callable[[FabricClient], Coroutine[Any, Any, Any]]) -> Any:
     """Connect once, and return the result of ``work`` with the connection.
 
     Raises:

@@ -18,8 +18,9 @@ from shmio.fabric.messages import MissingRequest, with_age
 from shmio.libraries import library
 
 if TYPE_CHECKING:
-    from nats.aio.client import Client
     from nats.aio.msg import Msg
+
+    from shmio.fabric.client import FabricClient
 
 WINDOW_BYTES: Final = 2 << 20
 """Maximum number of bytes that are sent and not yet confirmed by the server. Messages beyond wait in the backlog."""
@@ -56,7 +57,7 @@ class Publisher:
         self.late = 0
         """Number of messages that were sent as late."""
         self._backlog = backlog
-        self._client: Client | None = None
+        self._client: FabricClient | None = None
         self._due = asyncio.Event()
         self._asked = asyncio.Event()
         self._hurry = asyncio.Event()
@@ -71,7 +72,7 @@ class Publisher:
         """True if messages are being sent."""
         return self._client is not None
 
-    def begin(self, client: Client) -> None:
+    def begin(self, client: FabricClient) -> None:
         """Send messages on a new or restored connection, beginning with those that the server may not have."""
         self.end()
         for row in self._backlog.rows.values():
@@ -110,7 +111,7 @@ class Publisher:
 
     # ---- sending -----------------------------------------------------------------------------------------------------
 
-    async def _send_all(self, client: Client) -> None:
+    async def _send_all(self, client: FabricClient) -> None:
         with suppress(self._errors.Error):  # the connection is lost: begin() sends these messages again
             while True:
                 await self._due.wait()
@@ -118,7 +119,7 @@ class Publisher:
                 await self._send_new(client)
                 await self._send_late(client)
 
-    async def _send_new(self, client: Client) -> None:
+    async def _send_new(self, client: FabricClient) -> None:
         now_ns = time.monotonic_ns()
         for row in tuple(self._backlog.rows.values()):
             following = row.find(row.next)
@@ -130,7 +131,7 @@ class Publisher:
                 if kept is not None:
                     await self._send(client, row.live, row, kept)
 
-    async def _send_late(self, client: Client) -> None:
+    async def _send_late(self, client: FabricClient) -> None:
         """Send late messages, the oldest of all rows first, as long as they leave room for new ones."""
         while self._unconfirmed_bytes < LATE_BYTES:
             oldest: tuple[Row, Kept] | None = None
@@ -147,7 +148,7 @@ class Publisher:
             self.late += 1
             await self._send(client, row.late_subject, row, kept)
 
-    async def _send(self, client: Client, subject: str, row: Row, kept: Kept) -> None:
+    async def _send(self, client: FabricClient, subject: str, row: Row, kept: Kept) -> None:
         data = aged(kept)
         try:
             if self._history is None:
@@ -176,9 +177,9 @@ class Publisher:
 
     # ---- confirmation ------------------------------------------------------------------------------------------------
 
-    async def _confirm_all(self, client: Client) -> None:
+    async def _confirm_all(self, client: FabricClient) -> None:
         """Ask the server again and again whether it has what was sent. It answers in the order of sending."""
-        with suppress(self._errors.Error, TimeoutError):
+        with suppress(self._errors.Error):
             while True:
                 await self._asked.wait()
                 if not self._hurry.is_set():
@@ -188,7 +189,7 @@ class Publisher:
                 self._hurry.clear()
                 self._asked.clear()
                 place = self._place
-                await client.flush(timeout=int(CONFIRM_TIMEOUT_S))
+                await client.confirm()
                 self._confirm(place)
 
     def _confirm(self, place: int) -> None:
@@ -221,7 +222,8 @@ class Publisher:
                     await client.publish(message.reply, aged(kept))
                     size += kept.size
                     if size >= LATE_BYTES // 2:
-                        await client.flush(timeout=int(CONFIRM_TIMEOUT_S))
+                        async with asyncio.timeout(CONFIRM_TIMEOUT_S):
+                            await client.confirm()
                         size = 0
             await client.publish(message.reply, b"")
 

@@ -34,8 +34,9 @@ from shmio.segment.header import State
 from shmio.version import __version__
 
 if TYPE_CHECKING:
-    from nats.aio.client import Client
     from nats.aio.msg import Msg
+
+    from shmio.fabric.client import FabricClient
 
 MIRROR: Final = "fabric"
 """Connector of the sources that are mirrors. They are published only by their owner."""
@@ -106,7 +107,7 @@ class Uplink:
         self._missed = 0
         self._connected = asyncio.Event()
         self._changed = asyncio.Event()
-        self._client: Client | None = None
+        self._client: FabricClient | None = None
         self._claimed = self._closing = False
         self._revision = 0
         self._known_layouts: set[bytes] = set()
@@ -262,7 +263,7 @@ class Uplink:
         self.problem = f"{self._settings.access}: the connection is lost; the backlog keeps new messages"
         log.warning("%s", self.problem)
 
-    async def _establish(self, client: Client) -> bool:
+    async def _establish(self, client: FabricClient) -> bool:
         """Claim the cell, then publish. Return False if the registry does not answer."""
         try:
             self._registry = await Registry.open(client)
