@@ -40,4 +40,4 @@ def __getattr__(name: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name is None or not module.startswith(error.name):
             raise
-        raise ImportError(f"shmio.{name} is not part of shmio-client: it needs pip install shmio, on Linux") from None
+        raise ImportError(f"shmio.{name} is not part of shmio-client; run pip install shmio, on Linux") from None

@@ -1,4 +1,4 @@
-"""All errors that shmio raises on purpose, below one root class.
+"""The errors that shmio raises on purpose, below one root class.
 
 ::
 
@@ -30,7 +30,12 @@
     └── ControlError       the supervisor refused or did not answer
         └── UnreachableError     shmio cannot connect to the supervisor's socket
 
-The command-line tools print the message of any of these errors and exit with status 1.
+Some modules define further errors; those that can reach a program are subclasses of these. If a
+program calls shmio wrongly, Python's own errors are possible too, such as TypeError.
+
+The command-line tools print the message of any of these errors and exit with status 1. The exception
+is ``shmio-campaign``, where 1 means that an expectation failed: it exits with 2 after ConfigError,
+LayoutError, PathError and ValueRangeError, and with 3 after any other error.
 """
 
 from __future__ import annotations
@@ -42,7 +47,7 @@ import msgspec
 
 
 class ShmioError(Exception):
-    """Root of all errors that shmio raises on purpose."""
+    """Root of the errors that shmio raises on purpose."""
 
 
 class ConfigError(ShmioError):

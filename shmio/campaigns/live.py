@@ -136,11 +136,15 @@ class LiveRun:
             was_virtual = cell.clock.virtual
             self.virtual = not plan.real_time and (was_virtual or not cell.real_sources())
             if plan.real_time and was_virtual:
-                raise ConfigError("--real-time: the time of this instance is virtual already")
+                raise ConfigError(
+                    "--real-time: this instance runs in virtual time; leave out --real-time, or return the instance to "
+                    "real time with shmio step --release"
+                )
             if plan.step_s is not None and not self.virtual:
                 why = "--real-time" if plan.real_time else ", ".join(cell.real_sources())
                 raise ConfigError(
-                    f"step_ms and --step-ms need virtual time, but this run is in real time, because of {why}"
+                    f"step_ms and --step-ms need virtual time, but this run is in real time, because of {why}; leave "
+                    "out both"
                 )
             if plan.start is not None and not self.virtual:
                 why = "--real-time" if plan.real_time else ", ".join(cell.real_sources())

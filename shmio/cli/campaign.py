@@ -62,7 +62,10 @@ def _parser() -> argparse.ArgumentParser:
     judge.add_argument("-f", dest="campaign", type=Path, required=True, metavar="CAMPAIGN.toml", help="the campaign")
     for option, what in (("--from", "begin"), ("--to", "end")):
         judge.add_argument(
-            option, dest=what, metavar="TIME", help=f"{what} there: 2026-11-21T08:30:00, or seconds of the recording"
+            option,
+            dest=what,
+            metavar="TIME",
+            help=f"{what} at this time: 2026-11-21T08:30:00, or seconds of the recording",
         )
     _reports(judge)
     add_json(judge)
@@ -75,7 +78,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     where.add_argument("--instance", metavar="NAME", help="a running instance (default: the only one)")
     live.add_argument(
-        "--lab", action="store_true", help="run in this process, without an instance: if all sources are computed"
+        "--lab", action="store_true", help="run in this process, without an instance; all sources must be computed"
     )
     _settings(live)
     live.add_argument(
@@ -107,7 +110,11 @@ def _falsify(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("campaign", type=Path, metavar="CAMPAIGN.toml")
     verb.add_argument("--trials", type=at_least(1), default=200, metavar="N", help="number of trials (default: 200)")
     verb.add_argument(
-        "-c", dest="config", type=Path, metavar="FILE", help="the supervisor.toml (default: the key config)"
+        "-c",
+        dest="config",
+        type=Path,
+        metavar="FILE",
+        help="the supervisor.toml (default: the key config of the campaign)",
     )
     verb.add_argument(
         "--search",
@@ -126,7 +133,7 @@ def _falsify(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--all", action="store_true", help="go on after the first failure")
     verb.add_argument("--resume", action="store_true", help="continue an interrupted search")
     verb.add_argument(
-        "-o", dest="output", type=Path, metavar="FOLDER", help="where to store it (default: NAME-falsify)"
+        "-o", dest="output", type=Path, metavar="FOLDER", help="folder of the search (default: NAME-falsify)"
     )
     _settings(verb)
     verb.add_argument("--for", dest="for_s", type=seconds, metavar="S", help="duration (default: that of the file)")

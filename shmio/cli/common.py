@@ -24,6 +24,7 @@ from shmio.errors import CommandError, ConfigError, ControlError, LayoutError, S
 from shmio.wording import printable
 
 MAX_SECONDS = 86_400
+_MOST: Final = 9_999_999
 SHOWN_CHARACTERS = 60
 """Maximum number of characters of a value that a terminal shows."""
 
@@ -151,11 +152,11 @@ def _give_up_output() -> None:
 
 
 def at_least(least: int) -> Callable[[str], int]:
-    """Return an argparse type that accepts whole numbers from ``least`` on."""
+    """Return an argparse type that accepts whole numbers from ``least`` to 9,999,999."""
 
     def convert(text: str) -> int:
-        if not text.isascii() or not text.isdecimal() or len(text) > 7 or int(text) < least:
-            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {least} on")
+        if not text.isascii() or not text.isdecimal() or len(text) > len(str(_MOST)) or int(text) < least:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {least} to {_MOST}")
         return int(text)
 
     return convert
@@ -179,7 +180,9 @@ def milliseconds(text: str) -> float:
     except ValueError:
         found = math.nan
     if not 0 < found <= 1000 * MAX_SECONDS:
-        raise argparse.ArgumentTypeError(f"{text.strip()!r} is not a number of milliseconds above 0")
+        raise argparse.ArgumentTypeError(
+            f"{text.strip()!r} is not a number of milliseconds above 0 and up to {1000 * MAX_SECONDS}"
+        )
     return found
 
 
@@ -212,7 +215,7 @@ def seed_number(text: str) -> int:
 
 def add_json(parser: argparse._ActionsContainer, text: str = "print one JSON object") -> None:
     """Add the option ``--json``, with ``text`` as its help. It also makes :func:`run` print errors as JSON."""
-    parser.add_argument("--json", action="store_true", help=f"{text}; an error, too")
+    parser.add_argument("--json", action="store_true", help=f"{text}, also for an error")
 
 
 def add_full(parser: argparse.ArgumentParser) -> None:

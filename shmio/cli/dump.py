@@ -205,7 +205,7 @@ def _credentials(verb: argparse.ArgumentParser) -> None:
 
 def _times(verb: argparse.ArgumentParser, form: str = "2026-11-21T08:30:00, or seconds of the recording") -> None:
     for option, what in (("--from", "begin"), ("--to", "end")):
-        verb.add_argument(option, dest=what, metavar="TIME", help=f"{what} there: {form}")
+        verb.add_argument(option, dest=what, metavar="TIME", help=f"{what} at this time: {form}")
 
 
 def _some(verb: argparse.ArgumentParser) -> None:

@@ -44,7 +44,8 @@ def _parser() -> argparse.ArgumentParser:
         "types",
         metavar="SOURCE",
         nargs="*",
-        help="further sources, with the PLC data types, function blocks and constants it uses, and tag tables over it",
+        help="further sources, with the PLC data types, function blocks and constants that FILE uses, and tag tables "
+        "over its data blocks",
     )
     parser.add_argument("--block", metavar="NAME", help="only this data block; ignore errors in others")
     parser.add_argument(
@@ -53,7 +54,7 @@ def _parser() -> argparse.ArgumentParser:
         type=_size,
         action="append",
         default=[],
-        help="the size of a type whose members are not known; it becomes bytes without meaning",
+        help="the size of a type whose members are not known; shmio treats its values as bytes without meaning",
     )
     add_json(parser, "print JSON: one object, or a list for several blocks")
     parser.add_argument("--version", action="version", version=f"shmio {__version__}")

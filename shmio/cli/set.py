@@ -147,7 +147,7 @@ def _complaint(path: str, outcome: Outcome) -> str:
             "shmio-supervisor status"
         )
     if outcome.kind == OutcomeKind.REFUSED:
-        return f"{path}: the source refused it: {outcome.text}"
+        return f"{path}: the source refused the write: {outcome.text}"
     if outcome.kind == OutcomeKind.EXPIRED:
         return f"{path}: not written: {outcome.text}; try again, or with a longer --timeout"
     return f"{path}: {outcome.text}; check the value with shmio get {shlex.quote(path)} before you write it again"

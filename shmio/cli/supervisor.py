@@ -89,15 +89,17 @@ def _parser() -> argparse.ArgumentParser:
     add_json(logs, "print one JSON object per line")
     audit = verb("audit", "print who did what to the instance, from where, and with what outcome", target)
     audit.add_argument(
-        "pattern", metavar="PATTERN", nargs="?", help="only about this register or name; * is a wildcard"
+        "pattern", metavar="PATTERN", nargs="?", help="only entries about this register or name; * is a wildcard"
     )
     audit.add_argument("-f", "--follow", action="store_true", help="continue to print new entries until Ctrl-C")
     text = "maximum number of entries to print (default: 50, or all with --since)"
     audit.add_argument("-n", "--lines", type=at_least(0), metavar="LINES", help=text)
     text = "only entries from then on: 30s, 10m, 2h or 7d before now, or a date and time"
     audit.add_argument("--since", type=moment, metavar="TIME", help=text)
-    audit.add_argument("--who", metavar="NAME", help="only of this token, account, certificate, user number or kind")
-    audit.add_argument("--action", metavar="ACTION", help="only this action, such as write or restart")
+    audit.add_argument(
+        "--who", metavar="NAME", help="only entries of this token, account, certificate, user number or kind of user"
+    )
+    audit.add_argument("--action", metavar="ACTION", help="only entries with this action, such as write or restart")
     add_json(audit, "print one JSON object per line")
     init = verb("init", "write a configuration: the A50 example, or one for the files given", file)
     init.usage = (

@@ -50,8 +50,8 @@ class Target:
         if not segment.supervised:
             segment.close()
             raise NotRunningError(
-                f"the supervisor of instance {self.name!r} is dead: shmio-supervisor up takes over what it left, "
-                f"shmio-supervisor down --instance {self.name} clears it"
+                f"the supervisor of instance {self.name!r} is dead; take over what is left of the instance with "
+                f"shmio-supervisor up, or clear it with shmio-supervisor down --instance {self.name}"
             )
         return segment
 

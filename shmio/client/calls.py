@@ -163,7 +163,7 @@ def ns(dt_s: float | None) -> int:
     if dt_s is None:
         return 0
     if not 0 < dt_s <= 3600:
-        raise ValueRangeError(f"a step is from 0.001 ms to 3600000 ms (1 h), not {dt_s * 1e3:g} ms")
+        raise ValueRangeError(f"a step must be from 0.001 ms to 3600000 ms (1 h), not {dt_s * 1e3:g} ms")
     return max(1, round(dt_s * 1e9))
 
 

@@ -86,8 +86,8 @@ class CampaignFile:
             for one in self.space.dimensions:
                 if one.name not in point:
                     raise ConfigError(
-                        f"{key_of(one.place)}: this is a range, which only shmio-campaign falsify searches; "
-                        f"or choose a value with shmio-campaign run --set {one.name}=VALUE"
+                        f"{key_of(one.place)}: this is a range; search it with shmio-campaign falsify, or "
+                        f"choose a value with shmio-campaign run --set {one.name}=VALUE"
                     )
             return _parse(self.space.at(point), "expect")
         except ConfigError as error:

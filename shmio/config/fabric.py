@@ -47,7 +47,9 @@ def check_fabric(config: Config) -> None:
         _check_allow(f"fabric.allow[{index}]", one)
     for index, rule in enumerate(fabric.rule):
         if rule.send == "nothing" and (rule.registers or rule.max_rate_hz is not None):
-            raise ConfigError(f'fabric.rule[{index}]: send = "nothing" leaves nothing to choose; remove the other keys')
+            raise ConfigError(
+                f'fabric.rule[{index}]: registers and max_rate_hz have no effect with send = "nothing"; remove them'
+            )
 
 
 def _check_embedded(fabric: Fabric) -> None:

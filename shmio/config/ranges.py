@@ -226,14 +226,14 @@ def _dimension(table: Mapping[str, Any], name: str, place: tuple[str | int, ...]
         return _choice(table, name, place)
     low, high = (_number(table, key) for key in ("from", "to"))
     if not low < high:
-        raise ConfigError(f".to: {high:g} is not above from, {low:g}; without a range, write the value alone")
+        raise ConfigError(f".to: {high:g} is not above from, {low:g}; write a single value without a range")
     log = table.get("log", False)
     if not isinstance(log, bool):
         raise ConfigError(".log: expected true or false")
     whole_key = place[2] in _WHOLE and place[0] == "injection"
     step = _number(table, "step") if "step" in table else 1 if whole_key and not log else None
     if step is not None and log:
-        raise ConfigError(".log: a range with step has no log")
+        raise ConfigError(".log: a range cannot have both step and log = true; leave out one of them")
     if log and low <= 0:
         raise ConfigError(f".from: {low:g} is not above 0, so it has no logarithm; leave out log, or begin above 0")
     if step is not None and not 0 < step <= high - low:
@@ -254,7 +254,7 @@ def _choice(table: Mapping[str, Any], name: str, place: tuple[str | int, ...]) -
         raise ConfigError(f".choice: expected a list of 2 to {MAX_OPTIONS} values")
     for index, one in enumerate(options):
         if isinstance(one, dict):
-            raise ConfigError(f".choice[{index}]: a choice has no ranges in it")
+            raise ConfigError(f".choice[{index}]: a choice cannot contain a range; write a value")
         if any(one == other and type(one) is type(other) for other in options[:index]):
             raise ConfigError(f".choice[{index}]: {one!r} is given twice; remove one of them")
     return Choice(name, place, tuple(options))

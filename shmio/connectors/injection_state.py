@@ -123,4 +123,4 @@ def check_configured(layers: Sequence[Layer], wanted: Mapping[str, Declaration])
     """
     found = {one.name: one.program.declaration for one in layers if isinstance(one, DeclaredLayer) and one.configured}
     if wrong := sorted(name for name in found.keys() | wanted.keys() if found.get(name) != wanted.get(name)):
-        raise SnapshotError(f"the configuration declares other injections: {', '.join(wrong)}")
+        raise SnapshotError(f"the snapshot and the configuration declare different injections: {', '.join(wrong)}")

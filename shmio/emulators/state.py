@@ -52,7 +52,9 @@ class DeviceKeeper:
 
         """
         if self._disturbed():
-            raise SnapshotError("a command disturbs its answers; end that first with shmio-supervisor emulator … ok")
+            raise SnapshotError(
+                "a command disturbs the emulator's answers; end that first with shmio-supervisor emulator NAME ok"
+            )
         cycle = self._device.cycle
         with cycle.held():
             state = DeviceState(self._kind, self._program, self._time.place, cycle.position, self._device.save())

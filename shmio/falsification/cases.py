@@ -112,7 +112,7 @@ def _run(file: Path, limit_s: float, *options: str | Path) -> dict[str, Any]:
             command, capture_output=True, text=True, timeout=limit_s + START_S, check=False, process_group=0
         )  # in a group of its own, so that Ctrl-C does not cut the run short
     except subprocess.TimeoutExpired:
-        raise RecordingError(f"{file}: it took longer than {limit_s:g} s (--limit)") from None
+        raise RecordingError(f"{file}: the run took longer than {limit_s:g} s (--limit)") from None
     try:
         found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     except (ValueError, IndexError):

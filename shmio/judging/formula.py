@@ -124,7 +124,7 @@ def check(tree: Tree) -> None:
                 "operator"
             )
     if constant(tree):
-        raise ConfigError("it must read a register")
+        raise ConfigError("the formula must read a register")
     _check_bounds(tree, outer=True)
     if _changes(tree) > MAX_CHANGES:
         raise ConfigError(

@@ -243,7 +243,7 @@ class Judge:
                 return f"{first.reason} from {first.begin_ns / 1e9:.3f} s to {first.end_ns / 1e9:.3f} s"
             if unknown_ns + reach_ns < self.end_ns:
                 return f"a value was not a number at {unknown_ns / 1e9:.3f} s"
-        return f"the run ended at {(self.end_ns - 1) / 1e9:.3f} s, before it was decided"
+        return f"the run ended at {(self.end_ns - 1) / 1e9:.3f} s, before the expectation was decided"
 
 
 def _tubes(index: int, formula: Formula, network: Network, golden: Golden | None) -> list[tuple[TopLevel, Tube]]:

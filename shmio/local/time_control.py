@@ -415,7 +415,7 @@ class Coordinator:
                 return f"{names} did not deliver the step within {self._hard_ns / 1e9:g} s"
             if passed_ns >= self._soft_ns and not warned:
                 warned = True
-                log.warning("step %d waits until %s deliver it", number, names)
+                log.warning("step %d waits for its delivery by %s", number, names)
             # With a time limit, because a process that dies rings no doorbell.
             yield StepWait(None, seen, min(self._soft_ns, self._hard_ns - passed_ns))
 
@@ -559,7 +559,7 @@ class Timekeeper:
 def check_virtual(clock: Clock) -> None:
     """Raise TimeError if time is real, so that no snapshot can be saved or restored."""
     if not clock.virtual:
-        raise TimeError("time is real, but snapshots need virtual time: shmio step --pause stops time")
+        raise TimeError("time is real, but snapshots need virtual time; stop time with shmio step --pause")
 
 
 def _step_answer(block: Block, number: int) -> str | None:

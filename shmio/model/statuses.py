@@ -287,7 +287,7 @@ class StatusArea:
         self.write(image, index, status.code, status.source_ns)
 
     def write(self, image: bytearray, index: int, code: int, source_ns: int) -> None:
-        """Write code and time of a register's status: as :meth:`put`, but faster for many registers."""
+        """Write the status of a register as :meth:`put` does, but from its code and time, which is faster."""
         self._code.pack_into(image, self.codes_offset + _CODE_BYTES * index, code)
         self._time.pack_into(image, self.times_offset + _TIME_BYTES * index, source_ns)
 

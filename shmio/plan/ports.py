@@ -52,7 +52,7 @@ def check_listening(config: Config) -> None:
         address = parse_address(text)
         if isinstance(address, UnixAddress):
             if address in sockets:
-                raise ConfigError(f"{key}: {text} is already the socket of {sockets[address]}; choose another path")
+                raise ConfigError(f"{key}: {sockets[address]} has the same socket, {text}; choose another path")
             sockets[address] = key
             continue
         try:
@@ -61,7 +61,7 @@ def check_listening(config: Config) -> None:
             raise ConfigError(f"{key}: {error}") from None
         for other, seen_text, port, others in seen:
             if port == address.port != 0 and _share(hosts, others):
-                raise ConfigError(f"{key}: {text} is already the port of {other} ({seen_text}); choose another port")
+                raise ConfigError(f"{key}: {text} has the same port as {other} ({seen_text}); choose another port")
         seen.append((key, text, address.port, hosts))
 
 

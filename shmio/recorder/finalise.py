@@ -173,7 +173,7 @@ class _RecordingEnd:
         )
 
     def _damaged(self, at: int, why: str) -> RecordingError:
-        return RecordingError(f"{self._reader.file}: {why}, at byte {at}: shmio-dump recover saves what is intact")
+        return RecordingError(f"{self._reader.file}: {why}, at byte {at}; save what is intact with shmio-dump recover")
 
     # ---- reading the records of the file -----------------------------------------------------------------------------
 

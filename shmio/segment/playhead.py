@@ -155,9 +155,12 @@ class PlayState(NamedTuple):
 class MoveRequest(msgspec.Struct, tag="move", forbid_unknown_fields=True, omit_defaults=True):
     """A request to change a replay at time ``clock_ns`` of the instance's clock.
 
-    A field that is None changes nothing, with one exception: if ``position_ns`` is given and
-    ``until_ns`` is None, the replay plays to the end. At the position ``until_ns``, the replay
-    pauses once.
+    A field that is None changes nothing, with two exceptions. If ``position_ns`` is given and
+    ``until_ns`` is None, the replay plays to the end. At the end of the played range, a request
+    without ``position_ns`` that leaves the replay unpaused starts it from the beginning.
+
+    When it reaches ``until_ns``, the replay pauses and forgets ``until_ns``. At the end of the
+    played range, a replay in a loop starts again instead.
     """
 
     clock_ns: int

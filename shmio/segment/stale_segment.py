@@ -160,7 +160,7 @@ def _stop_orphans(segment: Segment, shared: SharedObject) -> list[str]:
     if alive:
         names = ", ".join(slot.name for slot in alive.values())
         raise SegmentError(
-            f"instance {segment.instance!r} has processes of which shmio cannot tell the pid, so it does not end "
+            f"instance {segment.instance!r} has processes whose pids shmio cannot find, so shmio does not end "
             f"them: {names}; end them, and try again"
         )
     return [f"stopped {worker.name}, pid {worker.pid}, which had lost its supervisor" for worker in found]

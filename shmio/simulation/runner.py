@@ -461,7 +461,7 @@ class ServedModel:
 
     def _lacks(self, path: str, joined: Source, what: str, remedy: str) -> str:
         return (
-            f"model {self._runner.name}: {path} is not a register that {joined.source} {what}: in the configuration of "
+            f"model {self._runner.name}: {path} is not a register that {joined.source} {what}; in the configuration of "
             f"the instance, add it to the layout or {remedy}"
         )
 

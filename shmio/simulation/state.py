@@ -1,9 +1,10 @@
 """Encodes the state of models for snapshots, as data that runs no code when it is read.
 
-The data may contain numbers, texts, bytes, lists, tuples, dicts, sets, deques, numpy arrays, random
-generators, and objects and enumerations of classes that the model's own modules define. An object is
-created without calling its class, and only its attributes are set. An object that is referenced from
-several places stays one object.
+The data may contain None, numbers, texts, bytes, bytearrays, lists, tuples, dicts, sets, deques,
+numpy arrays, random generators, and objects, named tuples and enumerations of classes that the
+model's own modules or the modules in its ``state_modules`` define. An object is created without
+calling its class, and only its attributes are set. An object that is referenced from several places
+stays one object.
 """
 
 from __future__ import annotations
@@ -189,7 +190,7 @@ class _Encoder:
         return SnapshotError(f"{where or 'the state'} is {value!r:.60}, which a snapshot cannot store{_HOOKS}")
 
 
-_HOOKS: Final = ": give the model save_state() and restore_state()"
+_HOOKS: Final = "; give the model save_state() and restore_state()"
 
 
 def _is_plain(kind: type) -> bool:
@@ -332,13 +333,13 @@ class _Decoder:
     def _object(self, module: str, name: str, pairs: list[Any], depth: int) -> Any:
         kind = self._class(module, name, object)
         if issubclass(kind, Enum | tuple):
-            raise TypeError(f"{name} is no class of objects with attributes")
+            raise TypeError(f"{name} is not a class whose objects have attributes")
         slots = frozenset(_slots(kind))
         made = self._keep(object.__new__(kind))
         for key, node in pairs:
             attribute = self.value(key, depth)
             if not isinstance(attribute, str):
-                raise TypeError("an attribute's name is no text")
+                raise TypeError("the name of an attribute is not text")
             if attribute in slots:
                 object.__setattr__(made, attribute, self.value(node, depth))
             else:

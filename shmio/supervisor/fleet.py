@@ -360,7 +360,7 @@ class Fleet:
             return
         if worker.pid not in spared:  # our child may have occupied the slot since the check above
             log.warning(
-                "pid %d occupies the slot of %s, but this supervisor did not start it; the supervisor is killing it",
+                "pid %d occupies the slot of %s, but this supervisor did not start that process and is killing it",
                 worker.pid,
                 managed.name,
             )

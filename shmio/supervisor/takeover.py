@@ -122,7 +122,7 @@ def _adopt_or_end(
             for pidfd in (*(worker.pidfd for worker in unfit), *(child.pidfd for _, child in fit)):
                 os.close(pidfd)
             raise SegmentError(
-                f"instance {segment.instance!r} has processes of which shmio cannot tell the pid, so it does not end "
+                f"instance {segment.instance!r} has processes whose pids shmio cannot find, so shmio does not end "
                 f"them: {', '.join(living)}; end them, and try again"
             )
         time.sleep(0.01 if living else 0)

@@ -146,7 +146,7 @@ class TestModbus(TableConformance, WriteConformance):
         )
         end = writer.write(Write(rig.spare, 0, b"x"))
         assert end.kind == EventKind.UNKNOWN
-        assert "another write" in end.text
+        assert "does not match the write" in end.text
         run.until(lambda frame: frame.quality is Quality.BAD)
         rig.proxy.pass_all()
         run.good()

@@ -280,7 +280,7 @@ def test_a_computed_register_cannot_be_set_and_the_remedy_works(line: Cell, remo
     assert unlisted.endswith("unless its model computes it: then only shmio inject can show another value\n")
     listed = line.run("shmio", "set", *way, "gate/closed", "true").stderr
     assert listed == (
-        "gate/closed: the source refused it: the model computes closed: outputs cannot be written; "
+        "gate/closed: the source refused the write: the model computes closed: outputs cannot be written; "
         "shmio inject can show another value\n"
     )
     laid = line.run("shmio", "inject", *way, "--keep", "belt/position", "-7")

@@ -158,26 +158,32 @@ def _await(fd: int) -> tuple[str, Started]:
 
     """
     log_file = ""
-    for line in _lines(fd):
-        message = msgspec.json.decode(line, type=StartMessage)
-        if isinstance(message, Started):
-            return log_file, message
-        if isinstance(message, Failed):
-            raise ControlError(message.error)
-        log_file = message.log_file
-        for warning in message.warnings:
-            say(warning, sys.stderr)
+    try:
+        for line in _lines(fd):
+            message = msgspec.json.decode(line, type=StartMessage)
+            if isinstance(message, Started):
+                return log_file, message
+            if isinstance(message, Failed):
+                raise ControlError(message.error)
+            log_file = message.log_file
+            for warning in message.warnings:
+                say(warning, sys.stderr)
+    except TimeoutError:
+        see = f"; see {log_file}" if log_file else ""
+        raise ControlError(
+            f"the instance was not running after {DETACH_S:g} s, so this command stopped it{see}"
+        ) from None
     raise ControlError(f"the supervisor died while it started; see {log_file or 'above'}")
 
 
 def _lines(fd: int) -> Iterator[bytes]:
-    """Yield the lines that arrive through the pipe. Raise ControlError after the time-out."""
+    """Yield the lines that arrive through the pipe. Raise TimeoutError after ``DETACH_S``."""
     deadline = time.monotonic() + DETACH_S
     received = b""
     while True:
         ready, _, _ = select.select([fd], [], [], max(0.0, deadline - time.monotonic()))
         if not ready:
-            raise ControlError(f"the instance is not running after {DETACH_S:g} s and is stopped again")
+            raise TimeoutError
         data = os.read(fd, 65536)
         if not data:
             return

@@ -141,7 +141,7 @@ class ModbusClient:
         """
         echo = 6 if function == MASK_WORD else 4
         if self.call(unit, function, data, echo) != data[:echo]:
-            raise self._failed("it confirmed another write")
+            raise self._failed("its confirmation does not match the write request")
 
     def call(self, unit: int, function: int, data: bytes, size: int, until_ns: int | None = None) -> bytes:
         """Send a request; return the data of the answer, which must have ``size`` bytes.

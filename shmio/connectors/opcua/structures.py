@@ -274,7 +274,7 @@ def find(found: Found, member: Member) -> Sample:
     """
     found = _walk(found, member)
     if not isinstance(found, Sample):
-        raise MismatchError(f"it is {_named(found)}; give the address of a member")
+        raise MismatchError(f"the address names {_named(found)}; give the address of a member")
     return found
 
 

@@ -87,7 +87,8 @@ def _identity(
         private = load(data, password=None)
     except (ValueError, TypeError):
         raise ConfigError(
-            f"{prefix}key: {key}: the file has no usable private key in PEM or DER, without a password"
+            f"{prefix}key: {key}: the file has no usable private key; it must be PEM or DER and not protected by "
+            "a password"
         ) from None
     if not isinstance(private, rsa.RSAPrivateKey) or private.key_size < _MIN_KEY_BITS:
         raise ConfigError(f"{prefix}key: {key}: the policies of OPC UA need an RSA key of {_MIN_KEY_BITS} bits or more")
@@ -128,8 +129,8 @@ def check_server(data: bytes, trusted: Path, host: str) -> x509.Certificate:
         check_dates(issuer, "the authority of the server's certificate")
         if not _is_for(certificate, host):
             raise ConnectorError(
-                f"the server's certificate is signed by a trusted authority, but is not for {host}; use the name in "
-                "it in url, or trust the certificate itself"
+                f"the server's certificate is signed by a trusted authority, but is not for {host}; write a "
+                "name of the certificate in url, or trust the certificate itself"
             )
     check_dates(certificate, "the server's certificate")
     return certificate

@@ -193,13 +193,13 @@ class Ros2Connector(Connector):
                 joined.discover(DISCOVERIES_AT_END)
                 reasons = [f"{name}: {one}" for name in self._topics.by_name for one in joined.obstacles(name)]
                 self.close()
-                fit = "that fits" if reasons else "of"
+                compatible = "compatible " if reasons else ""
                 why = ". ".join(reasons[:MAX_REASONS]) or (
                     "check that ROS_DOMAIN_ID, topic names and types are those of the robot"
                 )
                 raise ConnectorError(
-                    f"found no publisher or subscriber {fit} any topic in DDS {self._where} within {options.timeout} "
-                    f"ms; {why}"
+                    f"found no {compatible}publisher or subscriber of this source's topics in DDS {self._where} within "
+                    f"{options.timeout} ms; {why}"
                 )
             discovered |= joined.discover(DISCOVERIES)
             time.sleep(POLL_S)
@@ -312,7 +312,7 @@ class Ros2Connector(Connector):
                 if until_s < min(self._discovered_s, self._sending.until_s):
                     return None
                 if reasons := joined.obstacles(name):
-                    return f"no node that fits subscribes to {name}: {'. '.join(reasons[:MAX_REASONS])}"
+                    return f"no compatible node subscribes to {name}: {'. '.join(reasons[:MAX_REASONS])}"
                 return f"no node subscribes to {name}: nobody would receive the message"
             if "header" in message and not stamped(self._topics, publication.topic):
                 message["header"]["stamp"] = _time(time.time_ns())

@@ -108,7 +108,9 @@ def qos_of(source: QosKeys, topic: QosKeys | None, *, latched: bool, writable: b
                 "deadline_ms: this source writes the topic, and publishes only when there is a command; remove the key"
             )
         if own.get("liveliness") == "manual_by_topic":
-            raise ValueError("liveliness: this source writes the topic, and can only offer automatic")
+            raise ValueError(
+                "liveliness: this source writes the topic, and shmio offers only automatic; remove the key"
+            )
         return found._replace(deadline_ms=0, liveliness="automatic")
     if own.get("lifespan_ms"):
         raise ValueError("lifespan_ms: publishers set the lifespan of what they send; to limit the age, use max_age")

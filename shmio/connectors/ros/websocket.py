@@ -140,7 +140,7 @@ class Link:
             raise ConnectorError(self._failure or f"the connection to {self._peer} was lost: {_why(error)}") from None
 
     def newest(self) -> Mapping[str, Received]:
-        """Return the newest message of each topic on which a message has come since the last call."""
+        """Return the newest message of each topic that has received one since the last call."""
         with self._condition:
             found, self._newest = self._newest, {}
         return found
@@ -152,14 +152,20 @@ class Link:
             self._newest = {name: one for name, one in self._newest.items() if name in topics}
 
     def wait_newest(self, until_s: float) -> None:
-        """Wait until each topic has a message, at most until ``until_s`` (CLOCK_MONOTONIC, in s)."""
+        """Wait until a message has come on every topic since the last call of :meth:`newest`.
+
+        Wait at most until ``until_s`` (CLOCK_MONOTONIC, in s).
+        """
         with self._condition:
             self._condition.wait_for(
                 lambda: self._failure or len(self._newest) == len(self._topics), max(0.0, until_s - time.monotonic())
             )
 
     def wait_any(self, until_s: float) -> None:
-        """Wait until any topic has a message, at most until ``until_s`` (CLOCK_MONOTONIC, in s)."""
+        """Wait until a message has come on any topic since the last call of :meth:`newest`.
+
+        Wait at most until ``until_s`` (CLOCK_MONOTONIC, in s).
+        """
         with self._condition:
             self._condition.wait_for(lambda: self._failure or self._newest, max(0.0, until_s - time.monotonic()))
 

@@ -128,7 +128,7 @@ class BlockChangeMonitor(Query):
             self._doubts.pop(block.db_number, None)
         since = dt.datetime.fromtimestamp(seen_s, dt.UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
         log.warning(
-            "%s was changed in the controller since %s: %s; compare its layout",
+            "%s was changed in the controller since %s: %s; compare the layout with the block",
             block_name(block.db_number, block.name), since, text,
         )  # fmt: skip
 
@@ -139,7 +139,7 @@ class BlockChangeMonitor(Query):
         """
         if info.size and not _fits(block, info.size):
             log.warning(
-                "%s has %d bytes in the controller%s; compare its layout",
+                "%s has %d bytes in the controller%s; compare the layout with the block",
                 block_name(block.db_number, block.name), info.size, _misfit(block, info.size),
             )  # fmt: skip
 

@@ -116,7 +116,7 @@ def reference_of(frame: memoryview) -> int:
     """Return the reference of the request to which an answer belongs, without checking the answer."""
     if len(frame) < USERDATA_END:
         _check_cotp(frame)
-        raise ConnectorError(f"the controller's answer of {len(frame)} bytes is too short")
+        raise ConnectorError(f"the controller's answer is too short ({len(frame)} bytes)")
     return frame[REFERENCE_OFFSET] << 8 | frame[REFERENCE_OFFSET + 1]
 
 
@@ -127,7 +127,7 @@ def check_envelope(frame: memoryview) -> tuple[int, int, int]:
     """
     if len(frame) < USERDATA_END:
         _check_cotp(frame)
-        raise ConnectorError(f"the controller's answer of {len(frame)} bytes is too short")
+        raise ConnectorError(f"the controller's answer is too short ({len(frame)} bytes)")
     cotp, protocol, kind, parameter_length, data_length = _HEADER.unpack_from(frame)
     if cotp != _COTP_DATA:
         _check_cotp(frame)
@@ -150,7 +150,7 @@ def check_answer(frame: memoryview) -> int:
     if kind not in {_ACK, _ACK_DATA}:
         raise ConnectorError(f"the controller's reply is not an answer: ROSCTR {kind}")
     if len(frame) < HEADER_END:
-        raise ConnectorError(f"the controller's answer of {len(frame)} bytes is too short")
+        raise ConnectorError(f"the controller's answer is too short ({len(frame)} bytes)")
     error = frame[17] << 8 | frame[18]
     if HEADER_END + parameter_length + data_length != len(frame):
         raise ConnectorError(
@@ -257,14 +257,14 @@ def parse_read_answer(frame: memoryview) -> ReadAnswer:
             return ReadAnswer(ITEM_OK, frame[_ITEM_END:])
     data_length = check_answer(frame)
     if len(frame) < HEADER_END + 3:
-        raise ConnectorError(f"the controller's answer of {len(frame)} bytes is too short for a read")
+        raise ConnectorError(f"the controller's answer is too short for a read ({len(frame)} bytes)")
     if frame[HEADER_END] != READ or frame[HEADER_END + 1] != 1 or data_length != len(frame) - HEADER_END - 2:
         raise ConnectorError("the controller's reply is not an answer to a read of one item")
     code = frame[HEADER_END + 2]
     if code != ITEM_OK:
         return ReadAnswer(code, frame[:0])
     if len(frame) < _ITEM_END:
-        raise ConnectorError(f"the controller's answer of {len(frame)} bytes is too short for data")
+        raise ConnectorError(f"the controller's answer is too short for data ({len(frame)} bytes)")
     _, _, _, transport, length = _ITEM.unpack_from(frame, HEADER_END)
     if transport == _BITS and not length & 7:
         length >>= 3

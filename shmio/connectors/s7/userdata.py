@@ -180,7 +180,7 @@ def parse_block(data: bytes, db_number: int) -> BlockInfo:
 
     """
     if len(data) < _BLOCK.size:
-        raise ConnectorError(f"the controller's answer to '{BLOCK_INFO.name}' of {len(data)} bytes is too short")
+        raise ConnectorError(f"the controller's answer to '{BLOCK_INFO.name}' is too short ({len(data)} bytes)")
     number, load_size, code_ms, code_day, interface_ms, interface_day, size, checksum = _BLOCK.unpack_from(data)
     if number != db_number:
         raise ConnectorError(

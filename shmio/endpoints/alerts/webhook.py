@@ -94,7 +94,10 @@ class Webhook:
             raise TimeoutError
         if 300 <= status < 400:
             where = (response.getheader("Location") or "elsewhere")[:200]
-            raise DeliveryError(f"the server answers {status}, which points to {where}: redirects are not followed")
+            raise DeliveryError(
+                f"the server answers {status}, which points to {where}, but redirects are not followed; write the "
+                "final URL in webhook"
+            )
         if not 200 <= status < 300:
             raise DeliveryError(
                 f"the server answers {status} {reason}".rstrip(), again=status >= 500 or status in _AGAIN

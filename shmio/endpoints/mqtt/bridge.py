@@ -254,11 +254,15 @@ class Bridge:
         remedy = "let no other account publish there, and no other bridge use this prefix"
         if (channel := self._channels.get(topic)) is not None:
             log.warning(
-                "another client published on %s; the bridge publishes its own value again: %s", shorten(topic), remedy
+                "another client published on %s, so the bridge publishes its own value again; %s",
+                shorten(topic),
+                remedy,
             )
             self.outbox.mark(channel)
         elif self.outbox.waiting < MOST_WAITING:
-            log.warning("another client left a message on %s; the bridge deletes it: %s", shorten(topic), remedy)
+            log.warning(
+                "another client left a message on %s, so the bridge deletes that message; %s", shorten(topic), remedy
+            )
             self.outbox.mark(ClearedTopic(topic))
 
     def correct_all(self) -> None:

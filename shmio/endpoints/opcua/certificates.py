@@ -52,7 +52,8 @@ def read_identity(opcua: OpcUa) -> tuple[x509.Certificate, rsa.RSAPrivateKey] | 
         key = load(data, password=None)
     except (ValueError, TypeError):
         raise ConfigError(
-            f"opcua.key: {opcua.key}: the file has no usable private key in PEM or DER, without a password"
+            f"opcua.key: {opcua.key}: the file has no usable private key; it must be PEM or DER and not protected by "
+            "a password"
         ) from None
     if not isinstance(key, rsa.RSAPrivateKey) or key.key_size < MIN_KEY_BITS:
         raise ConfigError(

@@ -70,7 +70,9 @@ class CommandClient:
                     self._room.clear()
                     await self._room.wait()
         except TimeoutError:
-            raise CommandError(f"{self.block.source}: too many commands are in flight") from None
+            raise CommandError(
+                f"{self.block.source}: too many commands are in flight; wait for their results"
+            ) from None
         if self.block.retired:
             raise CommandError(RETIRED)
 

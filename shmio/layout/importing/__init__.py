@@ -1,1 +1,5 @@
-"""Convert tag lists of other vendors' tools to tag tables. Each format has a module."""
+"""Converts tag lists of engineering tools to tag tables.
+
+The tools are TIA Portal, STEP 7 and KEPServerEX; OPC UA node sets of any tool are read too. Each
+format has a module.
+"""

@@ -96,7 +96,9 @@ def _members(found: Found, section: Element, path: tuple[str, ...], depth: int) 
         name, kind = member.get("Name", ""), member.get("Datatype", "")
         here = (*path, name)
         if not name or '"' in name or not name.isprintable():
-            raise ImportingError(f"{'/'.join(path)}: a member has the name {name!r}, which no source can declare")
+            raise ImportingError(
+                f"{'/'.join(path)}: the member name {name!r} is not allowed in source text; rename the member"
+            )
         array = _ARRAY.fullmatch(kind)
         bounds, element = (f"ARRAY[{array[1]}] OF ", array[2]) if array else ("", kind)
         inner = member if element.lower() == "struct" else member.find("Sections/Section[@Name='None']")

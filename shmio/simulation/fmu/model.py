@@ -150,8 +150,8 @@ class FmuModel(Model):
         self._fixed_ns = self._fixed_ns or dt_ns
         if (passed_ns - self._done_ns) % self._fixed_ns:
             raise ModelError(
-                f"the FMU makes steps of one length only, which is {self._fixed_ns / 1e6:g} ms since its first step; "
-                f"{(passed_ns - self._done_ns) / 1e6:g} ms are not a multiple of it"
+                f"the FMU makes steps of one length only, {self._fixed_ns / 1e6:g} ms as in its first step; "
+                f"{(passed_ns - self._done_ns) / 1e6:g} ms is not a multiple of that, so choose a multiple"
             )
         while self._done_ns < passed_ns:
             self._advance(instance, _point_s(self._done_ns + self._fixed_ns, self._fixed_ns))

@@ -199,9 +199,9 @@ def test_json_output_is_an_object_by_path(device: Device, capsys: pytest.Capture
     assert json.loads(out) == {
         "cell/count": {"outcome": "refused", "reason": "locked"},
         "cell/run": {"outcome": "written", "reason": ""},
-        "error": "cell/count: the source refused it: locked",
+        "error": "cell/count: the source refused the write: locked",
     }
-    assert err == "cell/count: the source refused it: locked\n"
+    assert err == "cell/count: the source refused the write: locked\n"
 
 
 @pytest.mark.parametrize(
@@ -276,7 +276,7 @@ def test_further_refusals_are_printed_with_their_reason(device: Device, capsys: 
     assert main(["set", "cell/count", "1", "cell/speed", "2", "cell/run", "true"]) == 1
     out, err = capsys.readouterr()
     assert out.splitlines() == ["cell/count  refused", "cell/speed  refused: worn out", "cell/run    written"]
-    assert err == "cell/count: the source refused it: locked (and 1 more)\n"
+    assert err == "cell/count: the source refused the write: locked (and 1 more)\n"
 
 
 def test_unknown_outcome_is_reported_with_a_remedy(device: Device, capsys: pytest.CaptureFixture[str]) -> None:

@@ -562,7 +562,7 @@ def test_check_reports_a_priority_that_is_not_allowed(
     )
 
 
-TAKEN = "is already the port of emulator[0].listen (127.0.0.1:1102); choose another port"
+TAKEN = "has the same port as emulator[0].listen (127.0.0.1:1102); choose another port"
 
 
 @pytest.mark.parametrize(

@@ -80,7 +80,7 @@ def test_a_number_of_lines_is_one_or_more(count: str, capsys: pytest.CaptureFixt
     with pytest.raises(SystemExit) as stop:
         main(["watch", "-n", count, "cell/a"])
     assert stop.value.code == 2
-    assert "is not a whole number from 1 on" in capsys.readouterr().err
+    assert "is not a whole number from 1 to " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -140,8 +140,8 @@ def test_invalid_inputs_are_ignored_and_inputs_of_a_failed_step_are_kept() -> No
 @pytest.mark.parametrize(
     ("lacking", "message"),
     [
-        ("speed", "speed is not a register that belt sends to its model: in the configuration of the instance"),
-        ("position", "position is not a register that belt receives from its model: .* or name it in outputs"),
+        ("speed", "speed is not a register that belt sends to its model; in the configuration of the instance"),
+        ("position", "position is not a register that belt receives from its model; .* or name it in outputs"),
         ("drives/main", "drives/main is not a register that belt sends to its model"),
     ],
 )
@@ -158,7 +158,7 @@ def test_an_in_out_that_is_missing_in_the_configuration_is_named() -> None:
     runner = ModelRunner(Belt)
     inputs, outputs = split(values(runner, runner.begin()))
     del outputs["raw"]
-    with pytest.raises(ModelError, match="raw is not a register that belt receives from its model: in the"):
+    with pytest.raises(ModelError, match="raw is not a register that belt receives from its model; in the"):
         ServedModel(Belt).start(Joined(inputs, outputs))
 
 

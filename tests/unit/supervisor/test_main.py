@@ -225,7 +225,7 @@ def test_an_unknown_process_in_a_slot_is_killed(launch: Launch) -> None:
                 stranger.kill()
         until(lambda: cell.of("plc").state == "running")
         assert cell.pid("plc") != stranger.pid
-    assert f"pid {stranger.pid} occupies the slot of plc, but this supervisor did not start it" in cell.log()
+    assert f"pid {stranger.pid} occupies the slot of plc, but this supervisor did not start that process" in cell.log()
 
 
 def test_a_frozen_process_is_not_taken_over(launch: Launch) -> None:

@@ -27,9 +27,10 @@ class InjectionFollower:
         """Handle a command whose values were diverted to the injection."""
 
     def restack(self) -> None:
-        """Handle a change of another injection on the source.
+        """Handle a change of the source's injections.
 
-        The other injection was created, lifted, activated or deactivated.
+        Any of them, this one included, was created, lifted, activated or deactivated. Not called
+        after this one was lifted.
         """
 
     def lifted(self, reason: str) -> None:

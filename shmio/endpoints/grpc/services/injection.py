@@ -293,7 +293,7 @@ class Injection(InjectionFollower):
             self._tell_again()
 
     def restack(self) -> None:
-        """Handle a change of another injection on the source."""
+        """Handle a change of the source's injections, this one included."""
         if not self.inward and self._base.restack():
             self._tell_again()
 
@@ -435,7 +435,9 @@ class Shadows:
         for path, kind in kinds.items():
             name = self._topics.name(path)
             if name == str(target):
-                raise ValueRangeError(f"{shorten(path)} is the target of the injection: a shadow needs another path")
+                raise ValueRangeError(
+                    f"{shorten(path)} is the target of the injection; choose another path for the shadow"
+                )
             shadow = self._named.get(name)
             if name in _TIME_TOPICS or (shadow and (shadow.injection.target != target or shadow.kind is not kind)):
                 use = f"the shadow of {shadow.injection.target}" if shadow else "served by shmio"

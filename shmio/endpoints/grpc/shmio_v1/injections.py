@@ -431,7 +431,7 @@ class InjectCall(InjectionFollower):
         self._wake.set()
 
     def restack(self) -> None:
-        """Handle a change of another injection on the source."""
+        """Handle a change of the source's injections, this one included."""
         if not self._inward:
             self._base.restack()
             self._wake.set()

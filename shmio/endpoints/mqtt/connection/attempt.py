@@ -192,7 +192,7 @@ def refusal(code: ReasonCode, policy: ReconnectPolicy) -> str:
         return f"it accepts no more connections at present ({code})"
     if code.value == _TAKEN_OVER:
         return f"another client has connected as {policy.client_id}; give one of them another mqtt.client_id"
-    return f"it refuses: {code}"
+    return f"it refuses the connection: {code}"
 
 
 def ended(error: ssl.SSLError | None, *, up: bool, tls: bool) -> str:
@@ -224,7 +224,9 @@ def _why(error: Exception, target: Target, *, tls: bool) -> str:
             return "it does not run at present; shmio-supervisor logs broker says why"
         return "nothing listens there"
     if isinstance(error, ConnectionError):
-        return "it closed the connection" + (": it may not use TLS there (mqtt.tls, and the port)" if tls else "")
+        return "it closed the connection" + (
+            ", perhaps because that port has no TLS; check mqtt.tls, and the port" if tls else ""
+        )
     return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 

@@ -127,8 +127,12 @@ def test_a_block_that_becomes_longer_is_uncertain(
     found = [record.getMessage() for record in caplog.records]
     assert len(found) == 2
     assert found[0].startswith('DB1 "Press" was changed in the controller since 20')
-    assert found[0].endswith(" UTC: it had 100 bytes and now has 104, but its layout has 100; compare its layout")
-    assert found[1].endswith(" UTC: it had 104 bytes and now has 100, as in its layout; compare its layout")
+    assert found[0].endswith(
+        " UTC: it had 100 bytes and now has 104, but its layout has 100; compare the layout with the block"
+    )
+    assert found[1].endswith(
+        " UTC: it had 104 bytes and now has 100, as in its layout; compare the layout with the block"
+    )
 
 
 @pytest.mark.parametrize("layout", [press(), table({"x": {"type": "INT", "address": "DB1.DBW4"}})])
@@ -198,7 +202,7 @@ def test_of_a_tag_table_only_the_registers_beyond_the_end_are_bad(
         assert said.startswith("DB1 was changed in the controller since 20")
         assert said.endswith(
             "UTC: it had 20 bytes and now has 12, but its registers need 20; beyond its end: r12 (%DB1.DBW12), "
-            "r14 (%DB1.DBW14), r16 (%DB1.DBW16) and 1 more; compare its layout"
+            "r14 (%DB1.DBW14), r16 (%DB1.DBW16) and 1 more; compare the layout with the block"
         )
         assert connector.doubt == ""
         plc.load_block(1, bytearray(20))

@@ -268,7 +268,7 @@ class Answers:
     [
         (b"\x20\x03\x00\x97\x00", "it accepts no more connections at present"),
         (b"\x20\x03\x00\x89\x00", "it accepts no more connections at present"),
-        (b"\x20\x03\x00\x85\x00", "it refuses: Client identifier not valid"),
+        (b"\x20\x03\x00\x85\x00", "it refuses the connection: Client identifier not valid"),
         (b"", "the connection was lost before the login: the broker is full"),
         (b"HTTP/1.1 400 Bad Request\r\n\r\n", "the connection was lost"),
         (b"\x20\xff\xff\xff\xff\xff\xff", "the connection was lost"),
