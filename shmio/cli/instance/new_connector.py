@@ -75,8 +75,8 @@ def package(name: str) -> dict[str, str]:
 def _check_name(name: str) -> None:
     if len(name) > MAX_LENGTH or not _NAME.fullmatch(name):
         raise ConfigError(
-            f"{name[:MAX_LENGTH]!r} is not a name for a connector; use at most {MAX_LENGTH} characters: a lower-case letter, "
-            "then lower-case letters and digits, with single '-' or '_' between them, such as my-bus"
+            f"{name[:MAX_LENGTH]!r} is not a name for a connector; use at most {MAX_LENGTH} characters: a lower-case "
+            "letter, then lower-case letters and digits, with single '-' or '_' between them, such as my-bus"
         )
     if name in BUILT_IN:
         raise ConfigError(f"{name!r} is a connector of shmio; choose another name")
