@@ -602,7 +602,7 @@ TAKEN = "has the same port as emulator[0].listen (127.0.0.1:1102); choose anothe
         (
             '"127.0.0.1:8090"]',
             '"[::ffff:127.0.0.1]:1102"]\ninsecure = true',
-            "grpc.listen[1]: [::ffff:127.0.0.1]:1102 is",
+            "grpc.listen[1]: [::ffff:127.0.0.1]:1102 has the same port",
         ),
         (
             '"127.0.0.1:8090"]',

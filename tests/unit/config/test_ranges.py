@@ -87,7 +87,7 @@ def test_values_of_a_range(tmp_path: Path, text: str, values: tuple[float, ...])
         ("value = { from = 0, to = 1, step = 1e-300 }", r"value\.step: .*1e9"),
         ("value = { choice = [1] }", r"value\.choice: expected a list of 2"),
         ("value = { choice = [1, 2, 1] }", r"value\.choice\[2\]: 1 is given twice"),
-        ("value = { choice = [1, { from = 0, to = 1 }] }", r"value\.choice\[1\]: a choice has no ranges"),
+        ("value = { choice = [1, { from = 0, to = 1 }] }", r"value\.choice\[1\]: a choice cannot contain a range"),
         ("value = 1\nprobability = { from = 0.1, to = 1.5 }", r"probability: expected .*<= 1"),
         ("value = 1\ntimes = { from = 1, to = 2.5 }", r"times\.from: times takes only whole numbers"),
         ("value = 1\nwhen = { from = 1, to = 2 }", r"injection\[0\]\.when: expected text"),

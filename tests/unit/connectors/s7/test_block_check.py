@@ -223,8 +223,8 @@ def test_a_table_that_never_fitted_is_reported_once(plc: S7Server, caplog: pytes
     assert codes(layout, raw) == [GOOD] * 9 + [BAD_OUT_OF_RANGE] + [GOOD] * 2
     (said,) = [record.getMessage() for record in caplog.records if "in the controller," in record.getMessage()]
     assert said == (
-        "DB1 has 18 bytes in the controller, but its registers need 20; beyond its end: r18 (%DB1.DBW18); compare its "
-        "layout"
+        "DB1 has 18 bytes in the controller, but its registers need 20; beyond its end: r18 (%DB1.DBW18); compare the "
+        "layout with the block"
     )
 
 
