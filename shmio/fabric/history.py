@@ -260,13 +260,13 @@ async def _range(stream: Any, cell: CellName, subject: str, first: int, end: int
             except nats_errors.TimeoutError:
                 info = await reader.consumer_info()
                 if info.num_pending or info.delivered.consumer_seq != received:
-                    raise RemoteError(f"the server has stopped sending the history of {cell}; try it again") from None
+                    raise RemoteError(f"the server has stopped sending the history of {cell}; try again") from None
                 return  # its limits removed the rest meanwhile
             for message in batch:
                 place = message.metadata.sequence
                 received += 1
                 if place.consumer != received:
-                    raise RemoteError(f"the connection was lost while reading the history of {cell}; try it again")
+                    raise RemoteError(f"the connection was lost while reading the history of {cell}; try again")
                 if place.stream >= end:
                     return
                 left = message.metadata.num_pending

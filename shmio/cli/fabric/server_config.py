@@ -106,7 +106,7 @@ def _settings(options: argparse.Namespace, folder: Path) -> ServerSettings:
     for text in settings.listen:
         _check_listen(text, settings)
     if len(set(settings.listen)) < len(settings.listen):
-        raise ConfigError("--listen: two servers have the same address; give each another one")
+        raise ConfigError("--listen: two servers have the same address; give each server its own")
     return settings
 
 

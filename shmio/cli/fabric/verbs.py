@@ -64,7 +64,9 @@ def _server_options() -> argparse.ArgumentParser:
     parser.add_argument(
         "--server", action="append", metavar="URL", help="a NATS server, such as nats://10.76.0.5:4222; repeatable"
     )
-    parser.add_argument("--credentials", metavar="FILE", help="with --server: a seed or .creds file, if it needs one")
+    parser.add_argument(
+        "--credentials", metavar="FILE", help="with --server: a seed or .creds file, if the server needs one"
+    )
     parser.add_argument("--ca", metavar="FILE", help="with --server: use TLS, and trust this authority (PEM)")
     parser.add_argument("--certificate", metavar="FILE", help="client certificate (PEM), if the server needs one")
     parser.add_argument("--key", metavar="FILE", help="its key (PEM)")
@@ -97,6 +99,6 @@ def _add_server_config(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--store", type=Path, metavar="FOLDER", help=text)
     parser.add_argument("--certificate", metavar="FILE", help="use TLS: the certificate of the servers (PEM)")
     parser.add_argument("--key", metavar="FILE", help="its key (PEM)")
-    parser.add_argument("--ca", metavar="FILE", help="clients need a certificate of this authority (PEM), too")
+    parser.add_argument("--ca", metavar="FILE", help="require from clients a certificate of this authority (PEM)")
     parser.add_argument("--insecure", action="store_true", help="let other hosts connect without TLS")
     add_json(parser)

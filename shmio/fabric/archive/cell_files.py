@@ -105,7 +105,7 @@ class CellFiles:
             pass
         except msgspec.MsgspecError as error:
             raise RecordingError(
-                f"{file}: the file is damaged ({error}); move the folder of this cell away to archive it anew"
+                f"{file}: the file is damaged ({error}); move this cell's folder away, and the archive begins a new one"
             ) from None
         self._rename()
         for left in self._folder.glob(f"day=*/.*{PART}"):
@@ -124,7 +124,9 @@ class CellFiles:
             return
         again = now == self._state.created
         if again:
-            log.warning("%s: the server has lost its newest messages; it will use their numbers again", self._folder)
+            log.warning(
+                "%s: the server has lost its newest messages, and will use their numbers for new ones", self._folder
+            )
         self.commit()
         begun = datetime.now(UTC) if again else created.astimezone(UTC)
         self._state.created, self._state.stream = now, begun.strftime("%Y%m%dT%H%M%S%f")

@@ -40,7 +40,7 @@ class ArchiveFolder:
                 fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise RecordingError(
-                    f"{path}: another shmio fabric archive writes this folder; choose another"
+                    f"{path}: another shmio fabric archive writes this folder; choose another folder"
                 ) from None
             text = os.pread(self._fd, 64, 0).decode("ascii", "replace")
             if not re.match(r"[0-9a-f]{16}\Z", text):
