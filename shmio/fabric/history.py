@@ -10,7 +10,7 @@ import heapq
 import logging
 import os
 import time
-from collections.abc import AsyncIterator, Iterator, Mapping
+from collections.abc import AsyncIterator, Iterator
 from itertools import chain, count
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -22,7 +22,7 @@ from shmio.fabric.entries import SourceEntries
 from shmio.fabric.messages import Header, decode_header
 from shmio.fabric.names import CellName, source_of
 from shmio.fabric.place import Place
-from shmio.fabric.registry import Registry, SourceEntry
+from shmio.fabric.registry import CellEntry, Registry
 from shmio.layout.model import Layout
 from shmio.libraries import library
 from shmio.recording.reading.part import MAX_NS, Entry
@@ -67,7 +67,8 @@ def fetch(place: Place, file: Path, begin_ns: int | None = None, end_ns: int | N
     """
     begin, end = begin_ns or 0, MAX_NS if end_ns is None else end_ns
     with new_file(file) as stream, _Spool(file.parent) as spool:
-        layouts, known = asyncio.run(_read(place, spool, begin, end))
+        layouts, seen = asyncio.run(_read(place, spool, begin, end))
+        known = {} if seen is None else {source.name: source for source in seen.sources}
         numbers = count(1)
         sources = [SourceEntries(source, layouts, known.get(source), numbers) for source in spool.sources]
         spans = [_span(source, spool, begin, end) for source in sources]
@@ -75,18 +76,19 @@ def fetch(place: Place, file: Path, begin_ns: int | None = None, end_ns: int | N
         first = next(entries, None)
         if first is None:
             raise RecordingError(f"{place.cell}: the fabric has no history in that time")
-        work = Rewriter(stream, _about(place.cell, first), whole=True)
+        work = Rewriter(stream, _about(place.cell, first, seen), whole=True)
         for entry in chain((first,), entries):
             work.add(entry)
         work.finish()
     return work.counts["frames"]
 
 
-def _about(cell: CellName, first: Entry[Item]) -> dict[str, str]:
-    """Return the metadata of the recording."""
+def _about(cell: CellName, first: Entry[Item], seen: CellEntry | None) -> dict[str, str]:
+    """Return the metadata of the recording. ``seen`` is what the registry says of the cell now."""
     started_ns = first.time_ns - first.item.clock_ns if isinstance(first.item, Frame | Event) else first.time_ns
     return {
-        "instance": cell.cell,
+        "instance": cell.cell if seen is None else seen.instance,
+        "host": "an unknown host" if seen is None else seen.host,
         "cell": str(cell),
         "mode": "live",
         "started_utc_ns": str(max(0, started_ns)),
@@ -154,8 +156,8 @@ def _span(entries: SourceEntries, spool: _Spool, begin_ns: int, end_ns: int) -> 
 
 async def _read(
     place: Place, spool: _Spool, begin_ns: int, end_ns: int
-) -> tuple[dict[bytes, Layout], Mapping[str, SourceEntry]]:
-    """Fill the spool; return the layouts of its messages, and what the registry says of the sources."""
+) -> tuple[dict[bytes, Layout], CellEntry | None]:
+    """Fill the spool; return the layouts of its messages, and what the registry says of the cell."""
     client = await connect(place.access, "shmio history", patient=False)
     heads: set[bytes] = set()
     malformed = 0
@@ -177,7 +179,7 @@ async def _read(
         await client.close()
     if malformed:
         log.warning("%s: %d messages of the history are malformed and left out", place.cell, malformed)
-    return layouts, {} if seen is None else {source.name: source for source in seen.entry.sources}
+    return layouts, None if seen is None else seen.entry
 
 
 async def _messages(client: Client, cell: CellName, begin_ns: int, end_ns: int) -> AsyncIterator[Msg]:

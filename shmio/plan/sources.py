@@ -234,7 +234,10 @@ def _file(name: str, source: Source, config: Config) -> str:
     file = config.log_dir / f"{source.name}.{digest}.mem"
     if not file.exists():  # so that a restart plays the same history
         config.log_dir.mkdir(parents=True, exist_ok=True)
-        fetch(parse_place(name, None if config.fabric is None else config.fabric.credentials), file, begin, end)
+        part = file.with_suffix(".part")
+        part.unlink(missing_ok=True)  # an earlier process ended while it fetched
+        fetch(parse_place(name, None if config.fabric is None else config.fabric.credentials), part, begin, end)
+        part.replace(file)
     return str(file)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from shmio.cli.dump import main
+from shmio.cli.supervisor import main as supervisor
 from shmio.errors import RecordingError, RemoteError
 from shmio.fabric.history import fetch
 from shmio.fabric.messages import decode_entries, encode
@@ -201,3 +202,25 @@ def test_commands_read_a_history(segment: Segment, history: History, tmp_path: P
     table = tmp_path / "cell.csv"
     assert main(["export", place, "-o", str(table)]) == 0
     assert len(table.read_text().splitlines()) == 21
+
+
+def test_a_replay_fetches_its_part_once(
+    segment: Segment, history: History, instance: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    history.create()
+    uplink = Uplink(segment)
+    publish(segment.writer("cell"), 20)
+    history.publish(*uplink.messages())
+    config = tmp_path / "supervisor.toml"
+    source = f'name = "cell"\nconnector = "replay"\nfile = "{history.url}/{CELL}"'
+    config.write_text(f'[instance]\nname = "{instance}"\nlog_dir = "logs"\n[[source]]\n{source}\n')
+    assert supervisor(["check", "-c", str(config)]) == 0, capsys.readouterr().err
+    (file,) = (tmp_path / "logs").iterdir()
+    assert numbers(checked(file)) == list(range(1, 21))
+    file.rename(file.with_suffix(".part"))
+    file.with_suffix(".part").write_bytes(b"of a process that was killed")
+    assert supervisor(["check", "-c", str(config)]) == 0
+    publish(segment.writer("cell"), 5)
+    history.publish(*uplink.messages())
+    assert supervisor(["check", "-c", str(config)]) == 0
+    assert numbers(checked(file)) == list(range(1, 21))
