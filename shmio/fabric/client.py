@@ -6,6 +6,7 @@ Import this module only when nats-py is installed.
 from __future__ import annotations
 
 import asyncio
+import logging
 from contextlib import suppress
 from typing import Final
 
@@ -13,6 +14,14 @@ from nats.aio.client import PING_PROTO, Client, Srv
 from nats.errors import ConnectionReconnectingError
 
 CLOSE_S: Final = 1.0
+
+
+def _matters(record: logging.LogRecord) -> bool:
+    """Return False for a warning that the end of each TLS connection would cause, and that means nothing."""
+    return "eof_received() has no effect" not in str(record.msg)
+
+
+logging.getLogger("asyncio").addFilter(_matters)
 
 
 class FabricClient(Client):
