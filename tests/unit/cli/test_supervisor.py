@@ -923,6 +923,7 @@ def test_status_has_the_documented_keys_in_order(instance: str, capsys: pytest.C
         "source": "cell",
         "emulator": "plc",
         "grpc": "grpc",
+        "fabric": "fabric",
         "opcua": "opcua",
         "mqtt": "mqtt",
         "recorder": "recorder",
