@@ -81,7 +81,10 @@ def _parser() -> argparse.ArgumentParser:
     record.add_argument(
         "--when", metavar="CONDITION", help="record only the time around moments at which this condition is true"
     )
-    for option, what in (("--before", "before it becomes true"), ("--after", "after it was last true")):
+    for option, what in (
+        ("--before", "before the condition becomes true"),
+        ("--after", "after the condition was last true"),
+    ):
         record.add_argument(
             option, dest=f"{option[2:]}_s", type=_amount, metavar="SECONDS",
             help=f"with --when: time to record {what} (default 10)",

@@ -16,10 +16,10 @@ from shmio.wording import printable
 
 _VERBS: Final = {
     "status": "show how the recordings play (default)",
-    "pause": "stand",
-    "play": "continue; at the end, begin again",
-    "seek": "TIME: go there",
-    "until": "TIME: play until then, and pause",
+    "pause": "pause the recordings",
+    "play": "continue; at the end, start from the beginning",
+    "seek": "TIME: go to this time",
+    "until": "TIME: play until this time, and pause",
     "speed": "X: speed relative to the instance's clock, 0.01 to 1000",
     "loop": "on or off: begin again at the end",
     "to-change": "PATH: play to the next change of a register, and pause",

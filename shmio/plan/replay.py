@@ -129,7 +129,7 @@ def _notices(config: Config, section: Replay, names: list[str]) -> Iterator[str]
     if config.injection and section.injections == "keep":
         yield (
             "the configuration's injections are left out: those of the recording are kept; "
-            'replay.injections = "leave out" swaps this'
+            'replay.injections = "leave out" does the opposite'
         )
     if config.grpc and config.grpc.default_source not in (None, *names):
         yield f"grpc.default_source is left out: the recording has no source {config.grpc.default_source}"

@@ -437,7 +437,7 @@ class OpcUaConnector(Connector):
             for step, code in zip(batch, codes, strict=True):
                 if quality_of(code) is Quality.BAD:
                     path = self._path(step)
-                    outcomes[step.write] = f"{path}: the server refuses it: {describe(code)}"
+                    outcomes[step.write] = f"{path}: the server refuses the write: {describe(code)}"
         if sending.steps:
             await link.read_back(list({step.item.index: step.item for step in sending.steps}.values()))
 
