@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -83,6 +85,15 @@ async def test_the_instance_trusts_its_own_certificate(
         await client.close()
         with pytest.raises((NoServersError, OSError)):
             await nats.connect(f"nats://127.0.0.1:{address.port}", allow_reconnect=False)
+
+
+def test_nothing_is_imported_without_the_section() -> None:
+    code = (
+        "import sys, shmio.plan.prepare, shmio.supervisor.main, shmio.connectors.__main__, shmio.cli.user\n"
+        "print([name for name in sys.modules if name.split('.')[0] in ('nats', 'nkeys')])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
 
 
 def test_its_end_is_reported(address: Address, tmp_path: Path) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
+from contextlib import suppress
+from dataclasses import replace
 
 import pytest
 
@@ -11,7 +13,7 @@ from shmio.config.model import FabricRule
 from shmio.errors import ConfigError
 from shmio.fabric.connection import Access, connect
 from shmio.fabric.registry import Registry
-from shmio.segment import Frame, ProcessSpec, Quality, Segment
+from shmio.segment import BlockSpec, Frame, ProcessSpec, Quality, Segment
 from tests.nats_server import NatsServer, link
 from tests.unit.endpoints.fabric.harness import (
     CELL,
@@ -211,6 +213,33 @@ async def test_nothing_is_published_of_a_source(segment: Segment, server: NatsSe
         publish(segment.writer("cell"), 1)
         assert found._entry().sources == ()
         assert not found.backlog.rows
+
+
+@in_loop
+async def test_a_reload_changes_the_layout_and_goes_on_numbering(segment: Segment, server: NatsServer) -> None:
+    writer = segment.writer("cell")
+    async with listening(server.url) as listener, uplink(segment, server.url) as found:
+        await until(lambda: found.publisher.up)
+        publish(writer, 1)
+        got = await listener.until(1)
+        publish(writer, 2)
+        other = replace(LAYOUT, registers=LAYOUT.registers[:1])
+        segment.change(add=[BlockSpec("cell", other, 20_000_000, 60_000_000_000, 1 << 22)], retire=["cell"])
+        writer = segment.writer("cell")
+        publish(writer, 3)
+        while 3 not in got[-1].counts:
+            found.follow_reloads()
+            with suppress(TimeoutError):
+                got.append(decoded(await asyncio.wait_for(listener.queue.get(), 0.02)))
+        assert [count for one in got for count in one.counts] == [1, 2, 3]
+        assert [one.header.number for one in got] == list(range(1, len(got) + 1))
+        assert got[-1].header.layout == other.hash[:8]
+        await until(lambda: other.hash in found._known_layouts)
+        segment.change(retire=["cell"])
+        while "cell" in found.backlog.rows:
+            found.follow_reloads()
+            await asyncio.sleep(0.01)
+        assert found._entry().sources == ()
 
 
 @in_loop
