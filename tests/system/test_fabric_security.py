@@ -20,6 +20,8 @@ from nats.aio.client import Client
 from nats.errors import Error as NatsError
 
 from shmio.cli.user import main
+from shmio.config.model import FabricHistory
+from shmio.endpoints.fabric.history import History
 from shmio.endpoints.fabric.server import find_server
 from shmio.errors import ConflictError, RemoteError
 from shmio.fabric.connection import Access, connect
@@ -332,6 +334,29 @@ def test_wrong_credentials_are_named(fabric: Fabric, tmp_path: Path, capsys: pyt
         err = capsys.readouterr().err
         assert words in err, err
         assert "Traceback" not in err
+
+
+def test_histories_are_prepared_for_cells(fabric: Fabric, capsys: pytest.CaptureFixture[str]) -> None:
+    """A cell cannot create its history, but it fills the one that the administrator has created."""
+    prepare = ["fabric", "prepare", "--server", fabric.server.url, "--credentials", str(fabric.seed("admin"))]
+    assert main([*prepare, "--history", A, "--keep-days", "2"]) == 0
+    assert A in capsys.readouterr().out
+    assert main([*prepare, "--keep-days", "2"]) == 1
+    assert main([*prepare, "--history", A, "--keep-days", "-1"]) == 1
+
+    async def check() -> None:
+        a, b, admin = await fabric.join(A), await fabric.join(B), await fabric.join("admin")
+        mine, other = History(CELL_A, FabricHistory(keep_days=2)), History(CELL_B, FabricHistory())
+        await mine.begin(a)
+        assert not mine.problem
+        await other.begin(b)
+        assert f"shmio fabric prepare --history {B}" in other.problem
+        await a.jetstream().publish(CELL_A.live("cell"), b"x")
+        assert (await admin.jetstream().stream_info(CELL_A.history)).state.messages == 1
+        for user in (a, b, admin):
+            await user.close()
+
+    asyncio.run(check())
 
 
 def test_only_the_administrator_prepares(tmp_path: Path, port: int, capsys: pytest.CaptureFixture[str]) -> None:

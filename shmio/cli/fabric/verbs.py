@@ -51,6 +51,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     prepare.add_argument(
         "--replicas", type=at_least(1), default=1, metavar="N", help="number of servers that keep the data (default: 1)"
     )
+    prepare.add_argument(
+        "--history", nargs="+", default=[], metavar="CELL", help="also create the histories of these cells"
+    )
+    for name, text in (("days", "time (default: 7 days)"), ("mb", "size of each history (default: 1000 MB)")):
+        keep = f"with --history: the {text}, as keep_{name} in [fabric.history] of the cells"
+        prepare.add_argument(f"--keep-{name}", type=float, metavar=name.upper(), help=keep)
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -12,6 +12,7 @@ import msgspec
 from shmio.config.model import FabricHistory
 from shmio.endpoints.fabric.backlog import Row
 from shmio.fabric.connection import INSTALL
+from shmio.fabric.history_stream import create_history
 from shmio.fabric.names import CellName
 from shmio.libraries import library
 
@@ -21,9 +22,6 @@ if TYPE_CHECKING:
 
 ACK_NS: Final = 5_000_000_000
 """Time in ns after which a message without an acknowledgement counts as not stored."""
-DUPLICATES_S: Final = 600.0
-"""Time in s for which the servers recognise a message that comes twice."""
-_IN_USE: Final = 10058  # JSStreamNameExistErr: a stream of the name has another configuration
 _ID: Final = "Nats-Msg-Id"
 
 log = logging.getLogger("shmio.fabric")
@@ -76,29 +74,16 @@ class History:
 
     async def _create(self, client: Client) -> bool:
         """Create the stream. Return False if the servers do not: :attr:`problem` says why."""
-        api, errors = library("nats.js.api", INSTALL), library("nats.js.errors", INSTALL)
-        settings, name = self._settings, self._cell.history
-        age_s = settings.keep_days * 86_400
-        config = api.StreamConfig(
-            name=name,
-            description=f"shmio: history of {self._cell}",
-            subjects=[self._cell.live("*"), self._cell.late("*")],
-            max_age=age_s,
-            max_bytes=round(settings.keep_mb * 1e6),
-            storage=api.StorageType.FILE,
-            num_replicas=settings.replicas,
-            duplicate_window=min(DUPLICATES_S, age_s),
-            allow_direct=True,
-        )
-        stream = client.jetstream()
+        errors, name = library("nats.js.errors", INSTALL), self._cell.history
         try:
-            try:
-                await stream.add_stream(config)
-            except errors.APIError as error:
-                if error.err_code != _IN_USE:
-                    raise
-                await stream.update_stream(config)
-        except (errors.Error, library("nats.errors", INSTALL).TimeoutError) as error:
+            await create_history(client, self._cell, self._settings)
+        except library("nats.errors", INSTALL).TimeoutError:
+            self._complain(
+                f"fabric.history: the servers do not let this cell create or change the stream {name}; run "
+                f"shmio fabric prepare --history {self._cell} as their administrator, with the same limits"
+            )
+            return False
+        except errors.Error as error:
             why = getattr(error, "description", None) or str(error) or type(error).__name__
             self._complain(f"fabric.history: the servers do not create the stream {name}: {why}")
             return False
