@@ -31,6 +31,7 @@ from shmio.layout.model import Layout
 from shmio.layout.spelling import block_path, topic_path
 from shmio.layout.topic import find, look_up, names_part, near, parse_topic
 from shmio.layout.values.write import chosen
+from shmio.plan.fabric import odd_rules
 from shmio.plan.host import check_host, exposure
 from shmio.plan.layouts import LayoutFiles
 from shmio.plan.ports import check_listening
@@ -131,6 +132,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
         lambda: _odd(config, layouts, faults),
         lambda: _odd_topics(config, layouts),
         lambda: _odd_recorder(config, layouts),
+        lambda: odd_rules(config, layouts),
         lambda: _not_served(config, layouts, emulated),
         lambda: _not_emulated(config),
         lambda: _unread(emulated),

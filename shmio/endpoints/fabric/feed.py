@@ -64,6 +64,8 @@ class Feed:
         """
         self.block = block
         part = Selection(None, rule.registers).part(block, sources)
+        self.empty = part is None
+        """True if the rule publishes no register of the source."""
         self._keep = None if part is None else part.keep
         self.layout: Layout = block.layout if part is None else part.layout
         """The layout of the published frames: the registers that the rule names."""

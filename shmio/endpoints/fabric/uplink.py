@@ -157,12 +157,13 @@ class Uplink:
         self._generation = self._segment.generation  # first, so that the next check notices a change meanwhile
         self._segment.refresh()
         blocks = self._segment.blocks
-        return [
+        feeds = [
             self._new_feed(block, list(blocks))
             for block in blocks.values()
             if block.section not in known and block.attributes.connector != MIRROR
             if rule_for(self._settings.rule, block.source).send != "nothing"
         ]
+        return [feed for feed in feeds if not feed.empty]
 
     def _new_feed(self, block: Block, sources: Sequence[str]) -> Feed:
         # A block of a reload is published from its first frame on.

@@ -206,9 +206,12 @@ async def test_a_rate_limit_sends_the_last_frame(segment: Segment, server: NatsS
         assert len(counts) < 10
 
 
+@pytest.mark.parametrize(
+    "rule", [FabricRule(match=["a", "cell"], send="nothing"), FabricRule(match="*", registers=["cell/none"])]
+)
 @in_loop
-async def test_nothing_is_published_of_a_source(segment: Segment, server: NatsServer) -> None:
-    async with uplink(segment, server.url, rule=[FabricRule(match=["a", "cell"], send="nothing")]) as found:
+async def test_nothing_is_published_of_a_source(segment: Segment, server: NatsServer, rule: FabricRule) -> None:
+    async with uplink(segment, server.url, rule=[rule]) as found:
         await until(lambda: found.publisher.up)
         publish(segment.writer("cell"), 1)
         assert found._entry().sources == ()
