@@ -17,6 +17,8 @@ from shmio.errors import ConfigError, RemoteError
 from shmio.libraries import library
 
 if TYPE_CHECKING:
+    from nats.aio.msg import Msg
+
     from shmio.fabric.client import FabricClient
 
 INSTALL: Final = "pip install 'shmio[fabric]'"
@@ -135,6 +137,15 @@ async def connect(
             raise RemoteError(f"{access}: {_refused(access)}") from None
         raise RemoteError(f"{access}: no NATS server can be reached: {_said(why)}") from None
     return client
+
+
+def is_stored(message: Msg) -> bool:
+    """Return whether a server sent a message of a stream, as a user asked it to do.
+
+    A user who may read histories can let it send them to any subject, so readers of ``.live`` and the
+    owner of a source ignore such messages.
+    """
+    return message.reply.startswith("$JS.") or "Nats-Stream" in (message.headers or ())
 
 
 async def call_once(access: Access, work: Callable[[FabricClient], Coroutine[Any, Any, Any]]) -> Any:

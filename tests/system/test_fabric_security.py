@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import queue
 import signal
 import socket
 import stat
@@ -21,6 +22,7 @@ from nats.errors import Error as NatsError
 
 from shmio.cli.user import main
 from shmio.config.model import FabricHistory
+from shmio.connectors.fabric.link import Link
 from shmio.endpoints.fabric.history import History
 from shmio.endpoints.fabric.server import find_server
 from shmio.errors import ConflictError, RemoteError
@@ -357,6 +359,40 @@ def test_histories_are_prepared_for_cells(fabric: Fabric, capsys: pytest.Capture
             await user.close()
 
     asyncio.run(check())
+
+
+def test_mirrors_ignore_what_a_history_reader_lets_the_server_send(
+    fabric: Fabric, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A consumer delivers stored messages of one cell to the subject of another one."""
+    prepare = ["fabric", "prepare", "--server", fabric.server.url, "--credentials", str(fabric.seed("admin"))]
+    assert main([*prepare, "--history", A]) == 0
+    assert main(["fabric", "server-config", "-o", str(fabric.folder), "--history-reader", "archive"]) == 0
+    fabric.server.reload()
+    taken: queue.Queue[bytes] = queue.Queue()
+    access = Access((fabric.server.url,), credentials=str(fabric.seed(A)))
+    link = Link(access, CELL_B, "cell", "mirror", CELL_A, taken.put, lambda _: None)
+    link.start()
+
+    async def check() -> None:
+        a, b, reader = await fabric.join(A), await fabric.join(B), await fabric.join("archive")
+        while not link.connected:  # noqa: ASYNC110  another thread changes it
+            await asyncio.sleep(0.01)
+        await a.jetstream().publish(CELL_A.live("cell"), b"forged")
+        config = {"name": "x", "deliver_subject": CELL_B.live("cell"), "ack_policy": "none"}
+        request = json.dumps({"stream_name": CELL_A.history, "config": config}).encode()
+        bare = await reader.request(f"$JS.API.CONSUMER.CREATE.{CELL_A.history}.x", request, timeout=5)
+        assert b"error" not in bare.data
+        for _ in range(3):
+            await sender(b, CELL_B.live("cell"), b"genuine")()
+            assert await asyncio.to_thread(taken.get, timeout=20) == b"genuine"
+        for user in (a, b, reader):
+            await user.close()
+
+    try:
+        asyncio.run(check())
+    finally:
+        link.close()
 
 
 def test_only_the_administrator_prepares(tmp_path: Path, port: int, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,6 +15,7 @@ from shmio.cli.common import draw, dumps
 from shmio.cli.fabric.access import with_client
 from shmio.cli.instance.status import columns
 from shmio.errors import RemoteError
+from shmio.fabric.connection import is_stored
 from shmio.fabric.fleet import Member, members
 from shmio.fabric.live import live_source
 from shmio.fabric.messages import decode_entries, decode_header
@@ -104,6 +105,8 @@ async def _top(client: Client, options: argparse.Namespace) -> None:
     counts: dict[str, Counts] = {}
 
     async def take(message: Msg) -> None:
+        if is_stored(message):
+            return
         name = "/".join(live_source(message.subject))
         try:
             counts.setdefault(name, Counts()).add(message.data, time.time_ns(), live=message.subject.endswith(".live"))

@@ -14,11 +14,13 @@ from shmio.cli.common import dumps, room, say
 from shmio.cli.fabric.access import with_client
 from shmio.cli.read import clock, line_of, load_numpy, object_of
 from shmio.errors import RemoteError
+from shmio.fabric.connection import is_stored
 from shmio.fabric.live import LiveReadings, Watched
 from shmio.fabric.registry import Registry
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
+    from nats.aio.msg import Msg
 
     from shmio.model.values import Reading
 
@@ -40,8 +42,9 @@ async def _watch(client: Client, watched: Sequence[Watched], options: argparse.N
     await live.prepare()
     messages: asyncio.Queue[tuple[str, bytes]] = asyncio.Queue(MAX_WAITING)
 
-    async def take(message: object) -> None:
-        await messages.put((message.subject, message.data))  # type: ignore[attr-defined]
+    async def take(message: Msg) -> None:
+        if not is_stored(message):
+            await messages.put((message.subject, message.data))
 
     for subject in sorted({one.subject for one in watched}):
         await client.subscribe(subject, cb=take)

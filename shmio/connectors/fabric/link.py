@@ -14,7 +14,7 @@ import msgspec
 
 from shmio.connectors.fabric.order import Missing
 from shmio.errors import ShmioError
-from shmio.fabric.connection import INSTALL, Access, connect
+from shmio.fabric.connection import INSTALL, Access, connect, is_stored
 from shmio.fabric.messages import (
     CommandReply,
     CommandRequest,
@@ -157,7 +157,8 @@ class Link:
         log.info("connected to the fabric again")
 
     async def _take(self, message: Msg) -> None:
-        self._received(message.data)
+        if not is_stored(message):
+            self._received(message.data)
 
     async def _request(self, missing: Missing) -> None:
         client = self._client

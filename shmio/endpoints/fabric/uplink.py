@@ -21,7 +21,7 @@ from shmio.endpoints.fabric.feed import Feed, rule_for
 from shmio.endpoints.fabric.history import History
 from shmio.endpoints.fabric.publisher import Publisher
 from shmio.errors import ConfigError, ConflictError, RemoteError, SegmentError
-from shmio.fabric.connection import INSTALL, Access, connect
+from shmio.fabric.connection import INSTALL, Access, connect, is_stored
 from shmio.fabric.messages import Header, encode
 from shmio.fabric.names import CellName, source_of
 from shmio.fabric.registry import RENEW_S, CellEntry, Registry, SourceEntry
@@ -356,6 +356,8 @@ class Uplink:
         await self.publisher.answer(self.backlog.rows.get(source), message)
 
     async def _on_command(self, message: Msg) -> None:
+        if is_stored(message):
+            return
         tokens = message.subject.split(".")
         source, sender = source_of(tokens[4]), ".".join(tokens[6:])
         self.commands.take(sender, source, self._feeds.get(source), message.data, message.reply)
