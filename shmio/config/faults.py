@@ -17,7 +17,7 @@ from msgspec import Struct, ValidationError
 from msgspec.structs import fields
 
 from shmio.config.model import NAME_PATTERN, NAME_RULE
-from shmio.config.tokens import TOKEN
+from shmio.config.toml_tokens import TOKEN
 from shmio.errors import ConfigError, LayoutError
 from shmio.wording import unknown
 

@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from shmio.config.tokens import TOKEN
+from shmio.config.toml_tokens import TOKEN
 
 MASK: Final = "•••"
 _WORDS: Final = frozenset({"pass", "pw", "pin", "auth"})
