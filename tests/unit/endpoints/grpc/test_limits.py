@@ -32,7 +32,7 @@ SILENT_MS = sum(value for name, value in server.OPTIONS if name.startswith("grpc
         ("values of one topic that wait for a client", outbox.TOPIC_BOUND),
         ("values of all topics of a stream that wait", outbox.STATE_BOUND),
         ("messages of `/in` that wait in a stream", outbox.EVENT_BOUND),
-        ("bytes of each of both that wait in a stream", back_pressure.BOUND_BYTES // MIB),
+        ("bytes of values that wait in a stream; the same for messages of `/in`", back_pressure.BOUND_BYTES // MIB),
         ("bytes that wait in all streams", back_pressure.TOTAL_BYTES // MIB),
         ("subscribers of version 2", simlog_v2.MAX_SUBSCRIBERS),
         ("topics of a subscriber", simlog_v2.MAX_TOPICS),
