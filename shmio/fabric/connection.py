@@ -148,6 +148,15 @@ def is_stored(message: Msg) -> bool:
     return message.reply.startswith("$JS.") or "Nats-Stream" in (message.headers or ())
 
 
+def wants_reply(message: Msg) -> bool:
+    """Return whether a message names a subject for the reply at which a client may receive it.
+
+    The sender chooses the subject, but the owner of a source sends the reply with its own
+    permissions. So a sender could let it write into the fabric or to the servers.
+    """
+    return bool(message.reply) and not message.reply.startswith(("shmio.", "$"))
+
+
 async def call_once(access: Access, work: Callable[[FabricClient], Coroutine[Any, Any, Any]]) -> Any:
     """Connect once, and return the result of ``work`` with the connection.
 

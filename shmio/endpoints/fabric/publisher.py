@@ -13,7 +13,7 @@ import msgspec
 
 from shmio.endpoints.fabric.backlog import Backlog, Kept, Row
 from shmio.endpoints.fabric.history import History
-from shmio.fabric.connection import INSTALL
+from shmio.fabric.connection import INSTALL, wants_reply
 from shmio.fabric.messages import MissingRequest, with_age
 from shmio.libraries import library
 
@@ -205,7 +205,7 @@ class Publisher:
 
     async def answer(self, row: Row | None, message: Msg) -> None:
         """Answer a request for missing messages, and end the answer with an empty message."""
-        if not message.reply or self._client is None:
+        if not wants_reply(message) or self._client is None:
             return
         client = self._client
         try:

@@ -21,7 +21,7 @@ from shmio.endpoints.fabric.feed import Feed, rule_for
 from shmio.endpoints.fabric.history import History
 from shmio.endpoints.fabric.publisher import Publisher
 from shmio.errors import ConfigError, ConflictError, RemoteError, SegmentError
-from shmio.fabric.connection import INSTALL, Access, connect, is_stored
+from shmio.fabric.connection import INSTALL, Access, connect, is_stored, wants_reply
 from shmio.fabric.messages import Header, encode
 from shmio.fabric.names import CellName, source_of
 from shmio.fabric.registry import RENEW_S, CellEntry, Registry, SourceEntry
@@ -360,7 +360,8 @@ class Uplink:
             return
         tokens = message.subject.split(".")
         source, sender = source_of(tokens[4]), ".".join(tokens[6:])
-        self.commands.take(sender, source, self._feeds.get(source), message.data, message.reply)
+        reply = message.reply if wants_reply(message) else ""
+        self.commands.take(sender, source, self._feeds.get(source), message.data, reply)
 
     def _reply(self, subject: str, data: bytes) -> None:
         """Send a reply, unless the connection is lost: then the sender does not learn the outcome."""

@@ -32,6 +32,7 @@ FAILING: dict[Main, dict[str, list[str]]] = {
         "export": ["no.mem", "-o", "x.csv"],
         "diff": ["no.mem", "neither.mem"],
         "cat": ["no.mem"],
+        "fetch": ["no.mem", "-o", "part.mem"],
     },
     supervisor.main: {
         "status": ["-c", "no.toml"],

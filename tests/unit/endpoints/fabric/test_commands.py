@@ -42,14 +42,14 @@ class Commander:
     """A bare NATS client that sends commands to an uplink."""
 
     def __init__(self, client: Any, found: Uplink) -> None:
-        self._client, self.uplink = client, found
+        self.client, self.uplink = client, found
 
     async def send(
         self, data: bytes, sender: str = FRIEND, source: str = "cell", timeout_s: float = TIMEOUT_S
     ) -> bytes:
         """Send bytes to the subject of commands, and return the reply."""
         subject = f"shmio.{CELL}.{source}.command.{sender}"
-        return bytes((await self._client.request(subject, data, timeout=timeout_s)).data)
+        return bytes((await self.client.request(subject, data, timeout=timeout_s)).data)
 
     async def write(
         self, *writes: tuple[int, int, bytes], sender: str = FRIEND, source: str = "cell", expires_ns: int = HOUR_NS,
@@ -116,6 +116,18 @@ async def test_only_allowed_cells_write(segment: Segment, server: NatsServer, pl
         ("cell", FRIEND, "fabric", "written"),
     ]
     assert list(entries[1]["what"]) == ["cell/count.%B0"]
+
+
+@in_loop
+async def test_a_command_cannot_send_its_outcome_into_the_fabric(
+    segment: Segment, server: NatsServer, plant: Plant
+) -> None:
+    async with commander(segment, server.url) as client:
+        request = CommandRequest(1 << 62, LAYOUT.hash[:8], [WriteItem(0, 0, b"\1")])
+        subject = f"shmio.{CELL}.cell.command.{FRIEND}"
+        await client.client.publish(subject, encode_command(request), reply=f"shmio.{CELL}.cell.live")
+        await until(lambda: client.uplink.commands.refused == 1)
+        assert plant.memory == bytes(8)
 
 
 @in_loop

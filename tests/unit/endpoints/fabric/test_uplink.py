@@ -7,6 +7,7 @@ import json
 from contextlib import suppress
 from dataclasses import replace
 
+import nats
 import pytest
 
 from shmio.config.model import FabricRule
@@ -151,6 +152,25 @@ async def test_missing_messages_are_sent_again(segment: Segment, server: NatsSer
         answers = await listener.client.subscribe(inbox)
         await listener.client.publish(f"shmio.{CELL}.cell.missing", b"\xff{", reply=inbox)
         assert (await answers.next_msg(TIMEOUT_S)).data == b"", "a malformed request has an empty answer"
+
+
+@pytest.mark.parametrize("reply", [f"shmio.{CELL}.cell.live", "$KV.shmio_cells.victim"])
+@in_loop
+async def test_requests_cannot_send_the_answer_into_the_fabric(
+    segment: Segment, server: NatsServer, reply: str
+) -> None:
+    writer = segment.writer("cell")
+    async with listening(server.url) as listener, uplink(segment, server.url) as found:
+        await until(lambda: found.publisher.up)
+        publish(writer, 1)
+        (sent,) = await listener.until(1)
+        answers = await listener.client.subscribe(reply)
+        request = json.dumps({"stream": sent.header.stream, "first": 1, "last": 1}).encode()
+        await listener.client.publish(f"shmio.{CELL}.cell.missing", request, reply=reply)
+        (again,) = await _missing(listener, sent.header.stream, 1, 1)  # the uplink has seen the earlier request
+        assert again.entries == sent.entries
+        with pytest.raises(nats.errors.TimeoutError):
+            await answers.next_msg(0.1)
 
 
 @in_loop
