@@ -199,9 +199,9 @@ def cuts(hosts: Hosts, near: Segment, far: Segment, count: int, seconds: float) 
         source, mirror = there.stop(), here.stop()
         cycles = [frame.cycle for frame in mirror if frame.quality is not Quality.BAD]
         assert cycles == sorted(set(cycles)), "the frames of the mirror are not in order, or come twice"
-        sent = [frame.cycle for frame in source if cycles[0] <= frame.cycle <= cycles[-1]]
-        missing = set(sent) - set(cycles)
-        assert not missing, f"{len(missing)} frames are missing"
+        own = [frame for frame in source if cycles[0] <= frame.cycle <= cycles[-1]]
+        missing = {frame.cycle for frame in own if frame.quality is not Quality.BAD} - set(cycles)
+        assert not missing, f"frames are missing: cycles {sorted(missing)} of {cycles[0]} to {cycles[-1]}"
         delivered += len(cycles)
         late += sum(frame.delay_us > 1e6 for frame in mirror)
     return {
