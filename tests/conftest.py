@@ -90,6 +90,7 @@ START_PROCESSES = (
     "tests/unit/endpoints/web/test_dropped.py::test_page_",
     "tests/unit/fabric/archive/test_archive.py",
     "tests/unit/fabric/test_history.py",
+    "tests/unit/fabric/test_registry.py",
     "tests/unit/falsification/farm/test_farm.py",
     "tests/unit/falsification/test_pool.py",
     "tests/unit/lab/",

@@ -243,7 +243,7 @@ class Registry:
         except errors.KeyNotFoundError:
             raise RemoteError(f"the fabric has no layout {digest[:16]}; restart the cell that offers it") from None
         try:
-            data = zstandard.ZstdDecompressor().decompress(found.value or b"", max_output_size=MAX_LAYOUT_BYTES)
+            data = _unpack(found.value or b"")
         except zstandard.ZstdError as error:
             raise RemoteError(f"the layout {digest[:16]} in the fabric is damaged: {error}") from None
         if hashlib.sha256(data).hexdigest() != digest:
@@ -253,6 +253,19 @@ class Registry:
 
 class _StreamState(msgspec.Struct):
     subjects: dict[str, int] | None = None
+
+
+def _unpack(packed: bytes) -> bytes:
+    """Return the uncompressed bytes of a layout, at most ``MAX_LAYOUT_BYTES``.
+
+    Raises:
+        ZstdError: The data are damaged or too large.
+
+    """
+    size = zstandard.get_frame_parameters(packed).content_size
+    if size not in (zstandard.CONTENTSIZE_UNKNOWN, zstandard.CONTENTSIZE_ERROR) and size > MAX_LAYOUT_BYTES:
+        raise zstandard.ZstdError(f"it has {size} bytes")  # the library's limit does not apply to a size in the frame
+    return zstandard.ZstdDecompressor().decompress(packed, max_output_size=MAX_LAYOUT_BYTES)
 
 
 class _StreamInfo(msgspec.Struct):
