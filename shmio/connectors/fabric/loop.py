@@ -179,7 +179,7 @@ class MirrorLoop:
                 or f"{self._mirror.cell} has sent nothing for {(now_ns - self._last_ns) / 1e6:.0f} ms"
             )
             self._fail(why)
-        elif self._link.problem and self._bad and self._link.problem != self.note and self._cycle is None:
+        elif self._link.problem and self._bad and self._link.problem != self.note:
             self._fail(self._link.problem)
         wait_ns = 500_000_000 if self._bad else max(1_000_000, due_ns - now_ns)
         if self._ready:

@@ -233,12 +233,15 @@ class Uplink:
 
         Raises:
             ConfigError: Another living cell has this name, or a file cannot be used.
-            RemoteError: A server refuses the credentials.
 
         """
         self.problem = f"{self._settings.access}: no NATS server has answered yet"
         self._client = await connect(
-            self._settings.access, f"shmio {self.cell}", lost=self._on_lost, back=self._on_connected
+            self._settings.access,
+            f"shmio {self.cell}",
+            lost=self._on_lost,
+            back=self._on_connected,
+            failed=self._on_failed,
         )
         await self._client.subscribe(self.cell.missing("*"), cb=self._on_missing, pending_msgs_limit=MAX_REQUESTS)
         await self._client.subscribe(self.cell.command_subjects, cb=self._on_command, pending_msgs_limit=MAX_REQUESTS)
@@ -263,6 +266,9 @@ class Uplink:
             return
         self.problem = f"{self._settings.access}: the connection is lost; the backlog keeps new messages"
         log.warning("%s", self.problem)
+
+    def _on_failed(self, why: str) -> None:
+        self.problem = f"{why}; the backlog keeps new messages"
 
     async def _establish(self, client: FabricClient) -> bool:
         """Claim the cell, then publish. Return False if the registry does not answer."""
@@ -308,7 +314,9 @@ class Uplink:
 
     def _complain(self, error: Exception) -> None:
         why = str(error) or type(error).__name__
-        problem = f"{self._settings.access}: the registry does not answer: {why}"
+        if not isinstance(error, RemoteError):  # its text says what to do
+            why = f"the registry does not answer: {why}"
+        problem = f"{self._settings.access}: {why}"
         if problem != self.problem:
             self.problem = problem
             log.warning("%s", problem)

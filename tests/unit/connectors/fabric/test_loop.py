@@ -250,6 +250,8 @@ def test_a_lost_connection_is_the_reason_for_bad_quality(mirroring: Mirroring) -
     mirroring.link.problem = "the connection is lost"
     assert mirroring.next().reason == "the connection is lost"
     assert mirroring.loop.note == "the connection is lost"
+    mirroring.link.problem = "the server does not know the credentials"
+    assert mirroring.next().reason == "the server does not know the credentials"
 
 
 def test_events_of_the_owner_have_no_writer(mirroring: Mirroring) -> None:

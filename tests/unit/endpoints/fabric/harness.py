@@ -95,10 +95,12 @@ async def listening(url: str, source: str = "cell") -> AsyncIterator[Listener]:
         await client.close()
 
 
-def new_uplink(segment: Segment, url: str, **settings: Any) -> Uplink:
+def new_uplink(segment: Segment, url: str, *, credentials: str | None = None, **settings: Any) -> Uplink:
     """Return an uplink that has not started."""
     options: dict[str, Any] = {"cell": CELL, "backlog_mb": 4.0, **settings}
-    return Uplink(segment, segment.processes.find("fabric"), UplinkSettings(Access((url,)), **options))
+    return Uplink(
+        segment, segment.processes.find("fabric"), UplinkSettings(Access((url,), credentials=credentials), **options)
+    )
 
 
 @asynccontextmanager

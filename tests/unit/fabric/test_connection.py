@@ -1,0 +1,44 @@
+"""A connection that the server ends with an error comes back."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from shmio.fabric.connection import Access, connect
+
+TIMEOUT_S = 20
+
+
+@pytest.mark.parametrize("error", ["User Authentication Expired", "Authorization Violation", "Slow Consumer"])
+def test_a_connection_that_the_server_ends_comes_back(error: str) -> None:
+    """The first connection ends with an error; the library would give up, and never tell."""
+
+    async def work() -> None:
+        back = asyncio.Event()
+        served: list[asyncio.StreamWriter] = []
+
+        async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            served.append(writer)
+            writer.write(b'INFO {"server_id": "x", "version": "2.10.0", "max_payload": 1000}\r\n')
+            while line := await reader.readline():
+                if line.startswith(b"PING"):
+                    writer.write(b"PONG\r\n")
+                    if len(served) == 1:
+                        writer.write(f"-ERR '{error}'\r\n".encode())
+            writer.close()
+
+        async def restored() -> None:
+            back.set()
+
+        server = await asyncio.start_server(serve, "127.0.0.1", 0)
+        url = f"nats://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+        client = await connect(Access((url,)), "test", back=restored)
+        await asyncio.wait_for(back.wait(), TIMEOUT_S)
+        assert client.is_connected
+        await client.close()
+        server.close()
+        await server.wait_closed()
+
+    asyncio.run(work())
