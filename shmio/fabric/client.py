@@ -10,7 +10,7 @@ import logging
 from contextlib import suppress
 from typing import Final
 
-from nats.aio.client import PERMISSIONS_ERR, PING_PROTO, Client, Srv
+from nats.aio.client import PING_PROTO, Client, Srv
 from nats.errors import ConnectionReconnectingError, Error
 
 CLOSE_S: Final = 1.0
@@ -52,7 +52,7 @@ class FabricClient(Client):
 
     async def _process_err(self, err_msg: str) -> None:
         """Connect again after an error of the server: the library gives up, for example if the user was removed."""
-        if PERMISSIONS_ERR in err_msg.lower():
+        if "permissions violation" in err_msg.lower():
             await super()._process_err(err_msg)
         else:
             await self._process_op_err(Error(err_msg))

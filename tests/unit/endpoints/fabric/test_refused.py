@@ -8,12 +8,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import nkeys
 import pytest
 
 from shmio.connectors.fabric.link import Link
 from shmio.fabric.connection import Access
 from shmio.fabric.names import CellName
+from shmio.libraries import library
 from shmio.segment import Segment
 from tests.nats_server import NatsServer, nats_server
 from tests.unit.endpoints.fabric.harness import CELL, in_loop, publish, until, uplink
@@ -24,7 +24,8 @@ class Users:
 
     def __init__(self, folder: Path) -> None:
         self.known, self.unknown = folder / "known.seed", folder / "unknown.seed"
-        self._keys = {}
+        nkeys = library("nkeys", "test")
+        self._keys: dict[Path, str] = {}
         for file, byte in ((self.known, b"k"), (self.unknown, b"u")):
             seed = nkeys.encode_seed(byte * 32, nkeys.PREFIX_BYTE_USER)
             file.write_bytes(seed)
