@@ -72,9 +72,9 @@ def member(seen: Seen) -> Member:
     )  # fmt: skip
 
 
-async def members(registry: Registry) -> list[Member]:
-    """Return all cells, in the order of their names."""
-    return [member(seen) for seen in await registry.cells()]
+async def members(registry: Registry, most: int | None = None) -> list[Member]:
+    """Return all cells, in the order of their names; with ``most``, at most so many."""
+    return [member(seen) for seen in await registry.cells(most)]
 
 
 def changes(before: dict[str, Member], now: dict[str, Member]) -> list[tuple[str, str]]:

@@ -292,6 +292,7 @@ def make_plan(
         more = {"folders": _folders(config), "token": tokens, "config_file": str(config_file.resolve())}
         more["recordings"] = recordings and str(recordings)
         more["scene"] = scene  # in place of its path
+        more["fabric"] = config.fabric and msgspec.to_builtins(Access.of(config.fabric))
         sections.append(("web", "web", msgspec.to_builtins(config.web) | more))
     if config.alert and mode == "live":
         sections.append((ALERTS, "alerts", _alerts(config, log_dir)))

@@ -17,7 +17,7 @@ from shmio.local.attach import attach
 from shmio.logs import LogRateLimit
 from shmio.worker import BEAT_S, Worker
 
-LOGGERS: Final = ("shmio.web", "uvicorn", "asyncio", "websockets")
+LOGGERS: Final = ("shmio.web", "shmio.fabric", "uvicorn", "asyncio", "websockets", "nats")
 """Loggers whose lines clients can cause in great number. The rate of these lines is limited."""
 FOLDERS: Final = "folders"
 
@@ -25,7 +25,7 @@ FOLDERS: Final = "folders"
 def run(worker: Worker) -> None:
     """Serve clients until the worker is stopped."""
     check_library(worker.name)
-    limits = {name: LogRateLimit(one_kind=name != "shmio.web") for name in LOGGERS}
+    limits = {name: LogRateLimit(one_kind=not name.startswith("shmio.")) for name in LOGGERS}
     for name, limit in limits.items():
         logging.getLogger(name).addFilter(limit)
     for name in ("uvicorn", "websockets"):
@@ -50,6 +50,7 @@ async def _serve(worker: Worker) -> None:
     file: str = worker.config.pop("config_file", "")
     recordings: str | None = worker.config.pop("recordings", None)
     scene: dict[str, Any] | None = worker.config.pop("scene", None)
+    fabric: dict[str, Any] | None = worker.config.pop("fabric", None)
     config = msgspec.convert(worker.config, Web if worker.name == "web" else Metrics)
     loop = asyncio.get_running_loop()
     stopping = asyncio.Event()
@@ -59,7 +60,7 @@ async def _serve(worker: Worker) -> None:
     if isinstance(config, Web):
         cell = attach(worker.segment.instance, writable=True)
         sessions = Sessions(read_tokens(msgspec.convert(given, list[Token])), config.roles or ())
-        served = Served(worker.segment, cell, measurements, folders, file, recordings, scene)
+        served = Served(worker.segment, cell, measurements, folders, file, recordings, scene, fabric)
         page = PageApp(served, sessions, TABS, secure=config.certificate is not None)
         app = page.app(measurements, config.registers)
     else:

@@ -169,6 +169,8 @@ class Page:
     def __init__(self, served: Served, socket: WebSocket, user: User, tabs: Iterable[type[Tab]]) -> None:
         self.served = served
         self.user = user
+        self.host: str = socket.headers["host"]
+        """How the browser names this server: host and port."""
         self._socket = socket
         self._tabs = {tab.name: tab(self) for tab in tabs}
         self._calls = {name: (call, tab) for tab in self._tabs.values() for name, call in tab.calls.items()}

@@ -13,6 +13,7 @@ from typing import Any, Final
 import msgspec
 
 from shmio.endpoints.alerts.state_file import alert_states
+from shmio.endpoints.web.cells import Cells
 from shmio.endpoints.web.clients import clients
 from shmio.endpoints.web.configuration import ConfigurationFile
 from shmio.endpoints.web.measurements import Measurements
@@ -54,6 +55,7 @@ class Served:
         config_file: str = "",
         recordings: str | None = None,
         scene: Mapping[str, Any] | None = None,
+        fabric: Mapping[str, Any] | None = None,
     ) -> None:
         """Create the shared state.
 
@@ -65,6 +67,8 @@ class Served:
             config_file: Path of the configuration.
             recordings: The recorder's directory; None if no recorder is configured.
             scene: The cell in 3D, as shmio/plan/scene.py makes it; None if the configuration has none.
+            fabric: How to connect to the fabric, as JSON values of its ``Access``; None if the configuration
+                has none.
 
         """
         self.segment, self.cell, self.measurements, self.folders = segment, cell, measurements, folders
@@ -78,6 +82,8 @@ class Served:
         self.timeline = Timeline(segment)
         """The newest events."""
         self.recordings = Recordings(recordings)
+        self.cells = None if fabric is None else Cells(fabric, segment.instance)
+        """The cells of the fabric; None without a fabric."""
         self.messages = self.bytes = 0
         """Numbers of messages and bytes that were sent to pages."""
         self._overview: dict[str, Any] = {}

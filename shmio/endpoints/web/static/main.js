@@ -1,5 +1,6 @@
 // The page: head line, tabs, theme and session.
 
+import { CellsTab } from "./cells.js";
 import { ConfigurationTab } from "./configuration.js";
 import { Connection } from "./connection.js";
 import { byId, element, replace, setText } from "./dom.js";
@@ -23,6 +24,7 @@ import { TimeTab } from "./time.js";
 /** @type {Record<string, { title: string, make: (context: Context) => Tab }>} */
 const TABS = {
   overview: { title: "Overview", make: (context) => new OverviewTab(context) },
+  cells: { title: "Cells", make: (context) => new CellsTab(context) },
   registers: { title: "Registers", make: (context) => new RegistersTab(context) },
   plots: { title: "Plots", make: (context) => new PlotsTab(context) },
   scene: { title: "3D", make: (context) => new SceneTab(context) },

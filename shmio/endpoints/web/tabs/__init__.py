@@ -3,6 +3,7 @@
 from typing import Final
 
 from shmio.endpoints.web.page import Tab
+from shmio.endpoints.web.tabs.cells import CellsTab
 from shmio.endpoints.web.tabs.configuration import Configuration
 from shmio.endpoints.web.tabs.injections import Injections
 from shmio.endpoints.web.tabs.log import Log
@@ -15,6 +16,7 @@ from shmio.endpoints.web.tabs.time import Time
 
 TABS: Final[tuple[type[Tab], ...]] = (
     Overview,
+    CellsTab,
     Registers,
     Plots,
     Scene,

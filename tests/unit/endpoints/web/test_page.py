@@ -78,12 +78,13 @@ def pages(
     recordings: Path | None = None,
     scene: Mapping[str, Any] | None = None,
     config_file: str = "",
+    fabric: Mapping[str, Any] | None = None,
 ) -> Iterator[Pages]:
     """Serve the page of a segment on a free port."""
     measurements = Measurements(segment)
     with Segment.open(segment.instance, writable=True) as mapped:
         folder = None if recordings is None else str(recordings)
-        shown = Served(segment, Attachment(mapped), measurements, folders or {}, config_file, folder, scene)
+        shown = Served(segment, Attachment(mapped), measurements, folders or {}, config_file, folder, scene, fabric)
         served = PageApp(shown, Sessions(secrets, roles), TABS, secure=False)
         server = HttpServer(served.app(measurements, ()), Address("127.0.0.1", 0), sockets=True)
         loop = asyncio.new_event_loop()
