@@ -36,6 +36,14 @@ def test_the_server_starts_first_and_the_uplink_last(tmp_path: Path) -> None:
     assert [job.name for job in plan(tmp_path, FABRIC).jobs] == ["cell", "nats"], "nothing is published"
 
 
+def test_the_web_page_gets_the_access_only_with_a_fabric(tmp_path: Path) -> None:
+    web = '[web]\nlisten = "127.0.0.1:4334"\n'
+    (with_fabric,) = [job for job in plan(tmp_path, FABRIC + web).jobs if job.name == "web"]
+    assert with_fabric.config["fabric"]["servers"] == ("nats://127.0.0.1:4333",)
+    (without,) = [job for job in plan(tmp_path, web).jobs if job.name == "web"]
+    assert without.config["fabric"] is None
+
+
 @pytest.mark.parametrize(
     ("rule", "words"),
     [
