@@ -47,6 +47,16 @@ def _align(size: int, to: int) -> int:
     return -(-size // to) * to
 
 
+def _clocks() -> tuple[int, int]:
+    """Return CLOCK_MONOTONIC and UTC at the same moment, both in ns.
+
+    Other processes may interrupt this one between two readings, so the closest of some readings counts.
+    """
+    readings = [(time.monotonic_ns(), time.time_ns(), time.monotonic_ns()) for _ in range(5)]
+    before_ns, utc_ns, after_ns = min(readings, key=lambda reading: reading[2] - reading[0])
+    return (before_ns + after_ns) // 2, utc_ns
+
+
 _DAMAGED = "; the segment is damaged; restart the instance"
 _RING_SECONDS = 8
 _SECTIONS_PER_BLOCK = 9  # at most: one of every kind
@@ -256,7 +266,7 @@ def _build_segment(
     """Allocate a new shared-memory object, and write the whole segment; the magic number last."""
     import secrets  # noqa: PLC0415  programs that only read need no random numbers, and it loads OpenSSL
 
-    now_ns, begin_ns = time.monotonic_ns(), origin.clock_ns if origin else 0
+    (now_ns, utc_ns), begin_ns = _clocks(), origin.clock_ns if origin else 0
     size = segment_size(blocks, len(processes))
     sections_size, processes_size = _table_sizes(len(blocks), len(processes))
     shared.allocate(size)
@@ -264,7 +274,7 @@ def _build_segment(
         head = Header(
             epoch=secrets.randbits(64) | 1,
             size=size,
-            started_utc_ns=origin.started_utc_ns if origin else time.time_ns(),
+            started_utc_ns=origin.started_utc_ns if origin else utc_ns,
             started_ns=now_ns - begin_ns,
             sections_offset=HEADER_SIZE,
             section_capacity=sections_size // SECTION_SIZE,

@@ -26,8 +26,6 @@ def execute(options: argparse.Namespace) -> int:
         from shmio.fabric.archive.folder import ArchiveFolder  # noqa: PLC0415  it needs the extras
         from shmio.fabric.archive.service import Archive, ArchiveLimits  # noqa: PLC0415
 
-    folder = ArchiveFolder(options.output)
-
     def closed(file: ClosedFile) -> None:
         if options.json:
             say_json({"file": str(file.path), "rows": file.rows})
@@ -35,11 +33,15 @@ def execute(options: argparse.Namespace) -> int:
             say(f"{file.path}: {file.rows} rows")
 
     async def work() -> None:
-        limits = ArchiveLimits(options.close_mb * 1_000_000, options.close_after)
-        archive = Archive(place, folder, options.cells or ["*"], limits, closed)
-        for number in (signal.SIGINT, signal.SIGTERM):
-            asyncio.get_running_loop().add_signal_handler(number, archive.stop)
-        await archive.run()
+        stopping = asyncio.Event()
+        for number in (signal.SIGINT, signal.SIGTERM):  # before others can see that the folder is in use
+            asyncio.get_running_loop().add_signal_handler(number, stopping.set)
+        folder = ArchiveFolder(options.output)
+        try:
+            limits = ArchiveLimits(options.close_mb * 1_000_000, options.close_after)
+            await Archive(place, folder, options.cells or ["*"], limits, closed, stopping).run()
+        finally:
+            folder.close()
 
     console = logging.StreamHandler(sys.stderr)
     console.setFormatter(_Printable("%(asctime)s %(message)s"))
@@ -50,7 +52,6 @@ def execute(options: argparse.Namespace) -> int:
         asyncio.run(work())
     finally:
         log.removeHandler(console)
-        folder.close()
     return 0
 
 

@@ -75,6 +75,7 @@ class Archive:
         patterns: Sequence[str],
         limits: ArchiveLimits,
         closed: Callable[[ClosedFile], None],
+        stopping: asyncio.Event,
     ) -> None:
         """Create the archive.
 
@@ -84,6 +85,7 @@ class Archive:
             patterns: Globs for the names of cells.
             limits: When files are closed.
             closed: Called for each file that is complete.
+            stopping: When it is set, :meth:`run` closes all files and returns.
 
         """
         self._access = access
@@ -91,7 +93,7 @@ class Archive:
         self._patterns = patterns
         self._limits = limits
         self._closed = closed
-        self._stopping = asyncio.Event()
+        self._stopping = stopping
         self._files: dict[CellName, CellFiles] = {}
         self._layouts: dict[bytes, Layout] = {}
         self._unknown: set[bytes] = set()
@@ -100,18 +102,14 @@ class Archive:
         self._stream_errors = library("nats.js.errors", INSTALL)
         self._api = library("nats.js.api", INSTALL)
 
-    def stop(self) -> None:
-        """Close all files, and let :meth:`run` return."""
-        self._stopping.set()
-
     async def run(self) -> None:
-        """Archive until :meth:`stop` is called.
+        """Archive until ``stopping`` is set.
 
         Raises:
             ConfigError: A file with credentials or certificates cannot be used.
             OSError: A file cannot be written.
             RecordingError: The state of a cell is damaged.
-            RemoteError: The server refuses the credentials, or has no JetStream.
+            RemoteError: The server has no JetStream.
 
         """
         client = await self._connected()

@@ -53,6 +53,24 @@ def block(source: str = "cell", **changes: int) -> BlockSpec:
     return BlockSpec(source, LAYOUT, fields["period_ns"], fields["stale_ns"], fields["ring_bytes"])
 
 
+def test_both_start_times_are_of_the_same_moment(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They convert times of frames to UTC, so the time that the system needs for the memory must not change them."""
+    allocate = SharedObject.allocate
+
+    def busy(shared: SharedObject, size: int) -> None:
+        until_ns = time.monotonic_ns() + 50_000_000
+        while time.monotonic_ns() < until_ns:
+            pass
+        allocate(shared, size)
+
+    monkeypatch.setattr(SharedObject, "allocate", busy)
+    with Segment.create(instance, [block()], PROCESSES) as built:
+        head = built.header
+        apart_ns = head.started_utc_ns - head.started_ns - (time.time_ns() - time.monotonic_ns())
+        assert abs(apart_ns) < 25_000_000
+        built.unlink()
+
+
 def test_an_opened_segment_has_what_its_supervisor_created(instance: str) -> None:
     with Segment.create(instance, [block("cell"), block("press")], PROCESSES, control="/run/x.sock") as built:
         with Segment.open(instance) as opened:
