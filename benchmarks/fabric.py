@@ -27,7 +27,8 @@ from shmio.fabric.names import CellName
 from shmio.segment import Attributes, BlockSpec, BlockWriter, Frame, ProcessSpec, Provenance, Quality, Segment
 from shmio.testing.ports import reserved_port
 
-PERIOD_NS: Final = 20_000_000
+PERIOD_NS: Final = 100_000
+"""The period of the source, which determines the length of the rings, and so how fast a mirror may publish."""
 CELL: Final = CellName("bench", "line", "near")
 CELLS: Final = (1, 10, 50, 100, 150, 200)
 BURST: Final = 20_000
