@@ -174,7 +174,7 @@ async def call_once(access: Access, work: Callable[[FabricClient], Coroutine[Any
     try:
         return await work(client)
     except (TimeoutError, library("nats.errors", INSTALL).Error) as error:
-        raise RemoteError(f"{access}: {error or 'the server does not answer'}") from None
+        raise RemoteError(f"{access}: {reason(error)}") from None
     finally:
         await client.close()
 
@@ -263,7 +263,7 @@ class _Attempts:
 
     def add(self, error: BaseException, *, up: bool) -> None:
         """Take an error; ``up`` is True if there is a connection, so that the error has not ended it."""
-        text = _said(error) if up else _why(self._access, error)
+        text = reason(error) if up else _why(self._access, error)
         if text not in self._logged:
             if len(self._logged) >= MAX_REASONS:
                 self._logged.clear()
@@ -287,7 +287,7 @@ def _is_refusal(error: BaseException) -> bool:
 
 def _why(access: Access, error: BaseException) -> str:
     """Return why an attempt to connect has failed."""
-    return f"{access}: {_refused(access) if _is_refusal(error) else f'no NATS server can be reached: {_said(error)}'}"
+    return f"{access}: {_refused(access) if _is_refusal(error) else f'no NATS server can be reached: {reason(error)}'}"
 
 
 def _refused(access: Access) -> str:
@@ -296,5 +296,8 @@ def _refused(access: Access) -> str:
     return f"the server does not know the credentials in {access.credentials}, or has removed them"
 
 
-def _said(error: BaseException) -> str:
+def reason(error: BaseException) -> str:
+    """Return in words why a server cannot be reached, or why a request failed."""
+    if isinstance(error, TimeoutError):  # its text is empty, or says less
+        return "the server does not answer"
     return str(error) or type(error).__name__

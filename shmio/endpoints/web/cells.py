@@ -137,7 +137,7 @@ class Cells:
         """Read the registry over one connection until the connection fails, or no page shows the cells."""
         from nats.errors import Error  # noqa: PLC0415  pages of instances without a fabric do not need it
 
-        from shmio.fabric.connection import Access, connect  # noqa: PLC0415
+        from shmio.fabric.connection import Access, connect, reason  # noqa: PLC0415
         from shmio.fabric.fleet import members  # noqa: PLC0415
         from shmio.fabric.registry import Registry  # noqa: PLC0415
 
@@ -156,7 +156,7 @@ class Cells:
         except ShmioError as error:
             self._tell(str(error))
         except (TimeoutError, OSError, Error) as error:
-            self._tell(f"{access}: {error or 'the server does not answer'}")
+            self._tell(f"{access}: {reason(error)}")
         except Exception:  # noqa: BLE001  pages are told
             _log.exception("the cells of the fabric cannot be read")
             self._tell("the cells cannot be read; the log of the process web has the reason")

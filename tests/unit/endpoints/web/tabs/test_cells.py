@@ -5,7 +5,7 @@ import json
 import socket
 import urllib.request
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,8 @@ from shmio.fabric.registry import CellEntry, Registry, SourceEntry
 from shmio.segment import Segment
 from shmio.testing.ports import reserved_port
 from shmio.version import __version__
-from tests.nats_server import NatsServer, nats_server
+from tests.nats_server import Link, NatsServer, nats_server
+from tests.unit.endpoints.web.harness import TIMEOUT_S
 from tests.unit.endpoints.web.tabs.test_injections import pushed
 from tests.unit.endpoints.web.test_page import SECRETS, TOKEN, pages, said
 
@@ -129,6 +130,18 @@ def test_pages_share_one_connection_that_ends_with_the_last(segment: Segment, se
         assert [one["cell"] for one in pushed(first, "cells")["cells"]] == [NEAR, FAR]  # not what was read earlier
 
 
+def test_user_who_returns_to_the_tab_need_not_wait_for_the_next_reading(
+    segment: Segment, server: NatsServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cells, "INTERVAL_S", 10.0 * TIMEOUT_S)
+    register(server, entry(NEAR))
+    with pages(segment, fabric=fabric(server)) as served, served.open() as browser:
+        for _ in range(2):
+            said(browser, "cells.follow")
+            assert pushed(browser, "cells")["cells"]
+            said(browser, "cells.leave")
+
+
 def test_lost_server_is_named_and_the_list_comes_back(segment: Segment, server: NatsServer) -> None:
     register(server, entry(NEAR))
     with pages(segment, fabric=fabric(server)) as served, served.open() as browser:
@@ -148,6 +161,21 @@ def test_lost_server_is_named_and_the_list_comes_back(segment: Segment, server: 
         while not (found := pushed(browser, "cells"))["problem"] or found["cells"]:
             pass
         assert found["old_s"] is None
+
+
+def test_dead_link_is_named(segment: Segment, server: NatsServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cells, "ANSWER_S", 0.5)
+    link = Link(server.port)
+    with closing(link), pages(segment, fabric={"servers": [link.url]}) as served, served.open() as browser:
+        said(browser, "cells.follow")
+        assert not pushed(browser, "cells")["problem"]
+        link.cut()
+        while not (problem := pushed(browser, "cells")["problem"]):
+            pass
+        assert problem == f"{link.url}: the server does not answer"
+        link.heal()
+        while pushed(browser, "cells")["problem"]:
+            pass
 
 
 def test_hostile_entries_are_shortened_text(
