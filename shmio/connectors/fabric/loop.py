@@ -18,7 +18,15 @@ from shmio.connectors.injections import Blocks, OwnerOf
 from shmio.connectors.models.stepped import StepClock
 from shmio.connectors.output import Image, Output
 from shmio.connectors.poll_loop import Counters, QualityLog
-from shmio.fabric.messages import CommandReply, CommandRequest, Entry, WriteItem, decode_entries, decode_header
+from shmio.fabric.messages import (
+    CommandReply,
+    CommandRequest,
+    Entry,
+    Header,
+    WriteItem,
+    decode_entries,
+    decode_header,
+)
 from shmio.layout.values.write import Write
 from shmio.model.values import OutcomeKind
 from shmio.segment import NO_WRITER, BlockWriter, Event, EventKind, Frame, Provenance, Quality, Record
@@ -201,7 +209,7 @@ class MirrorLoop:
         self._left_out += one.header.left_out
         try:
             for entry in decode_entries(one.data):
-                self._publish(entry, late_ns)
+                self._publish(entry, late_ns + _waited_ns(one.header, entry))
         except ValueError as error:
             self._report(error)
 
@@ -351,6 +359,13 @@ class _Pace:
         """Count a published frame."""
         self._refill(now_ns)
         self._tokens -= 1
+
+
+def _waited_ns(header: Header, entry: Entry) -> int:
+    """Return how long a frame waited at the owner until its message was made, such as for a maximum rate."""
+    if not isinstance(entry, Frame) or not header.zero_ns:
+        return 0
+    return max(0, header.made_ns - header.zero_ns - entry.publish_ns)
 
 
 def _outcome(kind: OutcomeKind, reason: str) -> str | LostWrite:

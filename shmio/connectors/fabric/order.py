@@ -76,6 +76,7 @@ class MessageOrder:
                 self._old.append(self._stream)
             self._next = 1 if self._stream else header.number
             self._stream = header.stream
+            self.newest = None  # a restart of the owner may have set its clock back
             self._progress_ns, self._asked_ns = message.at_ns, None
         if header.number < self._next or header.number in self._held:
             return found

@@ -366,6 +366,8 @@ class Uplink:
     async def _on_command(self, message: Msg) -> None:
         if is_stored(message):
             return
+        if not self.publisher.up:  # another instance may own the name of this cell: only its owner carries out commands
+            return
         tokens = message.subject.split(".")
         source, sender = source_of(tokens[4]), ".".join(tokens[6:])
         reply = message.reply if wants_reply(message) else ""

@@ -92,7 +92,8 @@ class FakeLink:
         """Return the next message of the stream; ``skip`` leaves out numbers before it."""
         self.number += 1 + skip
         values: dict[str, Any] = {"layout": LAYOUT.hash[:8], "stream": STREAM} | head
-        header = Header(left_out, values["stream"], self.number, values["layout"], time.time_ns())
+        made_ns, zero_ns = head.get("made_ns", time.time_ns()), head.get("zero_ns", 0)
+        header = Header(left_out, values["stream"], self.number, values["layout"], made_ns, zero_ns=zero_ns)
         return with_age(encode(header, entries), age_ns)
 
 
@@ -197,6 +198,15 @@ def test_late_frames_are_stale_but_keep_their_quality(mirroring: Mirroring) -> N
     mirroring.send(frame(7, 1), age_ns=30 * S)
     late = mirroring.next()
     assert late.quality is Quality.GOOD
+    assert late.delay_us > 29_000_000
+    assert mirroring.block.assess(late)[0] is Quality.BAD
+
+
+def test_a_frame_that_waited_at_the_owner_is_as_old_as_it_is(mirroring: Mirroring) -> None:
+    """The rule of a maximum rate may publish a frame long after its source."""
+    held = frame(7, 1)._replace(publish_ns=2 * S)
+    mirroring.send(held, made_ns=100 * S + 32 * S, zero_ns=100 * S)
+    late = mirroring.next()
     assert late.delay_us > 29_000_000
     assert mirroring.block.assess(late)[0] is Quality.BAD
 

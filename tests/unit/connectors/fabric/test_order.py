@@ -153,3 +153,11 @@ def test_any_order_of_arrival_is_delivered_in_order_once_with_exact_losses(seed:
         delivered += [one] if isinstance(one, int) else range(one[0], one[1] + 1)
     assert delivered == list(range(1, count + 2))
     assert {one for one in numbers(found) if isinstance(one, int)} == {1, *kept}
+
+
+def test_an_owner_that_was_restarted_with_an_earlier_clock_has_the_newest_message() -> None:
+    order = MessageOrder()
+    order.add(message(9000))
+    order.add(message(1, stream=8))
+    assert order.newest is not None
+    assert order.newest.header.stream == 8

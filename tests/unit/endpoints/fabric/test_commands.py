@@ -174,3 +174,20 @@ async def test_many_commands_at_once_each_have_an_outcome(segment: Segment, serv
         replies = await asyncio.gather(*(client.write((0, 0, bytes([count]))) for count in range(200)))
         assert {reply.outcomes[0] for reply in replies} <= {"written", "rejected"}
         assert sum(reply.outcomes == ["written"] for reply in replies) >= 100
+
+
+@in_loop
+async def test_only_the_owner_of_the_name_carries_out_commands(
+    segment: Segment, server: NatsServer, plant: Plant
+) -> None:
+    """An uplink that has not claimed the cell yet may be a second one of the same name."""
+    async with commander(segment, server.url) as client:
+        found = client.uplink
+        nats_client = found.publisher._client
+        assert nats_client is not None
+        found.publisher.end()
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(client.write((0, 0, b"\1")), 0.5)
+        assert plant.memory == bytes(8)
+        found.publisher.begin(nats_client)
+        assert (await client.write((0, 0, b"\1"))).outcomes == ["written"]

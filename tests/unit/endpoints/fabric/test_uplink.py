@@ -280,3 +280,18 @@ async def test_a_dead_link_is_noticed_and_nothing_is_lost(segment: Segment, serv
     with link(server) as proxy:
         async with listening(server.url) as listener:
             await _outage(segment, proxy.url, listener, proxy.cut, proxy.heal)
+
+
+@in_loop
+async def test_a_request_cannot_publish_in_the_name_of_a_source(segment: Segment, server: NatsServer) -> None:
+    writer = segment.writer("cell")
+    async with listening(server.url) as listener, uplink(segment, server.url) as found:
+        await until(lambda: found.publisher.up)
+        publish(writer, 1)
+        [first] = await listener.until(1)
+        request = json.dumps({"stream": first.header.stream, "first": 1, "last": 1}).encode()
+        for kind in ("live", "late"):
+            reply = f"shmio.{CELL}.cell.{kind}"
+            await listener.client.publish(f"shmio.{CELL}.cell.missing", request, reply=reply)
+        assert len(await _missing(listener, first.header.stream, 1, 1)) == 1
+        assert listener.queue.empty(), "the server keeps the order of the requests"
