@@ -244,7 +244,8 @@ def _file(name: str, source: Source, config: Config) -> str:
 def _mirrored(key: str, source: Source, config: Config, files: LayoutFiles) -> Layout:
     """Return the layout of a source that mirrors another cell's source.
 
-    It comes from the registry, with the period and the stale age, unless the configuration names files.
+    It comes from the registry, with the period and the stale age. If the configuration names files,
+    they have the layout, also while the registry does not know it.
     """
     from shmio.connectors.fabric.source import CACHE, Mirror, offered  # noqa: PLC0415
 
@@ -253,17 +254,26 @@ def _mirrored(key: str, source: Source, config: Config, files: LayoutFiles) -> L
     mirror = Mirror(msgspec.convert(source.options, Mirror.Options), source.name)
     if str(mirror.cell) == config.fabric.cell:
         raise ConfigError(f"{key}.cell: {mirror.cell} is this instance; name the cell of another instance")
-    if source.layout is not None:
-        return files.get(key, source, None)
+    own = None if source.layout is None else files.get(key, source, None)
     file = config.log_dir / CACHE.format(source.name)
     try:
         offer, old = offered(mirror, Access.of(config.fabric), file)
     except ConfigError as error:
-        raise ConfigError(f"{key}.{error}") from None
-    if old:
+        if own is None:
+            raise ConfigError(f"{key}.{error}") from None
+        files.warnings.append(
+            f"{key}.{error}; until then, nothing checks that the owner has the layout in {key}.layout"
+        )
+        return own
+    if own is not None and not old and own.hash != offer.layout.hash:
+        raise ConfigError(
+            f"{key}.layout: {mirror} has another layout; use the owner's file, or remove this key: then the mirror "
+            "has the owner's layout"
+        )
+    if old and own is None:
         files.warnings.append(f"{key}: the layout is the one that {file.name} has kept: {old}")
     source.period_ms, source.stale_ms = offer.period_ns / 1e6, source.stale_ms or offer.stale_ns / 1e6
-    return offer.layout
+    return own or offer.layout
 
 
 def _model(key: str, source: Source, config: Config, files: LayoutFiles) -> tuple[Layout, tuple[str, ...]]:

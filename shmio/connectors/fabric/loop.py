@@ -74,6 +74,7 @@ class MirrorLoop:
         armed: bool = False,
         owner_of: OwnerOf = lambda _: None,
         blocks: Blocks | None = None,
+        own_layout: bool = False,
         changed: Callable[[], None] = lambda: None,
     ) -> None:
         """Create the loop.
@@ -89,13 +90,15 @@ class MirrorLoop:
             armed: Whether injections of this instance may change what is sent to the owner.
             owner_of: Returns the process that uses a command queue.
             blocks: Returns the blocks of all sources.
+            own_layout: True if files of this instance have the layout, so that a reload changes nothing.
             changed: Called when the owner's layout is another one, at most once.
 
         """
         self._mirror = mirror
         self._writer = writer
         self._clock = clock
-        self._changed: Callable[[], None] | None = changed
+        self._changed: Callable[[], None] | None = None if own_layout else changed
+        self._own_layout = own_layout
         self._layout = writer.block.layout.hash[:8]
         self._output = Output(writer, clock.now_ns)
         self.commands = CommandProcessor(
@@ -115,6 +118,7 @@ class MirrorLoop:
         self._open = False
         self._bad = True  # the last frame was bad
         self._reported_ns = -REPORT_NS
+        self._problem, self._problem_ns = "", clock.now_ns()  # of the link, and when it last had it
         self.missing = 0
         """Number of frames that the owner no longer had."""
         self._cycle: int | None = None
@@ -179,16 +183,16 @@ class MirrorLoop:
 
     def _watch(self, now_ns: int) -> int:
         """Publish a bad frame if the last one is too old. Return how long the loop may wait, in ns."""
-        stale_ns = self._writer.block.stale_ns
+        stale_ns, problem = self._writer.block.stale_ns, self._link.problem
         due_ns = self._last_ns + stale_ns
-        if now_ns >= due_ns and not self._bad:
-            why = (
-                self._link.problem
-                or f"{self._mirror.cell} has sent nothing for {(now_ns - self._last_ns) / 1e6:.0f} ms"
-            )
-            self._fail(why)
-        elif self._link.problem and self._bad and self._link.problem != self.note:
-            self._fail(self._link.problem)
+        if problem:
+            self._problem, self._problem_ns = problem, now_ns
+            if problem != self.note and (self._bad or now_ns >= due_ns):
+                self._fail(problem)
+        elif now_ns >= due_ns and not self._bad:
+            self._fail(f"{self._mirror.cell} has sent nothing for {(now_ns - self._last_ns) / 1e6:.0f} ms")
+        elif self._bad and self.note == self._problem and now_ns >= max(due_ns, self._problem_ns + stale_ns):
+            self._fail(f"{self._mirror.cell} sends nothing; shmio fabric cells shows its state")
         wait_ns = 500_000_000 if self._bad else max(1_000_000, due_ns - now_ns)
         if self._ready:
             wait_ns = min(wait_ns, max(1_000_000, self._pace.wait_ns(now_ns)))
@@ -288,7 +292,11 @@ class MirrorLoop:
             self._output.publish(image)
 
     def _refuse_layout(self) -> None:
-        self._fail(f"{self._mirror} has another layout now; run shmio-supervisor reload")
+        if self._own_layout:
+            what = "another layout than this source's key layout; use the owner's file, or remove the key"
+        else:
+            what = "another layout now"
+        self._fail(f"{self._mirror} has {what}; run shmio-supervisor reload")
         if self._changed is not None:
             changed, self._changed = self._changed, None
             changed()

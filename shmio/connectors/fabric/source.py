@@ -104,7 +104,7 @@ def offered(mirror: Mirror, access: Access, file: Path) -> tuple[Offer, str]:
         kept = _read(mirror, file)
         if kept is None:
             raise ConfigError(
-                f"cell: the layout of {mirror} is not known yet: {error}; start the server and the cell first"
+                f"cell: the layout of {mirror} is not known yet: {error}; the server and the cell must run first"
             ) from None
         return kept, str(error)
     _keep(mirror, offer, file)

@@ -100,7 +100,7 @@ class FakeLink:
 class Mirroring:
     """A mirror's process, run in threads."""
 
-    def __init__(self, segment: Segment) -> None:
+    def __init__(self, segment: Segment, *, own_layout: bool = False) -> None:
         self.segment = segment
         slot = segment.processes.find("cell")
         assert slot.take()
@@ -121,6 +121,7 @@ class Mirroring:
             connect,
             ("count",),
             owner_of=lambda writer: Owner(writer, os.getpid()),
+            own_layout=own_layout,
             changed=self._changed,
         )
         self._threads = [threading.Thread(target=run) for run in (self.loop.run, self.loop.commands.run)]
@@ -160,10 +161,10 @@ def mirroring(instance: str) -> Iterator[Mirroring]:
 
 
 @contextmanager
-def running(instance: str) -> Iterator[Mirroring]:
+def running(instance: str, *, own_layout: bool = False) -> Iterator[Mirroring]:
     block = BlockSpec("cell", LAYOUT, 20 * MS, STALE_NS, 1 << 20, Attributes("fabric", ("count",)))
     with Segment.create(instance, [block], [ProcessSpec("cell", "source")]) as segment:
-        mirroring = Mirroring(segment)
+        mirroring = Mirroring(segment, own_layout=own_layout)
         try:
             yield mirroring
         finally:
@@ -262,6 +263,8 @@ def test_a_lost_connection_is_the_reason_for_bad_quality(mirroring: Mirroring) -
     assert mirroring.loop.note == "the connection is lost"
     mirroring.link.problem = "the server does not know the credentials"
     assert mirroring.next().reason == "the server does not know the credentials"
+    mirroring.link.problem = ""
+    assert "plant1.line3.a50 sends nothing" in mirroring.next().reason, "the server has no JetStream, for example"
 
 
 def test_events_of_the_owner_have_no_writer(mirroring: Mirroring) -> None:
@@ -289,6 +292,15 @@ def test_another_layout_makes_the_source_bad_and_asks_for_a_reload_once(mirrorin
     mirroring.send(frame(9, 2), layout=b"another!")
     assert mirroring.changed.wait(PATIENCE_S)
     assert mirroring.changes == 1
+
+
+def test_another_layout_than_that_of_a_file_is_no_reason_to_reload(instance: str) -> None:
+    with running(instance, own_layout=True) as mirroring:
+        mirroring.send(frame(7, 1), layout=b"another!")
+        bad = mirroring.next()
+        assert bad.quality is Quality.BAD
+        assert "key layout" in bad.reason
+        assert mirroring.changes == 0
 
 
 def test_malformed_messages_change_nothing(mirroring: Mirroring) -> None:

@@ -1,0 +1,88 @@
+"""The layout of a mirror: from the registry, or from a file."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from shmio.errors import ConfigError
+from shmio.fabric.connection import Access, connect
+from shmio.fabric.registry import CellEntry, Registry, SourceEntry
+from shmio.plan.prepare import prepare
+from shmio.plan.processes import Plan
+from shmio.segment import BlockSpec
+from tests.nats_server import NatsServer, nats_server
+from tests.unit.plan.test_fabric import BLOCK, SOURCE
+
+NEAR = "plant1.line3.near"
+MIRROR = (
+    '[instance]\nname = "far"\nlog_dir = "logs"\n[fabric]\nserver = "{}"\ncell = "plant1.line3.far"\n'
+    '[[source]]\nname = "cell"\nconnector = "fabric"\ncell = "{}"\n'
+)
+FILE = 'layout = "x.db"\n'
+
+
+@pytest.fixture
+def owner(tmp_path: Path) -> BlockSpec:
+    """The block of the owner, which has a layout from a file."""
+    (tmp_path / "cell.db").write_text(BLOCK)
+    (tmp_path / "owner.toml").write_text(SOURCE + "period_ms = 40\n")
+    (block,) = prepare(tmp_path / "owner.toml").plan.blocks
+    return block
+
+
+@pytest.fixture
+def server(tmp_path: Path, owner: BlockSpec) -> Iterator[NatsServer]:
+    with nats_server(tmp_path / "nats") as server:
+
+        async def offer() -> None:
+            client = await connect(Access((server.url,)), "test", patient=False)
+            registry = await Registry.open(client)
+            await registry.put_layout(owner.layout)
+            source = SourceEntry("cell", owner.layout.hash.hex(), owner.period_ns, owner.stale_ns, 1)
+            await registry.claim(CellEntry(NEAR, "host1", "near", "0.1", "1", "running", 1, 2, "", (source,)))
+            await client.close()
+
+        asyncio.run(offer())
+        yield server
+
+
+def plan(folder: Path, url: str, layout: str = "", cell: str = NEAR) -> Plan:
+    (folder / "x.db").write_text(layout or BLOCK)
+    (folder / "far.toml").write_text(MIRROR.format(url, cell) + (FILE if layout else ""))
+    return prepare(folder / "far.toml").plan
+
+
+def test_a_file_has_the_layout_with_and_without_a_server(tmp_path: Path, owner: BlockSpec, server: NatsServer) -> None:
+    found = plan(tmp_path, server.url, BLOCK)
+    assert [(one.layout.hash, one.period_ns) for one in found.blocks] == [(owner.layout.hash, owner.period_ns)]
+    assert found.warnings == ()
+    (warning,) = plan(tmp_path, server.url, BLOCK, "plant1.line3.neer").warnings
+    assert "did you mean 'plant1.line3.near'" in warning
+    server.stop()
+    (tmp_path / "logs/cell.mirrored.json").unlink()
+    found = plan(tmp_path, server.url, BLOCK)
+    assert [one.layout.hash for one in found.blocks] == [owner.layout.hash]
+    assert "no NATS server can be reached" in found.warnings[0]
+    with pytest.raises(ConfigError, match=r"source\[0\]\.cell: the layout of .* is not known yet: .*server"):
+        plan(tmp_path, server.url)
+
+
+def test_another_layout_than_the_owners_is_refused(tmp_path: Path, server: NatsServer) -> None:
+    other = BLOCK.replace("Level : Real", "Level : DInt")
+    with pytest.raises(
+        ConfigError, match=rf"source\[0\]\.layout: {NEAR}/cell has another layout; use the owner's file"
+    ):
+        plan(tmp_path, server.url, other)
+
+
+@pytest.mark.parametrize("keys", [{"jetstream": None}, {"authorization": {"user": "a", "password": "b"}}])
+def test_a_server_that_refuses_is_not_taken_for_one_that_does_not_run(
+    tmp_path: Path, owner: BlockSpec, keys: dict[str, object]
+) -> None:
+    words = r"has no JetStream; start it with -js|fabric\.credentials"
+    with nats_server(tmp_path / "nats", **keys) as server, pytest.raises(ConfigError, match=words):
+        plan(tmp_path, server.url)
