@@ -42,6 +42,12 @@ CATCH_UP_S: Final = 0.8
 
 After an outage, many frames come at once. Readers such as the recorder must be able to follow.
 """
+MAX_WAITING_BYTES: Final = 64 << 20
+"""Maximum size of the messages that wait for the loop. It requests those that are dropped."""
+MAX_READY: Final = 64
+"""Number of messages that wait to be published, after which the loop takes no further ones."""
+RELOAD_NS: Final = 30_000_000_000
+"""Time in ns after which the mirror asks again for a reload, if the layout is still another one."""
 REPORT_NS: Final = 10_000_000_000
 """Shortest time in ns between two reports of malformed messages."""
 _LEFT_OUT: Final = frozenset({EventKind.STARTED, EventKind.STOPPED, EventKind.QUALITY})
@@ -91,14 +97,15 @@ class MirrorLoop:
             owner_of: Returns the process that uses a command queue.
             blocks: Returns the blocks of all sources.
             own_layout: True if files of this instance have the layout, so that a reload changes nothing.
-            changed: Called when the owner's layout is another one, at most once.
+            changed: Called when the owner's layout is another one, at most each ``RELOAD_NS``.
 
         """
         self._mirror = mirror
         self._writer = writer
         self._clock = clock
-        self._changed: Callable[[], None] | None = None if own_layout else changed
+        self._changed = changed
         self._own_layout = own_layout
+        self._reload_ns = -RELOAD_NS
         self._layout = writer.block.layout.hash[:8]
         self._output = Output(writer, clock.now_ns)
         self.commands = CommandProcessor(
@@ -109,6 +116,8 @@ class MirrorLoop:
         self.counters = Counters()
         self._order = MessageOrder()
         self._inbox: deque[Received | Missing] = deque()
+        self._received_bytes = 0  # changed only by the link's thread
+        self._taken_bytes = 0  # changed only by the loop's thread
         self._ready: deque[Received | Lost] = deque()
         ring = writer.block.ring
         self._pace = _Pace(max(ring.slot_count / CATCH_UP_S, 6e9 / writer.block.period_ns), ring.slot_count / 8)
@@ -133,13 +142,14 @@ class MirrorLoop:
     # ---- in the link's thread ------------------------------------------------------------------------------------
 
     def _receive(self, data: bytes) -> None:
-        if len(self._inbox) >= MAX_WAITING:
+        if len(self._inbox) >= MAX_WAITING or self._received_bytes - self._taken_bytes > MAX_WAITING_BYTES:
             return  # the loop will request it
         try:
             header = decode_header(data)
         except ValueError as error:
             self._report(error)
             return
+        self._received_bytes += len(data)
         self._inbox.append(Received(header, data, self._clock.now_ns()))
         self._clock.nudge()
 
@@ -164,8 +174,10 @@ class MirrorLoop:
 
     def _run_once(self) -> bool:
         """Publish what has come, pass on writes, then wait. Return whether the loop must stop."""
-        while self._inbox:
+        while self._inbox and len(self._ready) < MAX_READY:
             one = self._inbox.popleft()
+            if isinstance(one, Received):
+                self._taken_bytes += len(one.data)
             found = (
                 self._order.answered(one, self._clock.now_ns()) if isinstance(one, Missing) else self._order.add(one)
             )
@@ -194,6 +206,8 @@ class MirrorLoop:
         elif self._bad and self.note == self._problem and now_ns >= max(due_ns, self._problem_ns + stale_ns):
             self._fail(f"{self._mirror.cell} sends nothing; shmio fabric cells shows its state")
         wait_ns = 500_000_000 if self._bad else max(1_000_000, due_ns - now_ns)
+        if self._inbox and len(self._ready) < MAX_READY:
+            return 1  # the loop has not taken all messages
         if self._ready:
             wait_ns = min(wait_ns, max(1_000_000, self._pace.wait_ns(now_ns)))
         patience_ns = self._order.patience_ns(now_ns)
@@ -297,9 +311,10 @@ class MirrorLoop:
         else:
             what = "another layout now"
         self._fail(f"{self._mirror} has {what}; run shmio-supervisor reload")
-        if self._changed is not None:
-            changed, self._changed = self._changed, None
-            changed()
+        now_ns = self._clock.now_ns()
+        if not self._own_layout and now_ns - self._reload_ns >= RELOAD_NS:
+            self._reload_ns = now_ns  # not only once: the owner may publish before the registry has its new layout
+            self._changed()
 
     def _report(self, error: ValueError) -> None:
         now_ns = self._clock.now_ns()

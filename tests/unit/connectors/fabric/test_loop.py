@@ -303,6 +303,15 @@ def test_another_layout_than_that_of_a_file_is_no_reason_to_reload(instance: str
         assert mirroring.changes == 0
 
 
+def test_a_reload_that_came_too_early_is_repeated(mirroring: Mirroring, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The registry may still have had the old layout."""
+    monkeypatch.setattr("shmio.connectors.fabric.loop.RELOAD_NS", 0)
+    for _ in range(2):
+        mirroring.changed.clear()
+        mirroring.send(frame(8, 2), layout=b"another!")
+        assert mirroring.changed.wait(PATIENCE_S)
+
+
 def test_malformed_messages_change_nothing(mirroring: Mirroring) -> None:
     mirroring.link.send(b"\xff" * 100)
     mirroring.send(frame(7, 1)._replace(raw=b"too long for the block"))
@@ -348,3 +357,25 @@ def test_registers_that_are_not_writable_here_stay_here(mirroring: Mirroring) ->
     with pytest.raises(CommandError, match="writable"):
         SourceWriter(mirroring.block, 0).write({"other": 1})
     assert mirroring.link.commands == []
+
+
+def test_a_flood_needs_bounded_memory(mirroring: Mirroring, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Messages that come faster than the mirror may publish them, and do not fit, are requested later."""
+    monkeypatch.setattr("shmio.connectors.fabric.loop.MAX_WAITING_BYTES", 20_000)
+    total = 0
+    for first in range(7, 7 + 50 * 400, 50):
+        data = mirroring.link.message(*(frame(number, 1) for number in range(first, first + 50)), age_ns=30 * S)
+        total += len(data)
+        mirroring.link.send(data)
+    assert mirroring.loop._received_bytes < total // 2
+
+
+def test_all_of_many_messages_at_once_are_published(mirroring: Mirroring) -> None:
+    mirroring.send(frame(7, 1))
+    mirroring.next()
+    with mirroring.loop._output.lock:  # the loop stops
+        for number in range(8, 309):
+            mirroring.send(frame(number, 1))
+    began = time.monotonic()
+    assert [mirroring.next().cycle for _ in range(301)] == list(range(1008, 1309))
+    assert time.monotonic() - began < 4, "the loop does not wait while messages wait"
