@@ -46,6 +46,8 @@ MAX_WAITING_BYTES: Final = 64 << 20
 """Maximum size of the messages that wait for the loop. It requests those that are dropped."""
 MAX_READY: Final = 64
 """Number of messages that wait to be published, after which the loop takes no further ones."""
+MAX_TIME_NS: Final = (1 << 63) - 1
+"""Latest time that a command can have; a faulty owner may send later ones."""
 RELOAD_NS: Final = 30_000_000_000
 """Time in ns after which the mirror asks again for a reload, if the layout is still another one."""
 REPORT_NS: Final = 10_000_000_000
@@ -336,7 +338,9 @@ class MirrorLoop:
             return ["no message of the owner has come yet"] * len(writes)
         header = newest.header
         owner_ns = header.made_ns + header.age_ns + self._clock.now_ns() - newest.at_ns
-        request = CommandRequest(owner_ns + BEGIN_NS, self._layout, [WriteItem(*write) for write in writes])
+        request = CommandRequest(
+            min(owner_ns + BEGIN_NS, MAX_TIME_NS), self._layout, [WriteItem(*write) for write in writes]
+        )
         self._reply = self._link.command(request, ANSWER_S)
         self._reply.add_done_callback(lambda _: self._clock.nudge())
         return None

@@ -20,7 +20,7 @@ from shmio.connectors.fabric.source import Mirror
 from shmio.connectors.injection_layers import Owner
 from shmio.connectors.models.stepped import PageClock
 from shmio.errors import CommandError
-from shmio.fabric.messages import CommandReply, CommandRequest, Entry, Header, encode, with_age
+from shmio.fabric.messages import CommandReply, CommandRequest, Entry, Header, encode, encode_command, with_age
 from shmio.layout.model import Layout, Register
 from shmio.local.writer import SourceWriter
 from shmio.recording.format.encoding import Gap, Reason
@@ -379,3 +379,11 @@ def test_all_of_many_messages_at_once_are_published(mirroring: Mirroring) -> Non
     began = time.monotonic()
     assert [mirroring.next().cycle for _ in range(301)] == list(range(1008, 1309))
     assert time.monotonic() - began < 4, "the loop does not wait while messages wait"
+
+
+def test_a_faulty_age_of_the_owner_gives_a_command_that_can_be_sent(mirroring: Mirroring) -> None:
+    mirroring.send(frame(7, 1), age_ns=(1 << 64) - 1)
+    mirroring.event(EventKind.QUALITY)
+    mirroring.link.reply = CommandReply(["expired"], [""])
+    SourceWriter(mirroring.block, 0).write({"count": 77})
+    assert encode_command(mirroring.link.commands[0])
