@@ -145,7 +145,8 @@ def _check_external(mqtt: Mqtt) -> None:
 def _check_own(mqtt: Mqtt) -> None:
     for key in _ELSEWHERE:
         if getattr(mqtt, key) is not None:
-            raise ConfigError(f'mqtt.{key}: this key is only for broker = "external"; with "{mqtt.broker}", use listen')
+            remedy = "remove it: [[mqtt.account]] has the accounts" if key == "username" else "use listen"
+            raise ConfigError(f'mqtt.{key}: this key is only for broker = "external"; with "{mqtt.broker}", {remedy}')
     if mqtt.listen is None:
         raise ConfigError(f"mqtt.listen: this key is needed, such as 127.0.0.1:{PORT}")
     try:

@@ -406,7 +406,7 @@ def shape_of(dims: Dims) -> tuple[int, ...]:
 def flat_index(dims: Dims, index: tuple[int, ...]) -> int:
     """Return the position, from 0, of the element of an array with these declared indices.
 
-    The last index runs fastest.
+    The last index varies fastest.
     """
     flat = 0
     for i, (low, high) in zip(index, dims, strict=True):
@@ -426,7 +426,7 @@ def index_at(dims: Dims, flat: int) -> tuple[int, ...]:
 def bit_positions(register: Register) -> list[tuple[int, int]]:
     """Return (byte, bit) of each element of a BOOL register, relative to its first byte.
 
-    The last index runs fastest.
+    The last index varies fastest.
     """
     if not register.dims or register.partial:
         return [divmod((register.bit or 0) + flat, 8) for flat in range(register.count)]

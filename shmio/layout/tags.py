@@ -363,7 +363,7 @@ def _tag(key: str, given: object) -> _Tag:
     except msgspec.ValidationError as error:
         if isinstance(given, dict) and _is_nested(given.get("initial")):
             raise ValueError(
-                "initial: expected one flat list, in which the last index runs fastest, found nested lists"
+                "initial: expected one flat list, in which the last index varies fastest, found nested lists"
             ) from None
         raise ValueError(explain(error, "", _Tag)) from None
 

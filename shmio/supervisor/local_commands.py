@@ -285,7 +285,7 @@ _SNAPSHOTS: Final = {StateAction.SAVE: "save snapshot", StateAction.RESTORE: "re
 
 
 class TimeChanges:
-    """Writes to the audit log which programs move the instance's time, and save or restore snapshots.
+    """Records in the audit log which programs move the instance's time, save snapshots or restore them.
 
     Use it from one thread.
     """

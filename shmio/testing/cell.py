@@ -119,7 +119,8 @@ def until(condition: Callable[[], bool], what: str, patience_s: float = PATIENCE
 def kill(pid: int, sign: signal.Signals = signal.SIGKILL) -> None:
     """Send a signal to a process that need not be a child.
 
-    A pidfd ensures that no other process can get the signal.
+    A pidfd keeps the signal from another process if this one ends during the call. The pid must be
+    valid when the call begins.
     """
     handle = os.pidfd_open(pid)
     try:

@@ -60,7 +60,8 @@ class Shadow(AsyncIterator[Update]):
             raw: Values as raw bytes: see :data:`shmio.client.injection.Raw`.
 
         Returns:
-            An outcome for each value. All values have the same outcome: the worst of them. It is
+            An outcome for each path in ``values``, and one with an empty path for all arrays and
+            raw bytes together. All have the same kind: the worst outcome of any value. It is
             ``rejected`` if a path or value is wrong, or if the injection does not cover a path.
 
         Raises:

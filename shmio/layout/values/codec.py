@@ -198,14 +198,14 @@ class _BoolArray:
 
 
 def nest(flat: list[Value], shape: tuple[int, ...]) -> list[Value]:
-    """Return a flat list as nested lists with the lengths ``shape``; the last index runs fastest."""
+    """Return a flat list as nested lists with the lengths ``shape``; the last index varies fastest."""
     for length in reversed(shape[1:]):
         flat = [flat[start : start + length] for start in range(0, len(flat), length)]
     return flat
 
 
 def flatten(value: object, shape: tuple[int, ...], name: str) -> Iterator[object]:
-    """Yield the elements of nested lists; the last index runs fastest.
+    """Yield the elements of nested lists; the last index varies fastest.
 
     Raises:
         ValueRangeError: The lists do not have this shape.

@@ -157,7 +157,7 @@ def _joined(ranges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def elements(layout: Layout, register: Register) -> Iterator[Register]:
-    """Yield the elements of an array; the last index runs fastest."""
+    """Yield the elements of an array; the last index varies fastest."""
     index = [low for low, _ in register.dims]
     for _ in range(register.count):
         yield layout.element(register, tuple(index))

@@ -422,7 +422,11 @@ class Subscriber:
             leave = injection.given_values("v2", to_message, EventLane(self.outbox, shorten(path), finish))
 
         def over() -> None:
-            log.info("a subscribed topic no longer exists: %s", injection.over, extra=fields(topic=shorten(path)))
+            log.info(
+                "the injection behind a subscribed topic has ended: %s",
+                injection.over,
+                extra=fields(topic=shorten(path)),
+            )
             self._leave(self._subscriptions.pop(path))
 
         def leave_it() -> None:
