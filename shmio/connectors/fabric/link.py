@@ -27,8 +27,9 @@ from shmio.libraries import library
 from shmio.model.values import OutcomeKind
 
 if TYPE_CHECKING:
-    from nats.aio.client import Client
     from nats.aio.msg import Msg
+
+    from shmio.fabric.client import FabricClient
 
 MAX_WAITING: Final = 65_536
 """Maximum number of messages that wait for the mirror's loop. It requests those that are dropped."""
@@ -77,7 +78,7 @@ class Link:
         self._received = received
         self._answered = answered
         self._loop = asyncio.new_event_loop()
-        self._client: Client | None = None
+        self._client: FabricClient | None = None
         self._thread = threading.Thread(target=self._run, name="fabric", daemon=True)
         self.problem = "the fabric is not connected yet"
         """Why there is no connection; empty if there is one."""
@@ -125,7 +126,7 @@ class Link:
     async def _end(self, opening: asyncio.Task[None]) -> None:
         await asyncio.gather(opening, return_exceptions=True)
         if self._client is not None:
-            await self._client.close()
+            await self._client.abandon()  # close() waits until a dead link has taken what waits
         others = asyncio.all_tasks() - {asyncio.current_task()}
         for task in others:
             task.cancel()

@@ -1,0 +1,33 @@
+"""The connection of a mirror to a real server."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+from shmio.connectors.fabric.link import Link
+from shmio.fabric.connection import Access
+from shmio.fabric.messages import CommandRequest, WriteItem
+from shmio.fabric.names import CellName
+from tests.nats_server import Link as Proxy
+from tests.nats_server import nats_server
+
+PATIENCE_S = 20.0
+
+
+def test_a_dead_link_does_not_keep_the_process_from_stopping(tmp_path: Path) -> None:
+    with nats_server(tmp_path / "nats") as server:
+        proxy = Proxy(server.port)
+        owner, sender = CellName.parse("plant1.line3.a50"), CellName.parse("plant1.line3.twin")
+        link = Link(Access((proxy.url,)), owner, "cell", "test", sender, lambda _: None, lambda _: None)
+        link.start()
+        while link.problem:
+            threading.Event().wait(0.01)
+        proxy.cut()
+        for _ in range(12):  # more than the buffers of the sockets hold
+            link.command(CommandRequest(1, bytes(8), [WriteItem(0, 0, bytes(900_000))]), 2.0)
+        closing = threading.Thread(target=link.close, daemon=True)
+        closing.start()
+        closing.join(PATIENCE_S)
+        assert not closing.is_alive()
+        proxy.close()
