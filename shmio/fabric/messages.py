@@ -184,6 +184,8 @@ class CommandRequest(msgspec.Struct, frozen=True):
     Attributes:
         expires_ns: Time on the owner's clock, as ``made_ns`` of a message, after which the source
             must not begin. The outcome of a command that comes later is expired.
+        stream: Number of the uplink's numbering, from its messages. A command that was made for an
+            earlier uplink is expired: it may have been stuck on its way since.
         layout: First 8 bytes of the hash of the layout that the offsets belong to. The owner
             rejects a command for another layout.
         writes: The writes.
@@ -191,6 +193,7 @@ class CommandRequest(msgspec.Struct, frozen=True):
     """
 
     expires_ns: int
+    stream: int
     layout: bytes
     writes: list[WriteItem]
 

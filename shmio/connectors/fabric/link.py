@@ -204,6 +204,9 @@ class Link:
         except errors.NoRespondersError:
             why = f"{self._cell} takes no commands: its uplink does not run, or fabric.allow names no sender"
             return _all(count, OutcomeKind.EXPIRED, why)
+        except errors.MaxPayloadError:
+            why = "the command is larger than the server's max_payload; write fewer registers at once"
+            return _all(count, OutcomeKind.REJECTED, why)
         except errors.OutboundBufferLimitError:
             return _all(count, OutcomeKind.EXPIRED, _NOT_SENT)
         except (OSError, errors.Error, ValueError) as error:

@@ -117,6 +117,7 @@ class MirrorLoop:
         self._quality_log = QualityLog(writer)
         self.counters = Counters()
         self._order = MessageOrder()
+        self._transit = _Transit()
         self._inbox: deque[Received | Missing] = deque()
         self._received_bytes = 0  # changed only by the link's thread
         self._taken_bytes = 0  # changed only by the loop's thread
@@ -134,6 +135,7 @@ class MirrorLoop:
         """Number of frames that the owner no longer had."""
         self._cycle: int | None = None
         self._number = 0  # of the owner's last frame
+        self._zero_ns = 0  # when the owner's clock began
         self._left_out = 0  # frames that the owner's rules have left out since then
 
     @property
@@ -152,7 +154,9 @@ class MirrorLoop:
             self._report(error)
             return
         self._received_bytes += len(data)
-        self._inbox.append(Received(header, data, self._clock.now_ns()))
+        now_ns = self._clock.now_ns()
+        late_ns = header.age_ns + self._transit.excess_ns(header, now_ns)
+        self._inbox.append(Received(header, data, now_ns, late_ns))
         self._clock.nudge()
 
     def _answered(self, missing: Missing) -> None:
@@ -185,7 +189,10 @@ class MirrorLoop:
             )
             self._ready += found
         now_ns = self._clock.now_ns()
-        self._ready += self._order.expired(now_ns)
+        if self._link.connected:
+            self._ready += self._order.expired(now_ns)
+        else:
+            self._order.suspend(now_ns)
         while self._ready and self._pace.wait_ns(self._clock.now_ns()) == 0:
             self._deliver(self._ready.popleft())
         if (missing := self._order.missing(now_ns)) is not None and self._link.connected:
@@ -225,7 +232,9 @@ class MirrorLoop:
         if one.header.layout != self._layout:
             self._refuse_layout()
             return
-        late_ns = one.header.age_ns + (self._clock.now_ns() - one.at_ns)
+        late_ns = one.late_ns + (self._clock.now_ns() - one.at_ns)
+        if one.header.zero_ns != self._zero_ns:
+            self._zero_ns, self._number = one.header.zero_ns, 0  # another start of the owner: frames count anew
         self._left_out += one.header.left_out
         try:
             for entry in decode_entries(one.data):
@@ -268,7 +277,7 @@ class MirrorLoop:
         self._pace.spend(now_ns)
         self.counters.polls += 1
         self.counters.round_trip_us = late_ns // 1000
-        if not self._open and not self._bad:
+        if not self._open and not self._bad and age_ns < self._writer.block.stale_ns:
             self._open = True
             self.counters.connects += 1
             self.commands.open()
@@ -339,7 +348,7 @@ class MirrorLoop:
         header = newest.header
         owner_ns = header.made_ns + header.age_ns + self._clock.now_ns() - newest.at_ns
         request = CommandRequest(
-            min(owner_ns + BEGIN_NS, MAX_TIME_NS), self._layout, [WriteItem(*write) for write in writes]
+            min(owner_ns + BEGIN_NS, MAX_TIME_NS), header.stream, self._layout, [WriteItem(*write) for write in writes]
         )
         self._reply = self._link.command(request, ANSWER_S)
         self._reply.add_done_callback(lambda _: self._clock.nudge())
@@ -364,6 +373,34 @@ class MirrorLoop:
             reason = next(filter(None, reply.result().reasons), "no answer came")
             raise UnconfirmedError(reason, found)
         return cast(Sequence[str], found)
+
+
+class _Transit:
+    """Finds how much longer than usual a message was on its way, without equal clocks on both hosts.
+
+    The usual time is the shortest of the last ``WINDOW_NS`` to twice that. If the owner's clock is set
+    back, messages seem to be late for that long.
+    """
+
+    WINDOW_NS: Final = 30_000_000_000
+
+    def __init__(self) -> None:
+        self._stream = 0
+        self._begun_ns = 0
+        self._before: int | None = None  # shortest time in the window before
+        self._least: int | None = None  # shortest time in this window
+
+    def excess_ns(self, header: Header, at_ns: int) -> int:
+        """Return the extra time in ns of a message that came at ``at_ns``."""
+        taken_ns = at_ns - header.made_ns - header.age_ns
+        if header.stream != self._stream:
+            self._stream, self._begun_ns, self._before, self._least = header.stream, at_ns, None, None
+        elif at_ns - self._begun_ns >= self.WINDOW_NS:
+            self._begun_ns, self._before, self._least = at_ns, self._least, None
+        if not header.age_ns:  # the age of a late message is not that exact
+            self._least = taken_ns if self._least is None else min(self._least, taken_ns)
+        known = [least for least in (self._before, self._least) if least is not None]
+        return max(0, taken_ns - min(known)) if known else 0
 
 
 class _Pace:

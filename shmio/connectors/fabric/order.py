@@ -19,11 +19,20 @@ _OLD_STREAMS: Final = 16
 
 
 class Received(NamedTuple):
-    """A message, and when it was received on CLOCK_MONOTONIC, in ns."""
+    """A message.
+
+    Attributes:
+        header: Its header.
+        data: All its bytes.
+        at_ns: When it was received, on CLOCK_MONOTONIC, in ns.
+        late_ns: Its age in ns when it was received.
+
+    """
 
     header: Header
     data: bytes
     at_ns: int
+    late_ns: int = 0
 
 
 class Lost(NamedTuple):
@@ -113,6 +122,10 @@ class MessageOrder:
         if not self._held or now_ns - self._progress_ns < PATIENCE_NS:
             return []
         return self._give_up(now_ns)
+
+    def suspend(self, now_ns: int) -> None:
+        """Do not count the time until now as time without progress, because there is no connection."""
+        self._progress_ns, self._asked_ns = now_ns, None
 
     def patience_ns(self, now_ns: int) -> int | None:
         """Return the time in ns until :meth:`missing` or :meth:`expired` may have a result.

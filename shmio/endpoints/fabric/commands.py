@@ -22,6 +22,7 @@ from shmio.segment import Block
 from shmio.segment.commands import End, apply, decode_writes
 
 EXPIRED: Final = "the command came after its deadline; the source did not begin it"
+RESTARTED: Final = "the uplink was restarted after the command was sent; the source did not begin it"
 OTHER_LAYOUT: Final = "the layout of the source has changed; read the new layout before you write"
 
 Answer = Callable[[CommandReply], None]
@@ -117,13 +118,14 @@ class CommandReceiver:
         self._allow, self._writer, self._now_ns, self._reply, self._server = allow, writer, now_ns, reply, server
         self._clients: dict[int, CommandClient] = {}
 
-    def take(self, sender: str, source: str, feed: Feed | None, data: bytes, reply: str) -> None:
+    def take(self, sender: str, source: str, feed: Feed | None, stream: int, data: bytes, reply: str) -> None:
         """Handle a command.
 
         Args:
             sender: Name of the cell that sends the command.
             source: Name of the source.
             feed: The source's feed; None if the cell does not offer this source.
+            stream: Number of the present numbering of the source's messages.
             data: The encoded command.
             reply: Subject for the answer; empty: the sender does not wait for one.
 
@@ -150,6 +152,8 @@ class CommandReceiver:
         elif feed is None:
             why = f"this cell has no source {source!r}"
             self._refuse(attempt, answer, len(writes), OutcomeKind.REJECTED, why)
+        elif request.stream != stream:
+            self._refuse(attempt, answer, len(writes), OutcomeKind.EXPIRED, RESTARTED, "expired")
         elif request.layout != feed.digest[: len(request.layout)] or not request.layout:
             self._refuse(attempt, answer, len(writes), OutcomeKind.REJECTED, OTHER_LAYOUT)
         elif not feed.publishes(writes):

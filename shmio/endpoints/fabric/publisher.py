@@ -30,7 +30,7 @@ CONFIRM_S: Final = 0.1
 """Pause between two questions to the server whether it has the messages, in s."""
 LIVE_NS: Final = 1_000_000_000
 """If the next message is older than this, in ns, newer messages pass it, and it follows as late."""
-CONFIRM_TIMEOUT_S: Final = 30.0
+CONFIRM_TIMEOUT_S: Final = 5.0
 
 log = logging.getLogger("shmio.fabric")
 

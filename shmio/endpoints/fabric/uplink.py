@@ -371,7 +371,9 @@ class Uplink:
         tokens = message.subject.split(".")
         source, sender = source_of(tokens[4]), ".".join(tokens[6:])
         reply = message.reply if wants_reply(message) else ""
-        self.commands.take(sender, source, self._feeds.get(source), message.data, reply)
+        row = self.backlog.rows.get(source)
+        stream = 0 if row is None else row.stream
+        self.commands.take(sender, source, self._feeds.get(source), stream, message.data, reply)
 
     def _reply(self, subject: str, data: bytes) -> None:
         """Send a reply, unless the connection is lost: then the sender does not learn the outcome."""

@@ -84,7 +84,7 @@ def test_any_bytes_are_a_message_or_a_value_error(data: bytes) -> None:
 
 
 def test_commands_and_replies_keep_their_fields() -> None:
-    request = CommandRequest(5, b"abcdefgh", [WriteItem(3, 0, b"\1\2"), WriteItem(4, 8, b"\x08")])
+    request = CommandRequest(5, 7, b"abcdefgh", [WriteItem(3, 0, b"\1\2"), WriteItem(4, 8, b"\x08")])
     assert decode_request(encode_command(request)) == request
     reply = CommandReply(["written", "unknown"], ["", "no answer"])
     assert decode_reply(encode_command(reply), 2) == reply

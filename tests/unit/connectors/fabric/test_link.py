@@ -25,7 +25,7 @@ def test_a_dead_link_does_not_keep_the_process_from_stopping(tmp_path: Path) -> 
             threading.Event().wait(0.01)
         proxy.cut()
         for _ in range(12):  # more than the buffers of the sockets hold
-            link.command(CommandRequest(1, bytes(8), [WriteItem(0, 0, bytes(900_000))]), 2.0)
+            link.command(CommandRequest(1, 7, bytes(8), [WriteItem(0, 0, bytes(900_000))]), 2.0)
         closing = threading.Thread(target=link.close, daemon=True)
         closing.start()
         closing.join(PATIENCE_S)

@@ -212,6 +212,53 @@ def test_a_frame_that_waited_at_the_owner_is_as_old_as_it_is(mirroring: Mirrorin
     assert mirroring.block.assess(late)[0] is Quality.BAD
 
 
+def test_messages_that_were_long_on_their_way_are_late(mirroring: Mirroring) -> None:
+    """Both clocks may differ: what counts is how much longer a message took than others."""
+    ahead_ns = 3600 * S
+    for number in range(7, 10):
+        mirroring.send(frame(number, 1), made_ns=time.time_ns() + ahead_ns)
+        assert mirroring.next().delay_us < 1_000_000
+    mirroring.send(frame(10, 2), made_ns=time.time_ns() + ahead_ns - 20 * S)
+    late = mirroring.next()
+    assert 19_000_000 < late.delay_us < 25_000_000
+    assert mirroring.block.assess(late)[0] is Quality.BAD
+    mirroring.send(frame(11, 3), made_ns=time.time_ns() + ahead_ns)
+    assert mirroring.next().delay_us < 1_000_000
+
+
+def test_late_frames_do_not_open_the_source_for_writes(mirroring: Mirroring) -> None:
+    mirroring.send(frame(7, 1), age_ns=30 * S)
+    mirroring.next()
+    mirroring.event(EventKind.QUALITY)
+    [outcome] = SourceWriter(mirroring.block, 0).write({"count": 77})
+    assert str(outcome.kind) == "rejected"
+    assert mirroring.link.commands == []
+
+
+def test_a_hole_is_not_given_up_while_there_is_no_connection(mirroring: Mirroring) -> None:
+    mirroring.send(frame(7, 1))
+    mirroring.next()
+    missed = mirroring.link.message(frame(8, 2))
+    mirroring.link.problem = "no connection"
+    mirroring.send(frame(9, 3))
+    assert not mirroring.link.asked.wait(1.0)
+    mirroring.link.problem = ""
+    mirroring.send(frame(10, 4))
+    assert mirroring.link.asked.wait(PATIENCE_S)
+    mirroring.link.send(missed)
+    found = [mirroring.next()]
+    while found[-1].cycle != 1010:
+        found.append(mirroring.next())
+    assert [one.cycle for one in found if one.quality is Quality.GOOD] == [1008, 1009, 1010]
+
+
+def test_frames_of_a_restarted_owner_are_no_gap(mirroring: Mirroring) -> None:
+    mirroring.send(frame(7, 1), zero_ns=5)
+    mirroring.send(frame(900, 2), zero_ns=6)
+    assert [mirroring.next().cycle, mirroring.next().cycle] == [1007, 1900]
+    assert mirroring.loop.missing == 0
+
+
 def test_missing_messages_are_requested_and_come_before_later_ones(mirroring: Mirroring) -> None:
     mirroring.send(frame(7, 1))
     assert mirroring.next().cycle == 1007
@@ -382,8 +429,11 @@ def test_all_of_many_messages_at_once_are_published(mirroring: Mirroring) -> Non
 
 
 def test_a_faulty_age_of_the_owner_gives_a_command_that_can_be_sent(mirroring: Mirroring) -> None:
-    mirroring.send(frame(7, 1), age_ns=(1 << 64) - 1)
+    mirroring.send(frame(7, 1))
+    mirroring.next()
     mirroring.event(EventKind.QUALITY)
+    mirroring.send(frame(8, 1), age_ns=(1 << 64) - 1)
+    mirroring.next()
     mirroring.link.reply = CommandReply(["expired"], [""])
     SourceWriter(mirroring.block, 0).write({"count": 77})
     assert encode_command(mirroring.link.commands[0])

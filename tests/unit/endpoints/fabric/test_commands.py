@@ -44,6 +44,10 @@ class Commander:
     def __init__(self, client: Any, found: Uplink) -> None:
         self.client, self.uplink = client, found
 
+    @property
+    def stream(self) -> int:
+        return self.uplink.backlog.rows["cell"].stream
+
     async def send(
         self, data: bytes, sender: str = FRIEND, source: str = "cell", timeout_s: float = TIMEOUT_S
     ) -> bytes:
@@ -53,12 +57,14 @@ class Commander:
 
     async def write(
         self, *writes: tuple[int, int, bytes], sender: str = FRIEND, source: str = "cell", expires_ns: int = HOUR_NS,
-        layout: bytes = b"",
+        layout: bytes = b"", stream: int = 0,
     ) -> CommandReply:  # fmt: skip
         """Write, and return the outcomes."""
         now_ns = self.uplink._log_time(time.monotonic_ns())
         digest = layout or self.uplink._feeds["cell"].digest[:8]
-        request = CommandRequest(now_ns + expires_ns, digest, [WriteItem(*write) for write in writes])
+        request = CommandRequest(
+            now_ns + expires_ns, stream or self.stream, digest, [WriteItem(*write) for write in writes]
+        )
         return decode_reply(await self.send(encode_command(request), sender, source), len(writes))
 
 
@@ -123,7 +129,7 @@ async def test_a_command_cannot_send_its_outcome_into_the_fabric(
     segment: Segment, server: NatsServer, plant: Plant
 ) -> None:
     async with commander(segment, server.url) as client:
-        request = CommandRequest(1 << 62, LAYOUT.hash[:8], [WriteItem(0, 0, b"\1")])
+        request = CommandRequest(1 << 62, client.stream, LAYOUT.hash[:8], [WriteItem(0, 0, b"\1")])
         subject = f"shmio.{CELL}.cell.command.{FRIEND}"
         await client.client.publish(subject, encode_command(request), reply=f"shmio.{CELL}.cell.live")
         await until(lambda: client.uplink.commands.refused == 1)
@@ -134,6 +140,14 @@ async def test_a_command_cannot_send_its_outcome_into_the_fabric(
 async def test_a_command_that_comes_late_expires(segment: Segment, server: NatsServer, plant: Plant) -> None:
     async with commander(segment, server.url) as client:
         assert (await client.write((0, 0, b"\1"), expires_ns=-1)).outcomes == ["expired"]
+        assert plant.memory == bytes(8)
+
+
+@in_loop
+async def test_a_command_for_an_earlier_uplink_expires(segment: Segment, server: NatsServer, plant: Plant) -> None:
+    async with commander(segment, server.url) as client:
+        reply = await client.write((0, 0, b"\1"), stream=client.stream - 1)
+        assert (reply.outcomes, "restarted" in reply.reasons[0]) == (["expired"], True)
         assert plant.memory == bytes(8)
 
 
@@ -158,7 +172,7 @@ async def test_registers_that_are_not_published_are_not_written(
 
 @in_loop
 async def test_malformed_commands_are_counted(segment: Segment, server: NatsServer, plant: Plant) -> None:
-    request = CommandRequest(1 << 62, LAYOUT.hash[:8], [WriteItem(0, 0x81, b"\1")])
+    request = CommandRequest(1 << 62, 7, LAYOUT.hash[:8], [WriteItem(0, 0x81, b"\1")])
     async with commander(segment, server.url) as client:
         hostile = [b"", b"\xff" * 100, encode_command(request), b"\x81\xa6writes\xdd\xff\xff\xff\xff"]
         for data in hostile:
