@@ -1,4 +1,4 @@
-"""The NATS client, changed so that it leaves a dead connection at once, and flushes reliably.
+"""The NATS client, changed: it leaves a dead connection at once, flushes reliably, and insists on TLS.
 
 Import this module only when nats-py is installed.
 """
@@ -60,6 +60,15 @@ class FabricClient(Client):
     async def _connect_to_server(self, s: Srv) -> None:
         self._abort()  # of an attempt that failed: the library would leave its socket open
         await super()._connect_to_server(s)
+
+    def _connect_command(self) -> bytes:
+        """Refuse a server without TLS if TLS is required: the library would continue in plain text."""
+        writer = getattr(self._transport, "_io_writer", None)
+        encrypted = isinstance(writer, asyncio.StreamWriter) and writer.get_extra_info("ssl_object") is not None
+        if self.options.get("tls") and not encrypted:
+            self._abort()
+            raise Error("the server does not offer TLS, which this connection requires; connect to a server with TLS")
+        return bytes(super()._connect_command())
 
     async def _send_ping(self, future: asyncio.Future[bool] | None = None) -> None:
         """Send a ping behind all that waits to be sent: the library's ping overtakes it, so flush() ends too soon."""

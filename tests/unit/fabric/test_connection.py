@@ -1,4 +1,4 @@
-"""A connection that the server ends with an error comes back."""
+"""Connections to servers that end them with an error, or that offer no TLS."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import asyncio
 
 import pytest
 
+from shmio.config.model import MqttTls
+from shmio.errors import RemoteError
 from shmio.fabric.connection import Access, connect
 
 TIMEOUT_S = 20
@@ -42,3 +44,29 @@ def test_a_connection_that_the_server_ends_comes_back(error: str) -> None:
         await server.wait_closed()
 
     asyncio.run(work())
+
+
+@pytest.mark.parametrize(("scheme", "tls"), [("tls", None), ("nats", MqttTls()), ("tls", MqttTls())])
+def test_a_server_without_tls_gets_nothing_if_tls_is_required(scheme: str, tls: MqttTls | None) -> None:
+    """The server says what it offers in plain text, so somebody on the way can say that there is no TLS."""
+    received: list[bytes] = []
+
+    async def work() -> None:
+        async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            writer.write(b'INFO {"server_id": "x", "version": "2.10.0", "max_payload": 1000}\r\n')
+            received.append(await reader.read())
+            writer.close()
+            await writer.wait_closed()
+            ended.set()
+
+        ended = asyncio.Event()
+        server = await asyncio.start_server(serve, "127.0.0.1", 0)
+        url = f"{scheme}://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+        with pytest.raises(RemoteError, match="TLS"):
+            await connect(Access((url,), tls), "test", patient=False)
+        await asyncio.wait_for(ended.wait(), TIMEOUT_S)
+        server.close()
+        await server.wait_closed()
+
+    asyncio.run(work())
+    assert set(received) == {b""}
