@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from shmio.cli.common import (
+    add_access,
     add_json,
     add_verbs,
     at_least,
@@ -169,12 +170,7 @@ def _worker(verb: argparse.ArgumentParser) -> None:
 
 def _access(verb: argparse.ArgumentParser) -> None:
     """Add the options for the connection to a NATS server."""
-    verb.add_argument(
-        "--credentials", metavar="FILE", help="a .creds file, or the seed of an NKey, for the NATS server"
-    )
-    verb.add_argument("--ca", metavar="FILE", help="the authority of the NATS server's certificate (PEM)")
-    verb.add_argument("--certificate", metavar="FILE", help="the certificate to show to the NATS server (PEM)")
-    verb.add_argument("--key", metavar="FILE", help="its key (PEM)")
+    add_access(verb)
     verb.add_argument("--insecure", action="store_true", help="allow a NATS server on another host in plain text")
 
 

@@ -213,6 +213,16 @@ def seed_number(text: str) -> int:
     return int(text)
 
 
+def add_access(parser: argparse._ActionsContainer) -> None:
+    """Add the options for the connection to a NATS server."""
+    parser.add_argument(
+        "--credentials", metavar="FILE", help="a .creds file, or the seed of an NKey, for the NATS server"
+    )
+    parser.add_argument("--ca", metavar="FILE", help="the authority of the NATS server's certificate (PEM)")
+    parser.add_argument("--certificate", metavar="FILE", help="the certificate to show to the NATS server (PEM)")
+    parser.add_argument("--key", metavar="FILE", help="its key (PEM)")
+
+
 def add_json(parser: argparse._ActionsContainer, text: str = "print one JSON object") -> None:
     """Add the option ``--json``, with ``text`` as its help. It also makes :func:`run` print errors as JSON."""
     parser.add_argument("--json", action="store_true", help=f"{text}, also for an error")

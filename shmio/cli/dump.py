@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from shmio.cli.common import add_full, add_json, complete, exit_on_signals, load, run
+from shmio.cli.common import add_access, add_full, add_json, complete, exit_on_signals, load, run
 from shmio.version import __version__
 from shmio.wording import unknown
 
@@ -123,14 +123,14 @@ def _parser() -> argparse.ArgumentParser:
 
     fetch = verb("fetch", "write a part of a cell's history, which the servers of a fabric keep, to a new file")
     fetch.add_argument("place", metavar="nats://HOST:PORT/PLANT.LINE.CELL")
-    _credentials(fetch)
+    add_access(fetch)
     _output(fetch, "the new file")
     _times(fetch, "2026-11-21T08:30:00")
     add_json(fetch)
 
     export = verb("export", "write values for other programs: Parquet, CSV, or MCAP for viewers")
     export.add_argument("files", nargs="+", metavar="FILE", help="recordings, or nats://HOST:PORT/PLANT.LINE.CELL")
-    _credentials(export)
+    add_access(export)
     _output(export, "the new file, or for tables a new folder with a file for each block")
     export.add_argument(
         "--format",
@@ -198,12 +198,6 @@ def _parser() -> argparse.ArgumentParser:
 
 def _output(verb: argparse.ArgumentParser, text: str, *, required: bool = True) -> None:
     verb.add_argument("-o", dest="output", type=Path, required=required, metavar="FILE", help=text)
-
-
-def _credentials(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument(
-        "--credentials", metavar="FILE", help="what the fabric's servers require: a .creds file, or an NKey's seed"
-    )
 
 
 def _times(verb: argparse.ArgumentParser, form: str = "2026-11-21T08:30:00, or seconds of the recording") -> None:

@@ -32,6 +32,9 @@ RETRY_S: Final = 0.5
 MAX_REASONS: Final = 32
 """Maximum number of reasons that are remembered because they were logged."""
 
+_UNTRUSTED: Final = (18, 19, 20, 21)
+"""OpenSSL's codes for a certificate whose authority is unknown."""
+
 log = logging.getLogger("shmio.fabric")
 
 
@@ -287,7 +290,19 @@ def _is_refusal(error: BaseException) -> bool:
 
 def _why(access: Access, error: BaseException) -> str:
     """Return why an attempt to connect has failed."""
-    return f"{access}: {_refused(access) if _is_refusal(error) else f'no NATS server can be reached: {reason(error)}'}"
+    return f"{access}: {_refused(access) if _is_refusal(error) else _unreachable(access, error)}"
+
+
+def _unreachable(access: Access, error: BaseException) -> str:
+    if not isinstance(error, ssl.SSLCertVerificationError):
+        return f"no NATS server can be reached: {reason(error)}"
+    if access.pinned is not None:
+        return f"the server's certificate is not {access.pinned}; another program listens there"
+    if error.verify_code in _UNTRUSTED:
+        key = access.key("ca" if access.options else "tls.ca")
+        remedy = "give" if access.tls is None or access.tls.ca is None else "name its authority in"
+        return f"the server's certificate is not trusted; {remedy} {key}"
+    return f"the server's certificate is not valid: {error.verify_message}"
 
 
 def _refused(access: Access) -> str:

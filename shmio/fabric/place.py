@@ -24,18 +24,16 @@ def is_place(text: str) -> bool:
     return text.startswith(("nats://", "tls://"))
 
 
-def parse_place(text: str, credentials: str | None = None) -> Place:
-    """Parse ``nats://HOST:PORT/plant.line.cell``.
+def parse_place(text: str) -> tuple[str, CellName]:
+    """Return the server's URL and the cell of ``nats://HOST:PORT/plant.line.cell``.
 
     Raises:
         RecordingError: The text is not such a URL.
 
     """
-    from shmio.fabric.connection import Access  # noqa: PLC0415  commands for files do without it
-
     parts = urlsplit(text)
     try:
         cell = CellName.parse(parts.path.strip("/"))
     except ConfigError as error:
         raise RecordingError(f"{text}: {error}") from None
-    return Place(Access((f"{parts.scheme}://{parts.netloc}",), credentials=credentials), cell)
+    return f"{parts.scheme}://{parts.netloc}", cell

@@ -17,7 +17,7 @@ from shmio.connectors import registry
 from shmio.connectors.base import Computed, Connector, Mirrored, Replayed
 from shmio.errors import ConfigError, PathError, RecordingError, RemoteError, ShmioError, ValueRangeError
 from shmio.fabric.connection import Access
-from shmio.fabric.place import is_place, parse_place
+from shmio.fabric.place import Place, is_place, parse_place
 from shmio.layout.document import load_layout
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
@@ -236,7 +236,12 @@ def _file(name: str, source: Source, config: Config) -> str:
         config.log_dir.mkdir(parents=True, exist_ok=True)
         part = file.with_suffix(".part")
         part.unlink(missing_ok=True)  # an earlier process ended while it fetched
-        fetch(parse_place(name, None if config.fabric is None else config.fabric.credentials), part, begin, end)
+        url, cell = parse_place(name)
+        fabric = config.fabric
+        access = Access((url,))
+        if fabric is not None and not fabric.embedded:  # [fabric.tls] of an embedded server is not for clients
+            access = Access((url,), fabric.tls, fabric.credentials)
+        fetch(Place(access, cell), part, begin, end)
         part.replace(file)
     return str(file)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from shmio.errors import RecordingError
-from shmio.fabric.place import is_place, parse_place
+from shmio.fabric.place import Place, is_place, parse_place
 from shmio.local.replays import date_ns, moment_ns
 from shmio.recording.dump import Dump, open_dump
 from shmio.recording.format.records import Damage
@@ -135,15 +135,21 @@ def fetch_history(name: str, arguments: argparse.Namespace, file: Path) -> int:
     """Write a cell's history between ``--from`` and ``--to`` to a file; return the number of its frames.
 
     Raises:
+        ConfigError: The options for the server do not fit together, or a file cannot be used.
         RecordingError: A time is invalid, or there is no history.
         RemoteError: No server can be reached.
 
     """
-    from shmio.fabric.history import fetch  # noqa: PLC0415  most recordings are files
+    from shmio.cli.fabric.access import access_of  # noqa: PLC0415  most recordings are files
+    from shmio.fabric.history import fetch  # noqa: PLC0415
 
-    place = parse_place(name, arguments.credentials)
-    with Progress(f"reading the history of {place.cell}"):
-        return fetch(place, file, _date("--from", arguments.begin), _date("--to", arguments.end))
+    url, cell = parse_place(name)
+    place = Place(access_of(name, [url], arguments), cell)
+    begin_ns, end_ns = _date("--from", arguments.begin), _date("--to", arguments.end)
+    if begin_ns is not None and end_ns is not None and end_ns < begin_ns:
+        raise RecordingError(f"--to {arguments.end} is before --from {arguments.begin}")
+    with Progress(f"reading the history of {cell}"):
+        return fetch(place, file, begin_ns, end_ns)
 
 
 def _date(option: str, text: str | None) -> int | None:

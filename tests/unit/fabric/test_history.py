@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import trustme
 
 from shmio.cli.dump import main
 from shmio.cli.supervisor import main as supervisor
@@ -20,6 +21,7 @@ from shmio.recording.dump import open_dump
 from shmio.recording.format.encoding import Reason
 from shmio.recording.reading.reader import Reader
 from shmio.segment import EventKind, Record, Segment
+from tests.nats_server import nats_server
 from tests.unit.fabric.stored import CELL, History, Stored, Uplink, late, recorded
 from tests.unit.recorder.harness import OTHER, gaps, numbers, publish, spec
 
@@ -202,6 +204,45 @@ def test_commands_read_a_history(segment: Segment, history: History, tmp_path: P
     table = tmp_path / "cell.csv"
     assert main(["export", place, "-o", str(table)]) == 0
     assert len(table.read_text().splitlines()) == 21
+
+
+def test_an_end_before_the_begin_is_named(history: History, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    times = ["--from", "2026-11-27T09:00", "--to", "2026-11-27T08:00"]
+    assert main(["fetch", f"{history.url}/{CELL}", "-o", str(tmp_path / "a.mem"), *times]) != 0
+    assert "--to 2026-11-27T08:00 is before --from 2026-11-27T09:00" in capsys.readouterr().err
+
+
+def test_a_history_behind_an_own_authority(
+    segment: Segment, instance: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Commands name the authority by ``--ca``, a replay by ``[fabric.tls]``."""
+    with nats_server(tmp_path / "nats") as server:
+        history = History(server.url)
+        history.create()
+        publish(segment.writer("cell"), 20)
+        history.publish(*Uplink(segment).messages())
+    authority = trustme.CA()
+    ca, pem = tmp_path / "ca.pem", tmp_path / "server.pem"
+    authority.cert_pem.write_to_path(ca)
+    authority.issue_cert("127.0.0.1").private_key_and_cert_chain_pem.write_to_path(pem)
+    tls = {"cert_file": str(pem), "key_file": str(pem), "handshake_first": False}
+    with nats_server(tmp_path / "nats", tls=tls) as server:
+        url = f"tls://127.0.0.1:{server.port}"
+        file, table = tmp_path / "history.mem", tmp_path / "cell.csv"
+        assert main(["fetch", f"{url}/{CELL}", "-o", str(file), "--ca", str(ca)]) == 0
+        assert numbers(checked(file)) == list(range(1, 21))
+        assert main(["export", f"{url}/{CELL}", "-o", str(table), "--ca", str(ca)]) == 0
+        assert main(["fetch", f"{url}/{CELL}", "-o", str(tmp_path / "other.mem")]) == 1
+        assert "the server's certificate is not trusted; give --ca" in capsys.readouterr().err
+        config = tmp_path / "supervisor.toml"
+        source = f'name = "cell"\nconnector = "replay"\nfile = "{url}/{CELL}"'
+        fabric = f'[fabric]\nserver = "{url}"\n'
+        text = f'[instance]\nname = "{instance}"\nlog_dir = "logs"\n[[source]]\n{source}\n{fabric}'
+        config.write_text(text)
+        assert supervisor(["check", "-c", str(config)]) == 1
+        assert "not trusted; give fabric.tls.ca" in capsys.readouterr().err
+        config.write_text(f'{text}[fabric.tls]\nca = "ca.pem"\n')
+        assert supervisor(["check", "-c", str(config)]) == 0, capsys.readouterr().err
 
 
 def test_a_replay_fetches_its_part_once(
