@@ -14,6 +14,7 @@ from nats.aio.client import PING_PROTO, Client, Srv
 from nats.errors import ConnectionReconnectingError, Error
 
 CLOSE_S: Final = 1.0
+_VIOLATION: Final = "permissions violation"
 
 
 def _matters(record: logging.LogRecord) -> bool:
@@ -31,6 +32,9 @@ class FabricClient(Client):
     take anything, so the client would not connect again for minutes. Afterwards it would send what
     waited, as if it were new.
     """
+
+    refused = ""
+    """What the server has last refused to this user, in its words and in lower case; empty if nothing."""
 
     async def confirm(self) -> None:
         """Wait until the server has all that was sent so far. If the connection is lost meanwhile, wait for ever.
@@ -52,7 +56,8 @@ class FabricClient(Client):
 
     async def _process_err(self, err_msg: str) -> None:
         """Connect again after an error of the server: the library gives up, for example if the user was removed."""
-        if "permissions violation" in err_msg.lower():
+        if _VIOLATION in err_msg.lower():
+            self.refused = err_msg
             await super()._process_err(err_msg)
         else:
             await self._process_op_err(Error(err_msg))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import ssl
 from collections.abc import Awaitable, Callable, Coroutine
 from pathlib import Path
@@ -34,6 +35,10 @@ MAX_REASONS: Final = 32
 
 _UNTRUSTED: Final = (18, 19, 20, 21)
 """OpenSSL's codes for a certificate whose authority is unknown."""
+
+_VIOLATION: Final = re.compile(
+    r"permissions violation for (?P<verb>publish|subscription) to \"(?P<subject>[^\"]*)\"", re.IGNORECASE
+)
 
 log = logging.getLogger("shmio.fabric")
 
@@ -177,7 +182,7 @@ async def call_once(access: Access, work: Callable[[FabricClient], Coroutine[Any
     try:
         return await work(client)
     except (TimeoutError, library("nats.errors", INSTALL).Error) as error:
-        raise RemoteError(f"{access}: {reason(error)}") from None
+        raise RemoteError(f"{access}: {refusal(access, client.refused) or reason(error)}") from None
     finally:
         await client.close()
 
@@ -266,7 +271,7 @@ class _Attempts:
 
     def add(self, error: BaseException, *, up: bool) -> None:
         """Take an error; ``up`` is True if there is a connection, so that the error has not ended it."""
-        text = reason(error) if up else _why(self._access, error)
+        text = (refusal(self._access, str(error)) or reason(error)) if up else _why(self._access, error)
         if text not in self._logged:
             if len(self._logged) >= MAX_REASONS:
                 self._logged.clear()
@@ -309,6 +314,38 @@ def _refused(access: Access) -> str:
     if access.credentials is None:
         return f"the server asks for credentials; name the file with this host's seed in {access.key('credentials')}"
     return f"the server does not know the credentials in {access.credentials}, or has removed them"
+
+
+def refusal(access: Access, text: str, cell: object = None) -> str:
+    """Return what a user may not do, and which credentials may.
+
+    Args:
+        access: The servers, and the user's credentials.
+        text: The server's words, such as ``permissions violation for publish to "shmio.a.b.c.d.live"``.
+        cell: The name under which the user publishes; None: it is in the subject.
+
+    Returns:
+        The sentence; empty if the text is about something else.
+
+    """
+    found = _VIOLATION.search(text)
+    if found is None:
+        return ""
+    who = "this user" if access.credentials is None else f"the user of the credentials in {access.credentials}"
+    subject = found["subject"]
+    parts = subject.split(".")
+    if subject.lower().startswith("$js."):
+        return (
+            f"{who} may not use histories; reading them needs the seed of a history reader, and creating them that of "
+            "the administrator"
+        )
+    if parts[0] == "shmio" and len(parts) > 5:
+        own = parts[6:9] if parts[5] == "command" and found["verb"] == "publish" else parts[1:4]
+    elif parts[0].lower() == "$kv" and len(parts) == 5:
+        own = parts[2:5]
+    else:
+        return f"{who} may not {found['verb']} {subject}"
+    return f"{who} may not publish as {cell or '.'.join(own)}; use the seed of this cell"
 
 
 def reason(error: BaseException) -> str:

@@ -17,7 +17,7 @@ from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from shmio.errors import RecordingError, RemoteError
-from shmio.fabric.connection import INSTALL, connect
+from shmio.fabric.connection import INSTALL, connect, reason, refusal
 from shmio.fabric.entries import SourceEntries
 from shmio.fabric.messages import Header, decode_header
 from shmio.fabric.names import CellName, source_of
@@ -174,7 +174,7 @@ async def _read(
         layouts = {head: await registry.layout_like(head) for head in heads}
         seen = await registry.find(place.cell)
     except (TimeoutError, library("nats.errors", INSTALL).Error) as error:
-        raise RemoteError(f"{place.access}: {error or 'the server does not answer'}") from None
+        raise RemoteError(f"{place.access}: {refusal(place.access, client.refused) or reason(error)}") from None
     finally:
         await client.close()
     if malformed:

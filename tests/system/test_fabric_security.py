@@ -20,12 +20,15 @@ import trustme
 from nats.aio.client import Client
 from nats.errors import Error as NatsError
 
+from shmio.cli.dump import main as dump
 from shmio.cli.user import main
 from shmio.config.model import FabricHistory
 from shmio.connectors.fabric.link import Link
 from shmio.endpoints.fabric.history import History
 from shmio.endpoints.fabric.server import find_server
 from shmio.errors import ConflictError, RemoteError
+from shmio.fabric.archive.folder import ArchiveFolder
+from shmio.fabric.archive.service import Archive, ArchiveLimits
 from shmio.fabric.connection import Access, connect
 from shmio.fabric.names import CellName
 from shmio.fabric.registry import CELLS, CellEntry, Registry
@@ -336,6 +339,36 @@ def test_wrong_credentials_are_named(fabric: Fabric, tmp_path: Path, capsys: pyt
         err = capsys.readouterr().err
         assert words in err, err
         assert "Traceback" not in err
+
+
+def test_seeds_of_the_wrong_user_are_named(
+    fabric: Fabric, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    """The server itself only answers nothing."""
+    caplog.set_level("INFO", "shmio.fabric")
+    eye, file = str(fabric.seed("eye")), str(tmp_path / "a.mem")
+    for command in (
+        ["fabric", "prepare", "--server", fabric.server.url, "--history", A],
+        ["fetch", f"{fabric.server.url}/{A}", "-o", file],
+    ):
+        program = main if command[0] == "fabric" else dump
+        assert program([*command, "--credentials", eye]) == 1
+        err = capsys.readouterr().err
+        assert f"{eye} may not use histories; reading them needs the seed of a history reader" in err, err
+
+    async def archive() -> None:
+        access = Access((fabric.server.url,), credentials=eye)
+        stopping = asyncio.Event()
+        folder = ArchiveFolder(tmp_path / "archive")
+        task = asyncio.create_task(
+            Archive(access, folder, ["*"], ArchiveLimits(1 << 20, 1.0), lambda _: None, stopping).run()
+        )
+        assert await _until(lambda: "does not list its streams: the user of the credentials" in caplog.text)
+        stopping.set()
+        await task
+        folder.close()
+
+    asyncio.run(archive())
 
 
 def test_histories_are_prepared_for_cells(fabric: Fabric, capsys: pytest.CaptureFixture[str]) -> None:

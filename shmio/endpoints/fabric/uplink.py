@@ -21,7 +21,7 @@ from shmio.endpoints.fabric.feed import Feed, rule_for
 from shmio.endpoints.fabric.history import History
 from shmio.endpoints.fabric.publisher import Publisher
 from shmio.errors import ConfigError, ConflictError, RemoteError, SegmentError
-from shmio.fabric.connection import INSTALL, Access, connect, is_stored, wants_reply
+from shmio.fabric.connection import INSTALL, Access, connect, is_stored, reason, refusal, wants_reply
 from shmio.fabric.messages import Header, encode
 from shmio.fabric.names import CellName, source_of
 from shmio.fabric.registry import RENEW_S, CellEntry, Registry, SourceEntry
@@ -313,9 +313,10 @@ class Uplink:
                     await self._history.check()
 
     def _complain(self, error: Exception) -> None:
-        why = str(error) or type(error).__name__
+        why = str(error)
         if not isinstance(error, RemoteError):  # its text says what to do
-            why = f"the registry does not answer: {why}"
+            refused = "" if self._client is None else self._client.refused
+            why = refusal(self._settings.access, refused, self.cell) or f"the registry does not answer: {reason(error)}"
         problem = f"{self._settings.access}: {why}"
         if problem != self.problem:
             self.problem = problem
@@ -323,6 +324,8 @@ class Uplink:
 
     async def _renew(self, registry: Registry) -> None:
         """Store the layouts and the cell's entry, and publish the entry."""
+        if self._client is not None:
+            self._client.refused = ""
         for feed in tuple(self._feeds.values()):
             if feed.digest not in self._known_layouts:
                 await registry.put_layout(feed.layout)

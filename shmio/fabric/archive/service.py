@@ -23,7 +23,7 @@ import msgspec
 from shmio.errors import RemoteError
 from shmio.fabric.archive.cell_files import CellFiles, ClosedFile
 from shmio.fabric.archive.folder import ArchiveFolder
-from shmio.fabric.connection import INSTALL, Access, connect
+from shmio.fabric.connection import INSTALL, Access, connect, reason, refusal
 from shmio.fabric.messages import decode_header
 from shmio.fabric.names import ROOT, CellName, source_of
 from shmio.fabric.registry import Registry
@@ -31,8 +31,9 @@ from shmio.layout.model import Layout
 from shmio.libraries import library
 
 if TYPE_CHECKING:
-    from nats.aio.client import Client
     from nats.aio.msg import Msg
+
+    from shmio.fabric.client import FabricClient
 
 MEMORY_BYTES: Final = 256 << 20
 """Rows of all cells in memory. Beyond it, the cell with the most writes its rows to its files."""
@@ -126,7 +127,7 @@ class Archive:
             self._worker.shutdown()
             await client.close()
 
-    async def _connected(self) -> Client | None:
+    async def _connected(self) -> FabricClient | None:
         """Wait for a server; return None if the archive is stopped before."""
         connecting = asyncio.ensure_future(connect(self._access, "shmio archive"))
         stopping = asyncio.ensure_future(self._stopping.wait())
@@ -148,7 +149,7 @@ class Archive:
 
     # ---- cells -------------------------------------------------------------------------------------------------------
 
-    async def _find_cells(self, client: Client, tasks: asyncio.TaskGroup) -> None:
+    async def _find_cells(self, client: FabricClient, tasks: asyncio.TaskGroup) -> None:
         running: dict[CellName, asyncio.Task[None]] = {}
         problem = ""
         while not self._stopping.is_set():
@@ -160,12 +161,13 @@ class Archive:
             except self._errors.NoRespondersError:
                 raise RemoteError(f"{self._access}: the NATS server has no JetStream, and so no histories") from None
             except (self._errors.Error, TimeoutError) as error:
-                if client.is_connected and problem != str(error):
-                    problem = str(error)
-                    log.warning("%s: the server does not list its streams: %s", self._access, error)
+                why = refusal(self._access, client.refused) or reason(error)
+                if client.is_connected and problem != why:
+                    problem = why
+                    log.warning("%s: the server does not list its streams: %s", self._access, why)
             await self._pause(SCAN_S)
 
-    async def _cells(self, client: Client) -> list[CellName]:
+    async def _cells(self, client: FabricClient) -> list[CellName]:
         """Return the cells that have a history and match a pattern."""
         found: list[CellName] = []
         offset = 0
@@ -180,7 +182,7 @@ class Archive:
                 break
         return [cell for cell in found if any(fnmatchcase(str(cell), pattern) for pattern in self._patterns)]
 
-    async def _follow(self, client: Client, cell: CellName) -> None:
+    async def _follow(self, client: FabricClient, cell: CellName) -> None:
         """Archive one cell until the archive is stopped, or the stream of the cell is deleted."""
         if cell not in self._files:
             self._files[cell] = await self._work(partial(CellFiles, self._folder.path, cell))
@@ -199,7 +201,7 @@ class Archive:
             await self._pause(_RETRY_S)
         await reader.commit()
 
-    async def _exists(self, client: Client, cell: CellName) -> bool:
+    async def _exists(self, client: FabricClient, cell: CellName) -> bool:
         try:
             await client.jetstream().stream_info(cell.history)
         except self._stream_errors.NotFoundError:
@@ -210,7 +212,7 @@ class Archive:
 
     # ---- layouts and memory ------------------------------------------------------------------------------------------
 
-    async def _layout(self, client: Client, cell: CellName, head: bytes) -> Layout | None:
+    async def _layout(self, client: FabricClient, cell: CellName, head: bytes) -> Layout | None:
         """Return a layout; None if the registry does not have it. A cell stores it soon after its first frames."""
         if head in self._layouts:
             return self._layouts[head]
@@ -244,7 +246,7 @@ class _StreamNames(msgspec.Struct):
 class _CellReader:
     """Reads the stream of one cell."""
 
-    def __init__(self, archive: Archive, client: Client, cell: CellName, files: CellFiles) -> None:
+    def __init__(self, archive: Archive, client: FabricClient, cell: CellName, files: CellFiles) -> None:
         self._archive = archive
         self._client = client
         self._cell = cell

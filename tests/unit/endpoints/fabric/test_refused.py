@@ -75,6 +75,23 @@ async def test_an_uplink_names_the_refused_file_and_keeps_trying(
 
 
 @in_loop
+async def test_an_uplink_names_the_seed_of_another_cell(
+    segment: Segment, guarded: NatsServer, users: Users, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The registry exists, and the user may publish neither to it nor the cell's subjects; then it may."""
+    may = {"deny": ["shmio.plant1.>", "$KV.shmio_cells.plant1.>"]}
+    section = users.authorization(users.known, users.unknown)
+    section["users"][0]["permissions"] = {"publish": may}
+    guarded.reload(authorization=section)
+    async with uplink(segment, guarded.url, credentials=str(users.known)) as found:
+        await until(lambda: f"{users.known} may not publish as {CELL}; use the seed of this cell" in found.problem)
+        assert f"may not publish as {CELL}; use the seed" in caplog.text
+        guarded.reload(authorization=users.authorization(users.known))
+        await until(lambda: found.publisher.up)
+        assert found.problem == ""
+
+
+@in_loop
 async def test_an_uplink_without_credentials_learns_which_key_it_needs(segment: Segment, guarded: NatsServer) -> None:
     async with uplink(segment, guarded.url) as found:
         await until(lambda: "name the file with this host's seed in fabric.credentials" in found.problem)
