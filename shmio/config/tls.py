@@ -50,8 +50,9 @@ def read_tls(tls: Tls) -> TlsFiles:
 def client_context(tls: MqttTls, where: str = "mqtt.tls.") -> ssl.SSLContext:
     """Return the TLS context for an external broker.
 
-    The authority ``ca`` must have issued the broker's certificate; without ``ca``, an authority that
-    the host trusts. ``where`` is the beginning of the names of keys, for messages.
+    The authority ``ca`` must have issued the broker's certificate, or ``ca`` is this certificate;
+    without ``ca``, it comes from an authority that the host trusts. ``where`` is the beginning of the
+    names of keys, for messages.
 
     Raises:
         ConfigError: A file cannot be used.
@@ -60,6 +61,7 @@ def client_context(tls: MqttTls, where: str = "mqtt.tls.") -> ssl.SSLContext:
     context = ssl.create_default_context()
     if tls.ca is not None:
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN  # the file may have the server's own certificate
         _load_authority(context, tls.ca, f"{where}ca")
     if tls.certificate is not None:
         _identify(context, tls, where)

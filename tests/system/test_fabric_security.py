@@ -472,6 +472,17 @@ def test_tls_is_required_when_configured(
         assert server.url
 
 
+def test_the_printed_command_reaches_the_server(
+    tmp_path: Path, port: int, pem: dict[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "nats"
+    given = ["--certificate", pem["certificate"], "--key", pem["key"], "--listen", f"127.0.0.1:{port}"]
+    assert main(["fabric", "server-config", "-o", str(folder), *given]) == 0
+    command = capsys.readouterr().out.partition("then run shmio ")[2].partition(" once")[0].split()
+    with running(folder / "nats-server.conf", port):
+        assert main(command) == 0, capsys.readouterr().err
+
+
 def test_clients_need_a_certificate_of_the_given_authority(tmp_path: Path, port: int, pem: dict[str, str]) -> None:
     folder = tmp_path / "nats"
     given = [f"--{name}={file}" for name, file in pem.items()]

@@ -167,6 +167,14 @@ def _replace(file: Path, text: str) -> None:
         raise
 
 
+def _tls_options(tls: MqttTls | None) -> str:
+    """Return the options by which a client reaches the servers, with a space at the end."""
+    if tls is None:
+        return ""
+    own = "" if tls.ca is None else "--certificate CLIENT.pem --key CLIENT.key "
+    return f"--ca {tls.certificate} {own}"
+
+
 def _report(
     settings: ServerSettings, folder: Path, written: Sequence[Path], made: Sequence[Path], users: Sequence[User]
 ) -> None:
@@ -175,9 +183,13 @@ def _report(
     lines.append(f"{len(users)} users: {', '.join(user.name or user.kind for user in users)}")
     scheme = "nats" if settings.tls is None else "tls"
     replicas = f" --replicas {min(3, len(settings.listen))}" if len(settings.listen) > 1 else ""
-    prepare = (
-        f"shmio fabric prepare --server {scheme}://{settings.listen[0]} --credentials {folder / ADMIN}.seed{replicas}"
-    )
+    address = Address.parse(settings.listen[0])
+    if address.host in ("0.0.0.0", "::"):  # noqa: S104  a comparison
+        here = f"127.0.0.1:{address.port}" if settings.tls is None else f"NAME-IN-THE-CERTIFICATE:{address.port}"
+    else:
+        here = str(address)
+    prepare = f"shmio fabric prepare --server {scheme}://{here} {_tls_options(settings.tls)}"
+    prepare += f"--credentials {folder / ADMIN}.seed{replicas}"
     lines += [
         f"next: start {' and '.join(f'nats-server -c {file}' for file in written)}, then run {prepare} once",
         "copy each seed to its host, and name it there in fabric.credentials",
