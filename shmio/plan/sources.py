@@ -256,7 +256,10 @@ def _mirrored(key: str, source: Source, config: Config, files: LayoutFiles) -> L
 
     if config.fabric is None:
         raise ConfigError(f"{key}.connector: a mirror needs a table [fabric] with the server's address")
-    mirror = Mirror(msgspec.convert(source.options, Mirror.Options), source.name)
+    try:
+        mirror = Mirror(msgspec.convert(source.options, Mirror.Options), source.name)
+    except ConfigError as error:
+        raise ConfigError(f"{key}.{error}") from None
     if str(mirror.cell) == config.fabric.cell:
         raise ConfigError(f"{key}.cell: {mirror.cell} is this instance; name the cell of another instance")
     own = None if source.layout is None else files.get(key, source, None)

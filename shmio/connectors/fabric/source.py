@@ -116,7 +116,8 @@ async def _look_up(mirror: Mirror, client: Client) -> Offer:
     seen = await registry.find(mirror.cell)
     if seen is None:
         names = [other.entry.cell for other in await registry.cells()]
-        raise ConfigError(f"cell: {unknown('cell', str(mirror.cell), names, 'the fabric')}")
+        what = unknown("cell", str(mirror.cell), names, "the fabric")
+        raise ConfigError(f"cell: {what}; start that cell first: it tells the fabric its layout")
     found = seen.entry.source(mirror.source)
     if found is None:
         names = [source.name for source in seen.entry.sources]

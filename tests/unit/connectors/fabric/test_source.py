@@ -79,6 +79,17 @@ def test_another_layout_than_the_owners_is_refused(tmp_path: Path, server: NatsS
         plan(tmp_path, server.url, other)
 
 
+def test_a_malformed_and_an_absent_cell_are_named_with_their_key(tmp_path: Path, server: NatsServer) -> None:
+    file = tmp_path / "far.toml"
+    for cell, words in (
+        ("a50", r"far\.toml:10: source\[0\]\.cell: .*a50"),
+        ("plant1.line3.absent", r"far\.toml:10: source\[0\]\.cell: .*start that cell first"),
+    ):
+        file.write_text(MIRROR.format(server.url, cell))
+        with pytest.raises(ConfigError, match=words):
+            prepare(file)
+
+
 @pytest.mark.parametrize("keys", [{"jetstream": None}, {"authorization": {"user": "a", "password": "b"}}])
 def test_a_server_that_refuses_is_not_taken_for_one_that_does_not_run(
     tmp_path: Path, owner: BlockSpec, keys: dict[str, object]
