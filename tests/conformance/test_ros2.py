@@ -203,7 +203,7 @@ class TestRos2(TableConformance, WriteConformance):
 
     def test_absent_at_start(self, absent: None, run: Run, rig: Rig) -> None:
         """The source is bad with a reason until there is a node, and then good."""
-        assert "no publisher or subscriber of any topic" in run.bad().reason
+        assert "no publisher or subscriber of this source's topics" in run.bad().reason
         rig.proxy.admit()
         run.good()
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack
-from pathlib import Path
 
 import pytest
 
@@ -50,8 +49,9 @@ cell = "plant1.line3.far"
 """
 
 
-@pytest.fixture
-def cells(tmp_path: Path, instance: str) -> Iterator[tuple[Cell, Cell]]:
+@pytest.fixture(scope="module")
+def cells(tmp_path_factory: pytest.TempPathFactory, shared_instance: str) -> Iterator[tuple[Cell, Cell]]:
+    tmp_path, instance = tmp_path_factory.mktemp("cells"), shared_instance
     with reserved_port() as nats, ExitStack() as stack:
         found = []
         for mark, text in (("n", NEAR), ("f", FAR)):
@@ -127,3 +127,4 @@ def test_faults_in_the_configuration_of_a_mirror_are_named(cells: tuple[Cell, Ce
     assert "did you mean 'belt'" in done.stderr
     file.write_text(text.replace('cell = "plant1.line3.near"', 'cell = "plant1.line3.neer"'))
     assert "did you mean 'plant1.line3.near'" in far.supervisor("check").stderr
+    file.write_text(text)

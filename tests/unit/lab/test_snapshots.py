@@ -200,7 +200,7 @@ def test_a_snapshot_of_another_configuration_is_refused(plan: Callable[..., Plan
         cell.save_snapshot("old")
     for old, new, names in (
         ("[[injection]]", MORE, "no source more"),
-        ("amplitude = 0.5", "amplitude = 0.25", "other injections: configured"),
+        ("amplitude = 0.5", "amplitude = 0.25", "different injections: configured"),
         ("shmio.simulation.a50:A50Cell", "shmio.simulation.loopback:Loopback", "source cell.*layout"),
     ):
         assert old in SECTIONS
