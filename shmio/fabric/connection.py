@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from shmio.config.address import Address
+from shmio.config.credentials import read_secret
 from shmio.config.model import Fabric, MqttTls
 from shmio.config.tls import client_context
 from shmio.errors import ConfigError, RemoteError
@@ -30,6 +31,7 @@ MAX_PINGS: Final = 2
 """Number of unanswered pings after which the connection counts as lost."""
 RETRY_S: Final = 0.5
 """Wait between two attempts to connect again, in s."""
+MAX_CREDENTIALS_BYTES: Final = 1 << 16
 MAX_REASONS: Final = 32
 """Maximum number of reasons that are remembered because they were logged."""
 
@@ -215,25 +217,22 @@ def read_credentials(access: Access) -> dict[str, Any]:
     """Return the client's options for the credentials.
 
     Raises:
-        ConfigError: The file cannot be used.
+        ConfigError: The file cannot be used, or other users may have read it.
 
     """
     if access.credentials is None:
         return {}
     library("nkeys", INSTALL)
+    key = f"{access.key('credentials')}: {access.credentials}"
     try:
-        text = Path(access.credentials).read_text(encoding="ascii")
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "the file is not text"
-        raise ConfigError(f"{access.key('credentials')}: {access.credentials}: {why}") from None
+        text = read_secret(key, access.credentials, MAX_CREDENTIALS_BYTES, instead="a new seed").decode("ascii")
+    except UnicodeDecodeError:
+        raise ConfigError(f"{key}: the file is not text") from None
     if "BEGIN NATS USER JWT" in text:
         return {"user_credentials": access.credentials}
     seed = text.strip()
     if not seed.startswith("SU"):
-        raise ConfigError(
-            f"{access.key('credentials')}: {access.credentials} is neither a .creds file nor the seed of a user's "
-            "NKey, which begins with SU"
-        )
+        raise ConfigError(f"{key} is neither a .creds file nor the seed of a user's NKey, which begins with SU")
     return {"nkeys_seed_str": seed, "inbox_prefix": inbox_prefix(public_key(seed, access.credentials))}
 
 

@@ -328,10 +328,15 @@ def test_wrong_credentials_are_named(fabric: Fabric, tmp_path: Path, capsys: pyt
     stranger = tmp_path / "other/viewers/stranger.seed"
     wrong = tmp_path / "wrong.seed"
     wrong.write_text("SUANOTHING")
+    wrong.chmod(0o600)
+    shown = tmp_path / "shown.seed"
+    shown.write_text(stranger.read_text())
+    shown.chmod(0o644)
     for file, words in (
         (stranger, f"does not know the credentials in {stranger}"),
         (None, "asks for credentials"),
         (wrong, f"{wrong}: the seed is damaged"),
+        (shown, f"{shown}: other users may have read this file"),
         (tmp_path / "absent", "absent: No such file"),
     ):
         given = [] if file is None else ["--credentials", str(file)]

@@ -29,6 +29,7 @@ class Users:
         for file, byte in ((self.known, b"k"), (self.unknown, b"u")):
             seed = nkeys.encode_seed(byte * 32, nkeys.PREFIX_BYTE_USER)
             file.write_bytes(seed)
+            file.chmod(0o600)
             self._keys[file] = nkeys.from_seed(bytearray(seed)).public_key.decode()
 
     def authorization(self, *files: Path) -> dict[str, Any]:

@@ -218,6 +218,7 @@ def credentials(tmp_path: Path) -> tuple[str, str]:
     file = tmp_path / "farm.nk"
     seed = nkeys.encode_seed(os.urandom(32), nkeys.PREFIX_BYTE_USER)
     file.write_bytes(seed)
+    file.chmod(0o600)
     return str(file), nkeys.from_seed(bytearray(seed)).public_key.decode()
 
 
