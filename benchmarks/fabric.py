@@ -164,8 +164,9 @@ class Cells:
         self.writer.publish(bytes(layout.size), cycle=0)
         access = msgspec.to_builtins(Access((url,)))
         uplink = {"access": access, "cell": str(CELL), "backlog_mb": 256.0}
-        mirror = {
-            "connector": "fabric", "options": {"cell": str(CELL), "source": "cell"}, "writable": [],
+        mirror: dict[str, Any] = {
+            "connector": "fabric",
+            "layout": None, "options": {"cell": str(CELL), "source": "cell"}, "writable": [],
             "allow_nonfinite": [], "fabric": {"access": access, "cell": None},
         }  # fmt: skip
         self.pids = [
