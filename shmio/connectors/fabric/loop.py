@@ -234,7 +234,10 @@ class MirrorLoop:
             return
         late_ns = one.late_ns + (self._clock.now_ns() - one.at_ns)
         if one.header.zero_ns != self._zero_ns:
-            self._zero_ns, self._number = one.header.zero_ns, 0  # another start of the owner: frames count anew
+            self._zero_ns, self._number = (
+                one.header.zero_ns,
+                0,
+            )  # the owner was started again, and numbers its frames from 1
         self._left_out += one.header.left_out
         try:
             for entry in decode_entries(one.data):

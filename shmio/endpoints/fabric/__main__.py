@@ -11,6 +11,7 @@ import msgspec
 
 from shmio import worker
 from shmio.endpoints.fabric.server import NatsServer, ServerSettings
+from shmio.endpoints.server_process import serve
 from shmio.logs import LogRateLimit
 from shmio.worker import BEAT_S, Worker
 
@@ -39,16 +40,7 @@ def run(worker: Worker) -> None:
 
 def _serve(worker: Worker) -> None:
     settings = msgspec.convert(worker.config, ServerSettings)
-    server = NatsServer(settings, worker.segment.instance)
-    try:
-        server.await_start(worker.report)
-        log.info("nats-server serves NATS on %s", settings.listen)
-        worker.running()
-        while not worker.stopping.wait(BEAT_S):
-            server.check()
-            worker.report()
-    finally:
-        server.stop()
+    serve(worker, NatsServer(settings, worker.segment.instance), f"nats-server serves NATS on {settings.listen}")
 
 
 async def _publish(worker: Worker) -> None:

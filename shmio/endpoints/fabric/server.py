@@ -8,10 +8,7 @@ import os
 import re
 import shutil
 import socket
-import subprocess
 import sys
-import threading
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -20,13 +17,13 @@ import msgspec
 
 from shmio.config import Address
 from shmio.config.model import MqttTls
+from shmio.endpoints.server_process import ServerProcess
 from shmio.errors import ConfigError, EndpointError
 from shmio.fabric.messages import MAX_MESSAGE_BYTES
 
 PROGRAM: Final = "nats-server"
 CONFIGURATION: Final = "nats-server.conf"
 LOCK: Final = "lock"
-START_S: Final = 10.0
 STOP_S: Final = 5.0
 MAX_UNSENT_BYTES: Final = 64 << 20
 """Maximum size of what waits for a slow client, in bytes. Beyond it, the server disconnects the client."""
@@ -101,10 +98,7 @@ def _tls(tls: MqttTls) -> Mapping[str, Any]:
 
 
 class NatsServer:
-    """The server's process.
-
-    Start it from the main thread, because the process ends with the thread that started it.
-    """
+    """The NATS server and its directory. Start it from the main thread: see :class:`ServerProcess`."""
 
     def __init__(self, settings: ServerSettings, name: str) -> None:
         """Start the server.
@@ -116,91 +110,49 @@ class NatsServer:
         """
         check_installed()
         self._listen = Address.parse(settings.listen)
-        self._last = ""
         self._lock = _prepare(Path(settings.directory))
         file = Path(settings.directory) / CONFIGURATION
         try:
             fd = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
             with open(fd, "wb") as stream:  # noqa: PTH123  a descriptor
                 stream.write(configuration(settings, name))
-            command = [sys.executable, "-P", "-m", "shmio.parent", str(os.getpid()), str(find_server())]
-            self._process = subprocess.Popen(
-                [*command, "-c", str(file)],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                encoding="utf-8",
-                errors="replace",
-            )
+            command = [str(find_server()), "-c", str(file)]
+            self._process = ServerProcess("the NATS server", command, STOP_S, _read)
         except OSError as error:
             os.close(self._lock)
             raise EndpointError(f"{file}: {error.strerror}") from None
-        self._reader = threading.Thread(target=self._read, name="server's log", daemon=True)
-        self._reader.start()
 
     def await_start(self, beat: Callable[[], object]) -> None:
-        """Wait until the server accepts connections.
-
-        Args:
-            beat: Called repeatedly while waiting.
-
-        Raises:
-            EndpointError: The server has ended, or takes too long. The message has its last error.
-
-        """
-        until_s = time.monotonic() + START_S
+        """Wait until the server accepts connections; see :meth:`ServerProcess.await_start`."""
         here = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self._listen.host, self._listen.host)  # noqa: S104  a key
-        while True:
-            self.check()
-            try:
-                with socket.create_connection((here, self._listen.port), 1.0) as probe:
-                    if probe.recv(4) == b"INFO":
-                        return
-            except OSError:
-                pass
-            if time.monotonic() > until_s:
-                raise EndpointError(f"the NATS server does not accept connections: {self._last}")
-            beat()
-            time.sleep(0.02)
+
+        def accepts() -> bool:
+            with socket.create_connection((here, self._listen.port), 1.0) as probe:
+                return probe.recv(4) == b"INFO"
+
+        self._process.await_start(accepts, beat)
 
     def check(self) -> None:
-        """Check that the server is running.
-
-        Raises:
-            EndpointError: The server has ended.
-
-        """
-        code = self._process.poll()
-        if code is not None:
-            self._reader.join(1.0)
-            raise EndpointError(f"the NATS server has ended: {self._last or f'exit status {code}'}")
+        """Check that the server is running; raise EndpointError if it has ended."""
+        self._process.check()
 
     def stop(self) -> None:
-        """Stop the server."""
-        self._process.terminate()
-        try:
-            self._process.wait(STOP_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._reader.join(1.0)
-        if self._process.stderr is not None:
-            self._process.stderr.close()
+        """Stop the server, and release its directory."""
+        self._process.stop()
         os.close(self._lock)
 
-    def _read(self) -> None:
-        """Copy the server's log lines to the log of this process."""
-        for line in self._process.stderr or ():
-            text = _STAMP.sub("", line.strip())
-            level = _LEVEL.match(text)
-            text = text[level.end() :] if level else text
-            kind = level.group(1) if level else "ERR"
-            if kind == "INF":
-                log.debug("nats-server: %s", text)
-                continue
-            if kind in ("ERR", "FTL"):
-                self._last = text
-            log.log(logging.WARNING if kind == "WRN" else logging.ERROR, "nats-server: %s", text)
+
+def _read(line: str) -> str:
+    """Copy a line of the server's log to the log of this process; return it if it reports an error."""
+    text = _STAMP.sub("", line)
+    level = _LEVEL.match(text)
+    text = text[level.end() :] if level else text
+    kind = level.group(1) if level else "ERR"
+    if kind == "INF":
+        log.debug("nats-server: %s", text)
+        return ""
+    log.log(logging.WARNING if kind == "WRN" else logging.ERROR, "nats-server: %s", text)
+    return text if kind in ("ERR", "FTL") else ""
 
 
 def _prepare(directory: Path) -> int:

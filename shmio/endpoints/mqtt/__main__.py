@@ -12,6 +12,7 @@ from shmio.config import Mqtt
 from shmio.endpoints.mqtt.broker.directory import folder, prepare, remove
 from shmio.endpoints.mqtt.broker.mosquitto import Mosquitto
 from shmio.endpoints.mqtt.broker.program import choose_broker
+from shmio.endpoints.server_process import serve
 from shmio.logs import LogRateLimit
 from shmio.worker import BEAT_S, Worker
 
@@ -63,7 +64,8 @@ def run_broker(worker: Worker) -> None:
     prepare(place)
     try:
         if program is not None:
-            _run_mosquitto(worker, Mosquitto(program, settings, worker.segment.instance, place), settings)
+            broker = Mosquitto(program, settings, worker.segment.instance, place)
+            serve(worker, broker, f"mosquitto serves MQTT on {settings.listen}")
         else:
             log.warning(
                 "mosquitto is not installed, so aMQTT runs on %s, for development only: every program on this host "
@@ -77,18 +79,6 @@ def run_broker(worker: Worker) -> None:
             asyncio.run(amqtt.serve(worker, settings, place))
     finally:
         remove(place)
-
-
-def _run_mosquitto(worker: Worker, broker: Mosquitto, settings: Mqtt) -> None:
-    try:
-        broker.await_start(worker.report)
-        log.info("mosquitto serves MQTT on %s", settings.listen)
-        worker.running()
-        while not worker.stopping.wait(BEAT_S):
-            broker.check()
-            worker.report()
-    finally:
-        broker.stop()
 
 
 if __name__ == "__main__":

@@ -6,13 +6,8 @@ Only the bridge may publish values, status and results.
 from __future__ import annotations
 
 import logging
-import os
 import re
 import socket
-import subprocess
-import sys
-import threading
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -20,9 +15,8 @@ from typing import Final, NamedTuple
 from shmio.config import Address, Mqtt, MqttAccount
 from shmio.config.credentials import read_accounts
 from shmio.endpoints.mqtt.broker.directory import BRIDGE, ID, SOCKET, new_secret, write_private
-from shmio.errors import EndpointError
+from shmio.endpoints.server_process import ServerProcess
 
-START_S: Final = 10.0
 STOP_S: Final = 3.0
 MAX_PACKET_BYTES: Final = 1 << 21
 MAX_QUEUED_MESSAGES: Final = 100_000
@@ -134,10 +128,7 @@ def access_rules(given: Mapping[str | None, Rights], *, accounts: bool) -> str:
 
 
 class Mosquitto:
-    """The mosquitto process.
-
-    Start it from the main thread, because the process ends with the thread that started it.
-    """
+    """The mosquitto process. Start it from the main thread: see :class:`ServerProcess`."""
 
     def __init__(self, program: str, settings: Mqtt, instance: str, place: Path) -> None:
         """Start mosquitto.
@@ -155,70 +146,29 @@ class Mosquitto:
         write_private(place / "bridge-rights", f"user {BRIDGE}\ntopic readwrite #\n")
         write_private(place / "mosquitto.conf", configuration(settings, place, anonymous=None in given))
         self._socket = place / SOCKET
-        self._last = ""
-        command = [sys.executable, "-P", "-m", "shmio.parent", str(os.getpid()), program]
-        self._process = subprocess.Popen(
-            [*command, "-c", str(place / "mosquitto.conf")],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            encoding="utf-8",
-            errors="replace",
-        )
-        self._reader = threading.Thread(target=self._read, name="broker's log", daemon=True)
-        self._reader.start()
+        self._process = ServerProcess("mosquitto", [program, "-c", str(place / "mosquitto.conf")], STOP_S, _read)
 
     def await_start(self, beat: Callable[[], object]) -> None:
-        """Wait until mosquitto accepts connections.
+        """Wait until mosquitto accepts connections; see :meth:`ServerProcess.await_start`."""
 
-        Args:
-            beat: Called repeatedly during the wait.
-
-        Raises:
-            EndpointError: Mosquitto has ended, or takes too long. The message has its last log
-                line.
-
-        """
-        until_s = time.monotonic() + START_S
-        while True:
-            self.check()
+        def accepts() -> bool:
             with socket.socket(socket.AF_UNIX) as probe:
-                try:
-                    probe.connect(str(self._socket))
-                except OSError:
-                    if time.monotonic() > until_s:
-                        raise EndpointError(f"mosquitto does not accept connections: {self._last}") from None
-                else:
-                    return
-            beat()
-            time.sleep(0.02)
+                probe.connect(str(self._socket))
+            return True
+
+        self._process.await_start(accepts, beat)
 
     def check(self) -> None:
-        """Check that mosquitto is running.
-
-        Raises:
-            EndpointError: Mosquitto has ended.
-
-        """
-        code = self._process.poll()
-        if code is not None:
-            self._reader.join(1.0)
-            raise EndpointError(f"mosquitto has ended: {self._last or f'exit status {code}'}")
+        """Check that mosquitto is running; raise EndpointError if it has ended."""
+        self._process.check()
 
     def stop(self) -> None:
         """Stop mosquitto."""
-        self._process.terminate()
-        try:
-            self._process.wait(STOP_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._reader.join(1.0)
-        if self._process.stderr is not None:
-            self._process.stderr.close()
+        self._process.stop()
 
-    def _read(self) -> None:
-        """Copy mosquitto's log lines to the log of this process."""
-        for line in self._process.stderr or ():
-            self._last = ID.sub("…", _STAMP.sub("", line.strip()))
-            log.info("mosquitto: %s", self._last)
+
+def _read(line: str) -> str:
+    """Copy a line of mosquitto's log to the log of this process, and return it."""
+    text = ID.sub("…", _STAMP.sub("", line))
+    log.info("mosquitto: %s", text)
+    return text

@@ -99,8 +99,8 @@ def test_nothing_is_imported_without_the_section() -> None:
 def test_its_end_is_reported(address: Address, tmp_path: Path) -> None:
     with embedded(section(address, tmp_path)) as server:
         server.check()
-        os.kill(server._process.pid, signal.SIGKILL)
-        until(lambda: server._process.poll() is not None, "the server's end")
+        os.kill(server._process._process.pid, signal.SIGKILL)
+        until(lambda: server._process._process.poll() is not None, "the server's end")
         with pytest.raises(EndpointError, match="has ended"):
             server.check()
 
@@ -108,7 +108,7 @@ def test_its_end_is_reported(address: Address, tmp_path: Path) -> None:
 def test_a_port_in_use_is_reported(address: Address, tmp_path: Path) -> None:
     with embedded(section(address, tmp_path)):
         second = NatsServer(ServerSettings(str(address), str(tmp_path / "other")), "test")
-        until(lambda: second._process.poll() is not None, "its end")
+        until(lambda: second._process._process.poll() is not None, "its end")
         with pytest.raises(EndpointError, match="address already in use"):
             second.check()
         second.stop()
