@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +13,7 @@ import numpy.typing as npt
 from shmio.errors import ConnectorError, ValueRangeError
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
-from shmio.layout.values.codec import Value, codec
+from shmio.layout.values.codec import Value, codec, scalar_codec
 from shmio.model.statuses import (
     BAD_OUT_OF_RANGE,
     BAD_WAITING_FOR_INITIAL_DATA,
@@ -32,6 +35,44 @@ class Copy(NamedTuple):
     sources: npt.NDArray[np.intp]
     targets: npt.NDArray[np.intp]
     indices: frozenset[int]
+
+
+class Run(NamedTuple):
+    """Registers of numbers that follow each other in the layout and in the image.
+
+    Attributes:
+        part: Their part of the values of a :class:`Batch`.
+        pack: Returns the bytes of their values.
+        target: Their bytes in the image.
+        codes: The bytes of their status codes in the image.
+        good: These bytes if all codes are good.
+        times: The bytes of their source times in the image.
+        count: Their number.
+
+    """
+
+    part: slice
+    pack: Callable[..., bytes]
+    target: slice
+    codes: slice
+    good: bytes
+    times: slice
+    count: int
+
+
+class Batch(NamedTuple):
+    """Registers of numbers whose values can be stored together.
+
+    Attributes:
+        types: The types of their values, all float or all int.
+        indices: The indices of the registers in the layout.
+        runs: The registers again, divided into as few runs as possible.
+
+    """
+
+    types: tuple[type, ...]
+    indices: frozenset[int]
+    runs: tuple[Run, ...]
 
 
 def no_status_area() -> ConnectorError:
@@ -93,6 +134,66 @@ class RegisterImage:
         register = self._layout.registers[index]
         self._image[register.offset : register.offset + register.size] = data
         self._set_status(index, code, source_ns)
+
+    def batch(self, indices: Sequence[int]) -> Batch | None:
+        """Return the batch of some registers, in this order; None if they are not numbers of one type, float or int."""
+        registers = [self._layout.registers[index] for index in indices]
+        if any(register.dims or register.type == "BOOL" for register in registers):
+            return None
+        order = self._layout.byte_order
+        formats = [scalar_codec(register.element, order).plain for register in registers]
+        types = tuple(float if code in ("f", "d") else int for code in formats)
+        if not all(formats) or len({*types}) != 1:
+            return None
+        begins = [0] + [at for at in range(1, len(indices)) if not self._adjacent(indices[at - 1], indices[at])]
+        runs = []
+        for begin, end in pairwise([*begins, len(indices)]):
+            packer = struct.Struct((">" if order == "big" else "<") + "".join(formats[begin:end]))
+            first, count = indices[begin], end - begin
+            code_at, code_size = self._area.code_range(first)
+            time_at, time_size = self._area.time_range(first)
+            runs.append(Run(
+                slice(begin, end),
+                packer.pack,
+                slice(registers[begin].offset, registers[begin].offset + packer.size),
+                slice(code_at, code_at + count * code_size),
+                bytes(count * code_size),
+                slice(time_at, time_at + count * time_size),
+                count,
+            ))  # fmt: skip
+        return Batch(types, frozenset(indices), tuple(runs))
+
+    def _adjacent(self, before: int, index: int) -> bool:
+        """Return whether a register follows another one in the layout, and its bytes follow the other's bytes."""
+        registers = self._layout.registers
+        return index == before + 1 and registers[index].offset == registers[before].offset + registers[before].size
+
+    def put_batch(self, batch: Batch, values: Sequence[object], source_ns: int = 0) -> bool:
+        """Store the values of many registers with good statuses, which is faster than to :meth:`put` each of them.
+
+        Args:
+            batch: The registers.
+            values: Their values, in the order of the batch.
+            source_ns: The time of all values, as for :meth:`put`.
+
+        Returns:
+            Whether all values fit. If not, call :meth:`put` for each of them.
+
+        """
+        if (*map(type, values),) != batch.types:
+            return False
+        image = self._image
+        time = self._area.time_bytes(source_ns)
+        try:
+            for part, pack, target, codes, good, times, count in batch.runs:
+                image[target] = pack(*values[part])
+                image[codes] = good
+                image[times] = time * count
+        except (struct.error, OverflowError):
+            return False
+        if self._not_good:
+            self._not_good -= batch.indices
+        return True
 
     def copy(self, copy: Copy, answer: bytes) -> None:
         """Store the values of many registers, and make their statuses good.

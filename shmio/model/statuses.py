@@ -267,6 +267,10 @@ class StatusArea:
         """Return (offset, size) of a register's source time in an image."""
         return self.times_offset + _TIME_BYTES * index, _TIME_BYTES
 
+    def time_bytes(self, source_ns: int) -> bytes:
+        """Return the bytes of a source time, as an image has them."""
+        return self._time.pack(source_ns)
+
     def get(self, image: Buffer, index: int) -> RegisterStatus:
         """Return the status of the register with this index in the layout."""
         (code,) = self._code.unpack_from(image, self.codes_offset + _CODE_BYTES * index)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from operator import itemgetter
 from typing import Any, Final, NamedTuple
 
 from shmio.connectors.ros.messages import DEFINITIONS, PRIMITIVES, TYPE, plain
@@ -196,6 +197,61 @@ def getter(address: Address) -> Callable[[Any], Any]:
         return extract(message, address)
 
     return get
+
+
+def scope_of(address: Address) -> tuple[object, ...] | None:
+    """Return a key that is equal for addresses which a :func:`row_getter` can find together; None if it can find none.
+
+    These are fields of one message, or elements of one sequence that are selected in the same way.
+    """
+    *outer, (name, place, key) = address.steps
+    if any(not step.whole for step in outer):
+        return None
+    names = tuple(step.name for step in outer)
+    if place is None and key is None:
+        return names, None, None
+    return names, name, key and key[0]
+
+
+def row_getter(addresses: Sequence[Address]) -> Callable[[Any], Sequence[Any]]:
+    """Return a function that extracts the values of at least two addresses with an equal :func:`scope_of`.
+
+    It raises TypeError, LookupError or ValueError if the message does not contain all of them.
+    """
+    names = tuple(step.name for step in addresses[0].steps[:-1])
+    last = [address.steps[-1] for address in addresses]
+    sequence, place, key = last[0]
+    if place is None and key is None:
+        fields = itemgetter(*[step.name for step in last])
+        return lambda message: fields(_inner(message, names))
+    if key is None:
+        places = itemgetter(*[step.place for step in last])
+        return lambda message: places(_checked(_inner(message, names)[sequence]))
+    order_name, wanted = key[0], [step.key[1] for step in last if step.key]
+    known: list[Any] = []
+    elements: Callable[[list[Any]], Sequence[Any]] = itemgetter(0)
+
+    def get(message: Any) -> Sequence[Any]:
+        nonlocal known, elements
+        scope = _inner(message, names)
+        order = _checked(scope[order_name])
+        if order != known:  # else the elements have the same indices as in the last message
+            elements, known = itemgetter(*map(order.index, wanted)), [*order]
+        return elements(_checked(scope[sequence]))
+
+    return get
+
+
+def _inner(message: Any, names: tuple[str, ...]) -> Any:
+    for name in names:
+        message = message[name]
+    return message
+
+
+def _checked(found: Any) -> list[Any]:
+    if type(found) is not list:
+        raise TypeError("not a sequence")
+    return found
 
 
 def place_of(scopes: Sequence[Any], step: Step, address: Address) -> int:

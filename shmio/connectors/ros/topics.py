@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable
-from typing import Any, Final
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Final, NamedTuple
 
-from shmio.connectors.register_image import RegisterImage, no_status_area
-from shmio.connectors.ros.addresses import Address, FieldError, getter, leaf_type, parse
+from shmio.connectors.register_image import Batch, RegisterImage, no_status_area
+from shmio.connectors.ros.addresses import Address, FieldError, getter, leaf_type, parse, row_getter, scope_of
 from shmio.connectors.ros.messages import plain
 from shmio.connectors.ros.options import TopicOptions
 from shmio.connectors.ros.qos import TopicQos
@@ -29,12 +30,23 @@ MAX_SEC: Final = 1 << 33
 log = logging.getLogger("shmio.source")
 
 
+class Row(NamedTuple):
+    """Registers whose values are found and stored together."""
+
+    indices: list[int]
+    get: Callable[[Any], Sequence[Any]]
+    batch: Batch
+
+
 class Topic:
     """A topic, with the indices of the registers whose values are its fields, and its last message."""
 
     def __init__(self, name: str, kind: str) -> None:
         self.name, self.type = name, kind
         self.registers: list[int] = []
+        self.rows: list[Row] = []
+        self.single: list[int] = []
+        """Those of ``registers`` that are in no row."""
         self.writable = False
         self.latched = False
         self.qos = TopicQos()
@@ -92,6 +104,8 @@ class Topics:
             if name not in self.by_name:
                 raise ConfigError(f"latched: no register has the topic {name!r}")
             self.by_name[name].latched = True
+        for topic in self.by_name.values():
+            self._form_rows(topic)
 
     def _add(self, index: int, known_types: bool) -> None:
         register = self.layout.registers[index]
@@ -118,6 +132,19 @@ class Topics:
         self._getters.append(getter(address))
         topic.registers.append(index)
         topic.writable = topic.writable or register.writable
+
+    def _form_rows(self, topic: Topic) -> None:
+        """Divide the registers of a topic into rows and single registers."""
+        together: dict[object, list[int]] = defaultdict(list)
+        for index in topic.registers:
+            scope, native = scope_of(self.addresses[index]), self.converters[index].native
+            together[index if scope is None or native is None else (scope, native)].append(index)
+        for indices in together.values():
+            batch = self._image.batch(indices) if self._image is not None and len(indices) > 1 else None
+            if batch is None:
+                topic.single += indices
+            else:
+                topic.rows.append(Row(indices, row_getter([self.addresses[index] for index in indices]), batch))
 
     def reset(self) -> None:
         """Forget all messages, so that all registers wait for a value."""
@@ -186,7 +213,17 @@ class Topics:
         topic.shown = GOOD
         source_ns = self._source_ns(topic)
         message = topic.message
-        for index in topic.registers:
+        for row in topic.rows:
+            try:
+                if image.put_batch(row.batch, row.get(message), source_ns):
+                    continue
+            except (TypeError, LookupError, ValueError):  # the message lacks something
+                pass
+            self._put_each(image, row.indices, message, source_ns)
+        self._put_each(image, topic.single, message, source_ns)
+
+    def _put_each(self, image: RegisterImage, indices: Iterable[int], message: Any, source_ns: int) -> None:
+        for index in indices:
             try:
                 image.put(index, self.converters[index].value(self._getters[index](message)), source_ns)
             except FieldError as error:

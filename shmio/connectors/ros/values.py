@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Mapping
 from typing import Any, Final
 
 from shmio.connectors.ros.addresses import FieldError
@@ -16,6 +17,7 @@ from shmio.model.statuses import BAD_INDEX_RANGE_NO_DATA, BAD_TYPE_MISMATCH
 
 _REALS: Final = frozenset({"REAL", "LREAL"})
 _TEXTS: Final = frozenset({"STRING", "WSTRING"})
+_NATIVE: Final[Mapping[str, type]] = dict.fromkeys(model.INTEGERS, int) | dict.fromkeys(_REALS, float)
 _FLOAT32_MAX: Final = 3.4028234663852886e38
 
 
@@ -33,8 +35,8 @@ class ValueConverter:
         if base not in (*_REALS, *_TEXTS, *model.INTEGERS, "BOOL"):
             raise ValueError(f"a {base} cannot be read from ROS; use BOOL, whole numbers, REAL, LREAL or STRING[n]")
         self._register, self._base, self._scale = register, base, register.scale
-        self._is_plain = base in _REALS and register.scale is None and not register.dims
-        """True if a float is the register's value as it is."""
+        self.native = None if register.scale or register.dims else _NATIVE.get(base)
+        """The type whose values need no conversion; None if there is none."""
         self.kind = kind
         if kind is None:
             return
@@ -60,8 +62,8 @@ class ValueConverter:
             ValueRangeError: The register cannot hold the value.
 
         """
-        if self._is_plain and type(found) is float:
-            return found
+        if type(found) is self.native:
+            return found  # type: ignore[no-any-return]
         register = self._register
         if not register.dims:
             return self._element(found)
