@@ -47,7 +47,7 @@ class Run(NamedTuple):
         codes: The bytes of their status codes in the image.
         good: These bytes if all codes are good.
         times: The bytes of their source times in the image.
-        count: Their number.
+        length: Their number.
 
     """
 
@@ -57,7 +57,7 @@ class Run(NamedTuple):
     codes: slice
     good: bytes
     times: slice
-    count: int
+    length: int
 
 
 class Batch(NamedTuple):
@@ -185,10 +185,10 @@ class RegisterImage:
         image = self._image
         time = self._area.time_bytes(source_ns)
         try:
-            for part, pack, target, codes, good, times, count in batch.runs:
+            for part, pack, target, codes, good, times, length in batch.runs:
                 image[target] = pack(*values[part])
                 image[codes] = good
-                image[times] = time * count
+                image[times] = time * length
         except (struct.error, OverflowError):
             return False
         if self._not_good:

@@ -228,7 +228,7 @@ def row_getter(addresses: Sequence[Address]) -> Callable[[Any], Sequence[Any]]:
         places = itemgetter(*[step.place for step in last])
         return lambda message: places(_checked(_inner(message, names)[sequence]))
     order_name, wanted = key[0], [step.key[1] for step in last if step.key]
-    known: list[Any] = []
+    known: list[Any] | None = None
     elements: Callable[[list[Any]], Sequence[Any]] = itemgetter(0)
 
     def get(message: Any) -> Sequence[Any]:

@@ -63,7 +63,7 @@ class ValueConverter:
 
         """
         if type(found) is self.native:
-            return found  # type: ignore[no-any-return]
+            return found  # type: ignore[return-value]  # mypy does not see that it is a number
         register = self._register
         if not register.dims:
             return self._element(found)

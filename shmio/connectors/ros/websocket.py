@@ -6,13 +6,14 @@ The protocol is rosbridge v2: ROSBRIDGE_PROTOCOL.md of rosbridge_suite.
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 import logging
 import socket
 import struct
 import threading
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
@@ -24,12 +25,10 @@ from shmio.errors import ConnectorError
 from shmio.wording import printable
 
 if TYPE_CHECKING:
-    from websockets.sync.connection import Connection
+    from websockets.sync.client import ClientConnection
 
 CLOSE_S: Final = 0.2
 MAX_REPORTED: Final = 20
-MAX_FRAGMENTS: Final = 10_000
-"""Maximum number of fragments in a message."""
 _SEND_TIMEOUT: Final = struct.Struct("@ll")
 
 log = logging.getLogger("shmio.source")
@@ -82,6 +81,8 @@ class Link:
         from websockets.exceptions import WebSocketException  # noqa: PLC0415  the library is optional
         from websockets.sync.client import connect  # noqa: PLC0415
 
+        from shmio.connectors.ros.connection import Connection  # noqa: PLC0415
+
         self._peer, self._timeout_s, self._topics = peer, timeout_s, topics
         self._closed_errors = (WebSocketException, OSError)
         self._stack = contextlib.ExitStack()
@@ -107,25 +108,26 @@ class Link:
             channel.settimeout(None)  # the thread waits for ever; the option below limits the time of a send
             whole, part = divmod(timeout_s, 1)
             channel.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _SEND_TIMEOUT.pack(int(whole), int(part * 1e6)))
-            self._socket: Connection = self._stack.enter_context(connect(
-                url, sock=channel, open_timeout=timeout_s, close_timeout=CLOSE_S, max_size=max_bytes, max_queue=64,
+            connection: Any = functools.partial(Connection, handle=self._take, end=self._end)
+            self._socket: ClientConnection = connect(
+                url, sock=channel, open_timeout=timeout_s, close_timeout=CLOSE_S, max_size=max_bytes,
                 ping_interval=None, compression=None, proxy=None, user_agent_header="shmio",
-            ))  # fmt: skip
+                create_connection=connection,
+            )  # fmt: skip
+            self._stack.enter_context(self._socket)
         except TimeoutError:
             channel.close()
             raise ConnectorError(f"no answer within {timeout_s * 1000:.0f} ms from {peer}") from None
         except self._closed_errors as error:
             channel.close()
             raise ConnectorError(f"{peer} did not open a WebSocket: {printable(str(error))[:200]}") from None
-        self._thread = threading.Thread(target=self._receive, name="rosbridge", daemon=True)
-        self._thread.start()
 
     def close(self) -> None:
         """Close the connection."""
         with contextlib.suppress(*self._closed_errors):
             self._stack.close()
         self._socket.close_socket()
-        self._thread.join(CLOSE_S)
+        self._socket.recv_events_thread.join(CLOSE_S)
 
     def send(self, **message: Any) -> None:
         """Send an operation of the protocol, given by its fields.
@@ -251,53 +253,28 @@ class Link:
             raise ConnectorError(f"{self._peer} does not answer {service}: {printable(str(values))[:200]}")
         return values
 
-    def _receive(self) -> None:
-        """Receive messages until the connection ends. This runs in the connection's own thread."""
-        failure = f"{self._peer} closed the connection"
-        try:
-            for text in self._texts():
-                self._take(text)
-        except ConnectorError as error:
-            failure = str(error)
-        except self._closed_errors as error:
+    # -- the connection's thread ---------------------------------------------------------------------------------------
+
+    def _end(self, error: BaseException | None) -> None:
+        """Keep why the connection has ended; ``error`` is None if the server closed it in order."""
+        if error is None:
+            failure = f"{self._peer} closed the connection"
+        elif isinstance(error, ConnectorError):
+            failure = f"{self._peer} {error}"
+        elif isinstance(error, self._closed_errors):
             failure = f"the connection to {self._peer} was lost: {_why(error)}"
-        except Exception:
-            log.exception("a message of %s could not be handled", self._peer)
+        else:
+            log.error("a message of %s could not be handled", self._peer, exc_info=error)
             failure = f"a message of {self._peer} could not be handled; see the log"
         with self._condition:
             self._failure = failure
             self._condition.notify_all()
-        self._socket.close_socket()
 
-    def _texts(self) -> Iterator[str]:
-        """Yield the messages until the server closes the connection.
-
-        The library limits the bytes of a message, but not the number of its fragments.
-
-        Raises:
-            ConnectorError: A message is binary, or has too many fragments.
-
-        """
-        from websockets.exceptions import ConnectionClosedOK  # noqa: PLC0415  the library is optional
-
-        while True:
-            fragments: list[str] = []
-            try:
-                for one in self._socket.recv_streaming():
-                    if not isinstance(one, str):
-                        raise ConnectorError(f"{self._peer} sent a binary message, which shmio did not request")
-                    fragments.append(one)
-                    if len(fragments) > MAX_FRAGMENTS:
-                        raise ConnectorError(f"{self._peer} sent a message of more than {MAX_FRAGMENTS} fragments")
-            except ConnectionClosedOK:
-                return
-            yield "".join(fragments)
-
-    def _take(self, text: str) -> None:
+    def _take(self, text: bytes) -> None:
         try:
             envelope = _envelope.decode(text)
-        except (msgspec.MsgspecError, RecursionError, UnicodeEncodeError):
-            raise ConnectorError(f"{self._peer} sent a message that is not of the rosbridge protocol") from None
+        except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
+            raise ConnectorError("sent a message that is not of the rosbridge protocol") from None
         self.heard_ns = time.monotonic_ns()
         if envelope.op == "publish":
             self._take_message(envelope)

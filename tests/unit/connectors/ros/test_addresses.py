@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import pytest
@@ -10,7 +11,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmio.connectors.ros import messages
-from shmio.connectors.ros.addresses import Address, FieldError, Step, extract, getter, leaf_type, parse
+from shmio.connectors.ros.addresses import (
+    Address,
+    FieldError,
+    Step,
+    extract,
+    getter,
+    leaf_type,
+    parse,
+    row_getter,
+    scope_of,
+)
 from shmio.connectors.ros.messages import DEFINITIONS, PRIMITIVES, conforms, default
 
 _NAMES = st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,8}", fullmatch=True)
@@ -24,6 +35,11 @@ _JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(["a", "b", "name"]), inner, max_size=3),
     max_leaves=12,
+)
+
+_ORDERS = st.lists(st.sampled_from(["a", "b", "c"]), max_size=3)
+_ROBOT = st.fixed_dictionaries({"name": _ORDERS, "b": st.lists(st.floats(), max_size=3)}).flatmap(
+    lambda one: st.sampled_from([one, {"a": one}])
 )
 
 
@@ -55,6 +71,35 @@ def test_no_message_breaks_the_extraction(message: Any, field: str) -> None:
         return
     found, other = _outcome(lambda: extract(message, address)), _outcome(lambda: getter(address)(message))
     assert found is other or found == other
+
+
+_ROWS = (
+    ["a", "b"], ["a.b", "a.a"], ["b[1]", "b[0]"], ["a.b[0]", "a.b[2]", "a.b[0]"], ["b[name=a]", "b[name=b]"],
+    ["a.b[name=b]", "a.b[name=a]"],
+)  # fmt: skip
+
+
+@given(st.lists(_JSON | _ROBOT, min_size=1, max_size=3), st.sampled_from(_ROWS))
+def test_a_row_finds_what_its_addresses_find(messages: list[Any], fields: list[str]) -> None:
+    addresses = [parse(f"/t std_msgs/M {field}") for field in fields]
+    assert len({scope_of(address) for address in addresses}) == 1
+    get = row_getter(addresses)
+    for message in messages:
+        alone = [_outcome(partial(extract, message, address)) for address in addresses]
+        try:
+            found = get(message)
+        except (TypeError, LookupError, ValueError):
+            assert any(type(one) is tuple for one in alone) or fields == _ROWS[-1]  # the names may be further out
+        else:
+            assert [*map(id, found)] == [*map(id, alone)]
+
+
+def test_fields_of_different_messages_form_no_row() -> None:
+    texts = ["a", "a.b", "b[0]", "a[name=x]", "b[name=x]", "b[other=x]", "a.b[0]"]
+    scopes = [scope_of(parse(f"/t std_msgs/M {text}")) for text in texts]
+    assert None not in scopes
+    assert len({*scopes}) == len(texts)
+    assert scope_of(parse("/t std_msgs/M a[0].b")) is None
 
 
 def _outcome(call: Callable[[], object]) -> object:
