@@ -14,6 +14,7 @@ from nats.aio.client import PING_PROTO, Client, Srv
 from nats.errors import ConnectionReconnectingError, Error
 
 CLOSE_S: Final = 1.0
+FLUSH_S: Final = 10
 _VIOLATION: Final = "permissions violation"
 
 
@@ -37,17 +38,22 @@ class FabricClient(Client):
     """What the server has last refused to this user, in its words and in lower case; empty if nothing."""
 
     async def confirm(self) -> None:
-        """Wait until the server has all that was sent so far. If the connection is lost meanwhile, wait for ever.
-
-        The library's ``flush`` returns at once if the connection was just lost.
+        """Wait until the server has all that was sent so far.
 
         Raises:
-            nats.errors.Error: There is no connection.
+            nats.errors.Error: There is no connection, or it is lost meanwhile.
 
         """
         answer: asyncio.Future[bool] = asyncio.get_running_loop().create_future()
         await self._send_ping(answer)
-        await asyncio.shield(answer)
+        await asyncio.wait((answer,))
+        if answer.cancelled():
+            raise ConnectionReconnectingError
+
+    async def flush(self, timeout: int = FLUSH_S) -> None:  # noqa: ASYNC109  the library's signature
+        """Do the same for at most a time in s. The library's flush returns at once if the connection was just lost."""
+        async with asyncio.timeout(timeout):
+            await self.confirm()
 
     async def _process_op_err(self, e: Exception) -> None:
         if self.is_connected or self.is_connecting:
@@ -93,6 +99,9 @@ class FabricClient(Client):
     def _abort(self) -> None:
         self._pending = []
         self._pending_data_size = 0
+        pongs, self._pongs = self._pongs, []
+        for pong in pongs:
+            pong.cancel()
         writer = getattr(self._transport, "_io_writer", None)
         if isinstance(writer, asyncio.StreamWriter):
             writer.transport.abort()

@@ -34,6 +34,9 @@ MAX_ENTRY_BYTES: Final = MAX_MESSAGE_BYTES - 4096
 PREFERRED_BYTES: Final = 1 << 18
 """A message is ended when it has this many bytes."""
 
+LEFT_OUT_LIMIT: Final = 1 << 32
+"""The number of frames that were left out is counted modulo this."""
+
 _HEADER: Final = struct.Struct("<BBHIQQ8sqqQ")
 _ENTRY: Final = struct.Struct("<BI")
 _AGE_AT: Final = _HEADER.size - 8
@@ -46,8 +49,8 @@ class Header(NamedTuple):
     """The header of a message.
 
     Attributes:
-        left_out: Number of frames before this message that a rule of the uplink has left out since
-            the previous message. They are not missing.
+        left_out: Number of frames that a rule of the uplink has left out since the stream began,
+            before the last frame of this message, modulo 2^32. They are not missing.
         stream: Number of the uplink's numbering; a restarted uplink has another.
         number: Number of the message within the stream; the first is 1.
         layout: First 8 bytes of the hash of the layout of the frames.
@@ -74,11 +77,10 @@ Entry = Frame | Event | Gap
 
 def encode(header: Header, entries: Iterable[Entry]) -> bytearray:
     """Encode a message. :func:`with_age` changes its age later."""
-    left_out = min(header.left_out, 0xFFFFFFFF)
     data = bytearray(
         _HEADER.pack(
-            VERSION, 0, 0, left_out, header.stream, header.number, header.layout, header.made_ns, header.zero_ns,
-            header.age_ns,
+            VERSION, 0, 0, header.left_out % LEFT_OUT_LIMIT, header.stream, header.number, header.layout,
+            header.made_ns, header.zero_ns, header.age_ns,
         )
     )  # fmt: skip
     for entry in entries:

@@ -79,6 +79,7 @@ class Link:
         self._answered = answered
         self._loop = asyncio.new_event_loop()
         self._client: FabricClient | None = None
+        self._closing = False
         self._thread = threading.Thread(target=self._run, name="fabric", daemon=True)
         self.problem = "the fabric is not connected yet"
         """Why there is no connection; empty if there is one."""
@@ -124,6 +125,7 @@ class Link:
             loop.close()
 
     async def _end(self, opening: asyncio.Task[None]) -> None:
+        self._closing = True
         await asyncio.gather(opening, return_exceptions=True)
         if self._client is not None:
             await self._client.abandon()  # close() waits until a dead link has taken what waits
@@ -143,6 +145,8 @@ class Link:
         except ShmioError as error:
             self.problem = str(error)
             log.error("%s", error)
+        except library("nats.errors", INSTALL).ConnectionReconnectingError:
+            return  # _lost and _back follow
         except (OSError, library("nats.errors", INSTALL).Error) as error:
             self.problem = f"the fabric refuses the connection: {error}"
             log.error("%s", self.problem)
@@ -151,7 +155,7 @@ class Link:
             log.info("connected to the fabric at %s", self._access)
 
     async def _lost(self) -> None:
-        if not self.problem:
+        if not self.problem and not self._closing:
             log.warning("%s", _NOT_SENT)
         self.problem = _NOT_SENT
 

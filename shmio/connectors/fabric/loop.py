@@ -19,6 +19,7 @@ from shmio.connectors.models.stepped import StepClock
 from shmio.connectors.output import Image, Output
 from shmio.connectors.poll_loop import Counters, QualityLog
 from shmio.fabric.messages import (
+    LEFT_OUT_LIMIT,
     CommandReply,
     CommandRequest,
     Entry,
@@ -29,6 +30,7 @@ from shmio.fabric.messages import (
 )
 from shmio.layout.values.write import Write
 from shmio.model.values import OutcomeKind
+from shmio.recording.format.encoding import Gap
 from shmio.segment import NO_WRITER, BlockWriter, Event, EventKind, Frame, Provenance, Quality, Record
 from shmio.segment.commands import MAX_WRITES
 from shmio.wording import counted
@@ -48,6 +50,8 @@ MAX_READY: Final = 64
 """Number of messages that wait to be published, after which the loop takes no further ones."""
 MAX_TIME_NS: Final = (1 << 63) - 1
 """Latest time that a command can have; a faulty owner may send later ones."""
+MAX_MISSING: Final = (1 << 63) - 1
+"""Maximum number of missing frames that is counted; a faulty owner may name larger numbers."""
 RELOAD_NS: Final = 30_000_000_000
 """Time in ns after which the mirror asks again for a reload, if the layout is still another one."""
 REPORT_NS: Final = 10_000_000_000
@@ -136,7 +140,8 @@ class MirrorLoop:
         self._cycle: int | None = None
         self._number = 0  # of the owner's last frame
         self._zero_ns = 0  # when the owner's clock began
-        self._left_out = 0  # frames that the owner's rules have left out since then
+        self._stream = 0  # of the last message
+        self._left_out = 0  # frames that the owner's rules have left out in the stream before that frame
 
     @property
     def note(self) -> str:
@@ -234,13 +239,12 @@ class MirrorLoop:
             return
         late_ns = one.late_ns + (self._clock.now_ns() - one.at_ns)
         if one.header.zero_ns != self._zero_ns:
-            self._zero_ns, self._number = (
-                one.header.zero_ns,
-                0,
-            )  # the owner was started again, and numbers its frames from 1
-        self._left_out += one.header.left_out
+            # The owner was started again, and numbers its frames from 1.
+            self._zero_ns, self._number = one.header.zero_ns, 0
         try:
-            for entry in decode_entries(one.data):
+            entries = list(decode_entries(one.data))
+            self._find_gap(one.header, entries)
+            for entry in entries:
                 self._publish(entry, late_ns + _waited_ns(one.header, entry))
         except ValueError as error:
             self._report(error)
@@ -252,21 +256,33 @@ class MirrorLoop:
             self._happen(entry)
         else:
             self._tell_gap(entry.what, entry.first, entry.last, f"{self._mirror.cell}: {entry.reason}")
-            if entry.what == "frames":
-                self._number = entry.last
 
-    def _find_gap(self, number: int) -> None:
-        """Report the frames that are missing before a frame of the owner, except those that its rules leave out."""
-        first, left_out, self._left_out = self._number + 1, self._left_out, 0
-        if 1 < first < number - left_out:
-            self._tell_gap("frames", first, number - 1 - left_out, "the owner no longer had them")
-        self._number = number
+    def _find_gap(self, header: Header, entries: Sequence[Entry]) -> None:
+        """Report the frames that are missing before those of a message, except those that the owner's rules leave out.
+
+        Each message counts those of its whole stream, so it does not matter how many messages are missing.
+        """
+        if header.stream != self._stream:
+            self._stream, self._left_out = header.stream, 0
+        last, counted_here = 0, 0
+        for entry in entries:
+            if isinstance(entry, Frame):
+                last, counted_here = entry.number, counted_here + 1
+            elif isinstance(entry, Gap) and entry.what == "frames":
+                last, counted_here = entry.last, counted_here + entry.count
+        if not counted_here:
+            return
+        left_out = (header.left_out - self._left_out) % LEFT_OUT_LIMIT
+        missing = last - self._number - counted_here - left_out
+        if self._number and missing > 0:
+            first = self._number + 1
+            self._tell_gap("frames", first, first + missing - 1, "the owner no longer had them")
+        self._number, self._left_out = last, header.left_out
 
     def _show(self, frame: Frame, late_ns: int) -> None:
         if len(frame.raw) != self._writer.block.layout.size:
             raise ValueError(f"a frame has {len(frame.raw)} bytes instead of {self._writer.block.layout.size}")
         now_ns = self._clock.now_ns()
-        self._find_gap(frame.number)
         self._writer.cycle = self._cycle = frame.cycle
         self._bad = frame.quality is Quality.BAD
         self._last_ns = now_ns
@@ -299,8 +315,8 @@ class MirrorLoop:
 
     def _tell_gap(self, what: str, first: int, last: int, why: str) -> None:
         if what == "frames":
-            self.counters.overruns += last - first + 1
-            self.missing += last - first + 1
+            self.missing = min(self.missing + last - first + 1, MAX_MISSING)
+            self.counters.overruns = self.missing
         text = f"{what} {first} to {last} are missing, {why}"
         log.warning("%s", text)
         self._writer.event(Record(EventKind.NOTED, text))

@@ -51,6 +51,8 @@ class Row:
         self.live, self.late_subject = cell.live(source), cell.late(source)
         self.last = 0
         """Number of the newest message."""
+        self.left_out = 0
+        """Number of frames that a rule has left out before the last frame of the newest message."""
         self.next = 1
         self.late: deque[int] = deque()
         self._kept: deque[Kept] = deque()

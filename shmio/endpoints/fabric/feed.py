@@ -33,7 +33,8 @@ class Batch(NamedTuple):
 
     Attributes:
         entries: The frames, events and gaps.
-        left_out: Number of frames that the rule has left out since the previous batch.
+        left_out: Number of frames that the rule has left out between the last frame of the previous
+            batches and the last frame of this one.
 
     """
 
@@ -82,7 +83,8 @@ class Feed:
         """The newest frame, if ``max_rate_hz`` has left it out."""
         self.left_out = 0
         """Number of frames that the rule has left out."""
-        self._counted = 0
+        self._counted = 0  # of these, those before the last frame of a batch
+        self._before = 0  # of these, those before the last published frame
         self.missed = 0
         """Number of frames and events that the source overwrote before they were read."""
 
@@ -113,35 +115,40 @@ class Feed:
         taken = list(self._follower.take(MAX_ENTRIES))
         if self._follower.done:
             taken += self._follower.remaining()
-        entries: list[Entry] = []
+        entries: list[tuple[Entry, int]] = []
         for _, _, item in taken:
             if isinstance(item, Frame):
-                entries += self._chosen(item if self._keep is None else self._keep(item))
+                chosen = self._chosen(item if self._keep is None else self._keep(item))
+                entries += ((frame, self._before) for frame in chosen)
             else:
                 if isinstance(item, Gap):
                     self.missed += item.count
-                entries.append(item)
+                entries.append((item, self._before))
         if not taken and self._held is not None and time.monotonic_ns() - self._published_ns >= self._pause_ns:
-            entries += self._publish(self._held)
+            entries += ((frame, self._before) for frame in self._publish(self._held))
         return list(self._batches(entries)), len(taken) >= MAX_ENTRIES
 
-    def _batches(self, entries: list[Entry]) -> Iterator[Batch]:
-        """Group entries so that no message becomes too large."""
+    def _batches(self, entries: list[tuple[Entry, int]]) -> Iterator[Batch]:
+        """Group entries so that no message becomes too large.
+
+        With each entry comes the number of frames that the rule had left out before the last frame.
+        """
         group: list[Entry] = []
-        size = 0
-        for entry in entries:
+        size = left_out = 0
+        for entry, before in entries:
             own = _size(entry)
             if group and (size >= PREFERRED_BYTES or size + own > MAX_ENTRY_BYTES):
-                yield self._batch(group)
+                yield self._batch(group, left_out)
                 group, size = [], 0
             group.append(entry)
             size += own
+            left_out = before
         if group:
-            yield self._batch(group)
+            yield self._batch(group, left_out)
 
-    def _batch(self, entries: list[Entry]) -> Batch:
-        left_out, self._counted = self.left_out - self._counted, self.left_out
-        return Batch(entries, left_out)
+    def _batch(self, entries: list[Entry], left_out: int) -> Batch:
+        more, self._counted = left_out - self._counted, left_out
+        return Batch(entries, more)
 
     def _chosen(self, frame: Frame) -> Iterator[Frame]:
         """Yield the frame, unless the rule leaves it out."""
@@ -164,6 +171,7 @@ class Feed:
 
     def _publish(self, frame: Frame) -> Iterator[Frame]:
         self._last, self._held, self._published_ns = frame, None, time.monotonic_ns()
+        self._before = self.left_out
         yield frame
 
 

@@ -220,7 +220,8 @@ class Uplink:
             now_ns = time.monotonic_ns()
             number = row.last + 1
             times = self._log_time(now_ns), 0, self._log_time(0)
-            header = Header(batch.left_out, row.stream, number, feed.digest[:8], *times)
+            row.left_out += batch.left_out
+            header = Header(row.left_out, row.stream, number, feed.digest[:8], *times)
             self.backlog.put(row, Kept(number, encode(header, batch.entries), now_ns))
         if batches:
             self.publisher.wake()
@@ -399,7 +400,9 @@ class Uplink:
                 pass
             self._stop(feed)
         if self._replies:
-            await asyncio.wait(self._replies)
+            _, waiting = await asyncio.wait(self._replies, timeout=LEAVE_S)
+            for task in waiting:  # the server does not take them
+                task.cancel()
         await self.publisher.finish(LEAVE_S)
         client = self._client
         if client is not None and self._connected.is_set():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 
 import pytest
+from nats.errors import Error
 
 from shmio.config.model import MqttTls
 from shmio.errors import RemoteError
@@ -39,6 +40,30 @@ def test_a_connection_that_the_server_ends_comes_back(error: str) -> None:
         client = await connect(Access((url,)), "test", back=restored)
         await asyncio.wait_for(back.wait(), TIMEOUT_S)
         assert client.is_connected
+        await client.close()
+        server.close()
+        await server.wait_closed()
+
+    asyncio.run(work())
+
+
+def test_a_confirmation_ends_when_the_connection_is_lost() -> None:
+    async def work() -> None:
+        async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            writer.write(b'INFO {"server_id": "x", "version": "2.10.0", "max_payload": 1000}\r\n')
+            pings = 0
+            while pings < 2 and (line := await reader.readline()):
+                if line.startswith(b"PING"):
+                    pings += 1
+                    if pings == 1:
+                        writer.write(b"PONG\r\n")
+            writer.close()
+
+        server = await asyncio.start_server(serve, "127.0.0.1", 0)
+        url = f"nats://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+        client = await connect(Access((url,)), "test")
+        with pytest.raises(Error):
+            await asyncio.wait_for(client.confirm(), TIMEOUT_S)
         await client.close()
         server.close()
         await server.wait_closed()

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from pathlib import Path
+
+import pytest
 
 from shmio.connectors.fabric.link import Link
 from shmio.fabric.connection import Access
@@ -31,3 +34,14 @@ def test_a_dead_link_does_not_keep_the_process_from_stopping(tmp_path: Path) -> 
         closing.join(PATIENCE_S)
         assert not closing.is_alive()
         proxy.close()
+
+
+def test_a_normal_stop_is_no_lost_connection(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with nats_server(tmp_path / "nats") as server, caplog.at_level(logging.INFO, "shmio.source"):
+        owner = CellName.parse("plant1.line3.a50")
+        link = Link(Access((server.url,)), owner, "cell", "test", None, lambda _: None, lambda _: None)
+        link.start()
+        while link.problem:
+            threading.Event().wait(0.01)
+        link.close()
+    assert [record.getMessage() for record in caplog.records] == [f"connected to the fabric at {server.url}"]

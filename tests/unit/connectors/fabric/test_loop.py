@@ -285,10 +285,21 @@ def test_frames_that_the_owner_no_longer_has_are_reported_as_a_gap(mirroring: Mi
 def test_frames_that_the_owners_rules_leave_out_are_no_gap(mirroring: Mirroring) -> None:
     mirroring.send(frame(7, 1))
     mirroring.send(frame(17, 2), left_out=9)
-    mirroring.send(Gap("cell", 1, "frames", 18, 20, 3, Reason.OVERTAKEN), frame(21, 3))
+    mirroring.send(Gap("cell", 1, "frames", 18, 20, 3, Reason.OVERTAKEN), frame(21, 3), frame(23, 4), left_out=10)
     assert "frames 18 to 20" in mirroring.event(EventKind.NOTED).text
-    assert [mirroring.next().cycle for _ in range(3)] == [1007, 1017, 1021]
+    mirroring.send(frame(24, 5), left_out=10)
+    assert [mirroring.next().cycle for _ in range(5)] == [1007, 1017, 1021, 1023, 1024]
     assert mirroring.loop.missing == 3
+
+
+def test_frames_that_the_owners_rules_leave_out_are_no_gap_if_messages_are_lost(mirroring: Mirroring) -> None:
+    mirroring.send(frame(7, 1), left_out=(1 << 32) - 5)
+    mirroring.send(frame(27, 3), skip=2, left_out=12)  # 17 were left out, and two messages with a frame each are lost
+    assert mirroring.link.asked.wait(PATIENCE_S)
+    mirroring.link.answered(mirroring.link.requests[0])
+    assert [mirroring.next().cycle, mirroring.next().cycle] == [1007, 1027]
+    assert "frames 8 to 9" in mirroring.event(EventKind.NOTED).text
+    assert mirroring.loop.missing == mirroring.loop.counters.overruns == 2
 
 
 def test_a_silent_owner_makes_the_source_bad_until_it_sends_again(mirroring: Mirroring) -> None:
