@@ -1,6 +1,6 @@
-"""The C extension; everything else is in pyproject.toml.
+"""The C extensions; everything else is in pyproject.toml.
 
-``SHMIO_SANITIZE=address,undefined`` builds it under sanitizers (see .ci/checks).
+``SHMIO_SANITIZE=address,undefined`` builds them under sanitizers (see .ci/checks).
 """
 
 import os
@@ -22,22 +22,29 @@ class AbiWheel(bdist_wheel):
     """One wheel for every CPython from 3.11 on (limited API)."""
 
     def finalize_options(self) -> None:
-        """Say which Pythons the extension serves."""
+        """Say which Pythons the extensions serve."""
         self.py_limited_api = "cp311"
         super().finalize_options()
 
 
+def extension(name: str, *headers: str) -> Extension:
+    """Return the extension of a module, whose C file is beside it."""
+    file = name.replace(".", "/")
+    return Extension(
+        name,
+        [f"{file}.c"],
+        depends=[f"{file.rpartition('/')[0]}/{header}" for header in headers],
+        define_macros=[("Py_LIMITED_API", "0x030B0000")],
+        py_limited_api=True,
+        extra_compile_args=flags,
+        extra_link_args=link,
+    )
+
+
 setup(
     ext_modules=[
-        Extension(
-            "shmio.segment._atomics",
-            ["shmio/segment/_atomics.c"],
-            depends=["shmio/segment/queue.h", "shmio/segment/relay.h", "shmio/segment/ring.h"],
-            define_macros=[("Py_LIMITED_API", "0x030B0000")],
-            py_limited_api=True,
-            extra_compile_args=flags,
-            extra_link_args=link,
-        )
+        extension("shmio.injection._numbers"),
+        extension("shmio.segment._atomics", "queue.h", "relay.h", "ring.h"),
     ],
     cmdclass={"bdist_wheel": AbiWheel},
 )

@@ -21,7 +21,6 @@ from shmio.injection import Program
 from shmio.injection.activation import Activation, State
 from shmio.injection.condition import Memory
 from shmio.injection.draw import SeededRandom
-from shmio.injection.language import Number
 from shmio.injection.operations import Delay, Drop, Operation, OperationContext
 from shmio.layout.values.write import Write, apply, merge
 from shmio.model.injection import Running
@@ -323,7 +322,7 @@ class DeclaredLayer(Layer):
     @property
     def active(self) -> bool:
         """True if the injection is active at present."""
-        return self.activation.state is _ACTIVE
+        return self.activation.state is _ACTIVE  # LayerStack.effective() has the same, without this call
 
     @property
     def configured(self) -> bool:
@@ -349,13 +348,12 @@ class DeclaredLayer(Layer):
         if self.active and self.direction is Direction.OUT:
             self.operation.resume(seen)
 
-    def advance(self, now: CycleImage, values: Sequence[Number | None]) -> bool:
-        """Evaluate the condition for the next image; return whether the injection's state has changed.
+    def advance(self, now: CycleImage, *, holds: bool) -> bool:
+        """Update the injection's state for the next image, and return whether it has changed.
 
-        ``values`` are the values that the condition reads.
+        ``holds`` is True if the condition is true, or if there is none.
         """
-        condition, activation = self.program.condition, self.activation
-        holds = condition is None or condition.expression.evaluate(values, self.memory) is True
+        activation = self.activation
         runs = activation.runs
         changed = activation.advance(now.time_ns, now.cycle, holds=holds)
         if activation.runs != runs:
@@ -366,6 +364,9 @@ class DeclaredLayer(Layer):
     def show(self, image: Bits, now: CycleImage) -> None:
         """Apply the operation to the covered bits of an image, in place."""
         activation, operation = self.activation, self.operation
+        if operation.single is not None and self._probability is None:
+            operation.single(image, activation.runs, now.cycle - activation.cycle)
+            return
         at = OperationContext(activation.runs, now.cycle - activation.cycle, now.cycle, now.time_ns)
         if self._probability is not None and not self._happens(at):
             operation.passed(image, at)

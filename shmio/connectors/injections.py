@@ -12,7 +12,7 @@ import secrets
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 import numpy as np
@@ -35,11 +35,10 @@ from shmio.connectors.injection_state import LayerState, check_configured, make_
 from shmio.connectors.output import Image, LayerPublisher, Output, in_parts, layer_event, lost, pieces
 from shmio.errors import ConfigError, SegmentError, SnapshotError
 from shmio.injection import Program, compile_program
+from shmio.injection._numbers import evaluate, read
 from shmio.injection.activation import State
-from shmio.injection.language import Number
-from shmio.injection.program import NEVER, Condition, compile_condition
+from shmio.injection.program import NEVER, compile_condition
 from shmio.layout.values.write import Write, apply
-from shmio.model.clock import Clock
 from shmio.model.injection import Running
 from shmio.segment import NO_WRITER, Block, Command, CommandKind, Direction, EventKind, Frame, Quality, Record, Segment
 from shmio.segment.block import Layouts
@@ -83,49 +82,58 @@ def blocks_of(segment: Segment) -> Mapping[str, Block]:
 # -- declared injections -----------------------------------------------------------------------------------------------
 
 
-class ConditionValues:
-    """Reads the register values that conditions need in one cycle.
+class Conditions:
+    """The conditions of one source's declared injections.
 
-    Each source's image is fetched at most once, and only if a condition needs it. Injections are
-    not applied to the images, so that no injection can influence its own condition. A value is
-    unknown if its source has bad quality or its register has a bad status.
+    Injections are not applied to the images that conditions read, so that no injection can influence
+    its own condition. A value is unknown if its source has bad quality or its register has a bad status.
     """
 
-    def __init__(self, own: str, image: Image, blocks: Mapping[str, Block], before: int | None) -> None:
-        """Create the values for one image.
+    def __init__(self, layers: Sequence[DeclaredLayer], own: str, blocks: Mapping[str, Block]) -> None:
+        """Collect the conditions of all layers.
 
         Args:
-            own: The name of the source to which the image belongs.
-            image: The source's next image.
+            layers: The declared injections.
+            own: The name of their source.
             blocks: The blocks of all sources.
-            before: The number of the present step; None outside steps. If a source has already
+
+        """
+        self._conditions = [
+            None if (condition := layer.program.condition) is None
+            else (condition.expression.codes, condition.expression.operands, condition.reads, layer.memory.seen)
+            for layer in layers
+        ]  # fmt: skip
+        self._own = own
+        self._blocks = blocks
+        self.foreign = frozenset(source for layer in layers for source in layer.program.foreign)
+        """The names of the other sources that conditions read."""
+
+    def hold(self, image: Image, before: int | None) -> list[bool]:
+        """Return for each injection whether its condition is true; True if it has no condition.
+
+        Args:
+            image: The source's next image.
+            before: The number of the present step; None outside steps. If another source has already
                 completed this step, its values from before the step count.
 
         """
-        self._blocks = blocks
-        self._before = before
         known = image.quality is not _BAD and image.source_ns != 0
-        self._images: dict[str, bytes | None] = {own: image.raw if known else None}
+        images: dict[str, bytes | None] = {self._own: image.raw if known else None}
+        for source in self.foreign:
+            images[source] = self._fetch(source, before)
+        return [
+            one is None or evaluate(one[0], one[1], read(one[2], images), one[3]) is True for one in self._conditions
+        ]
 
-    def of(self, condition: Condition) -> Sequence[Number | None]:
-        """Return the values that a condition reads; each unknown value is None."""
-        images = self._images
-        values: list[Any] = []  # only numbers, because number_register() has checked the registers' types
-        for source, codec in condition.reads:
-            image = images[source] if source in images else self._fetch(source)
-            values.append(None if image is None else codec.decode(image))
-        return values
-
-    def _fetch(self, source: str) -> bytes | None:
-        self._images[source] = None
+    def _fetch(self, source: str, before: int | None) -> bytes | None:
         block = self._blocks.get(source)
         try:
-            frame = None if block is None else newest(block, self._before)
+            frame = None if block is None else newest(block, before)
         except SegmentError:
             return None
-        if block is not None and frame is not None and not block.retired and frame.source_ns != 0:
-            self._images[source] = None if block.assess(frame)[0] is Quality.BAD else frame.raw
-        return self._images[source]
+        if block is None or frame is None or block.retired or frame.source_ns == 0:
+            return None
+        return None if block.assess(frame)[0] is Quality.BAD else frame.raw
 
 
 def newest(block: Block, before: int | None) -> Frame | None:
@@ -156,6 +164,9 @@ class DeclaredInjections:
         self._blocks = dict(blocks())
         self._configuration: int | None = None
         self._layers: list[DeclaredLayer] = []
+        self._conditions = Conditions((), self._own.source, self._blocks)
+        self._steady: tuple[list[bool], int, float] | None = None
+        """Conditions for which no injection changes its state, from a time until before another; None: none known."""
 
     @property
     def overload(self) -> str:
@@ -166,7 +177,7 @@ class DeclaredInjections:
     @property
     def reads_other_sources(self) -> bool:
         """True if a condition reads registers of other sources, which may change on a reload."""
-        return any(layer.program.foreign for layer in self._layers)
+        return bool(self._conditions.foreign)
 
     def seen(self, frame: Frame) -> None:
         """Continue from ``frame``, the last frame of the source's previous process."""
@@ -255,7 +266,12 @@ class DeclaredInjections:
 
     def _settle(self) -> None:
         self._layers = [layer for layer in self._publisher.injections.layers if isinstance(layer, DeclaredLayer)]
+        self._collect()
         self._output.advance = self._advance if self._layers else None
+
+    def _collect(self) -> None:
+        self._conditions = Conditions(self._layers, self._own.source, self._blocks)
+        self._steady = None
 
     def _add_configured(self, declaration: Declaration) -> None:
         try:
@@ -316,6 +332,7 @@ class DeclaredInjections:
             with self._output.lock:
                 layer.program = replace(layer.program, condition=condition)
                 layer.memory.seen.clear()
+                self._collect()
 
     # -- called by the loop's thread -----------------------------------------------------------------------------------
 
@@ -328,32 +345,53 @@ class DeclaredInjections:
         """
         stack, cycle = self._publisher.injections, image.cycle
         looked = stack.now.cycle
-        state = self._own.clock.last_written()
-        time_ns = image.at.clock_ns if image.at else self._time_of(cycle, state)
-        now = stack.now = CycleImage(cycle, time_ns, image.raw)
+        time_ns = image.at.clock_ns if image.at else self._time_ns(cycle)
+        stack.now = CycleImage(cycle, time_ns, image.raw)
         if cycle == looked:
             return []
-        readings: ConditionValues | None = None
-        changed = over = False
-        events = []
-        for layer in self._layers:
-            before = layer.active
-            values: Sequence[Number | None] = ()
-            if (condition := layer.program.condition) is not None:
-                if readings is None:
-                    step = state.step if self._own.attributes.stepped and state.virtual else None
-                    readings = ConditionValues(self._own.source, image, self._blocks, step)
-                values = readings.of(condition)
-            if layer.advance(now, values):
-                changed = True
-                if layer.active is not before:
-                    events.append(_activation_event(layer))
-            over = over or layer.activation.state is _OVER
-        if changed:
-            self._publisher.publish()
+        conditions = self._conditions
+        holds = conditions.hold(image, self._step() if conditions.foreign else None)
+        steady = self._steady
+        if steady is None or steady[0] != holds or not steady[1] <= time_ns < steady[2]:
+            events, over = self._change(holds)
+        else:
+            events, over = [], False
         if len(stack.layers) > len(self._layers):  # clients' layers get values from declared ones
             events = [*self._publisher.computed(image.base), *events]
         return events + self._lift_finished() if over else events
+
+    def _change(self, holds: list[bool]) -> tuple[list[Record], bool]:
+        """Update the state of all injections.
+
+        Args:
+            holds: For each injection, whether its condition is true.
+
+        Returns:
+            Events about the changes, and whether an injection may have to be lifted.
+
+        """
+        now = self._publisher.injections.now
+        changed = over = False
+        steady = True
+        events = []
+        for layer, condition in zip(self._layers, holds, strict=True):
+            before, met = layer.active, layer.activation.met
+            if layer.advance(now, holds=condition):
+                changed = True
+                if layer.active is not before:
+                    events.append(_activation_event(layer))
+            steady = steady and layer.activation.met is met
+            over = over or (layer.activation.state is _OVER and not layer.configured)
+        if changed:
+            self._publisher.publish()
+        limits = [layer.activation.steady_until(now.time_ns) for layer in self._layers]
+        self._steady = (holds, now.time_ns, min(limits)) if steady and not changed and not over else None
+        return events, over
+
+    def _step(self) -> int | None:
+        """Return the number of the present step; None outside steps."""
+        state = self._own.clock.last_written()
+        return state.step if self._own.attributes.stepped and state.virtual else None
 
     def _lift_finished(self) -> list[Record]:
         """Lift the injections that are over, and return the events about them."""
@@ -385,10 +423,7 @@ class DeclaredInjections:
 
     def _time_ns(self, cycle: int) -> int:
         """Return the instance time of a cycle in ns; in wall time, its scheduled time."""
-        return self._time_of(cycle, self._own.clock.last_written())
-
-    def _time_of(self, cycle: int, state: Clock) -> int:
-        """Return the instance time of a cycle in ns, by the state of the clock page."""
+        state = self._own.clock.last_written()
         if state.virtual:
             return state.time_ns
         period_ns = self._own.period_ns

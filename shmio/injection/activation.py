@@ -8,6 +8,7 @@ time.)
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -80,6 +81,20 @@ class Activation:
         if self.state is _WAITING and (ended or used_up):
             self.state = _OVER
         return self.state is not before
+
+    def steady_until(self, time_ns: int) -> float:
+        """Return the next time in ns at which the window begins or ends, or at which the activation ends.
+
+        If a call of :meth:`advance` has changed nothing, not even :attr:`met`, further calls change
+        nothing before this time, as long as ``holds`` is the same.
+        """
+        window = self.window
+        limits = [window.start_ns]
+        if window.end_ns is not None:
+            limits.append(window.end_ns)
+        if window.for_ns is not None:
+            limits.append(self.time_ns + window.for_ns)
+        return min((limit for limit in limits if limit > time_ns), default=math.inf)
 
     def _begins(self) -> bool:
         """Return whether a waiting injection becomes active now that its condition is true.

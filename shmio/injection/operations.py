@@ -7,7 +7,6 @@ the operation's state. If an operation is applied twice in a cycle, the results 
 
 from __future__ import annotations
 
-import struct
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -18,7 +17,8 @@ from typing import Any, ClassVar, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from shmio.injection.draw import SeededRandom
+from shmio.injection._numbers import Number
+from shmio.injection.draw import BATCH, SeededRandom
 from shmio.layout.model import ByteOrder, ElementType, Register, bit_positions
 from shmio.layout.values.codec import REAL_MAX, scalar_codec
 
@@ -98,47 +98,17 @@ class ValueGroup:
         image[self.index] = fitting.view(np.uint8).reshape(self.index.shape)
 
     @cached_property
-    def single(self) -> struct.Struct | None:
-        """The packing of the group's value; None unless it is a single number that a double can represent.
+    def single(self) -> Number | None:
+        """The group's value; None unless it is a single number that a double can represent.
 
-        For one number, plain Python with this packing is faster than numpy, and gives the same bytes.
+        For one number, this is faster than :meth:`numbers` and :meth:`put_numbers`, and gives the same bytes.
         """
         kind, size = self.dtype.kind, self.dtype.itemsize
         if len(self) > 1 or not (kind == "f" or (kind in "iu" and size <= 4)):
             return None
         code = next(code for code, name in _NUMPY.items() if name == f"{kind}{size}")
-        return struct.Struct(("<" if self.dtype.newbyteorder("<") == self.dtype else ">") + code)
-
-    def change_single(self, packing: struct.Struct, image: Bytes, change: Callable[[float], float]) -> None:
-        """Change the group's only value, faster than with :meth:`numbers` and :meth:`put_numbers`.
-
-        Args:
-            packing: The packing of the value (:attr:`single`).
-            image: The image.
-            change: Returns the new number for the present number.
-        """
-        at, data = self._at, image.data
-        value = change(float(packing.unpack_from(data, at)[0]))
-        least, most = self._range
-        if self._whole:
-            packing.pack_into(data, at, round(min(max(value, least), most)))
-        elif least <= value <= most or value != value:  # noqa: PLR0124  NaN stays NaN
-            packing.pack_into(data, at, value)
-        else:
-            packing.pack_into(data, at, min(max(value, least), most))
-
-    @cached_property
-    def _whole(self) -> bool:
-        return self.dtype.kind != "f"
-
-    @cached_property
-    def _at(self) -> int:
-        return int(self.index.ravel()[0])
-
-    @cached_property
-    def _range(self) -> tuple[float, float]:
-        least, most = self.limits
-        return (float(least), float(most)) if self.dtype.kind == "f" else (int(least), int(most))
+        order = "<" if self.dtype.newbyteorder("<") == self.dtype else ">"
+        return Number(order + code, int(self.index.ravel()[0]))
 
     def put(self, image: Bytes, table: Bytes, choice: npt.NDArray[np.intp]) -> None:
         """Write encoded values into an image.
@@ -236,6 +206,12 @@ class Operation(ABC):
     exact: ClassVar[bool] = False
     """True if :meth:`apply` changes no bits but those that the injection covers."""
 
+    single: Callable[[Bytes, int, int], None] | None = None
+    """Does the same as :meth:`apply`, but faster, with an image, the run and the place; None: there is no such way.
+
+    Only operations on a single number have it.
+    """
+
     def begin(self) -> None:  # noqa: B027  most operations have no state
         """Reset the operation's state at the start of an activation."""
 
@@ -281,24 +257,24 @@ class Arithmetic(Operation):
     exact = True
 
     def __init__(
-        self, places: Sequence[ValueGroup], change: _Change, single: Callable[[float], float] | None = None
+        self, places: Sequence[ValueGroup], change: _Change, single: Callable[[Number, Bytes], None] | None = None
     ) -> None:
         """Create the operation.
 
         Args:
             places: The values.
             change: Computes new numbers of a group.
-            single: Computes the same for a single number, but faster; if None, ``change`` does it.
+            single: Does the same with a single number in an image, but faster; if None, ``change`` does it.
 
         """
         self._places = places
         self._change = change
-        self._single = single
+        if len(places) == 1 and single is not None and (number := places[0].single) is not None:
+            self.single = lambda image, _run, _place: single(number, image)
 
-    def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: ARG002, D102
-        only = self._places[0]
-        if len(self._places) == 1 and self._single is not None and only.single is not None:
-            only.change_single(only.single, image, self._single)
+    def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: D102
+        if self.single is not None:
+            self.single(image, at.run, at.place)
             return
         with np.errstate(all="ignore"):
             for group in self._places:
@@ -316,16 +292,20 @@ class Noise(Operation):
         self._draw = draw
         self._amplitude = amplitude
         self._gaussian = gaussian
+        self._addends: tuple[int, int, list[float]] = (
+            0,
+            0,
+            [],
+        )  # for BATCH places: the run, the first place, the numbers
+        if self._count == 1 and (number := places[0].single) is not None:
+            self._number = number
+            self.single = self._add
 
     def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: D102
-        count = self._count
-        only = self._places[0]
-        if count == 1 and only.single is not None:
-            draw = self._draw.one_gaussian if self._gaussian else self._draw.one_uniform
-            number = draw(at.run, at.place)
-            by = (number if self._gaussian else 2 * number - 1) * self._amplitude
-            only.change_single(only.single, image, lambda value: value + by)
+        if self.single is not None:
+            self.single(image, at.run, at.place)
             return
+        count = self._count
         if self._gaussian:
             noise = self._draw.gaussian(at.run, at.place, count) * self._amplitude
         else:
@@ -334,6 +314,19 @@ class Noise(Operation):
             for group in self._places:
                 own = noise[group.first : group.first + len(group)]
                 group.put_numbers(image, group.numbers(image) + own)
+
+    def _add(self, image: Bytes, run: int, place: int) -> None:
+        known, first, addends = self._addends
+        if known != run or not 0 <= place - first < len(addends):
+            first = place
+            addends = [self._addend(run, one) for one in range(place, place + BATCH)]
+            self._addends = run, place, addends
+        self._number.add(image, addends[place - first])
+
+    def _addend(self, run: int, place: int) -> float:
+        if self._gaussian:
+            return self._draw.one_gaussian(run, place) * self._amplitude
+        return (2 * self._draw.one_uniform(run, place) - 1) * self._amplitude
 
 
 class RandomRange(Operation):

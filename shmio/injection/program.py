@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from functools import cached_property
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
 from shmio.config import Declaration
 from shmio.errors import ConfigError, PathError, ValueRangeError
+from shmio.injection._numbers import Number
 from shmio.injection.activation import Window
 from shmio.injection.condition import Expression, parse
 from shmio.injection.draw import SeededRandom
@@ -34,11 +36,11 @@ from shmio.injection.operations import (
 )
 from shmio.layout.model import INTEGERS, ElementType, Layout, Register
 from shmio.layout.topic import Direction, look_up, parse_topic
-from shmio.layout.values.codec import RegisterCodec, codec, scalar_codec
+from shmio.layout.values.codec import Buffer, Value, codec, scalar_codec
 from shmio.layout.values.literal import parse_literal
 from shmio.layout.values.text import from_text, wire_type
 from shmio.layout.values.write import bits_of, chosen
-from shmio.model.statuses import trusted_codec
+from shmio.model.statuses import status_area, trusted_codec
 from shmio.wording import unknown
 
 _NS: Final = 1_000_000_000
@@ -63,12 +65,19 @@ class Target(NamedTuple):
     cover: bytes
 
 
+class Decoder(Protocol):
+    """Decodes a register that a condition reads."""
+
+    def decode(self, data: Buffer, /) -> Value:
+        """Return the register's value in an image; None if it is unknown."""
+
+
 @dataclass(frozen=True)
 class Condition:
-    """A parsed condition, with the source and the codec of each register that it reads."""
+    """A parsed condition, with the source and the decoder of each register that it reads."""
 
     expression: Expression
-    reads: tuple[tuple[str, RegisterCodec], ...]
+    reads: tuple[tuple[str, Decoder], ...]
 
 
 NEVER: Final = Condition(parse("false"), ())
@@ -86,7 +95,7 @@ class Program:
     condition: Condition | None
     operate: _Operate
 
-    @property
+    @cached_property
     def foreign(self) -> frozenset[str]:
         """The names of the sources that the condition reads, without the source of the injection."""
         reads = self.condition.reads if self.condition else ()
@@ -138,9 +147,13 @@ def compile_condition(text: str, layouts: Mapping[str, Layout]) -> Condition:
         raise ConfigError(f"when: {error}") from None
 
 
-def _read(path: str, layouts: Mapping[str, Layout]) -> tuple[str, RegisterCodec]:
+def _read(path: str, layouts: Mapping[str, Layout]) -> tuple[str, Decoder]:
     source, register = number_register(path, layouts)
-    return source, trusted_codec(register, layouts[source])
+    layout = layouts[source]
+    if status_area(layout) is not None:
+        return source, trusted_codec(register, layout)
+    code = "?" if register.type == "BOOL" else scalar_codec(register.element).plain
+    return source, Number((">" if layout.byte_order == "big" else "<") + code, register.offset, register.bit or 0)
 
 
 def number_register(path: str, layouts: Mapping[str, Layout]) -> tuple[str, Register]:
@@ -279,12 +292,16 @@ def _encode(value: Any, key: str, register: Register, layout: Layout, image: byt
 
 def _offset(declaration: Declaration, target: Target, layout: Layout, _period_ns: int) -> _Operate:
     groups, by = _numbers(declaration, target, layout), _number(declaration.value, "value")
-    return lambda _draw: Arithmetic(groups, lambda _places, values: values + by, lambda value: value + by)
+    return lambda _draw: Arithmetic(
+        groups, lambda _places, values: values + by, lambda number, image: number.add(image, by)
+    )
 
 
 def _scale(declaration: Declaration, target: Target, layout: Layout, _period_ns: int) -> _Operate:
     groups, by = _numbers(declaration, target, layout), _number(declaration.value, "value")
-    return lambda _draw: Arithmetic(groups, lambda _places, values: values * by, lambda value: value * by)
+    return lambda _draw: Arithmetic(
+        groups, lambda _places, values: values * by, lambda number, image: number.multiply(image, by)
+    )
 
 
 def _clamp(declaration: Declaration, target: Target, layout: Layout, _period_ns: int) -> _Operate:

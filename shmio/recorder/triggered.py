@@ -14,8 +14,7 @@ from shmio.config import Trigger as TriggerSettings
 from shmio.errors import ConfigError, RecordingError
 from shmio.injection.condition import Memory
 from shmio.injection.language import Number
-from shmio.injection.program import NEVER, compile_condition
-from shmio.layout.values.codec import RegisterCodec
+from shmio.injection.program import NEVER, Decoder, compile_condition
 from shmio.recorder.instance_follower import TURN_S, InstanceEntry, InstanceFollower
 from shmio.recorder.recorder import CLOSE_S, AttachedFiles, Counters, RotatingRecorder, is_process_change
 from shmio.recording.block_follower import BlockEntry
@@ -78,7 +77,7 @@ class Trigger:
         self._images[source] = frame.image if known else None
         return self._condition.expression.holds([self._value(*read) for read in self._condition.reads], self._memory)
 
-    def _value(self, source: str, codec: RegisterCodec) -> Number | None:
+    def _value(self, source: str, codec: Decoder) -> Number | None:
         image = self._images.get(source)
         value = None if image is None else codec.decode(image)
         return value if isinstance(value, bool | int | float) else None

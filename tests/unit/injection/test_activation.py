@@ -84,3 +84,24 @@ def test_invariants(start: int, end: int | None, for_ns: int | None, most: int |
             assert activation.state is State.OVER
         assert most is None or activation.runs <= most
         before = activation.state
+
+
+@given(
+    st.builds(Window, st.integers(0, 200), times, times, st.none() | st.integers(1, 3)),
+    st.lists(st.tuples(st.booleans(), st.integers(1, 4), st.integers(1, 40)), max_size=12),
+)
+def test_a_steady_activation_needs_no_further_calls(window: Window, phases: list[tuple[bool, int, int]]) -> None:
+    """Leaving out the calls that ``steady_until`` allows to leave out changes nothing."""
+    every, some = Activation(window), Activation(window)
+    time_ns = cycle = 0
+    steady: tuple[bool, float] = False, -1.0
+    for holds, count, step_ns in phases:
+        for _ in range(count):
+            time_ns, cycle = time_ns + step_ns, cycle + 1
+            every.advance(time_ns, cycle, holds=holds)
+            if holds is not steady[0] or time_ns >= steady[1]:
+                met = some.met
+                changed = some.advance(time_ns, cycle, holds=holds)
+                quiet = not changed and some.met is met
+                steady = holds, some.steady_until(time_ns) if quiet else -1.0
+            assert some == every

@@ -29,8 +29,8 @@ def groups(type_: str, order: ByteOrder, group: type[ValueGroup]) -> list[ValueG
 def test_arithmetic(type_: str, order: ByteOrder, data: bytes, by: float) -> None:
     at = OperationContext(1, 2, 3, 4)
     for array, single in (
-        (lambda _, values: values + by, lambda value: value + by),
-        (lambda _, values: values * by, lambda value: value * by),
+        (lambda _, values: values + by, lambda number, image: number.add(image, by)),
+        (lambda _, values: values * by, lambda number, image: number.multiply(image, by)),
     ):
         found = []
         for kind in (ValueGroup, NeverSingle):

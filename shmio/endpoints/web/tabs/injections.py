@@ -20,8 +20,7 @@ from shmio.endpoints.web.page import FollowedTab, Nothing, Page, call, release
 from shmio.errors import CommandError, ConfigError
 from shmio.injection.condition import Memory
 from shmio.injection.language import Number
-from shmio.injection.program import compile_condition
-from shmio.layout.values.codec import RegisterCodec
+from shmio.injection.program import Decoder, compile_condition
 from shmio.layout.values.write import Write, bits_of, paths_of
 from shmio.local.injection import Campaign, compile_declarations
 from shmio.model.clock import ClockMode
@@ -182,7 +181,7 @@ class Injections(FollowedTab):
         return found
 
 
-def _present(block: Block, codec: RegisterCodec) -> Number | None:
+def _present(block: Block, codec: Decoder) -> Number | None:
     """Return the present value of a register, by the rules for conditions of injections; None: unknown."""
     frame = block.latest()
     if frame is None or not frame.source_ns or block.assess(frame)[0] is Quality.BAD:

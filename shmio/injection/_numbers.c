@@ -1,0 +1,383 @@
+/* Numbers in the images of a block: reads them, changes them, and evaluates conditions over them.
+ *
+ * Limited API: one build serves CPython 3.11 and later. Conditions compute with Python's own numbers, so they
+ * mean the same as in Python.
+ */
+#include <Python.h>
+#include <math.h>
+#include <stdbool.h>
+#include <stdint.h>
+#include <string.h>
+
+/* ---- numbers in images ----------------------------------------------------------------------------------------------- */
+
+typedef struct {
+    PyObject_HEAD
+    Py_ssize_t offset, size;
+    char code;       /* as in Python's struct; ?: one bit */
+    uint8_t mask;    /* the bit, for ? */
+    bool big;        /* the byte order in the image */
+    double least, most; /* the range for add() and multiply() */
+} Number;
+
+static void Number_dealloc(PyObject *self)
+{
+    PyTypeObject *type = Py_TYPE(self);
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+static int Number_init(Number *self, PyObject *args, PyObject *kwargs)
+{
+    static const char codes[] = "?bBhHiIqQfd";
+    static const Py_ssize_t sizes[] = {1, 1, 1, 2, 2, 4, 4, 8, 8, 4, 8};
+    static const double least[] = {0, INT8_MIN, 0, INT16_MIN, 0, INT32_MIN, 0, 0, 0, -3.4028234663852886e38, -1.7976931348623157e308};
+    static const double most[] = {0, INT8_MAX, UINT8_MAX, INT16_MAX, UINT16_MAX, INT32_MAX, UINT32_MAX, 0, 0,
+                                  3.4028234663852886e38, 1.7976931348623157e308};
+    const char *format;
+    Py_ssize_t offset;
+    int bit = 0;
+    if (kwargs && PyDict_Size(kwargs)) {
+        PyErr_SetString(PyExc_TypeError, "Number takes no keyword arguments");
+        return -1;
+    }
+    if (!PyArg_ParseTuple(args, "sn|i", &format, &offset, &bit)) return -1;
+    const char *found = strlen(format) == 2 && (format[0] == '<' || format[0] == '>') ? strchr(codes, format[1]) : NULL;
+    if (!found || offset < 0 || bit < 0 || bit > 7) {
+        PyErr_SetString(PyExc_ValueError, "not the format, offset or bit of a number");
+        return -1;
+    }
+    self->offset = offset;
+    self->size = sizes[found - codes];
+    self->least = least[found - codes];
+    self->most = most[found - codes];
+    self->code = *found;
+    self->big = format[0] == '>';
+    self->mask = (uint8_t)(1u << bit);
+    return 0;
+}
+
+/* Returns the number's bytes in an image, or NULL with an exception. */
+static uint8_t *number_at(const Number *self, const Py_buffer *image)
+{
+    if (self->size && self->offset <= image->len - self->size) return (uint8_t *)image->buf + self->offset;
+    PyErr_SetString(PyExc_ValueError, "the number lies outside the image");
+    return NULL;
+}
+
+static uint64_t load(const Number *self, const uint8_t *at)
+{
+    uint64_t word = 0;
+    for (Py_ssize_t i = 0; i < self->size; i++) word = word << 8 | at[self->big ? i : self->size - 1 - i];
+    return word;
+}
+
+static void store(const Number *self, uint8_t *at, uint64_t word)
+{
+    for (Py_ssize_t i = 0; i < self->size; i++) at[self->big ? self->size - 1 - i : i] = (uint8_t)(word >> 8 * i);
+}
+
+static PyObject *decode(const Number *self, const uint8_t *at)
+{
+    if (self->code == '?') return PyBool_FromLong(*at & self->mask);
+    uint64_t word = load(self, at);
+    uint32_t half = (uint32_t)word;
+    float single;
+    double number;
+    switch (self->code) {
+    case 'b': return PyLong_FromLong((int8_t)word);
+    case 'h': return PyLong_FromLong((int16_t)word);
+    case 'i': return PyLong_FromLong((int32_t)word);
+    case 'q': return PyLong_FromLongLong((int64_t)word);
+    case 'f': memcpy(&single, &half, 4); return PyFloat_FromDouble(single);
+    case 'd': memcpy(&number, &word, 8); return PyFloat_FromDouble(number);
+    default: return PyLong_FromUnsignedLongLong(word);
+    }
+}
+
+static PyObject *Number_decode(Number *self, PyObject *object)
+{
+    Py_buffer image;
+    if (PyObject_GetBuffer(object, &image, PyBUF_SIMPLE) < 0) return NULL;
+    const uint8_t *at = number_at(self, &image);
+    PyObject *value = at ? decode(self, at) : NULL;
+    PyBuffer_Release(&image);
+    return value;
+}
+
+static double as_double(const Number *self, const uint8_t *at)
+{
+    uint64_t word = load(self, at);
+    uint32_t half = (uint32_t)word;
+    float single;
+    double number;
+    switch (self->code) {
+    case 'b': return (int8_t)word;
+    case 'h': return (int16_t)word;
+    case 'i': return (int32_t)word;
+    case 'f': memcpy(&single, &half, 4); return single;
+    case 'd': memcpy(&number, &word, 8); return number;
+    default: return (double)word;
+    }
+}
+
+/* Writes a number, clamped to the range of its type and, for integers, rounded half to even. A float may be NaN. */
+static void put(const Number *self, uint8_t *at, double value)
+{
+    uint64_t word = 0;
+    if (value < self->least) value = self->least;
+    if (value > self->most) value = self->most;
+    if (self->code == 'f') {
+        float single = (float)value;
+        uint32_t half;
+        memcpy(&half, &single, 4);
+        word = half;
+    } else if (self->code == 'd') {
+        memcpy(&word, &value, 8);
+    } else {
+        int64_t whole = (int64_t)value; /* towards 0 */
+        double rest = value - (double)whole;
+        if (rest > 0.5 || (rest == 0.5 && whole % 2)) whole++;
+        if (rest < -0.5 || (rest == -0.5 && whole % 2)) whole--;
+        word = (uint64_t)whole;
+    }
+    store(self, at, word);
+}
+
+static PyObject *change(Number *self, PyObject *const *args, Py_ssize_t count, bool multiply)
+{
+    Py_buffer image;
+    if (count != 2) {
+        PyErr_SetString(PyExc_TypeError, "an image and a number are needed");
+        return NULL;
+    }
+    double by = PyFloat_AsDouble(args[1]);
+    if (by == -1.0 && PyErr_Occurred()) return NULL;
+    if (!self->size || self->code == '?' || self->code == 'q' || self->code == 'Q') {
+        PyErr_SetString(PyExc_TypeError, "a double cannot represent each value of this type");
+        return NULL;
+    }
+    if (PyObject_GetBuffer(args[0], &image, PyBUF_WRITABLE) < 0) return NULL;
+    uint8_t *at = number_at(self, &image);
+    if (at) {
+        double value = as_double(self, at);
+        value = multiply ? value * by : value + by;
+        if (isnan(value) && self->code != 'f' && self->code != 'd') {
+            PyErr_SetString(PyExc_ValueError, "an integer cannot be NaN");
+            at = NULL;
+        } else {
+            put(self, at, value);
+        }
+    }
+    PyBuffer_Release(&image);
+    if (!at) return NULL;
+    Py_RETURN_NONE;
+}
+
+static PyObject *Number_add(Number *self, PyObject *const *args, Py_ssize_t count) { return change(self, args, count, false); }
+
+static PyObject *Number_multiply(Number *self, PyObject *const *args, Py_ssize_t count)
+{
+    return change(self, args, count, true);
+}
+
+#define METHOD(type, name, flags, doc) {#name, (PyCFunction)(void (*)(void))type##_##name, flags, doc}
+static PyMethodDef Number_methods[] = {
+    METHOD(Number, decode, METH_O, "Return the number in an image."),
+    METHOD(Number, add, METH_FASTCALL, "Add to the number in an image; clamp and round the result to its type."),
+    METHOD(Number, multiply, METH_FASTCALL, "Multiply the number in an image; clamp and round the result to its type."),
+    {0},
+};
+
+static PyType_Slot Number_slots[] = {
+    {Py_tp_doc, "The place and the type of a number in images of a block."},
+    {Py_tp_init, Number_init},
+    {Py_tp_dealloc, Number_dealloc},
+    {Py_tp_methods, Number_methods},
+    {0, NULL},
+};
+static PyType_Spec Number_spec = {"shmio.injection._numbers.Number", sizeof(Number), 0, Py_TPFLAGS_DEFAULT, Number_slots};
+
+/* ---- conditions ------------------------------------------------------------------------------------------------------ */
+
+/* Reads the values for a condition: `reads` has pairs of a source and a Number, or another object with decode();
+ * `images` has the image of each source, or None. */
+static PyObject *numbers_read(PyObject *module, PyObject *const *args, Py_ssize_t given)
+{
+    PyTypeObject *own = *(PyTypeObject **)PyModule_GetState(module);
+    if (given != 2 || !PyTuple_Check(args[0]) || !PyDict_Check(args[1])) {
+        PyErr_SetString(PyExc_TypeError, "a tuple and a dict are needed");
+        return NULL;
+    }
+    Py_ssize_t count = PyTuple_Size(args[0]);
+    PyObject *values = PyList_New(count);
+    for (Py_ssize_t i = 0; values && i < count; i++) {
+        PyObject *pair = PyTuple_GetItem(args[0], i), *value = NULL;
+        PyObject *source = PyTuple_GetItem(pair, 0), *place = source ? PyTuple_GetItem(pair, 1) : NULL;
+        PyObject *image = place ? PyDict_GetItemWithError(args[1], source) : NULL;
+        if (image == Py_None) {
+            Py_INCREF(image);
+            value = image;
+        } else if (image) {
+            value = Py_TYPE(place) == own ? Number_decode((Number *)place, image) : PyObject_CallMethod(place, "decode", "O", image);
+        } else if (!PyErr_Occurred()) {
+            PyErr_SetObject(PyExc_KeyError, source);
+        }
+        if (!value || PyList_SetItem(values, i, value) < 0) Py_CLEAR(values);
+    }
+    return values;
+}
+
+#define MAX_STEPS 256
+
+enum { PUSH, LOAD, NOT, NEG, ABS, RISING, FALLING, CHANGED, OR, AND, LT, LE, EQ, NE, GT, GE, ADD, SUB, MUL, DIV, MOD };
+
+/* Returns the result of an edge function, or -1 with an exception. Remembers `now` as the last argument. */
+static int edge(int code, PyObject *seen, PyObject *place, PyObject *now)
+{
+    int found = 0;
+    PyObject *before = PyDict_GetItemWithError(seen, place);
+    if (before) {
+        int was = code == CHANGED ? 0 : PyObject_IsTrue(before), is = code == CHANGED ? 0 : PyObject_IsTrue(now);
+        if (was < 0 || is < 0) return -1;
+        found = code == CHANGED ? PyObject_RichCompareBool(before, now, Py_NE) : code == RISING ? !was && is : was && !is;
+    } else if (PyErr_Occurred()) {
+        return -1;
+    }
+    return found < 0 || PyDict_SetItem(seen, place, now) < 0 ? -1 : found;
+}
+
+static PyObject *one(int code, PyObject *seen, PyObject *place, PyObject *value)
+{
+    int truth;
+    switch (code) {
+    case NEG: return PyNumber_Negative(value);
+    case ABS: return PyNumber_Absolute(value);
+    case NOT: truth = PyObject_Not(value); break;
+    default: truth = edge(code, seen, place, value);
+    }
+    return truth < 0 ? NULL : PyBool_FromLong(truth);
+}
+
+static PyObject *two(int code, PyObject *left, PyObject *right)
+{
+    static const int compared[] = {Py_LT, Py_LE, Py_EQ, Py_NE, Py_GT, Py_GE};
+    switch (code) {
+    case ADD: return PyNumber_Add(left, right);
+    case SUB: return PyNumber_Subtract(left, right);
+    case MUL: return PyNumber_Multiply(left, right);
+    case DIV: return PyNumber_TrueDivide(left, right);
+    case MOD: return PyNumber_Remainder(left, right);
+    case OR:
+    case AND: {
+        int first = PyObject_IsTrue(left), second = PyObject_IsTrue(right);
+        if (first < 0 || second < 0) return NULL;
+        return PyBool_FromLong(code == OR ? first || second : first && second);
+    }
+    default: return PyObject_RichCompare(left, right, compared[code - LT]);
+    }
+}
+
+/* Runs the steps on a stack; returns the number of values that are left on it, or -1 with an exception. */
+static Py_ssize_t run(const uint8_t *codes, PyObject *operands, Py_ssize_t count, PyObject *values, PyObject *seen,
+                      PyObject **stack)
+{
+    Py_ssize_t depth = 0;
+    for (Py_ssize_t i = 0; i < count; i++) {
+        int code = codes[i];
+        PyObject *operand = PyTuple_GetItem(operands, i), *result;
+        Py_ssize_t taken = code <= LOAD ? 0 : code <= CHANGED ? 1 : 2;
+        if (code > MOD || depth < taken) {
+            PyErr_SetString(PyExc_ValueError, "not the steps of a condition");
+            goto failed;
+        }
+        if (code == PUSH) {
+            Py_INCREF(operand);
+            result = operand;
+        } else if (code == LOAD) {
+            Py_ssize_t place = PyLong_AsSsize_t(operand);
+            result = place == -1 && PyErr_Occurred() ? NULL : PySequence_GetItem(values, place);
+        } else if (taken == 1) {
+            result = one(code, seen, operand, stack[depth - 1]);
+        } else {
+            result = two(code, stack[depth - 2], stack[depth - 1]);
+        }
+        if (!result) goto failed;
+        while (taken-- > 0) Py_DECREF(stack[--depth]);
+        stack[depth++] = result;
+    }
+    return depth;
+failed:
+    while (depth) Py_DECREF(stack[--depth]);
+    return -1;
+}
+
+/* Evaluates a condition by its codes (bytes), operands (a tuple), values (a sequence) and last arguments (a dict).
+ * Returns True, False, or None if a value is None or the arithmetic fails, which clears the last arguments. */
+static PyObject *numbers_evaluate(PyObject *module, PyObject *const *args, Py_ssize_t given)
+{
+    (void)module;
+    PyObject *stack[MAX_STEPS];
+    char *codes;
+    Py_ssize_t count;
+    if (given != 4 || !PyTuple_Check(args[1]) || !PyDict_Check(args[3])) {
+        PyErr_SetString(PyExc_TypeError, "bytes, a tuple, a sequence and a dict are needed");
+        return NULL;
+    }
+    if (PyBytes_AsStringAndSize(args[0], &codes, &count) < 0) return NULL;
+    int unknown = PySequence_Contains(args[2], Py_None);
+    if (unknown < 0) return NULL;
+    if (!unknown) {
+        if (count == 0 || count > MAX_STEPS || PyTuple_Size(args[1]) != count) {
+            PyErr_SetString(PyExc_ValueError, "not the steps of a condition");
+            return NULL;
+        }
+        Py_ssize_t left = run((const uint8_t *)codes, args[1], count, args[2], args[3], stack);
+        if (left > 0) {
+            int truth = PyObject_IsTrue(stack[left - 1]);
+            while (left) Py_DECREF(stack[--left]);
+            return truth < 0 ? NULL : PyBool_FromLong(truth);
+        }
+        if (!PyErr_ExceptionMatches(PyExc_ArithmeticError)) return NULL;
+        PyErr_Clear();
+    }
+    PyDict_Clear(args[3]);
+    Py_RETURN_NONE;
+}
+
+/* ---- module ---------------------------------------------------------------------------------------------------------- */
+
+static PyMethodDef functions[] = {
+    METHOD(numbers, read, METH_FASTCALL, "Return the values that a condition reads from images; None for each unknown one."),
+    METHOD(numbers, evaluate, METH_FASTCALL, "Return whether a condition is true; None if that is unknown."),
+    {0},
+};
+
+/* The state of the module is a pointer to the type Number. */
+static int module_exec(PyObject *module)
+{
+    PyObject **type = PyModule_GetState(module);
+    *type = PyType_FromModuleAndSpec(module, &Number_spec, NULL);
+    return *type ? PyModule_AddObjectRef(module, "Number", *type) : -1;
+}
+
+static int module_traverse(PyObject *module, visitproc visit, void *arg)
+{
+    Py_VISIT(*(PyObject **)PyModule_GetState(module));
+    return 0;
+}
+
+static int module_clear(PyObject *module)
+{
+    Py_CLEAR(*(PyObject **)PyModule_GetState(module));
+    return 0;
+}
+
+static PyModuleDef_Slot module_slots[] = {{Py_mod_exec, module_exec}, {0, NULL}};
+
+static struct PyModuleDef definition = {
+    PyModuleDef_HEAD_INIT, "shmio.injection._numbers", "Numbers in images, and conditions over them.",
+    sizeof(PyObject *), functions, module_slots, module_traverse, module_clear, NULL};
+
+PyMODINIT_FUNC PyInit__numbers(void);
+PyMODINIT_FUNC PyInit__numbers(void) { return PyModuleDef_Init(&definition); }

@@ -1,0 +1,30 @@
+"""Types of the C extension; see _numbers.c."""
+
+from collections.abc import Sequence
+from typing import Any, Protocol, final
+
+import numpy as np
+from typing_extensions import Buffer
+
+Image = Buffer | np.ndarray[Any, Any]
+
+class Decoder(Protocol):
+    def decode(self, data: bytes, /) -> object: ...
+
+@final
+class Number:
+    def __init__(self, code: str, offset: int, bit: int = 0, /) -> None: ...
+    def decode(self, data: Buffer, /) -> bool | float: ...
+    def add(self, image: Image, by: float, /) -> None: ...
+    def multiply(self, image: Image, by: float, /) -> None: ...
+
+def read(
+    reads: tuple[tuple[str, Decoder], ...], images: dict[str, bytes | None], /
+) -> list[bool | int | float | None]: ...
+def evaluate(
+    codes: bytes,
+    operands: tuple[bool | float, ...],
+    values: Sequence[bool | float | None],
+    seen: dict[int, bool | int | float],
+    /,
+) -> bool | None: ...

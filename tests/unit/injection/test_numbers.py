@@ -1,0 +1,97 @@
+"""The C extension reads and changes numbers as Python's struct does, and survives any arguments."""
+
+from __future__ import annotations
+
+import math
+import struct
+from contextlib import suppress
+from typing import Any, cast
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shmio.injection._numbers import Number, evaluate, read
+
+CODES = "bBhHiIqQfd"
+formats = st.builds("{}{}".format, st.sampled_from("<>"), st.sampled_from(CODES))
+
+
+@given(formats, st.binary(min_size=20, max_size=20), st.integers(0, 12))
+def test_decodes_as_struct(format_: str, image: bytes, offset: int) -> None:
+    (expected,) = struct.unpack_from(format_, image, offset)
+    found = Number(format_, offset).decode(image)
+    assert type(found) is type(expected)
+    assert found == expected or (math.isnan(found) and math.isnan(expected))
+
+
+@given(st.binary(min_size=3, max_size=3), st.integers(0, 2), st.integers(0, 7))
+def test_decodes_bits(image: bytes, offset: int, bit: int) -> None:
+    assert Number("<?", offset, bit).decode(image) is bool(image[offset] >> bit & 1)
+
+
+@given(st.sampled_from("<>"), st.integers(-(2**31), 2**31 - 1), st.floats(-(2.0**34), 2.0**34))
+def test_rounds_as_python_and_clamps(order: str, value: int, by: float) -> None:
+    image = bytearray(struct.pack(f"{order}xi", value))
+    Number(f"{order}i", 1).add(image, by)
+    assert struct.unpack(f"{order}xi", image) == (min(max(round(value + by), -(2**31)), 2**31 - 1),)
+
+
+@given(st.sampled_from("<>"), st.floats(width=32), st.floats())
+def test_a_real_is_clamped_but_stays_nan(order: str, value: float, by: float) -> None:
+    image = bytearray(struct.pack(f"{order}f", value))
+    Number(f"{order}f", 0).multiply(image, by)
+    (found,) = struct.unpack(f"{order}f", image)
+    if math.isnan(value * by):
+        assert math.isnan(found)
+    else:
+        assert found == struct.unpack("f", struct.pack("f", min(max(value * by, -REAL_MAX), REAL_MAX)))[0]
+
+
+REAL_MAX = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
+
+
+def test_an_integer_cannot_become_nan() -> None:
+    with pytest.raises(ValueError, match="NaN"):
+        Number("<h", 0).multiply(bytearray(2), math.inf)
+
+
+@pytest.mark.parametrize(
+    ("format_", "offset", "bit"), [("f", 0, 0), ("=f", 0, 0), ("<x", 0, 0), ("<", 0, 0), ("<f", -1, 0), ("<?", 0, 8)]
+)
+def test_refuses_what_is_no_number(format_: str, offset: int, bit: int) -> None:
+    with pytest.raises(ValueError, match="format"):
+        Number(format_, offset, bit)
+
+
+def test_touches_no_byte_outside_the_image() -> None:
+    for offset in (1, 2**62):
+        number = Number("<i", offset)
+        with pytest.raises(ValueError, match="outside"):
+            number.decode(bytes(4))
+        with pytest.raises(ValueError, match="outside"):
+            number.add(bytearray(4), 1)
+    with pytest.raises(BufferError):
+        Number("<i", 0).add(bytes(4), 1)
+    with pytest.raises(TypeError, match="double"):
+        Number("<q", 0).add(bytearray(8), 1)
+    with pytest.raises(ValueError, match="outside"):
+        cast("Any", Number).__new__(Number).decode(bytes(4))
+
+
+def test_reads_the_values_of_a_condition() -> None:
+    reads = (("a", Number("<h", 0)), ("b", Number("<h", 2)), ("a", Number("<?", 2, 1)))
+    assert read(reads, {"a": b"\1\0\2", "b": None}) == [1, None, True]
+    for wrong in ((), ("a",), "ab", 1):
+        with pytest.raises((IndexError, SystemError, KeyError, AttributeError, TypeError)):
+            cast("Any", read)((wrong,), {})
+    with pytest.raises(KeyError):
+        read(reads, {"a": bytes(3)})
+
+
+@given(st.binary(max_size=300), st.data())
+def test_any_steps_are_run_or_refused(codes: bytes, data: st.DataObject) -> None:
+    numbers = st.integers(-2, 2) | st.floats() | st.booleans()
+    operands = tuple(data.draw(st.lists(numbers, min_size=len(codes), max_size=len(codes))))
+    with suppress(ValueError, IndexError, TypeError):
+        assert evaluate(codes, operands, data.draw(st.lists(numbers, max_size=3)), {}) in (True, False, None)
