@@ -44,7 +44,7 @@ def extension(name: str, *headers: str) -> Extension:
 setup(
     ext_modules=[
         extension("shmio.injection._numbers"),
-        extension("shmio.segment._atomics", "queue.h", "relay.h", "ring.h"),
+        extension("shmio.segment._atomics", "frames.h", "queue.h", "relay.h", "ring.h"),
     ],
     cmdclass={"bdist_wheel": AbiWheel},
 )

@@ -139,6 +139,24 @@ class Output:
                 self._pending += self.advance(image)
             self._publish(image.at)
 
+    def publish_many(self, publish: Callable[[], Image | None]) -> bool:
+        """Publish several images at once, unless injections may change them.
+
+        Args:
+            publish: Publishes the images, and returns the last one; None: it has published none.
+
+        Returns:
+            Whether images were published.
+        """
+        with self.lock:
+            if self.advance is not None or self.injections.layers or self._pending:
+                return False
+            if (last := publish()) is None:
+                return False
+            self._last, self._changed = last, False
+            self._next_ns = self._now_ns() + self._gap_ns
+            return True
+
     @property
     def last(self) -> Image | None:
         """The image published last, or by the source's previous process; None if there is none."""

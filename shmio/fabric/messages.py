@@ -39,6 +39,8 @@ LEFT_OUT_LIMIT: Final = 1 << 32
 
 _HEADER: Final = struct.Struct("<BBHIQQ8sqqQ")
 _ENTRY: Final = struct.Struct("<BI")
+ENTRIES_AT: Final = _HEADER.size
+"""Position of the first entry in a message."""
 _AGE_AT: Final = _HEADER.size - 8
 _FRAME: Final = 1
 _EVENT: Final = 2
@@ -77,12 +79,24 @@ Entry = Frame | Event | Gap
 
 def encode(header: Header, entries: Iterable[Entry]) -> bytearray:
     """Encode a message. :func:`with_age` changes its age later."""
+    return with_header(header, encode_entries(entries))
+
+
+def with_header(header: Header, entries: bytearray) -> bytearray:
+    """Encode a message whose entries are encoded."""
     data = bytearray(
         _HEADER.pack(
             VERSION, 0, 0, header.left_out % LEFT_OUT_LIMIT, header.stream, header.number, header.layout,
             header.made_ns, header.zero_ns, header.age_ns,
         )
     )  # fmt: skip
+    data += entries
+    return data
+
+
+def encode_entries(entries: Iterable[Entry]) -> bytearray:
+    """Encode entries of a message. For runs of plain frames, ``Ring.pack`` does the same (frames.h)."""
+    data = bytearray()
     for entry in entries:
         if isinstance(entry, Frame):
             kind, content = _FRAME, encode_frame(entry)
@@ -118,33 +132,48 @@ def decode_header(data: bytes) -> Header:
     return Header(left_out, stream, number, layout, made_ns, age_ns, zero_ns)
 
 
-def decode_entries(data: bytes) -> Iterator[Entry]:
-    """Yield the entries of a message.
+def decode_entries(data: bytes, at: int = ENTRIES_AT) -> Iterator[Entry]:
+    """Yield the entries of a message, from the one at a position on.
 
     Raises:
         ValueError: The message is malformed.
 
     """
-    at = _HEADER.size
     while at < len(data):
-        if len(data) - at < _ENTRY.size:
-            raise ValueError("the message ends within an entry")
-        kind, size = _ENTRY.unpack_from(data, at)
-        at += _ENTRY.size
-        content = data[at : at + size]
-        if len(content) != size:
-            raise ValueError("the message ends within an entry")
-        at += size
-        if kind == _FRAME:
-            yield decode_frame(content)
-        elif kind == _EVENT:
-            yield decode_event(content)
-        elif kind == _GAP:
-            try:
-                yield decode_gap(content)
-            except msgspec.MsgspecError as error:
-                raise ValueError(f"a gap is malformed: {error}") from None
-        # An entry of another kind comes from a newer version: this version skips it.
+        entry, at = decode_entry(data, at)
+        if entry is not None:
+            yield entry
+
+
+def decode_entry(data: bytes, at: int) -> tuple[Entry | None, int]:
+    """Decode the entry at a position of a message.
+
+    Returns:
+        The entry, and the position after it. The entry is None if a newer version has made it, of a
+        kind that this version skips.
+
+    Raises:
+        ValueError: The message is malformed.
+
+    """
+    if len(data) - at < _ENTRY.size:
+        raise ValueError("the message ends within an entry")
+    kind, size = _ENTRY.unpack_from(data, at)
+    at += _ENTRY.size
+    content = data[at : at + size]
+    if len(content) != size:
+        raise ValueError("the message ends within an entry")
+    at += size
+    if kind == _FRAME:
+        return decode_frame(content), at
+    if kind == _EVENT:
+        return decode_event(content), at
+    if kind != _GAP:
+        return None, at
+    try:
+        return decode_gap(content), at
+    except msgspec.MsgspecError as error:
+        raise ValueError(f"a gap is malformed: {error}") from None
 
 
 class MissingRequest(msgspec.Struct, frozen=True):

@@ -96,6 +96,28 @@ class BlockFollower:
                 return
             yield from self._entries(side)
 
+    def pack(self, limit: int) -> bytearray:
+        """Read frames as entries of a message of the fabric: ``limit`` at most, up to the next event.
+
+        Returns:
+            The entries. They are empty if the next entry is not a good frame that follows the last
+            one without a gap: then call :meth:`take`, which also finds out whether there is none.
+        """
+        frames, events = self._frames, self._events
+        if frames.held is not None or events.held is not None:
+            return bytearray()
+        entries, last, clock_ns = self.block.ring.pack(frames.last, events.last, limit)
+        if entries:
+            self._log_ns = max(self._log_ns, self._log_time(self.block.clock.monotonic_ns(clock_ns)))
+            frames.last, frames.log_ns = last, self._log_ns
+            frames.cursor.resume(after=last)
+        return entries
+
+    @property
+    def behind(self) -> bool:
+        """True if there are unread entries."""
+        return bool(self._frames.cursor.behind or self._events.cursor.behind)
+
     def remaining(self) -> Iterator[BlockEntry]:
         """Yield gaps for the frames and events that were overwritten after the last entry that was read."""
         for side in (self._frames, self._events):

@@ -40,6 +40,11 @@ class RecordedRegisters:
         self.layout = values.with_statuses()
         self._mask, self._taken = _with_statuses(layout, self.layout, mask[: layout.status_offset])
 
+    @property
+    def whole(self) -> bool:
+        """True if all registers are selected, so that frames stay as they are."""
+        return self._mask is None
+
     def keep(self, frame: Frame) -> Frame:
         """Return the frame with images that have only these registers; all other bits are zero."""
         if self._mask is None:

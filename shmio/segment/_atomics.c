@@ -1,4 +1,4 @@
-/* Python binding of ring.h, relay.h and queue.h (limited API: one build serves CPython 3.11 and later).
+/* Python binding of ring.h, frames.h, relay.h and queue.h (limited API: one build serves CPython 3.11 and later).
  *
  * All functions hold the GIL, except during the wait on a doorbell and in the relay. A Ring keeps its
  * buffer exported, so that the mapping cannot be closed while the Ring exists.
@@ -6,6 +6,7 @@
 #include <Python.h>
 #include <stdlib.h>
 
+#include "frames.h"
 #include "queue.h"
 #include "relay.h"
 #include "ring.h"
@@ -72,6 +73,15 @@ static bool Ring_writable(Ring *self)
     return false;
 }
 
+/* Returns true if frames may be written; else false with an exception. */
+static bool Ring_begun(Ring *self)
+{
+    if (!Ring_writable(self)) return false;
+    if (self->incarnation) return true;
+    PyErr_SetString(PyExc_ValueError, "call begin() before the first publish()");
+    return false;
+}
+
 static PyObject *Ring_begin(Ring *self, PyObject *args)
 {
     a32 *stored = &ring_head(&self->ring)->incarnation;
@@ -96,11 +106,7 @@ static PyObject *Ring_publish(Ring *self, PyObject *args)
                           &info.quality, &info.provenance, &event, &delay_us, &reason))
         return NULL;
     if (effective_object != Py_None && PyObject_GetBuffer(effective_object, &effective, PyBUF_SIMPLE) < 0) goto done;
-    if (!Ring_writable(self)) goto done;
-    if (self->incarnation == 0) {
-        PyErr_SetString(PyExc_ValueError, "call begin() before the first publish()");
-        goto done;
-    }
+    if (!Ring_begun(self)) goto done;
     if (raw.len != self->ring.frame_size || (effective.obj && effective.len != self->ring.frame_size)) {
         PyErr_Format(PyExc_ValueError, "a frame of this ring has %u bytes", self->ring.frame_size);
         goto done;
@@ -185,6 +191,54 @@ static PyObject *Ring_read(Ring *self, PyObject *number)
     if (PyErr_Occurred()) return NULL;
     if (frame == 0 || frame > UINT64_MAX / 2 - 1) Py_RETURN_NONE;
     return Ring_copy(self, false, frame);
+}
+
+/* Returns (entries, last, clock_ns). If there are no entries, last is `after`, and clock_ns is 0. */
+static PyObject *Ring_pack(Ring *self, PyObject *args)
+{
+    unsigned long long after, event;
+    unsigned int limit;
+    if (!PyArg_ParseTuple(args, "KKI", &after, &event, &limit) || !Ring_ready(self)) return NULL;
+    uint64_t head = atomic_load_explicit(&ring_head(&self->ring)->head, memory_order_acquire);
+    uint64_t count = after < head ? head - after : 0;
+    if (count > limit) count = limit;
+    uint64_t room = count * frames_entry_size(&self->ring);
+    if (room > PY_SSIZE_T_MAX) return PyErr_NoMemory();
+    PyObject *entries = PyByteArray_FromStringAndSize(NULL, (Py_ssize_t)room);
+    if (!entries) return NULL;
+    uint64_t last = after;
+    int64_t clock_ns = 0;
+    size_t size = frames_pack(&self->ring, event, (uint8_t *)PyByteArray_AsString(entries), room, &last, &clock_ns);
+    if (PyByteArray_Resize(entries, (Py_ssize_t)size) < 0) {
+        Py_DECREF(entries);
+        return NULL;
+    }
+    return Py_BuildValue("NKL", entries, (unsigned long long)last, (long long)clock_ns);
+}
+
+/* Returns (count, last, end). If there is no plain frame at the position, count is 0, and the others are the position. */
+static PyObject *Ring_publish_packed(Ring *self, PyObject *args)
+{
+    Py_buffer data;
+    Py_ssize_t at;
+    unsigned long long number, event, late_ns;
+    long long publish_ns, clock_ns, made_ns;
+    PyObject *result = NULL;
+    if (!PyArg_ParseTuple(args, "y*nKLLKLK", &data, &at, &number, &publish_ns, &clock_ns, &event, &made_ns, &late_ns))
+        return NULL;
+    if (!Ring_begun(self)) goto done;
+    if (at < 0 || at > data.len) {
+        PyErr_SetString(PyExc_ValueError, "outside the message");
+        goto done;
+    }
+    slot_info stamp = {.publish_ns = publish_ns, .clock_ns = clock_ns, .event = event, .incarnation = self->incarnation};
+    size_t last = 0, end = 0;
+    uint32_t count = frames_publish(&self->ring, (const uint8_t *)data.buf + at, (size_t)(data.len - at), number, stamp,
+                                    made_ns, late_ns, &last, &end);
+    result = Py_BuildValue("Inn", count, at + (Py_ssize_t)last, at + (Py_ssize_t)end);
+done:
+    PyBuffer_Release(&data);
+    return result;
 }
 
 static PyObject *Ring_doorbell(Ring *self, PyObject *unused)
@@ -289,6 +343,8 @@ static PyMethodDef Ring_methods[] = {
     METHOD(Ring, head, METH_NOARGS, "Return the number of the newest complete frame; 0: there is none yet."),
     METHOD(Ring, latest, METH_NOARGS, "Return a validated copy of the newest frame, or None."),
     METHOD(Ring, read, METH_O, "Return a validated copy of one frame; None if it is not in the ring."),
+    METHOD(Ring, pack, METH_VARARGS, "Return plain frames after a number and an event as entries, last number and clock."),
+    METHOD(Ring, publish_packed, METH_VARARGS, "Write the plain frames at a position; return how many, last position, end."),
     METHOD(Ring, doorbell, METH_NOARGS, "Return the value of the futex word. Read it before you check for changes."),
     METHOD(Ring, wake, METH_NOARGS, "Ring the doorbell without a new frame, for another change."),
     METHOD(Ring, wait, METH_VARARGS, "Wait until the doorbell is not `seen`, at most `timeout_ns`; return its value."),

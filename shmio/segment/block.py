@@ -433,6 +433,8 @@ class Layouts(Mapping[str, "Layout"]):
 Bytes = bytes | bytearray | memoryview
 
 _MAX_DELAY_US: Final = 2**32 - 1
+_MIN_I64: Final = -(2**63)
+_MAX_I64: Final = 2**63 - 1
 
 
 class Stamp(NamedTuple):
@@ -532,6 +534,31 @@ class BlockWriter:
                 0 if asked_ns is None else min(-(-max(0, now_ns - asked_ns) // 1000), _MAX_DELAY_US),
                 cut(reason, REASON_SIZE) if reason else b"",
             )
+
+    def publish_packed(self, data: Bytes, at: int, *, number: int, made_ns: int, late_ns: int) -> tuple[int, int, int]:
+        """Publish the good frames at a position of a message of the fabric, and wake their readers once.
+
+        Args:
+            data: The message.
+            at: Position of an entry.
+            number: Number of the owner's frame before the first one. Frames after a gap are not
+                published, nor those after another entry.
+            made_ns: CLOCK_MONOTONIC of the owner when it made the message, in ns. The frames are as
+                much older as they waited until then.
+            late_ns: Age of the message in ns.
+
+        Returns:
+            The number of frames, the position of the last one, and the position after it.
+        """
+        with self._lock:
+            now_ns = self.now_ns()
+            done = self._frames.publish_packed(
+                data, at, number, now_ns, self._clock_ns(now_ns), self._events.head(),
+                max(_MIN_I64, min(made_ns, _MAX_I64)), max(0, min(late_ns, 1000 * _MAX_DELAY_US)),
+            )  # fmt: skip
+            if done[0]:
+                self._quality = Quality.GOOD
+            return done
 
     def _present(self) -> Stamp:
         now_ns = self.now_ns()

@@ -165,10 +165,10 @@ static inline int doorbell_wait(const a32 *word, uint32_t seen, int64_t timeout_
     return result == 0 || errno == EAGAIN ? 0 : errno;
 }
 
-/* Publishes a frame, and returns its number. Each ring has one writer. `effective` is NULL if consumers see
- * the raw image, or if slots have no room for another. */
-static inline uint64_t ring_publish(const ring_view *ring, slot_info info, const uint8_t *reason, const uint8_t *raw,
-                                    const uint8_t *effective)
+/* Writes a frame, and returns its number. It wakes no reader. Each ring has one writer. `effective` is NULL if
+ * consumers see the raw image, or if slots have no room for another. */
+static inline uint64_t ring_write(const ring_view *ring, slot_info info, const uint8_t *reason, const uint8_t *raw,
+                                  const uint8_t *effective)
 {
     ring_header *header = ring_head(ring);
     uint64_t frame = atomic_load_explicit(&header->head, memory_order_relaxed) + 1; /* only the writer changes it */
@@ -187,7 +187,15 @@ static inline uint64_t ring_publish(const ring_view *ring, slot_info info, const
     atomic_store_explicit(&slot->sequence, 2 * frame + 2, memory_order_release);
     /* Pairs with the acquire load of head in every reader: the slots of all frames up to head were complete. */
     atomic_store_explicit(&header->head, frame, memory_order_release);
-    doorbell_ring(&header->doorbell);
+    return frame;
+}
+
+/* Writes a frame, wakes all readers, and returns the frame's number. */
+static inline uint64_t ring_publish(const ring_view *ring, slot_info info, const uint8_t *reason, const uint8_t *raw,
+                                    const uint8_t *effective)
+{
+    uint64_t frame = ring_write(ring, info, reason, raw, effective);
+    doorbell_ring(&ring_head(ring)->doorbell);
     return frame;
 }
 

@@ -19,6 +19,7 @@ from shmio.connectors.models.stepped import StepClock
 from shmio.connectors.output import Image, Output
 from shmio.connectors.poll_loop import Counters, QualityLog
 from shmio.fabric.messages import (
+    ENTRIES_AT,
     LEFT_OUT_LIMIT,
     CommandReply,
     CommandRequest,
@@ -26,6 +27,7 @@ from shmio.fabric.messages import (
     Header,
     WriteItem,
     decode_entries,
+    decode_entry,
     decode_header,
 )
 from shmio.layout.values.write import Write
@@ -52,6 +54,8 @@ MAX_TIME_NS: Final = (1 << 63) - 1
 """Latest time that a command can have; a faulty owner may send later ones."""
 MAX_MISSING: Final = (1 << 63) - 1
 """Maximum number of missing frames that is counted; a faulty owner may name larger numbers."""
+NEVER_NS: Final = -(1 << 63)
+"""A time before all others."""
 RELOAD_NS: Final = 30_000_000_000
 """Time in ns after which the mirror asks again for a reload, if the layout is still another one."""
 REPORT_NS: Final = 10_000_000_000
@@ -137,7 +141,7 @@ class MirrorLoop:
         self._problem, self._problem_ns = "", clock.now_ns()  # of the link, and when it last had it
         self.missing = 0
         """Number of frames that the owner no longer had."""
-        self._cycle: int | None = None
+        self._good = False  # the last frame was good
         self._number = 0  # of the owner's last frame
         self._zero_ns = 0  # when the owner's clock began
         self._stream = 0  # of the last message
@@ -242,7 +246,7 @@ class MirrorLoop:
             # The owner was started again, and numbers its frames from 1.
             self._zero_ns, self._number = one.header.zero_ns, 0
         try:
-            entries = list(decode_entries(one.data))
+            entries = list(decode_entries(one.data, self._show_run(one, late_ns)))
             self._find_gap(one.header, entries)
             for entry in entries:
                 self._publish(entry, late_ns + _waited_ns(one.header, entry))
@@ -283,8 +287,9 @@ class MirrorLoop:
         if len(frame.raw) != self._writer.block.layout.size:
             raise ValueError(f"a frame has {len(frame.raw)} bytes instead of {self._writer.block.layout.size}")
         now_ns = self._clock.now_ns()
-        self._writer.cycle = self._cycle = frame.cycle
+        self._writer.cycle = frame.cycle
         self._bad = frame.quality is Quality.BAD
+        self._good = frame.quality is Quality.GOOD and not frame.reason
         self._last_ns = now_ns
         self._quality_log.update(frame.quality, frame.reason, frame.cycle, f", mirrored from {self._mirror}")
         age_ns = late_ns + 1000 * frame.delay_us
@@ -301,6 +306,43 @@ class MirrorLoop:
             self.counters.connects += 1
             self.commands.open()
         self.commands.release(frame.cycle)
+
+    def _show_run(self, one: Received, late_ns: int) -> int:
+        """Publish the frames at the beginning of a message that change nothing but values, all at once.
+
+        Return the position after them.
+        """
+        header, end = one.header, ENTRIES_AT
+        if not self._good or (header.stream, header.left_out) != (self._stream, self._left_out):
+            return end
+        if not self._open and late_ns < self._writer.block.stale_ns:
+            return end  # the next frame may open the source for writes
+        count, now_ns = 0, self._clock.now_ns()
+        made_ns = header.made_ns - header.zero_ns if header.zero_ns else NEVER_NS
+
+        def publish() -> Image | None:
+            nonlocal count, end
+            count, last, end = self._writer.publish_packed(
+                one.data, ENTRIES_AT, number=self._number, made_ns=made_ns, late_ns=late_ns
+            )
+            if not count:
+                return None
+            frame, _ = decode_entry(one.data, last)
+            assert isinstance(frame, Frame)  # noqa: S101  publish_packed has read it
+            age_ns = late_ns + _waited_ns(header, frame) + 1000 * frame.delay_us
+            return Image(
+                frame.raw, frame.cycle, frame.source_ns, frame.quality, frame.provenance, "", now_ns - age_ns,
+                frame.effective,
+            )  # fmt: skip
+
+        if self._output.publish_many(publish):
+            self._number += count
+            self._writer.cycle = self._output.cycle
+            self._last_ns = now_ns
+            self._pace.spend(now_ns, count)
+            self.counters.polls += count
+            self.counters.round_trip_us = late_ns // 1000
+        return end
 
     def _happen(self, event: Event) -> None:
         """Publish an event of the owner without its writer, so that no client takes it for an answer to itself."""
@@ -323,7 +365,7 @@ class MirrorLoop:
 
     def _fail(self, reason: str) -> None:
         """Publish the last image with bad quality, and stop accepting writes."""
-        self._open = False
+        self._open = self._good = False
         self.commands.close(reason)
         self._bad = True
         if self._quality_log.update(Quality.BAD, reason, self._writer.cycle):
@@ -438,10 +480,10 @@ class _Pace:
         self._refill(now_ns)
         return 0 if self._tokens > 0 else 1 + int(-self._tokens / self._rate)
 
-    def spend(self, now_ns: int) -> None:
-        """Count a published frame."""
+    def spend(self, now_ns: int, count: int = 1) -> None:
+        """Count published frames."""
         self._refill(now_ns)
-        self._tokens -= 1
+        self._tokens -= count
 
 
 def _waited_ns(header: Header, entry: Entry) -> int:

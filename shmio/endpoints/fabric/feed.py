@@ -8,7 +8,7 @@ from fnmatch import fnmatchcase
 from typing import Final, NamedTuple
 
 from shmio.config.model import FabricRule
-from shmio.fabric.messages import MAX_ENTRY_BYTES, PREFERRED_BYTES, Entry
+from shmio.fabric.messages import MAX_ENTRY_BYTES, PREFERRED_BYTES, Entry, encode_entries
 from shmio.layout.model import Layout
 from shmio.layout.values.write import Write, covering
 from shmio.recording.block_follower import BlockFollower
@@ -32,13 +32,13 @@ class Batch(NamedTuple):
     """Entries of one message.
 
     Attributes:
-        entries: The frames, events and gaps.
+        entries: The frames, events and gaps, encoded.
         left_out: Number of frames that the rule has left out between the last frame of the previous
             batches and the last frame of this one.
 
     """
 
-    entries: list[Entry]
+    entries: bytearray
     left_out: int
 
 
@@ -68,6 +68,9 @@ class Feed:
         self.empty = part is None
         """True if the rule publishes no register of the source."""
         self._keep = None if part is None else part.keep
+        self._all = part is not None and part.whole and rule.send == "frames" and rule.max_rate_hz is None
+        """True if the rule publishes each frame as it is."""
+        self._limit = max(1, min(MAX_ENTRIES, PREFERRED_BYTES // max(1, block.ring.frame_size)))
         self.layout: Layout = block.layout if part is None else part.layout
         """The layout of the published frames: the registers that the rule names."""
         self.digest = self.layout.hash
@@ -112,6 +115,8 @@ class Feed:
 
     def read(self) -> tuple[list[Batch], bool]:
         """Read new entries; return them in batches, and whether more are waiting."""
+        if self._all and (packed := self._follower.pack(self._limit)):
+            return [Batch(packed, 0)], self._follower.behind
         taken = list(self._follower.take(MAX_ENTRIES))
         if self._follower.done:
             taken += self._follower.remaining()
@@ -148,7 +153,7 @@ class Feed:
 
     def _batch(self, entries: list[Entry], left_out: int) -> Batch:
         more, self._counted = left_out - self._counted, left_out
-        return Batch(entries, more)
+        return Batch(encode_entries(entries), more)
 
     def _chosen(self, frame: Frame) -> Iterator[Frame]:
         """Yield the frame, unless the rule leaves it out."""

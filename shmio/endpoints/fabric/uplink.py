@@ -22,7 +22,7 @@ from shmio.endpoints.fabric.history import History
 from shmio.endpoints.fabric.publisher import Publisher
 from shmio.errors import ConfigError, ConflictError, RemoteError, SegmentError
 from shmio.fabric.connection import INSTALL, Access, connect, is_stored, reason, refusal, wants_reply
-from shmio.fabric.messages import Header, encode
+from shmio.fabric.messages import Header, with_header
 from shmio.fabric.names import CellName, source_of
 from shmio.fabric.registry import RENEW_S, CellEntry, Registry, SourceEntry
 from shmio.libraries import library
@@ -222,7 +222,7 @@ class Uplink:
             times = self._log_time(now_ns), 0, self._log_time(0)
             row.left_out += batch.left_out
             header = Header(row.left_out, row.stream, number, feed.digest[:8], *times)
-            self.backlog.put(row, Kept(number, encode(header, batch.entries), now_ns))
+            self.backlog.put(row, Kept(number, with_header(header, batch.entries), now_ns))
         if batches:
             self.publisher.wake()
         return more

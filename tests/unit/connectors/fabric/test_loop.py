@@ -302,6 +302,48 @@ def test_frames_that_the_owners_rules_leave_out_are_no_gap_if_messages_are_lost(
     assert mirroring.loop.missing == mirroring.loop.counters.overruns == 2
 
 
+def test_frames_of_one_message_are_published_as_those_of_several(mirroring: Mirroring) -> None:
+    """A run of good frames is published at once; all that follows it, one at a time."""
+    noted = Event(4, EventKind.NOTED, 10, 1010, 0, 0, 9, 3, Quality.GOOD, 5, 99, 1, 2, 0, 0, 0, b"", "by the owner")
+    doubtful = frame(13, 13, quality=Quality.UNCERTAIN, reason="2 of 4 nodes")
+    good = [frame(number, number, effective=b"\0\x09\0\0" if number == 9 else None) for number in range(7, 18)]
+    mirroring.send(good[0])
+    mirroring.next()
+    mirroring.send(*good[1:4], noted, good[5], doubtful, *good[7:], age_ns=STALE_NS)  # frame 11 is missing
+    frames = [mirroring.next() for _ in range(9)]
+    assert [(one.cycle, one.source_ns, one.raw[1], one.effective) for one in frames] == [
+        (1000 + number, 5 * S + number, number, b"\0\x09\0\0" if number == 9 else None)
+        for number in (8, 9, 10, 12, 13, 14, 15, 16, 17)
+    ]
+    assert [one.quality for one in frames[3:6]] == [Quality.GOOD, Quality.UNCERTAIN, Quality.GOOD]
+    assert all(one.delay_us >= STALE_NS // 1000 for one in frames)
+    assert "frames 11 to 11 are missing" in (gap := mirroring.event(EventKind.NOTED)).text
+    owners = mirroring.event(EventKind.NOTED)
+    assert (owners.text, owners.cycle, gap.number + 1) == ("by the owner", 1010, owners.number)
+    assert (frames[2].number, frames[3].event) == (gap.frame, owners.number)
+    assert mirroring.loop.counters.polls == 10
+
+
+def test_each_frame_of_a_message_shows_an_injection_of_this_host(mirroring: Mirroring) -> None:
+    mirroring.send(frame(7, 1))
+    mirroring.next()
+    writer = SourceWriter(mirroring.block, 0)
+    injection = writer.inject(["other"])
+    writer.shadow(injection, {"other": 5})
+    mirroring.send(*(frame(number, number) for number in range(8, 12)))
+    frames = [mirroring.next()]
+    while frames[-1].cycle < 1011:
+        frames.append(mirroring.next())
+    assert [(one.raw, one.effective) for one in frames[-4:]] == [
+        (bytes((0, number, 0, 0)), bytes((0, number, 0, 5))) for number in range(8, 12)
+    ]
+    writer.lift(injection)
+    mirroring.send(frame(12, 12))
+    while frames[-1].cycle < 1012:
+        frames.append(mirroring.next())
+    assert frames[-1].effective is None
+
+
 def test_a_silent_owner_makes_the_source_bad_until_it_sends_again(mirroring: Mirroring) -> None:
     mirroring.send(frame(7, 1))
     mirroring.next()
@@ -420,12 +462,13 @@ def test_registers_that_are_not_writable_here_stay_here(mirroring: Mirroring) ->
 def test_a_flood_needs_bounded_memory(mirroring: Mirroring, monkeypatch: pytest.MonkeyPatch) -> None:
     """Messages that come faster than the mirror may publish them, and do not fit, are requested later."""
     monkeypatch.setattr("shmio.connectors.fabric.loop.MAX_WAITING_BYTES", 20_000)
-    total = 0
-    for first in range(7, 7 + 50 * 400, 50):
-        data = mirroring.link.message(*(frame(number, 1) for number in range(first, first + 50)), age_ns=30 * S)
-        total += len(data)
+    messages = [
+        mirroring.link.message(*(frame(number, 1) for number in range(first, first + 50)), age_ns=30 * S)
+        for first in range(7, 7 + 50 * 400, 50)
+    ]
+    for data in messages:
         mirroring.link.send(data)
-    assert mirroring.loop._received_bytes < total // 2
+    assert mirroring.loop._received_bytes < sum(map(len, messages)) // 2
 
 
 def test_all_of_many_messages_at_once_are_published(mirroring: Mirroring) -> None:

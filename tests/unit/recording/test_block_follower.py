@@ -1,0 +1,73 @@
+"""A block follower reads the same entries in the same order, one at a time or in runs."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shmio.fabric.messages import Entry, decode_entries
+from shmio.layout.model import Layout, Register
+from shmio.recording.block_follower import BlockFollower
+from shmio.recording.format.encoding import BlockPosition, Gap, Reason
+from shmio.segment import Attributes, BlockSpec, BlockWriter, EventKind, Quality, Record, Segment
+
+LAYOUT = Layout("DB1", 1, 4, False, (Register("count", "INT", (), 0, None, 2, 1),))
+
+
+def follower(segment: Segment) -> BlockFollower:
+    return BlockFollower(segment.blocks["cell"], 1, BlockPosition(), Reason.OVERTAKEN, lambda at_ns: at_ns)
+
+
+def publish(writer: BlockWriter, action: str, cycle: int) -> None:
+    if action == "event":
+        writer.event(Record(EventKind.NOTED, f"at {cycle}"))
+    elif action == "flood":  # the ring overwrites what was not read
+        for _ in range(writer.block.ring.slot_count + 3):
+            writer.publish(bytes(4), cycle=cycle)
+    else:
+        writer.publish(bytes(4), cycle=cycle, quality=Quality.BAD if action == "bad" else Quality.GOOD)
+
+
+def in_runs(of: BlockFollower, limit: int) -> Iterator[Entry]:
+    """Yield all entries that are there, as the uplink of the fabric reads them."""
+    while True:
+        if run := of.pack(limit):
+            yield from decode_entries(bytes(run), 0)
+            assert of.behind or not of.pack(limit)
+            continue
+        taken = [item for _, _, item in of.take(limit)]
+        yield from taken
+        if not taken:
+            return
+
+
+@given(
+    st.lists(st.sampled_from(["good", "good", "good", "bad", "event", "flood", "read", "read one"]), max_size=40),
+    st.integers(1, 5),
+)
+def test_runs_leave_nothing_out(actions: list[str], limit: int) -> None:
+    block = BlockSpec("cell", LAYOUT, 20_000_000, 500_000_000, 1 << 16, Attributes("s7", ()))
+    with Segment.create(f"followed{os.getpid()}", [block], []) as segment:
+        try:
+            writer = segment.writer("cell")
+            one, other = follower(segment), follower(segment)
+            expected: list[Entry] = []
+            found: list[Entry] = []
+            for cycle, action in enumerate([*actions, "read"]):
+                if action == "read one":
+                    expected += [item for _, _, item in one.take(1)]
+                    found += [item for _, _, item in other.take(1)]
+                elif action == "read":
+                    expected += [item for _, _, item in one.take(1 << 20)]
+                    found += in_runs(other, limit)
+                else:
+                    publish(writer, action, cycle)
+            assert found == expected
+            assert other.last == one.last == segment.blocks["cell"].ring.head()
+            frames = sum(gap.count for gap in found if isinstance(gap, Gap) and gap.what == "frames")
+            assert frames + sum(hasattr(entry, "raw") for entry in found) == one.last
+        finally:
+            segment.unlink()
