@@ -204,6 +204,8 @@ def _turn(connect: Connect, count: int, duration_s: float, costs: list[float]) -
 def follow(device: Child, newest: Callable[[], object], period_s: float) -> Callable[[], object]:
     """Return a function that lets a device change all its values at once, and waits until a client has the last one.
 
+    The client reads while the device sends, as the process of a source does.
+
     Args:
         device: A program that gives all values the number that it reads.
         newest: Returns the client's newest number from the last value.
@@ -229,9 +231,10 @@ def follow(device: Child, newest: Callable[[], object], period_s: float) -> Call
 
     def change() -> None:
         number = next(numbers)
-        device.ask(number)
+        device.send(number)
         if not wait(number, PATIENCE_S):
             raise SystemExit("a value of the device is lost")
+        device.answer()
 
     return change
 
@@ -300,9 +303,10 @@ class Child:
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
         )
         self.pid = self._process.pid
-        self.hello: Any = self._line()
+        self.hello: Any = self.answer()
 
-    def _line(self) -> Any:
+    def answer(self) -> Any:
+        """Wait for the child's next line, and return what it says."""
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
         if not line:
@@ -310,17 +314,21 @@ class Child:
             raise SystemExit(f"{self._script} ended with status {self._process.returncode}")
         return json.loads(line)
 
-    def ask(self, line: object) -> Any:
-        """Send a line, and return the JSON answer."""
+    def send(self, line: object) -> None:
+        """Send a line. The child's :meth:`answer` to it must be awaited before the next one."""
         assert self._process.stdin is not None
         print(line, file=self._process.stdin, flush=True)
-        return self._line()
+
+    def ask(self, line: object) -> Any:
+        """Send a line, and return the JSON answer."""
+        self.send(line)
+        return self.answer()
 
     def finish(self) -> Any:
         """Close the child's input, and return the last line that it prints."""
         assert self._process.stdin is not None
         self._process.stdin.close()
-        return self._line()
+        return self.answer()
 
     def stop(self) -> None:
         """End the child, and wait until it has ended."""

@@ -89,13 +89,22 @@ def dds_library(stack: ExitStack, _: Any, arms: int) -> Newest:
     """Create readers of cyclonedds."""
     from cyclonedds.core import Listener  # noqa: PLC0415
     from cyclonedds.domain import Domain, DomainParticipant  # noqa: PLC0415
+    from cyclonedds.idl import make_idl_struct  # noqa: PLC0415
+    from cyclonedds.idl.types import float64, int32, sequence, uint32  # noqa: PLC0415
     from cyclonedds.qos import Policy, Qos  # noqa: PLC0415
     from cyclonedds.sub import DataReader  # noqa: PLC0415
     from cyclonedds.topic import Topic  # noqa: PLC0415
 
     from shmio.connectors.ros import participant  # noqa: PLC0415
-    from shmio.connectors.ros.dds_types import sample_type  # noqa: PLC0415
+    from shmio.connectors.ros.dds_types import dds_type  # noqa: PLC0415
 
+    def struct(ros_type: str, **fields: Any) -> Any:
+        return make_idl_struct(ros_type.partition("/")[2], dds_type(ros_type), fields)
+
+    time = struct("builtin_interfaces/Time", sec=int32, nanosec=uint32)
+    header = struct("std_msgs/Header", stamp=time, frame_id=str)
+    numbers = sequence[float64]
+    kind = struct(KIND, header=header, name=sequence[str], position=numbers, velocity=numbers, effort=numbers)
     values: dict[str, dict[str, float]] = {}
 
     class Taking(Listener):  # type: ignore[misc]  # the library has no types
@@ -106,10 +115,7 @@ def dds_library(stack: ExitStack, _: Any, arms: int) -> Newest:
     kept = [Domain(DOMAIN, participant.configuration(DOMAIN, "lo", [], 1 << 20))]
     member = DomainParticipant(DOMAIN)
     qos = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(1))
-    kept += [
-        DataReader(member, Topic(member, f"rt/arm{arm}", sample_type(KIND)), qos=qos, listener=Taking())
-        for arm in range(arms)
-    ]
+    kept += [DataReader(member, Topic(member, f"rt/arm{arm}", kind), qos=qos, listener=Taking()) for arm in range(arms)]
     stack.callback(kept.clear)
     return lambda: values.get(f"rt/arm{arms - 1}", {}).get(JOINTS[-1])
 

@@ -27,8 +27,8 @@ from snap7.datatypes import S7Area
 
 from shmio.connectors.modbus.client import ModbusClient
 from shmio.connectors.opcua import decode
+from shmio.connectors.ros import cdr, websocket
 from shmio.connectors.ros import messages as ros
-from shmio.connectors.ros import websocket
 from shmio.connectors.ros.addresses import FieldError
 from shmio.connectors.ros.values import ValueConverter
 from shmio.connectors.s7 import pdu, userdata
@@ -263,6 +263,25 @@ def _ros_messages() -> list[bytes]:
     ]
 
 
+def _cdr_messages() -> list[bytes]:
+    """Return a message of each type whose values are all zero, and one with values."""
+    kinds = sorted(ros.DEFINITIONS)
+    start = b"\0\1\0\0" + bytes(8)
+    texts = struct.pack("<I2s2xI2s2xI2s2x", 2, b"f\0", 2, b"a\0", 2, b"b\0")
+    numbers = struct.pack("<I4x2d", 2, 1.5, -2.5)
+    return [bytes((at,)) + start + bytes(200) for at in range(len(kinds))] + [
+        bytes((kinds.index("sensor_msgs/JointState"),)) + start + texts + numbers * 3
+    ]
+
+
+def _check_cdr(data: bytes) -> None:
+    kinds = sorted(ros.DEFINITIONS)
+    with suppress(ValueError, struct.error):
+        kind = kinds[data[0] % len(kinds)] if data else kinds[0]
+        found = cdr.decode(data[1:], kind)
+        assert found is None or found.keys() == ros.DEFINITIONS[kind].keys()
+
+
 @cache
 def _ros_registers() -> list[ValueConverter]:
     tags = {kind.replace("[", "").replace("]", ""): {"type": kind, "address": "0"} for kind in mqtt.KINDS}
@@ -391,6 +410,7 @@ PARSERS: dict[str, Parser] = {
     "mqtt": Parser(damaged(_mqtt_payloads), _check_mqtt),
     "sparkplug": Parser(damaged(_sparkplug_messages), _check_sparkplug),
     "ros": Parser(damaged(_ros_messages), _check_ros),
+    "ros-cdr": Parser(damaged(_cdr_messages), _check_cdr),
     "grpc": Parser(damaged(_grpc_messages), _check_grpc),
     "recording": Parser(damaged(_recordings), _check_recording),
     "snapshot": Parser(damaged(_snapshots), _check_snapshot),

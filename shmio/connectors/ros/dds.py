@@ -188,7 +188,7 @@ class Ros2Connector(Connector):
         options = self._options
         self._discovered_s = time.monotonic() + DISCOVERY_S
         discovered: set[str] = set()
-        while not self._met(joined):
+        while not joined.met():
             if time.monotonic() > end_s:
                 joined.discover(DISCOVERIES_AT_END)
                 reasons = [f"{name}: {one}" for name in self._topics.by_name for one in joined.obstacles(name)]
@@ -206,11 +206,6 @@ class Ros2Connector(Connector):
         for name in sorted(discovered):
             self._report(joined, self._topics.by_name[name])
 
-    def _met(self, joined: Participant) -> bool:
-        """Return whether another participant publishes or subscribes to one of the topics."""
-        names = self._topics.by_name
-        return any(joined.publishers(name) or joined.subscribers(name) for name in names)
-
     def read(self) -> bytes:
         """Return the image of the newest messages.
 
@@ -223,14 +218,15 @@ class Ros2Connector(Connector):
         if joined is None:
             raise ConnectorError(f"this process has not joined DDS {self._where}")
         self._pull(joined)
-        if not self._met(joined):
+        if not joined.met():
             raise ConnectorError(f"all publishers and subscribers of this source's topics have left DDS {self._where}")
         for name in joined.discover(DISCOVERIES):
             self._report(joined, self._topics.by_name[name])
+        lost = joined.lost()
         for topic in self._topics.by_name.values():
             topic.fault = GOOD
             if topic.received_ns:
-                if not topic.writable and not joined.alive(topic.name):
+                if topic.name in lost and not topic.writable:
                     topic.fault = BAD_NO_COMMUNICATION
             elif topic.name in self._obstructed and not joined.publishers(topic.name):
                 topic.fault = BAD_CONFIGURATION_ERROR

@@ -10,6 +10,7 @@ from typing import Any, Final
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl import types as idl
 
+from shmio.connectors.ros import cdr
 from shmio.connectors.ros.messages import DEFINITIONS
 
 _PRIMITIVES: Final[dict[str, Any]] = {
@@ -40,16 +41,32 @@ def ros_type(name: str) -> str:
     return f"{package}/{last.removesuffix('_')}" if middle else name
 
 
+class Received:
+    """A sample that a reader returns: its message, as dictionaries and lists."""
+
+    def __init__(self, message: Any) -> None:
+        self.message = message
+        self.sample_info: Any = None
+        """Set by the library."""
+
+
 @lru_cache(maxsize=256)
 def sample_type(kind: str) -> Any:
-    """Return the class whose instances are samples of a type."""
+    """Return the class whose instances are samples of a type. Readers of such a type return :class:`Received`."""
     annotations = {name: _annotation(inner) for name, inner in DEFINITIONS[kind].items()}
 
+    def deserialize(data: bytes) -> Received:
+        message = cdr.decode(data, kind)
+        return Received(to_message(made.__idl__.deserialize(data), kind) if message is None else message)
+
     def fill(namespace: dict[str, Any]) -> None:
-        namespace |= {"__annotations__": annotations, "__module__": __name__}
+        namespace |= {
+            "__annotations__": annotations, "__module__": __name__, "deserialize": staticmethod(deserialize)
+        }  # fmt: skip
 
     name = f"{kind.partition('/')[2]}_"
-    return dataclasses.dataclass(types.new_class(name, (IdlStruct,), {"typename": dds_type(kind)}, fill))
+    made: Any = dataclasses.dataclass(types.new_class(name, (IdlStruct,), {"typename": dds_type(kind)}, fill))
+    return made
 
 
 def _annotation(kind: str) -> Any:

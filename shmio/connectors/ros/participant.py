@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 from xml.sax.saxutils import quoteattr
 
-from cyclonedds.core import DDSException
+from cyclonedds.core import DDSException, DDSStatus, WaitSet
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.internal import InvalidSample
 from cyclonedds.pub import DataWriter
@@ -26,7 +26,6 @@ from shmio.connectors.ros.dds_types import (
     ros_topic,
     ros_type,
     sample_type,
-    to_message,
     to_sample,
 )
 from shmio.connectors.ros.discovery import POLICIES, Discovery, reader_qos, unmet, writer_qos
@@ -42,6 +41,8 @@ _KEYS: Final = {"deadline": "deadline_ms", "lease": "lease_ms"}
 """The configuration keys of those policies whose keys have other names."""
 _COMPARED: Final = frozenset({2, 4, 8, 11})
 """The numbers of the policies that ``unmet`` compares."""
+_MATCHING: Final = DDSStatus.SubscriptionMatched | DDSStatus.LivelinessChanged
+"""The changes of a reader that change which publishers it has."""
 _HEARTBEAT: Final = '<HeartbeatInterval min="2 ms" minsched="2 ms" max="1 s">5 ms</HeartbeatInterval>'
 """Makes writers ask for acknowledgements at short intervals, because the poll loop waits for them."""
 
@@ -95,27 +96,47 @@ def _keep_to_loopback(before: set[int]) -> None:
 class _Endpoint:
     """The reader of a topic, and the writer of a command topic."""
 
-    def __init__(self, participant: Any, topic: Topic, blocking_ns: int) -> None:
+    def __init__(self, participant: Any, changes: WaitSet, topic: Topic, blocking_ns: int) -> None:
         self.kind, self.qos = plain(topic.type), topic.qos
-        self._participant = participant
+        self._participant, self._changes = participant, changes
+        self.publishers = self.subscribers = 0
+        self.alive = False
+        """Whether a publisher has shown, within its lease, that it is alive."""
         self._dds = DdsTopic(participant, dds_topic(topic.name), sample_type(self.kind))
         self.requested, self.offered = reader_qos(topic.qos), writer_qos(topic.qos, blocking_ns)
         self.reader = DataReader(participant, self._dds, qos=self.requested)
+        self.reader.set_status_mask(_MATCHING)
+        changes.attach(self.reader)
         self.writer: Any = None
         self.set_writable(topic.writable)
 
     def set_writable(self, writable: bool) -> None:
         """Create the writer if the topic is writable and has none; delete it if the topic is not writable."""
         if not writable:
-            _delete(self.writer)
+            self._delete(self.writer)
             self.writer = None
         elif self.writer is None:
             self.writer = DataWriter(self._participant, self._dds, qos=self.offered)
+            self.writer.set_status_mask(DDSStatus.PublicationMatched)
+            self._changes.attach(self.writer)
+
+    def count(self) -> None:
+        """Count the publishers and subscribers, not counting this participant, and acknowledge the changes."""
+        self.publishers = self.reader.get_subscription_matched_status().current_count
+        living = self.reader.get_liveliness_changed_status().alive_count
+        self.alive = bool(living if self.qos.lease_ms else self.publishers)
+        self.subscribers = 0 if self.writer is None else self.writer.get_publication_matched_status().current_count
 
     def close(self) -> None:
         """Delete the reader, the writer and the topic at once."""
-        for entity in (self.writer, self.reader, self._dds):
-            _delete(entity)
+        for entity in (self.writer, self.reader):
+            self._delete(entity)
+        _delete(self._dds)
+
+    def _delete(self, entity: Any) -> None:
+        if entity is not None:
+            self._changes.detach(entity)
+        _delete(entity)
 
 
 def _other_policies(endpoint: _Endpoint) -> list[str]:
@@ -158,6 +179,9 @@ class Participant:
         self._endpoints: dict[str, _Endpoint] = {}
         self._blocking_ns = round(timeout_s * 1e9)
         self._domain = self._participant = None
+        self._changes: Any = None
+        """The readers and writers whose publishers or subscribers have changed since they were counted."""
+        self._lost: frozenset[str] = frozenset()
         self.discovery = Discovery()
         try:
             before = set(_sockets())
@@ -165,6 +189,7 @@ class Participant:
             if loopback:
                 _keep_to_loopback(before)
             self._participant = DomainParticipant(domain)
+            self._changes = WaitSet(self._participant)
             self.add(topics)
             self._watch()
         except ConnectorError:
@@ -186,7 +211,7 @@ class Participant:
         for topic in topics:
             if topic.name not in self._endpoints:
                 try:
-                    self._endpoints[topic.name] = _Endpoint(self._participant, topic, self._blocking_ns)
+                    self._endpoints[topic.name] = _Endpoint(self._participant, self._changes, topic, self._blocking_ns)
                 except DDSException as error:
                     raise ConnectorError(f"cannot read {topic.name}: {error}") from None
 
@@ -222,25 +247,36 @@ class Participant:
         """Leave the domain."""
         self._endpoints.clear()
         self.discovery.close()
-        for entity in (self._participant, self._domain):
+        for entity in (self._changes, self._participant, self._domain):
             _delete(entity)
-        self._participant = self._domain = None
+        self._changes = self._participant = self._domain = None
+
+    def _count(self) -> None:
+        """Count publishers and subscribers again if they have changed."""
+        if self._changes.wait(0):
+            for endpoint in self._endpoints.values():
+                endpoint.count()
+            self._lost = frozenset(name for name, endpoint in self._endpoints.items() if not endpoint.alive)
 
     def publishers(self, topic: str) -> int:
         """Return how many publishers a topic has, not counting this participant."""
-        return len(self._endpoints[topic].reader.get_matched_publications())
+        self._count()
+        return self._endpoints[topic].publishers
 
     def subscribers(self, topic: str) -> int:
         """Return how many subscribers a command topic has, not counting this participant."""
-        writer = self._endpoints[topic].writer
-        return 0 if writer is None else len(writer.get_matched_subscriptions())
+        self._count()
+        return self._endpoints[topic].subscribers
 
-    def alive(self, topic: str) -> bool:
-        """Return whether a topic has a publisher that has shown, within its lease, that it is alive."""
-        endpoint = self._endpoints[topic]
-        if not endpoint.qos.lease_ms:
-            return bool(self.publishers(topic))
-        return bool(endpoint.reader.get_liveliness_changed_status().alive_count)
+    def met(self) -> bool:
+        """Return whether any topic has a publisher or a subscriber."""
+        self._count()
+        return any(endpoint.publishers or endpoint.subscribers for endpoint in self._endpoints.values())
+
+    def lost(self) -> frozenset[str]:
+        """Return the topics that have had a publisher, and now have none that is alive; others may be among them."""
+        self._count()
+        return self._lost
 
     def discover(self, most: int) -> set[str]:
         """Process at most ``most`` discovered changes of each kind; return the names of the topics with changes."""
@@ -278,7 +314,7 @@ class Participant:
             try:
                 for sample in endpoint.reader.take(1):
                     if not isinstance(sample, InvalidSample):
-                        yield name, to_message(sample, endpoint.kind)
+                        yield name, sample.message
             except DDSException as error:
                 raise ConnectorError(f"{name}: {error.msg or error}") from None
             except Exception as error:  # noqa: BLE001  decoding of a peer's bytes may fail in any way
