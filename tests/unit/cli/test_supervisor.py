@@ -45,8 +45,10 @@ def block(name: str, kind: str) -> str:
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+    folder = tmp_path / "cell"  # beside no other test's folder: init reads its neighbours
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    return folder
 
 
 @pytest.fixture
@@ -713,13 +715,13 @@ def test_broker_that_lets_everybody_write_is_a_warning(
     example: Edit,
     roles: str,
     warned: bool,
-    tmp_path: Path,
+    folder: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setenv("SHMIO_MOSQUITTO", sys.executable)  # any program will do
-    (tmp_path / "accounts").write_text("anna:secret\n")
-    (tmp_path / "accounts").chmod(0o600)
+    (folder / "accounts").write_text("anna:secret\n")
+    (folder / "accounts").chmod(0o600)
     example('listen = "127.0.0.1:1883"', 'listen = "0.0.0.0:1883"\ninsecure = true\npassword_file = "accounts"')
     example('roles = ["read", "write"]', f"roles = {roles}")
     assert main(["check"]) == 0

@@ -49,14 +49,14 @@ def test_the_scan_equals_a_comparison_of_each_register(old: bytes, changes: list
     assert ChangeScan([LAYOUT.registers[i] for i in chosen]).changed(old, bytes(new)) == wanted
 
 
-@pytest.mark.parametrize("bit", range(LAYOUT.size * 8))
-def test_a_change_of_each_single_bit_is_found(bit: int) -> None:
+def test_a_change_of_each_single_bit_is_found() -> None:
     old = bytes(LAYOUT.size)
-    new = bytearray(old)
-    new[bit // 8] |= 1 << bit % 8
-    changed = ChangeScan(LAYOUT.registers).changed(old, bytes(new))
-    assert changed == naive(old, bytes(new))
-    assert len(changed) <= 1
+    for bit in range(LAYOUT.size * 8):
+        new = bytearray(old)
+        new[bit // 8] |= 1 << bit % 8
+        changed = ChangeScan(LAYOUT.registers).changed(old, bytes(new))
+        assert changed == naive(old, bytes(new)), bit
+        assert len(changed) <= 1, bit
 
 
 @pytest.mark.parametrize(("low", "high"), [(0, 3), (2, 5), (0, 7), (3, 8), (5, 19), (8, 19), (16, 19), (19, 19)])
