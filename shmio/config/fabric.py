@@ -16,7 +16,7 @@ PORT: Final = 4222
 LISTEN: Final = f"127.0.0.1:{PORT}"
 """Address at which the embedded server listens if the configuration gives no other."""
 SCHEMES: Final = ("nats", "tls")
-ROLES: Final = ("read", "write")
+ROLES: Final = ("read", "write", "inject")
 """Roles of the cells that send commands."""
 EXTRA: Final = "fabric: the fabric needs another library; run pip install 'shmio[fabric]'"
 _REMEDY: Final = "add a [fabric.tls] table, or write insecure = true in [fabric]"

@@ -122,6 +122,9 @@ class InFlightTable:
     def __len__(self) -> int:
         return len(self._by_number)
 
+    def __contains__(self, number: int) -> bool:
+        return number in self._by_number
+
     @property
     def due_ns(self) -> int | None:
         """The earliest deadline of a command, in ns of the monotonic clock; None if no command is in flight."""

@@ -1,7 +1,8 @@
-"""Messages of the fabric: a source's frames and events, requests for those missing, and commands.
+"""Messages of the fabric: a source's frames and events, its injections, requests, and commands.
 
 A message has a fixed header and entries, in the order in which the source published them. An entry
-has the encoding of a recording (docs/reference/dump-format.md). The uplink numbers the messages of
+has the encoding of a recording (docs/reference/dump-format.md). The list of the source's injections
+is a message of its own. The uplink numbers the messages of
 each source without gaps, so a mirror knows which ones it has not received.
 docs/reference/fabric.md describes the bytes.
 """
@@ -10,7 +11,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Iterator
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import msgspec
 
@@ -25,7 +26,9 @@ from shmio.recording.format.encoding import (
     encode_json,
 )
 from shmio.segment.block import Frame
+from shmio.segment.commands import MAX_NAME_BYTES
 from shmio.segment.events import Event
+from shmio.segment.injection_list import LIST_SIZE, InjectionEntry
 
 VERSION: Final = 1
 MAX_MESSAGE_BYTES: Final = 1 << 20
@@ -45,6 +48,7 @@ _AGE_AT: Final = _HEADER.size - 8
 _FRAME: Final = 1
 _EVENT: Final = 2
 _GAP: Final = 3
+_STATE: Final = 4
 
 
 class Header(NamedTuple):
@@ -149,8 +153,8 @@ def decode_entry(data: bytes, at: int) -> tuple[Entry | None, int]:
     """Decode the entry at a position of a message.
 
     Returns:
-        The entry, and the position after it. The entry is None if a newer version has made it, of a
-        kind that this version skips.
+        The entry, and the position after it. The entry is None if it is a state, or if a
+        newer version has made it.
 
     Raises:
         ValueError: The message is malformed.
@@ -176,6 +180,47 @@ def decode_entry(data: bytes, at: int) -> tuple[Entry | None, int]:
         raise ValueError(f"a gap is malformed: {error}") from None
 
 
+class SourceState(msgspec.Struct, frozen=True):
+    """What a source has besides its frames and events. It is the content of a message of its own.
+
+    Attributes:
+        injections: The injections, the innermost first. ``cell`` is the cell whose program has created
+            an injection, if it is another one than the owner.
+        clock_ns: The owner's clock when the message was made, in ns.
+        virtual: True if the owner's time is virtual.
+
+    """
+
+    injections: tuple[InjectionEntry, ...]
+    clock_ns: int
+    virtual: bool
+
+
+_STATES: Final = msgspec.json.Decoder(SourceState)  # created before there are threads, as in layout/document.py
+
+
+def encode_state(header: Header, state: SourceState) -> bytearray:
+    """Encode a message with the state of a source."""
+    content = msgspec.json.encode(state)
+    return with_header(header, bytearray(_ENTRY.pack(_STATE, len(content)) + content))
+
+
+def decode_state(data: bytes) -> SourceState | None:
+    """Return the state of a source if the message has one.
+
+    Raises:
+        ValueError: The state is malformed.
+
+    """
+    start = _HEADER.size + _ENTRY.size
+    if len(data) < start or _ENTRY.unpack_from(data, _HEADER.size)[0] != _STATE:
+        return None
+    try:
+        return _STATES.decode(memoryview(data)[start:])
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise ValueError(f"the state is malformed: {error}") from None
+
+
 class MissingRequest(msgspec.Struct, frozen=True):
     """A request for the messages of a stream from ``first`` to ``last``.
 
@@ -188,8 +233,22 @@ class MissingRequest(msgspec.Struct, frozen=True):
     last: int
 
 
+STATE_REQUEST: Final = MissingRequest(0, 0, 0)
+"""Request for the state of a source: the uplink publishes it for all. No messages have these numbers."""
+
+
+def asks_for_state(data: bytes) -> bool:
+    """Return whether a request is :data:`STATE_REQUEST`."""
+    try:
+        return msgspec.json.decode(data, type=MissingRequest) == STATE_REQUEST
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+        return False
+
+
 MAX_ITEMS: Final = 4096
 """Maximum number of writes of a command."""
+MAX_RENEWED: Final = 256
+"""Maximum number of injections that a command renews."""
 MAX_WAIT_S: Final = 60.0
 """Longest time for which the owner waits for the outcome of a command, in s."""
 
@@ -209,8 +268,42 @@ class WriteItem(msgspec.Struct, frozen=True, array_like=True):
     data: bytes
 
 
-class CommandRequest(msgspec.Struct, frozen=True):
-    """A command of another cell to a source. The source carries out all writes or none.
+InjectionKind = Literal["inject", "shadow", "lift", "declare", "renew"]
+"""What a command does with injections; the first four are as in :class:`shmio.segment.commands.CommandKind`."""
+
+
+class InjectionRequest(msgspec.Struct, frozen=True, omit_defaults=True):
+    """What a command does with injections of a source.
+
+    Attributes:
+        kind: What it does. ``renew``: the programs that have created injections still run.
+        number: Number that the sender gave the command. The owner's events about the command have it,
+            and so has an injection that the command creates. 0 with ``renew``.
+        injection: With ``lift`` and ``shadow``: number of the injection.
+        direction: With ``inject``: 0 for ``/out``, 1 for ``/in``.
+        priority: With ``inject``: the priority.
+        keep: With ``inject`` and ``declare``: the injection stays, also if it is not renewed.
+        name: With ``inject``: the name.
+        items: With ``inject``: the bits to cover; with ``shadow``: the values.
+        declaration: With ``declare``: the declaration as JSON. Names and times are the owner's.
+        renewed: With ``renew``: numbers of the injections.
+
+    """
+
+    kind: InjectionKind
+    number: int = 0
+    injection: int = 0
+    direction: int = 0
+    priority: int = 0
+    keep: bool = False
+    name: str = ""
+    items: list[WriteItem] = []
+    declaration: bytes = b""
+    renewed: list[int] = []
+
+
+class CommandRequest(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A command of another cell to a source: writes, of which the source carries out all or none, or an injection.
 
     Attributes:
         expires_ns: Time on the owner's clock, as ``made_ns`` of a message, after which the source
@@ -219,27 +312,40 @@ class CommandRequest(msgspec.Struct, frozen=True):
             earlier uplink is expired: it may have been stuck on its way since.
         layout: First 8 bytes of the hash of the layout that the offsets belong to. The owner
             rejects a command for another layout.
-        writes: The writes.
+        writes: The writes; none if the command is about injections.
+        injection: What to do with injections; None if the command writes.
 
     """
 
     expires_ns: int
     stream: int
     layout: bytes
-    writes: list[WriteItem]
+    writes: list[WriteItem] = []
+    injection: InjectionRequest | None = None
+
+    @property
+    def outcomes(self) -> int:
+        """Number of outcomes in the reply: one for each write, and one for an injection."""
+        if self.injection is None:
+            return len(self.writes)
+        return {"shadow": len(self.injection.items), "renew": 0}.get(self.injection.kind, 1)
 
 
 class CommandReply(msgspec.Struct, frozen=True):
-    """The outcomes of a command: one for each write, in their order.
+    """The outcomes of a command: one for each write, in their order; one for a command about an injection.
 
     Attributes:
-        outcomes: The outcomes, each a value of :class:`shmio.model.values.OutcomeKind`.
+        outcomes: The outcomes, each a value of :class:`shmio.model.values.OutcomeKind`, or ``injected`` or
+            ``lifted``.
         reasons: For each outcome, its reason; empty for a success.
 
     """
 
     outcomes: list[str]
     reasons: list[str]
+
+
+_OUTCOMES: Final = frozenset({*map(str, OutcomeKind), "injected", "lifted"})
 
 
 def encode_command(message: CommandRequest | CommandReply) -> bytes:
@@ -258,17 +364,42 @@ def decode_request(data: bytes) -> CommandRequest:
         request = msgspec.msgpack.decode(data, type=CommandRequest)
     except msgspec.MsgspecError as error:
         raise ValueError(f"the message is not a command: {error}") from None
-    if not 0 < len(request.writes) <= MAX_ITEMS:
-        raise ValueError(f"a command has 1 to {MAX_ITEMS} writes, but this one has {len(request.writes)}")
-    for item in request.writes:
+    injection = request.injection
+    if injection is not None and not request.writes:
+        _check_injection(injection)
+        items = injection.items
+    elif injection is None and 0 < len(request.writes) <= MAX_ITEMS:
+        items = request.writes
+    else:
+        raise ValueError(f"a command has 1 to {MAX_ITEMS} writes or an injection, not {len(request.writes)} writes")
+    for item in items:
         bit = len(item.data) == 1 and 0 < item.mask < 256 and item.mask & (item.mask - 1) == 0
         if item.offset < 0 or not item.data or (item.mask and not bit):
             raise ValueError("a write of the command is malformed")
     return request
 
 
+def _check_injection(injection: InjectionRequest) -> None:
+    """Raise ValueError if a request about an injection is malformed."""
+    kind = injection.kind
+    numbers = (injection.number, injection.injection, *injection.renewed)
+    sound = (
+        all(0 <= number < 1 << 64 for number in numbers)
+        and (kind == "renew" or injection.number > 0)
+        and (kind not in ("lift", "shadow") or injection.injection > 0)
+        and (0 < len(injection.items) <= MAX_ITEMS if kind in ("inject", "shadow") else not injection.items)
+        and injection.direction in (0, 1)
+        and -(1 << 31) <= injection.priority < 1 << 31
+        and len(injection.name.encode("utf-8", "surrogatepass")) <= MAX_NAME_BYTES
+        and (0 < len(injection.declaration) <= LIST_SIZE if kind == "declare" else not injection.declaration)
+        and len(injection.renewed) <= MAX_RENEWED
+    )
+    if not sound:
+        raise ValueError(f"the {kind} request of the command is malformed")
+
+
 def decode_reply(data: bytes, items: int) -> CommandReply:
-    """Decode the reply to a command with this number of writes.
+    """Decode the reply to a command with this number of outcomes.
 
     Raises:
         ValueError: The message is not such a reply.
@@ -276,10 +407,10 @@ def decode_reply(data: bytes, items: int) -> CommandReply:
     """
     try:
         reply = msgspec.msgpack.decode(data, type=CommandReply)
-        for outcome in reply.outcomes:
-            OutcomeKind(outcome)
-    except (msgspec.MsgspecError, ValueError) as error:
+    except msgspec.MsgspecError as error:
         raise ValueError(f"the message is not a reply to a command: {error}") from None
+    if not _OUTCOMES.issuperset(reply.outcomes):
+        raise ValueError("the message is not a reply to a command: an outcome is unknown")
     if len(reply.outcomes) != items or len(reply.reasons) != items:
         raise ValueError("the reply has another number of outcomes than the command has writes")
     return reply

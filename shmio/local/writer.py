@@ -63,6 +63,7 @@ class CommandSender:
         deadline_ns: int,
         kind: CommandKind = CommandKind.WRITE,
         injection: int = 0,
+        number: int = 0,
         **options: Unpack[InjectionOptions],
     ) -> int:
         """Send a command to the source's present process, without waiting.
@@ -72,6 +73,7 @@ class CommandSender:
             deadline_ns: Time after which the source must not start the command, CLOCK_MONOTONIC.
             kind: Kind of command.
             injection: Number of the injection to lift, or to give values to; 0: none.
+            number: Number of the command, if another process has chosen it; 0: the next number.
             options: Options of the injection to create, if the command creates one.
 
         Returns:
@@ -85,7 +87,8 @@ class CommandSender:
         if (len(writes) > 0) == (kind in EMPTY) or len(writes) > MAX_WRITES:
             raise CommandError(f"{source}: a command must have 1 to {MAX_WRITES} items, but this one has {len(writes)}")
         with self._lock:
-            number, self._next = self._next, self._next + 1
+            if not number:
+                number, self._next = self._next, self._next + 1
             incarnation = self.block.incarnation
             command = Command(self.writer, number, incarnation, deadline_ns, tuple(writes), kind, injection, **options)
             record = command.pack()
@@ -226,6 +229,31 @@ class SourceWriter:
         """
         return self._send(("",) * len(writes), writes, timeout_s, CommandKind.SHADOW, injection)
 
+    def forward(
+        self,
+        number: int,
+        kind: CommandKind,
+        writes: Sequence[Write],
+        timeout_s: float,
+        injection: int = 0,
+        **options: Unpack[InjectionOptions],
+    ) -> PendingCommand:
+        """Send a command about an injection for another program, without waiting.
+
+        Args:
+            number: Number that the program has given the command.
+            kind: INJECT, SHADOW, LIFT or DECLARE.
+            writes: The items.
+            timeout_s: Time in s that the command may wait for the source.
+            injection: Number of the injection to lift, or to give values to; 0: none.
+            options: Options of the injection to create.
+
+        Raises:
+            CommandError: The command could not be sent.
+        """
+        paths = ("",) * (len(writes) if kind is CommandKind.SHADOW else 1)
+        return self._send(paths, writes, timeout_s, kind, injection, number, **options)
+
     def inject(
         self, patterns: Iterable[str], timeout_s: float | None = None, **options: Unpack[InjectionOptions]
     ) -> int:
@@ -355,12 +383,13 @@ class SourceWriter:
         timeout_s: float | None,
         kind: CommandKind = CommandKind.WRITE,
         injection: int = 0,
+        number: int = 0,
         **options: Unpack[InjectionOptions],
     ) -> PendingCommand:
         wait_s = self.timeout_s if timeout_s is None else timeout_s
         deadline_ns = time.monotonic_ns() + round(wait_s * 1e9)
         events, incarnation = self.block.events.cursor(), self.block.incarnation
-        number = self._sender.submit(writes, deadline_ns, kind, injection, **options)
+        number = self._sender.submit(writes, deadline_ns, kind, injection, number, **options)
         return PendingCommand(number, paths, incarnation, deadline_ns + round(PATIENCE_S * 1e9), events)
 
     def outcomes(self, ticket: PendingCommand) -> list[Outcome]:

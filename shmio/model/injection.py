@@ -46,6 +46,7 @@ class Injection(msgspec.Struct, Generic[DeclarationT], frozen=True, omit_default
         ranges: The covered bits, as (offset in bytes, size in bytes, mask).
         running: State of a declared injection; None: a program gives the values.
         source: Name of the source; empty in the segment, where the injection's block has the name.
+        cell: Only in mirrors: the cell in which ``pid`` runs; empty if it runs in this instance.
     """
 
     number: int = msgspec.field(name="id")
@@ -58,6 +59,7 @@ class Injection(msgspec.Struct, Generic[DeclarationT], frozen=True, omit_default
     ranges: tuple[tuple[int, int, int], ...]
     running: Running[DeclarationT] | None = None
     source: str = ""
+    cell: str = ""
 
 
 class Declared(msgspec.Struct, frozen=True):

@@ -113,6 +113,18 @@ class Feed:
                 return False
         return True
 
+    @property
+    def partial(self) -> bool:
+        """True if only some registers are published."""
+        return self._visible is not None
+
+    def shows(self, ranges: Iterable[tuple[int, int, int]]) -> bool:
+        """Return whether any of these bits are published. A range is (offset, size in bytes, mask)."""
+        visible = self._visible
+        return visible is None or any(
+            mask & bits for offset, size, mask in ranges for bits in visible[offset : offset + size]
+        )
+
     def read(self) -> tuple[list[Batch], bool]:
         """Read new entries; return them in batches, and whether more are waiting."""
         if self._all and (packed := self._follower.pack(self._limit)):

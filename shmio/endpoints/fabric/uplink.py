@@ -7,7 +7,7 @@ import logging
 import secrets
 import socket
 import time
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Final
@@ -22,7 +22,7 @@ from shmio.endpoints.fabric.history import History
 from shmio.endpoints.fabric.publisher import Publisher
 from shmio.errors import ConfigError, ConflictError, RemoteError, SegmentError
 from shmio.fabric.connection import INSTALL, Access, connect, is_stored, reason, refusal, wants_reply
-from shmio.fabric.messages import Header, with_header
+from shmio.fabric.messages import Header, asks_for_state, encode_state, with_header
 from shmio.fabric.names import CellName, source_of
 from shmio.fabric.registry import RENEW_S, CellEntry, Registry, SourceEntry
 from shmio.libraries import library
@@ -89,18 +89,20 @@ class Uplink:
         self._segment, self._settings = segment, settings
         if slot.writer is None:
             raise SegmentError("the segment has no command queue for this process")
+        self._feeds: dict[str, Feed] = {}
         self.commands = CommandReceiver(
+            self.cell,
             settings.allow,
             slot.writer,
             lambda: self._log_time(time.monotonic_ns()),
             self._reply,
             str(settings.access),
+            self._feeds,
         )
         self._replies: set[asyncio.Task[None]] = set()
         self._errors = library("nats.errors", INSTALL)
         self._generation = -1
         self._first = True
-        self._feeds: dict[str, Feed] = {}
         self._relays: dict[int, Relay] = {}
         self._stopped: list[Relay] = []
         self._reading: asyncio.Task[list[Feed]] | None = None
@@ -213,19 +215,26 @@ class Uplink:
 
     def _poll(self, feed: Feed) -> bool:
         """Put new entries into the backlog, and return whether more are waiting."""
-        self.commands.poll(feed.block)
+        client = self.commands.client(feed)
+        client.poll()
         batches, more = feed.read()
         row = self.backlog.rows[feed.block.source]
+        if (state := client.state.read()) is not None:
+            self._put(feed, row, partial(encode_state, state=state))
         for batch in batches:
-            now_ns = time.monotonic_ns()
-            number = row.last + 1
-            times = self._log_time(now_ns), 0, self._log_time(0)
             row.left_out += batch.left_out
-            header = Header(row.left_out, row.stream, number, feed.digest[:8], *times)
-            self.backlog.put(row, Kept(number, with_header(header, batch.entries), now_ns))
-        if batches:
+            self._put(feed, row, partial(with_header, entries=batch.entries))
+        if batches or state is not None:
             self.publisher.wake()
         return more
+
+    def _put(self, feed: Feed, row: Row, encoded: Callable[[Header], bytearray]) -> None:
+        """Put a message into the backlog."""
+        now_ns = time.monotonic_ns()
+        number = row.last + 1
+        times = self._log_time(now_ns), 0, self._log_time(0)
+        header = Header(row.left_out, row.stream, number, feed.digest[:8], *times)
+        self.backlog.put(row, Kept(number, encoded(header), now_ns))
 
     # ---- the connection ----------------------------------------------------------------------------------------------
 
@@ -366,6 +375,9 @@ class Uplink:
     async def _on_missing(self, message: Msg) -> None:
         source = source_of(message.subject.split(".")[4])
         await self.publisher.answer(self.backlog.rows.get(source), message)
+        if (feed := self._feeds.get(source)) is not None and asks_for_state(message.data):
+            self.commands.client(feed).state.wanted = True
+            self._poll_on(feed)
 
     async def _on_command(self, message: Msg) -> None:
         if is_stored(message):
@@ -377,7 +389,7 @@ class Uplink:
         reply = message.reply if wants_reply(message) else ""
         row = self.backlog.rows.get(source)
         stream = 0 if row is None else row.stream
-        self.commands.take(sender, source, self._feeds.get(source), stream, message.data, reply)
+        self.commands.take(sender, source, stream, message.data, reply)
 
     def _reply(self, subject: str, data: bytes) -> None:
         """Send a reply, unless the connection is lost: then the sender does not learn the outcome."""
