@@ -195,6 +195,7 @@ def injections(found: Any) -> list[Injection[Mapping[str, Any]]]:
             ranges=tuple((part.offset, part.size, part.mask) for part in one.ranges),
             running=_running(one.running, one.name) if one.HasField("running") else None,
             source=one.source,
+            cell=one.cell,
         )
         for one in found.injections
     ]

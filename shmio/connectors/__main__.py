@@ -254,6 +254,7 @@ def _mirror_loop(worker: Worker, options: Any) -> _LoopHandle:
         armed=segment.blocks[worker.name].attributes.armed,
         owner_of=partial(owner_of, segment),
         blocks=partial(blocks_of, segment),
+        names={**settings.names, worker.name: mirror.source},
         own_layout=worker.config["layout"] is not None,
         changed=partial(_ask_to_reload, segment.instance),
     )

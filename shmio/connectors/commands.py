@@ -14,12 +14,12 @@ import time
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import accumulate, groupby
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from shmio.connectors.base import Lost, WriteLostError
-from shmio.connectors.injection_layers import Layer, uncovered
+from shmio.connectors.injection_layers import DeclaredLayer, Layer, uncovered
 from shmio.connectors.injections import Blocks, InjectionProcessor, OwnerOf
 from shmio.connectors.output import Output, pieces
 from shmio.errors import ConnectorError
@@ -299,6 +299,41 @@ class _Batch(NamedTuple):
 # -- commands ----------------------------------------------------------------------------------------------------------
 
 
+class Injections(Protocol):
+    """Carries out the commands about injections of a source."""
+
+    @property
+    def patience_ns(self) -> int:
+        """Time in ns until :meth:`follow_changes` must be called; negative if no call is needed."""
+
+    @property
+    def overload(self) -> str:
+        """Why the source can accept no write at present; empty if it can accept writes."""
+
+    def toward_device(self, command: Command) -> Layer | None:
+        """Return the injection over ``/in`` by which a command sends values to the device; None if there is none."""
+
+    def take(self, command: Command) -> str:
+        """Carry out a command about an injection. Return "", or why the command is rejected."""
+
+    def release(self, cycle: int) -> list[tuple[DeclaredLayer, Write]]:
+        """Return the delayed writes that are due in ``cycle``, each with the injection that delayed it."""
+
+    def forget(self, reason: str) -> None:
+        """Discard all delayed writes, because the connection to the device was lost."""
+
+    def follow_changes(self) -> None:
+        """Follow changes of the configuration, and check the programs that have created injections."""
+
+
+MakeInjections = Callable[[bytes, str], Injections]
+"""Function that creates an object for injections.
+
+Its arguments are the bits that commands may write, as an image of the block, and why injections over
+``/in`` are refused (empty if they are allowed).
+"""
+
+
 class CommandProcessor:
     """Processes the commands of one block.
 
@@ -317,6 +352,7 @@ class CommandProcessor:
         owner_of: OwnerOf = lambda _: None,
         blocks: Blocks | None = None,
         accepted: Callable[[], None] = lambda: None,
+        injections: MakeInjections | None = None,
     ) -> None:
         """Create the processor.
 
@@ -329,6 +365,8 @@ class CommandProcessor:
             owner_of: Returns the process that uses a command queue.
             blocks: Returns the blocks of all sources, for conditions. Default: only this source.
             accepted: Called when newly accepted items wait for a cycle.
+            injections: Creates the object that carries out commands about injections. None: this process applies
+                injections to the source's images.
 
         """
         self._writer = output.writer
@@ -342,7 +380,10 @@ class CommandProcessor:
         self._most_bytes = MAX_WAITING_BLOCKS * layout.size
         refuse_in = self._cannot or ("" if armed else _UNARMED)
         blocks = blocks or (lambda: {output.writer.block.source: output.writer.block})
-        self._injections = InjectionProcessor(output, self._writable, refuse_in, owner_of, blocks)
+        if injections is None:
+            self._injections: Injections = InjectionProcessor(output, self._writable, refuse_in, owner_of, blocks)
+        else:
+            self._injections = injections(self._writable, refuse_in)
         self._lock = threading.Lock()
         self._verdict = threading.Lock()  # locked while acceptances are published, until the items are in _items
         self._closed = "the source is not connected yet"
@@ -369,7 +410,7 @@ class CommandProcessor:
             self._closed = f"the source is not connected: {reason}"
             items, self._items = self._items, []
         self._end(items, [(EventKind.EXPIRED, reason)] * len(items))
-        self._injections.declared.forget(reason)
+        self._injections.forget(reason)
         self._make_room()
 
     def settle(self) -> None:
@@ -382,13 +423,14 @@ class CommandProcessor:
 
         Call this before :meth:`carry_out`.
         """
-        for layer, write in self._injections.declared.release(cycle):
+        for layer, write in self._injections.release(cycle):
             command = Command(NO_WRITER, layer.id, self._writer.incarnation, FAR_NS, (write,))
             self._accept(command, layer)
 
     @property
     def injections(self) -> InjectionProcessor:
-        """The processor of the source's injections."""
+        """The processor of the injections of a source that applies them itself."""
+        assert isinstance(self._injections, InjectionProcessor)  # noqa: S101  a mirror has no snapshots
         return self._injections
 
     @property
@@ -540,7 +582,7 @@ class CommandProcessor:
         if not reason:
             reason = self._unwritable(command) if write else self._injections.take(command)
         if not reason and write:
-            reason = self._injections.declared.overload
+            reason = self._injections.overload
         if reason:
             count = max(1, len(command.writes))
             record = Record(EventKind.REJECTED, reason, command.writer, command.id, 0, count)

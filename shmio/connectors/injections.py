@@ -49,6 +49,7 @@ LOOK_NS: Final = 400_000_000
 """Interval in ns for checking owners, so short that an injection ends within 1 s after its client."""
 SEED_BITS: Final = 53
 """Length of a generated seed in bits; every JSON reader represents such integers exactly."""
+NO_OWNER: Final = "no live process owns the queue from which the command came"
 CONFIGURED: Final = Owner(NO_WRITER, 0)
 """The owner of injections that the configuration declares."""
 
@@ -493,6 +494,19 @@ class InjectionProcessor:
             return -1
         return max(0, self._look_ns - time.monotonic_ns())
 
+    @property
+    def overload(self) -> str:
+        """Why the source can accept no write at present; empty if it can accept writes."""
+        return self.declared.overload
+
+    def release(self, cycle: int) -> list[tuple[DeclaredLayer, Write]]:
+        """Return the delayed writes that are due in ``cycle``, each with the injection that delayed it."""
+        return self.declared.release(cycle)
+
+    def forget(self, reason: str) -> None:
+        """Discard all delayed writes, because the connection to the device was lost."""
+        self.declared.forget(reason)
+
     def toward_device(self, command: Command) -> Layer | None:
         """Return the injection over ``/in`` by which a command sends values to the device; None if there is none."""
         layer = self.injections.find(command.injection) if command.kind is CommandKind.SHADOW else None
@@ -510,7 +524,7 @@ class InjectionProcessor:
         if command.kind in (CommandKind.INJECT, CommandKind.DECLARE):
             owner = self._owner_of(command.writer)
             if owner is None:
-                return "no live process owns the queue from which the command came"
+                return NO_OWNER
             if command.kind is CommandKind.DECLARE:
                 return self.declared.declare(command, owner)
             return self._add(command, owner)

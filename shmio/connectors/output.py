@@ -27,6 +27,8 @@ At this rate, a ring has room for the frames of 8 s.
 GROWTH: Final = 64
 """Number of bytes reserved in the segment for each injection: its JSON grows with the numbers in it."""
 
+NOT_WRITABLE: Final = "the injection covers registers that are not writable; name them in the source's `writable`"
+
 
 class Image(NamedTuple):
     """An image of the block, and its metadata.
@@ -248,7 +250,7 @@ class LayerPublisher:
             if self._refuse_in:
                 return self._refuse_in
             if (layer.cover & ~self._writable).any():
-                return "the injection covers registers that are not writable; name them in the source's `writable`"
+                return NOT_WRITABLE
         if reason := self.injections.add(layer):
             return reason
         self._ranges[layer.id] = ranges_of(layer.cover.tobytes())

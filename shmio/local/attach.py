@@ -765,8 +765,9 @@ def _with_source(source: str, one: InjectionEntry) -> Injection[Mapping[str, Any
         declaration = msgspec.to_builtins(now.declaration)
         running = Running(declaration, now.state, now.seed, now.runs, now.cycle, now.time_ns)
     return Injection(
-        one.number, one.direction, one.priority, one.keep, one.name, one.writer, one.pid, one.ranges, running, source
-    )
+        one.number, one.direction, one.priority, one.keep, one.name, one.writer, one.pid, one.ranges, running, source,
+        one.cell,
+    )  # fmt: skip
 
 
 def _ns(dt_s: float | None) -> int | None:

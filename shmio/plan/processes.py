@@ -10,7 +10,7 @@ from typing import Any, Final
 import msgspec
 
 from shmio.audit.file import AuditSettings
-from shmio.config import Config, Mqtt
+from shmio.config import Config, Mqtt, Source
 from shmio.config.model import Fabric
 from shmio.errors import ConfigError
 from shmio.fabric.connection import Access
@@ -274,7 +274,7 @@ def make_plan(
     for source in config.source:
         keys: dict[str, Any] = {"snapshots": str(config.snapshot_dir)} if source.name in computed else {}
         if source.connector == "fabric" and config.fabric is not None:
-            keys["fabric"] = mirror_settings(config.fabric)
+            keys["fabric"] = mirror_settings(config.fabric) | {"names": _names(config, source)}
         sections.append((source.name, "source", msgspec.to_builtins(source) | keys))
     if config.grpc and mode != "log":
         place = {"group": config.instance.group, "config_file": str(config_file.resolve())}
@@ -346,6 +346,16 @@ def process_names(config: Config) -> list[str]:
 def mirror_settings(fabric: Fabric) -> dict[str, Any]:
     """Return what the process of a mirror needs to connect to the fabric, and the instance's name in it."""
     return {"access": msgspec.to_builtins(Access.of(fabric)), "cell": fabric.cell}
+
+
+def _names(config: Config, mirror: Source) -> dict[str, str]:
+    """Return the names at the owner of all sources that mirror the same cell as ``mirror``."""
+    mirrors = [one for one in config.source if one.connector == "fabric"]
+    return {
+        one.name: one.options.get("source", one.name)
+        for one in mirrors
+        if one.options.get("cell") == mirror.options.get("cell")
+    }
 
 
 def _folders(config: Config) -> dict[str, str]:

@@ -796,7 +796,7 @@ class ListInjectionsResponse(_message.Message):
     def __init__(self, injections: _Optional[_Iterable[_Union[Injection, _Mapping]]] = ...) -> None: ...
 
 class Injection(_message.Message):
-    __slots__ = ("source", "number", "direction", "priority", "keep", "name", "pid", "ranges", "running", "writer")
+    __slots__ = ("source", "number", "direction", "priority", "keep", "name", "pid", "ranges", "running", "writer", "cell")
     SOURCE_FIELD_NUMBER: _ClassVar[int]
     NUMBER_FIELD_NUMBER: _ClassVar[int]
     DIRECTION_FIELD_NUMBER: _ClassVar[int]
@@ -807,6 +807,7 @@ class Injection(_message.Message):
     RANGES_FIELD_NUMBER: _ClassVar[int]
     RUNNING_FIELD_NUMBER: _ClassVar[int]
     WRITER_FIELD_NUMBER: _ClassVar[int]
+    CELL_FIELD_NUMBER: _ClassVar[int]
     source: str
     number: int
     direction: Direction
@@ -817,7 +818,8 @@ class Injection(_message.Message):
     ranges: _containers.RepeatedCompositeFieldContainer[Range]
     running: Running
     writer: int
-    def __init__(self, source: _Optional[str] = ..., number: _Optional[int] = ..., direction: _Optional[_Union[Direction, str]] = ..., priority: _Optional[int] = ..., keep: bool = ..., name: _Optional[str] = ..., pid: _Optional[int] = ..., ranges: _Optional[_Iterable[_Union[Range, _Mapping]]] = ..., running: _Optional[_Union[Running, _Mapping]] = ..., writer: _Optional[int] = ...) -> None: ...
+    cell: str
+    def __init__(self, source: _Optional[str] = ..., number: _Optional[int] = ..., direction: _Optional[_Union[Direction, str]] = ..., priority: _Optional[int] = ..., keep: bool = ..., name: _Optional[str] = ..., pid: _Optional[int] = ..., ranges: _Optional[_Iterable[_Union[Range, _Mapping]]] = ..., running: _Optional[_Union[Running, _Mapping]] = ..., writer: _Optional[int] = ..., cell: _Optional[str] = ...) -> None: ...
 
 class Running(_message.Message):
     __slots__ = ("declaration", "state", "seed", "runs", "cycle", "time_ns")

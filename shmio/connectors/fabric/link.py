@@ -16,6 +16,7 @@ from shmio.connectors.fabric.order import Missing
 from shmio.errors import ShmioError
 from shmio.fabric.connection import INSTALL, Access, connect, is_stored
 from shmio.fabric.messages import (
+    STATE_REQUEST,
     CommandReply,
     CommandRequest,
     MissingRequest,
@@ -107,6 +108,10 @@ class Link:
         """Send a command to the owner, and return its reply as a future."""
         return self._submit(self._command(request, timeout_s))
 
+    def request_state(self) -> None:
+        """Ask the owner to publish the state of the source, if there is a connection."""
+        self._submit(self._request_state())
+
     # ---- in the link's thread ------------------------------------------------------------------------------------
 
     def _submit(self, work: Coroutine[Any, Any, Any]) -> Future[Any]:
@@ -194,9 +199,14 @@ class Link:
             with suppress(errors.Error):
                 await answers.unsubscribe()
 
+    async def _request_state(self) -> None:
+        if self._client is not None and self._client.is_connected:
+            with suppress(library("nats.errors", INSTALL).Error):
+                await self._client.publish(self._cell.missing(self._source), msgspec.json.encode(STATE_REQUEST))
+
     async def _command(self, request: CommandRequest, timeout_s: float) -> CommandReply:
         errors = library("nats.errors", INSTALL)
-        count, client = len(request.writes), self._client
+        count, client = request.outcomes, self._client
         if self._sender is None:
             return _all(count, OutcomeKind.REJECTED, "this instance has no name in the fabric; set fabric.cell")
         if client is None or not client.is_connected:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from typing import Final, cast
 
 from shmio.connectors.base import Lost as LostWrite
 from shmio.connectors.base import UnconfirmedError
 from shmio.connectors.commands import CommandProcessor
+from shmio.connectors.fabric.injections import BEGIN_NS, MirroredInjections
 from shmio.connectors.fabric.link import MAX_WAITING, Link
 from shmio.connectors.fabric.order import Lost, MessageOrder, Missing, Received
 from shmio.connectors.fabric.source import Mirror
@@ -25,20 +26,20 @@ from shmio.fabric.messages import (
     CommandRequest,
     Entry,
     Header,
+    InjectionRequest,
     WriteItem,
     decode_entries,
     decode_entry,
     decode_header,
+    decode_state,
 )
 from shmio.layout.values.write import Write
 from shmio.model.values import OutcomeKind
 from shmio.recording.format.encoding import Gap
-from shmio.segment import NO_WRITER, BlockWriter, Event, EventKind, Frame, Provenance, Quality, Record
+from shmio.segment import BlockWriter, Event, EventKind, Frame, Provenance, Quality, Record
 from shmio.segment.commands import MAX_WRITES
 from shmio.wording import counted
 
-BEGIN_NS: Final = 1_000_000_000
-"""Time in ns after which the owner no longer begins a write."""
 ANSWER_S: Final = 2.0
 """Longest wait for the outcome of a write, in s."""
 CATCH_UP_S: Final = 0.8
@@ -56,6 +57,10 @@ MAX_MISSING: Final = (1 << 63) - 1
 """Maximum number of missing frames that is counted; a faulty owner may name larger numbers."""
 NEVER_NS: Final = -(1 << 63)
 """A time before all others."""
+STATE_NS: Final = 2_000_000_000
+"""Time in ns after which the mirror asks again for the owner's injections, if none came."""
+BUSY_NS: Final = 100_000_000
+"""Longest wait of the loop in ns while outcomes of commands about injections are awaited."""
 RELOAD_NS: Final = 30_000_000_000
 """Time in ns after which the mirror asks again for a reload, if the layout is still another one."""
 REPORT_NS: Final = 10_000_000_000
@@ -70,7 +75,7 @@ Connect = Callable[[Callable[[bytes], None], Callable[[Missing], None]], Link]
 
 
 class MirrorLoop:
-    """Publishes what the owner's uplink sends, and passes writes on to the owner.
+    """Publishes what the owner's uplink sends, and passes writes and injections on to the owner.
 
     Frames keep their cycle, source time, quality and provenance. A message that comes late has the
     age that it had when the owner sent it, so readers see its frames as stale. Missing messages are
@@ -90,6 +95,7 @@ class MirrorLoop:
         armed: bool = False,
         owner_of: OwnerOf = lambda _: None,
         blocks: Blocks | None = None,
+        names: Mapping[str, str] | None = None,
         own_layout: bool = False,
         changed: Callable[[], None] = lambda: None,
     ) -> None:
@@ -103,9 +109,12 @@ class MirrorLoop:
             writable: Patterns of the registers that commands of this instance may write. The owner
                 has such a list, too.
             allow_nonfinite: Patterns of the registers to which NaN and infinities may be written.
-            armed: Whether injections of this instance may change what is sent to the owner.
+            armed: Whether injections of this instance may change what the owner's device gets. The owner
+                has such a key, too.
             owner_of: Returns the process that uses a command queue.
             blocks: Returns the blocks of all sources.
+            names: For each source of this instance that mirrors a source of the same cell, its name there;
+                None: only this one.
             own_layout: True if files of this instance have the layout, so that a reload changes nothing.
             changed: Called when the owner's layout is another one, at most each ``RELOAD_NS``.
 
@@ -118,9 +127,18 @@ class MirrorLoop:
         self._reload_ns = -RELOAD_NS
         self._layout = writer.block.layout.hash[:8]
         self._output = Output(writer, clock.now_ns)
+
+        def mirrored(writable: bytes, refuse_in: str) -> MirroredInjections:
+            self._injections = MirroredInjections(
+                mirror.cell, writer, writable, refuse_in, ask=self._ask,
+                names=names or {writer.block.source: mirror.source}, owner_of=owner_of,
+                blocks=blocks or (lambda: {writer.block.source: writer.block}), now_ns=clock.now_ns, wake=clock.nudge,
+            )  # fmt: skip
+            return self._injections
+
         self.commands = CommandProcessor(
-            self._output, writable, clock.now_ns, allow_nonfinite=allow_nonfinite, armed=armed, owner_of=owner_of,
-            blocks=blocks, accepted=clock.nudge,
+            self._output, writable, clock.now_ns, allow_nonfinite=allow_nonfinite, armed=armed,
+            accepted=clock.nudge, injections=mirrored,
         )  # fmt: skip
         self._quality_log = QualityLog(writer)
         self.counters = Counters()
@@ -138,6 +156,8 @@ class MirrorLoop:
         self._open = False
         self._bad = True  # the last frame was bad
         self._reported_ns = -REPORT_NS
+        self._state_of = 0  # number of the stream from which the owner's injections are known
+        self._state_ns = -STATE_NS  # when the mirror asked for them last
         self._problem, self._problem_ns = "", clock.now_ns()  # of the link, and when it last had it
         self.missing = 0
         """Number of frames that the owner no longer had."""
@@ -206,6 +226,8 @@ class MirrorLoop:
             self._deliver(self._ready.popleft())
         if (missing := self._order.missing(now_ns)) is not None and self._link.connected:
             self._link.request(missing)
+        self._ask_state(now_ns)
+        self._injections.turn()
         self._confirm()
         if self.commands.waiting and not self.commands.unconfirmed:
             self._carry_out()
@@ -228,6 +250,8 @@ class MirrorLoop:
             return 1  # the loop has not taken all messages
         if self._ready:
             wait_ns = min(wait_ns, max(1_000_000, self._pace.wait_ns(now_ns)))
+        if self._injections.busy:
+            wait_ns = min(wait_ns, BUSY_NS)
         patience_ns = self._order.patience_ns(now_ns)
         return wait_ns if patience_ns is None else min(wait_ns, patience_ns)
 
@@ -237,6 +261,7 @@ class MirrorLoop:
         if isinstance(one, Lost):
             what = counted(one.last - one.first + 1, "message")
             log.warning("%s no longer has %s, which this host has not received", self._mirror, what)
+            self._state_of = 0  # a change of the injections may be among them
             return
         if one.header.layout != self._layout:
             self._refuse_layout()
@@ -246,6 +271,10 @@ class MirrorLoop:
             # The owner was started again, and numbers its frames from 1.
             self._zero_ns, self._number = one.header.zero_ns, 0
         try:
+            if (state := decode_state(one.data)) is not None:
+                self._state_of = one.header.stream
+                self._injections.show(state, late_ns)
+                return
             entries = list(decode_entries(one.data, self._show_run(one, late_ns)))
             self._find_gap(one.header, entries)
             for entry in entries:
@@ -345,12 +374,16 @@ class MirrorLoop:
         return end
 
     def _happen(self, event: Event) -> None:
-        """Publish an event of the owner without its writer, so that no client takes it for an answer to itself."""
-        if event.kind in _LEFT_OUT:
+        """Publish an event of the owner.
+
+        If it is about a command or an injection of this instance, it gets the writer of that command.
+        Any other event gets none, so that no client takes it for an answer to itself.
+        """
+        if event.kind in _LEFT_OUT or (writer := self._injections.writer_of(event)) is None:
             return
         self._writer.cycle = event.cycle
         record = Record(
-            cast(EventKind, event.kind), event.text, NO_WRITER, event.command, event.item,
+            cast(EventKind, event.kind), event.text, writer, event.command, event.item,
             min(event.items, MAX_WRITES), event.offset, event.mask, event.size, event.data, event.injection,
         )  # fmt: skip
         self._writer.event(record, quality=event.quality)
@@ -394,7 +427,31 @@ class MirrorLoop:
             self._reported_ns = now_ns
             log.warning("%s sent a malformed message: %s", self._mirror, error)
 
-    # ---- writes --------------------------------------------------------------------------------------------------
+    # ---- commands ------------------------------------------------------------------------------------------------
+
+    def _ask_state(self, now_ns: int) -> None:
+        """Ask for the owner's injections until they are known: there may be some that do not change."""
+        newest = self._order.newest
+        known = newest is not None and newest.header.stream == self._state_of
+        if not known and self._link.connected and now_ns - self._state_ns >= STATE_NS:
+            self._state_ns = now_ns
+            self._link.request_state()
+
+    def _ask(self, injection: InjectionRequest, begin_ns: int) -> Future[CommandReply] | None:
+        """Send a command about an injection. Any thread may call this."""
+        return self._command([], injection, begin_ns)
+
+    def _command(
+        self, writes: list[WriteItem], injection: InjectionRequest | None = None, begin_ns: int = BEGIN_NS
+    ) -> Future[CommandReply] | None:
+        """Send a command; return None if no message of the owner has come yet."""
+        newest = self._order.newest
+        if newest is None:
+            return None
+        header = newest.header
+        owner_ns = header.made_ns + header.age_ns + self._clock.now_ns() - newest.at_ns
+        expires_ns = min(owner_ns + begin_ns, MAX_TIME_NS)
+        return self._link.command(CommandRequest(expires_ns, header.stream, self._layout, writes, injection), ANSWER_S)
 
     def _carry_out(self) -> None:
         try:
@@ -403,15 +460,9 @@ class MirrorLoop:
             log.warning("%s", error)
 
     def _send(self, writes: Sequence[Write]) -> Sequence[str] | None:
-        newest = self._order.newest
-        if newest is None:
+        self._reply = self._command([WriteItem(*write) for write in writes])
+        if self._reply is None:
             return ["no message of the owner has come yet"] * len(writes)
-        header = newest.header
-        owner_ns = header.made_ns + header.age_ns + self._clock.now_ns() - newest.at_ns
-        request = CommandRequest(
-            min(owner_ns + BEGIN_NS, MAX_TIME_NS), header.stream, self._layout, [WriteItem(*write) for write in writes]
-        )
-        self._reply = self._link.command(request, ANSWER_S)
         self._reply.add_done_callback(lambda _: self._clock.nudge())
         return None
 

@@ -28,10 +28,18 @@ CACHE: Final = "{}.mirrored.json"
 
 
 class Settings(msgspec.Struct, frozen=True):
-    """What a mirror's process needs from the section ``[fabric]``: the servers, and the instance's name."""
+    """What a mirror's process needs from the configuration.
+
+    Attributes:
+        access: The servers.
+        cell: Name of this instance in the fabric; None if it has none.
+        names: For each source of this instance that mirrors a source of the same cell, its name there.
+
+    """
 
     access: Access
     cell: str | None = None
+    names: dict[str, str] = {}
 
     @property
     def sender(self) -> CellName | None:

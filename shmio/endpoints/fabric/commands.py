@@ -275,8 +275,8 @@ class CommandReceiver:
         role = "write" if request.injection is None else "inject"
         if not self._may(sender, role):
             why = (
-                f"no [[fabric.allow]] of cell {self._cell} gives {sender} the role {role}; to allow it, add {role!r} to "
-                f"roles in the supervisor.toml of {self._cell}, and reload that instance"
+                f"no [[fabric.allow]] of cell {self._cell} gives {sender} the role {role}; to allow it, add {role!r} "
+                f"to its roles in the supervisor.toml of {self._cell}, and reload that instance"
             )
             return OutcomeKind.REJECTED, why, "denied"
         if feed is None:

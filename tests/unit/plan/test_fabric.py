@@ -73,7 +73,7 @@ def test_a_source_that_is_too_large_is_named(tmp_path: Path) -> None:
         ('cell = "a50"\n', r"fabric\.cell: 'a50' is not the name of a cell"),
         (f'{CELL}[fabric.tls]\ncertificate = "none.pem"\nkey = "none.pem"\n', r"fabric\.tls\.certificate: .*No such"),
         (f'{CELL}[[fabric.allow]]\nsender = "plant1"\nroles = ["write"]\n', r"fabric\.allow\[0\]\.sender: 'plant1'"),
-        (f'{CELL}[[fabric.allow]]\nsender = "*.*.*"\nroles = ["inject"]\n', r"roles\[0\]: unknown role 'inject'"),
+        (f'{CELL}[[fabric.allow]]\nsender = "*.*.*"\nroles = ["control"]\n', r"roles\[0\]: unknown role 'control'"),
     ],
 )
 def test_faults_are_named(tmp_path: Path, keys: str, words: str) -> None:

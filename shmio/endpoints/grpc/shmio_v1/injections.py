@@ -664,6 +664,7 @@ def _describe(block: Block, one: InjectionEntry) -> wire.Injection:
         writer=one.writer,
         ranges=[wire.Range(offset=offset, size=size, mask=mask) for offset, size, mask in one.ranges],
         running=None if one.running is None else _running(one.running),
+        cell=one.cell,
     )
 
 

@@ -6,7 +6,7 @@ import asyncio
 import json
 import time
 import tomllib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import islice
 from typing import Annotated, Any, ClassVar, Final
 
@@ -26,6 +26,7 @@ from shmio.local.injection import Campaign, compile_declarations
 from shmio.model.clock import ClockMode
 from shmio.segment import Block, Quality
 from shmio.segment.block import Layouts
+from shmio.segment.injection_list import InjectionEntry
 
 INTERVAL_S: Final = 0.5
 """Interval in s at which injections and events are sent, if they have changed."""
@@ -169,7 +170,7 @@ class Injections(FollowedTab):
                         "direction": one.direction,
                         "priority": one.priority,
                         "keep": one.keep,
-                        "by": "configuration" if one.configured else names.get(one.pid) or f"process {one.pid}",
+                        "by": _creator(one, names),
                         "state": "active" if running is None else running.state,
                         "since_s": running.time_ns / 1e9 if running is not None and running.time_ns else None,
                         "utc_s": None if utc_s is None or running is None else utc_s + running.time_ns / 1e9,
@@ -179,6 +180,13 @@ class Injections(FollowedTab):
                     | _first_paths(paths)
                 )
         return found
+
+
+def _creator(one: InjectionEntry, names: Mapping[int, str]) -> str:
+    """Return what has created an injection; ``names`` are the names of the instance's processes by pid."""
+    if one.cell:
+        return f"{one.cell} (configuration)" if one.configured else f"process {one.pid} of {one.cell}"
+    return "configuration" if one.configured else names.get(one.pid) or f"process {one.pid}"
 
 
 def _present(block: Block, codec: Decoder) -> Number | None:

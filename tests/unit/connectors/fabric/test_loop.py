@@ -65,7 +65,7 @@ class FakeLink:
         self.asked = threading.Event()
         self.commands: list[CommandRequest] = []
         self.reply = CommandReply([], [])
-        self.number = 0
+        self.number = self.states = 0
 
     @property
     def connected(self) -> bool:
@@ -80,6 +80,9 @@ class FakeLink:
     def request(self, missing: Missing) -> None:
         self.requests.append(missing)
         self.asked.set()
+
+    def request_state(self) -> None:
+        self.states += 1
 
     def command(self, request: CommandRequest, timeout_s: float) -> Future[CommandReply]:
         assert timeout_s > 0
