@@ -37,6 +37,12 @@ def check_injections(config: Config, layouts: Mapping[str, Layout]) -> tuple[dic
                 raise ConfigError("target: the configuration has no [[source]]")
             program = compile_program(declaration, layouts, periods_ns)
             source = next(source for source in config.source if source.name == program.source)
+            if source.connector == "fabric":
+                cell = source.options.get("cell")
+                raise ConfigError(
+                    f"target: source {source.name!r} is a mirror; declare the injection in the supervisor.toml of its "
+                    f"owner, cell {cell}, or from here by shmio inject --file"
+                )
             if program.direction == "in":
                 _check_in(program, source, layouts[source.name])
         except ConfigError as error:

@@ -51,6 +51,10 @@ cell = "plant1.line3.near"
 source = "belt"
 writable = ["speed"]
 armed = true
+[[source]]
+name = "own"
+connector = "memory"
+tags = "tags.toml"
 [fabric]
 server = "nats://{nats}"
 cell = "plant1.line3.far"
@@ -58,7 +62,7 @@ cell = "plant1.line3.far"
 CAMPAIGN = """
 duration_s = 1.5
 [[injection]]
-name = "too fast"
+name = "too-fast"
 target = "mirrored/speed"
 operation = "set"
 value = 99.0
@@ -67,7 +71,7 @@ start_s = 0.5
 for_s = 0.3
 times = 1
 [[expect]]
-name = "it is seen"
+name = "seen"
 formula = "eventually[0, 1.4] mirrored/speed > 90"
 """
 
@@ -85,6 +89,7 @@ def cells(tmp_path_factory: pytest.TempPathFactory, shared_instance: str) -> Ite
             stack.callback(found[-1].supervisor, "down")
         near, far = found
         (near.folder / "tags.toml").write_text(TAGS)
+        (far.folder / "tags.toml").write_text('[registers]\nswitch = { type = "BOOL" }\n')
         near.up()
         far.up()
         yield near, far
@@ -194,8 +199,22 @@ def test_a_campaign_runs_on_the_far_host(cells: tuple[Cell, Cell], attached: tup
 
 def test_what_cannot_be_evaluated_at_the_owner_is_refused(attached: tuple[Attachment, Attachment]) -> None:
     _, mirror = attached
-    with pytest.raises(CommandError, match="no such register"):
-        mirror.declare([{"name": "a", "target": "mirrored/nothing", "operation": "freeze"}])
+    freeze = {"name": "a", "target": "mirrored/speed", "operation": "freeze"}
+    with pytest.raises(CommandError, match="plant1.line3.near evaluates the condition, but own is no mirror"):
+        mirror.declare([freeze | {"when": "own/switch"}])
+
+
+def test_the_configuration_of_a_mirror_declares_no_injection(cells: tuple[Cell, Cell]) -> None:
+    far = cells[1]
+    file = far.folder / "supervisor.toml"
+    text = file.read_text()
+    declared = '[[injection]]\nname = "a"\ntarget = "mirrored/speed"\noperation = "freeze"\n'
+    file.write_text(text + declared)
+    done = far.supervisor("check")
+    file.write_text(text)
+    assert done.returncode == 1
+    assert "injection[0].target" in done.stderr
+    assert "plant1.line3.near" in done.stderr
 
 
 def test_the_role_is_needed(cells: tuple[Cell, Cell], attached: tuple[Attachment, Attachment]) -> None:
