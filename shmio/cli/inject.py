@@ -168,8 +168,8 @@ def _list(cell: Cell, *, as_json: bool) -> None:
         more = f" and {len(paths) - 3} more" if paths[3:] else ""
         keep = ", kept" if one_found["keep"] else ""
         by = f"pid {one_found['pid']}" if one_found["pid"] else "supervisor.toml"
-        if cell := one_found.get("cell"):
-            by += f" of {cell}"
+        if "cell" in one_found:
+            by += f" of {one_found['cell']}"
         print(
             f"{one_found['id']}  {', '.join(map(printable, paths[:3]))}{more} /{one_found['direction']}, "
             f"priority {one_found['priority']}, {by}{keep}{_running(one_found.get('running'))}  "

@@ -327,26 +327,6 @@ def test_frames_of_one_message_are_published_as_those_of_several(mirroring: Mirr
     assert mirroring.loop.counters.polls == 10
 
 
-def test_each_frame_of_a_message_shows_an_injection_of_this_host(mirroring: Mirroring) -> None:
-    mirroring.send(frame(7, 1))
-    mirroring.next()
-    writer = SourceWriter(mirroring.block, 0)
-    injection = writer.inject(["other"])
-    writer.shadow(injection, {"other": 5})
-    mirroring.send(*(frame(number, number) for number in range(8, 12)))
-    frames = [mirroring.next()]
-    while frames[-1].cycle < 1011:
-        frames.append(mirroring.next())
-    assert [(one.raw, one.effective) for one in frames[-4:]] == [
-        (bytes((0, number, 0, 0)), bytes((0, number, 0, 5))) for number in range(8, 12)
-    ]
-    writer.lift(injection)
-    mirroring.send(frame(12, 12))
-    while frames[-1].cycle < 1012:
-        frames.append(mirroring.next())
-    assert frames[-1].effective is None
-
-
 def test_a_silent_owner_makes_the_source_bad_until_it_sends_again(mirroring: Mirroring) -> None:
     mirroring.send(frame(7, 1))
     mirroring.next()
