@@ -2,10 +2,11 @@
 
 Usage (as root): python -m tests.faults.two_hosts [--calm SECONDS] [--cuts N] [--cut SECONDS] [--writes N] [--seed N]
 
-The near host runs the A50 cell, the server and the uplink. The far host runs a mirror, a recorder and a gRPC client.
-First the link works, and the two recordings must be equal. Then it is cut again and again: the mirror must turn bad
-within its stale age, recover, and deliver what it missed, in order and once. At last, programs write through the
-mirror while the link is cut at random, and each outcome must be true.
+The near host runs the A50 cell, the server and the uplink. The far host runs a mirror, a recorder, a gRPC endpoint
+with a client, and a model. First the link works: the client must see every frame, and the model the same values as a
+model on the near host. In the end, the two recordings must be equal. Then the link is cut again and again: the mirror
+must turn bad within its stale age, recover, and deliver what it missed, in order and once. At last, programs write
+through the mirror while the link is cut at random, and each outcome must be true.
 """
 
 from __future__ import annotations
@@ -28,8 +29,9 @@ from typing import Any, Final
 
 import shmio
 from shmio.model.values import OutcomeKind
-from shmio.segment import EventKind, Frame, Quality, Segment
+from shmio.segment import EventKind, Quality, Segment
 from shmio.testing.cell import BIN, until
+from tests.faults.far_consumers import FOLLOWER, FrameWatcher, GrpcClient, check_client, check_model, values
 
 NEAR: Final = """
 [instance]
@@ -42,6 +44,12 @@ host = "127.0.0.1"
 port = 1102
 period_ms = 20
 writable = ["Outputs", "Robot_*/*"]
+[[source]]
+name = "follower"
+connector = "simulation"
+model = "follower:Follower"
+period_ms = 5
+connections = {{ value = "cell/Robot_800/Axs1_Pos" }}
 [[emulator]]
 name = "plc"
 kind = "s7"
@@ -49,11 +57,15 @@ layout = "db201.db"
 program = "a50"
 listen = "127.0.0.1:1102"
 [recorder]
+sources = ["cell"]
 [fabric]
 server = "embedded"
 listen = "10.77.{net}.1:4222"
 insecure = true
 cell = "plant1.line3.near"
+[[fabric.rule]]
+match = "follower"
+send = "nothing"
 [[fabric.allow]]
 sender = "plant1.line3.far"
 roles = ["write"]
@@ -66,7 +78,14 @@ name = "cell"
 connector = "fabric"
 cell = "plant1.line3.near"
 writable = ["Outputs", "Robot_*/*"]
+[[source]]
+name = "follower"
+connector = "simulation"
+model = "follower:Follower"
+period_ms = 5
+connections = {{ value = "cell/Robot_800/Axs1_Pos" }}
 [recorder]
+sources = ["cell"]
 [grpc]
 listen = ["unix:grpc.sock"]
 [fabric]
@@ -74,7 +93,8 @@ server = "nats://10.77.{net}.1:4222"
 insecure = true
 cell = "plant1.line3.far"
 """
-REGISTER: Final = "cell/Robot_800/Axs1_Pos"
+AXIS: Final = "Robot_800/Axs1_Pos"
+REGISTER: Final = f"cell/{AXIS}"
 PATIENCE_S: Final = 60.0
 
 
@@ -129,30 +149,12 @@ def ip(*arguments: str) -> None:
     subprocess.run(["ip", *arguments], check=True)
 
 
-class Watcher(threading.Thread):
+class Watcher(FrameWatcher):
     """Follows all frames of the source ``cell`` of an instance."""
 
-    def __init__(self, cell: Segment) -> None:
-        super().__init__(daemon=True)
-        self._block = cell.blocks["cell"]
-        self._cursor = self._block.cursor()
-        self._ends = threading.Event()
-        self.frames: list[Frame] = []
-        self.start()
-
-    def run(self) -> None:
-        while not self._ends.is_set():
-            if (frame := self._cursor.next(0.2)) is not None:
-                self.frames.append(frame._replace(raw=frame.raw[:16], effective=None))
-
     def await_frames(self, count: int) -> None:
+        """Wait until this many frames have come."""
         until(lambda: len(self.frames) >= count, f"{count} frames come", PATIENCE_S)
-
-    def stop(self) -> list[Frame]:
-        self._ends.set()
-        self.join()
-        assert self._cursor.missed == 0, "the test missed frames"
-        return self.frames
 
 
 def is_good(cell: Segment) -> bool:
@@ -161,11 +163,17 @@ def is_good(cell: Segment) -> bool:
     return frame is not None and block.assess(frame)[0] is not Quality.BAD
 
 
-def calm(near: Segment, far: Segment, seconds: float) -> dict[str, Any]:
-    """Compare all frames of both hosts while the link works."""
+def calm(near: Segment, far: Segment, folder: Path, seconds: float) -> dict[str, Any]:
+    """Compare all frames of both hosts while the link works, also as a client and a model see them."""
     there, here = Watcher(near), Watcher(far)
+    there.await_frames(20)
+    client = GrpcClient(f"unix:{folder / 'grpc.sock'}", "cell")
+    models = [FrameWatcher(host, "follower") for host in (near, far)]
     time.sleep(seconds)
+    received, followed = client.stop(), [(model.block, model.stop()) for model in models]
     source, mirror = there.stop(), here.stop()
+    axis = values(there.block, AXIS, source)
+    seen = [check_model(values(block, "seen", frames), axis) for block, frames in followed]
     first, last = mirror[0].cycle, min(mirror[-1].cycle, source[-1].cycle)
     sent = {frame.cycle: frame for frame in source}
     got = [frame for frame in mirror if first <= frame.cycle <= last and frame.cycle in sent]
@@ -175,7 +183,31 @@ def calm(near: Segment, far: Segment, seconds: float) -> dict[str, Any]:
         own = sent[frame.cycle]
         assert (frame.raw, frame.source_ns, frame.quality) == (own.raw, own.source_ns, own.quality)
     delays = [(frame.publish_ns - sent[frame.cycle].publish_ns) / 1e6 for frame in got]
-    return {"frames": len(got), "delay_ms": statistics.median(delays), "delay_max_ms": max(delays)}
+    return {
+        "frames": len(got), "delay_ms": statistics.median(delays), "delay_max_ms": max(delays),
+        "frames of the gRPC client": check_client(received, source),
+        "values of the near and far model, passed over": seen,
+    }  # fmt: skip
+
+
+def stepped(near: Segment, far: Segment, count: int) -> dict[str, Any]:
+    """Step the far host's time once for each frame of the mirror, and compare what the model has seen."""
+    there = Watcher(near)
+    there.await_frames(20)
+    skipped = 0
+    with shmio.attach(far.instance, writable=True) as cell:
+        cell.step(dt_s=0.02)
+        follower = FrameWatcher(far, "follower")
+        for number, view in enumerate(cell.stream("cell", timeout_s=PATIENCE_S), 1):
+            cell.step(dt_s=0.02)
+            skipped += view.missed
+            if number == count:
+                break
+        time.sleep(0.2)
+        cell.release()
+    followed, source = follower.stop(), there.stop()
+    seen = check_model(values(follower.block, "seen", followed), values(there.block, AXIS, source))
+    return {"steps": count, "frames missed": skipped, "values, passed over": seen}
 
 
 def cuts(hosts: Hosts, near: Segment, far: Segment, count: int, seconds: float) -> dict[str, Any]:
@@ -293,13 +325,15 @@ def main() -> int:
         for folder, text in zip(folders, (NEAR, FAR), strict=True):
             folder.mkdir()
             shutil.copy(root / "db201.db", folder)
+            (folder / "follower.py").write_text(FOLLOWER)
             (folder / "supervisor.toml").write_text(text.format(mark=mark, net=hosts.net))
         with (
             hosts.running(0, folders[0], f"near{mark}") as near,
             hosts.running(1, folders[1], f"far{mark}") as far,
         ):
             until(lambda: is_good(far), "the mirror is good", PATIENCE_S)
-            print("calm:", calm(near, far, arguments.calm), flush=True)
+            print("calm:", calm(near, far, folders[1], arguments.calm), flush=True)
+            print("stepped:", stepped(near, far, round(50 * arguments.calm)), flush=True)
             if arguments.cuts:
                 print("cuts:", cuts(hosts, near, far, arguments.cuts, arguments.cut), flush=True)
             if arguments.writes:
