@@ -9,10 +9,9 @@ import asyncio
 import inspect
 import logging
 from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Mapping, Sequence
 from contextlib import aclosing
 from dataclasses import dataclass
-from functools import partial
 from importlib import import_module
 from typing import Any, Final
 from weakref import WeakKeyDictionary
@@ -231,7 +230,7 @@ class OpenCalls:
             )
 
 
-class CallGuard(grpc.aio.ServerInterceptor):
+class CallGuard:
     """Checks every call at one listening address.
 
     It declares to gRPC that each call has a stream of requests. So it can check and count a call
@@ -242,18 +241,18 @@ class CallGuard(grpc.aio.ServerInterceptor):
     def __init__(self, access: ListenerAccess, calls: OpenCalls) -> None:
         self._access = access
         self._calls = calls
-        self._handlers: dict[str, Handler] = {}
 
-    async def intercept_service(
-        self, continuation: Callable[[Any], Awaitable[Handler]], handler_call_details: Any
-    ) -> Handler:
-        """Return a handler that checks a call, and then runs the call's own handler."""
-        method: str = handler_call_details.method
-        if method not in self._handlers:
-            self._handlers[method] = self._guarded(method, await continuation(handler_call_details))
-        return self._handlers[method]
+    def guarded(self, method: str, handler: Handler) -> Handler:
+        """Return a handler that checks a call, and then runs the call's own handler.
 
-    def _guarded(self, method: str, handler: Handler) -> Handler:
+        This is not an interceptor, because gRPC looks for the handler of each call anew if there is
+        one.
+
+        Args:
+            method: The full name of the call.
+            handler: The call's own handler.
+
+        """
         found: Any = handler  # its attributes depend on its kind
         behaviour = found.stream_stream or found.stream_unary or found.unary_stream or found.unary_unary
         decode = handler.request_deserializer
@@ -349,7 +348,8 @@ WORKERS: Final = 8
 """Maximum number of calls with unknown names that are refused at the same time."""
 
 _NEEDED: Final[Mapping[str, str]] = {
-    "AioServer": "_make_request_call_future _request_call add_registered_method_handlers is_running shutdown",
+    "AioServer": "_make_request_call_future _request_call _request_registered_call add_registered_method_handlers "
+    "is_running shutdown",
     "_ServicerContext": "abort",
     "_RequestCallError": "",
     "asyncio": "wait",
@@ -403,7 +403,7 @@ class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
-        self._asking: set[asyncio.Task[Any]] = set()  # asyncio itself holds tasks only weakly
+        self._asking: set[asyncio.Task[None]] = set()  # asyncio itself holds tasks only weakly
         self._came: set[asyncio.Future[Any]] = set()
         self._coming = asyncio.Event()
         cygrpc.asyncio = _CoreAsyncio()
@@ -418,21 +418,6 @@ class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]
         self._coming.clear()
         came, self._came = self._came, set()
         return came, set()
-
-    def _call_came(self, request: asyncio.Future[Any], done: asyncio.Task[Any]) -> None:
-        """End a request, and wake the serving task in the same turn of the loop."""
-        self._asking.discard(done)
-        failure = None if done.cancelled() else done.exception()
-        if done.cancelled():
-            request.cancel()
-        elif request.done():  # cancelled
-            return
-        elif failure is not None:
-            request.set_exception(failure)
-        else:
-            request.set_result(done.result())
-        self._came.add(request)
-        self._coming.set()
 
     def start_workers(self) -> None:
         """Start the workers that refuse calls with unknown names."""
@@ -453,10 +438,29 @@ class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]
         request: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
         _requests[request] = self
         if method is not None:  # the workers take calls of other methods
-            asking = super()._make_request_call_future(method)
+            asking = asyncio.get_running_loop().create_task(self._ask(method, request))
             self._asking.add(asking)
-            asking.add_done_callback(partial(self._call_came, request))
+            asking.add_done_callback(self._asking.discard)
         return request
+
+    async def _ask(self, method: bytes, request: asyncio.Future[Any]) -> None:
+        """Wait for a call of a method, and wake the serving task in the same turn of the loop."""
+        state, failure = None, None
+        try:
+            state = await self._request_registered_call(method)
+        except asyncio.CancelledError:
+            request.cancel()
+            raise
+        except Exception as error:  # noqa: BLE001  the serving task handles it
+            failure = error
+        if request.done():  # cancelled
+            return
+        if failure is None:
+            request.set_result(state)
+        else:
+            request.set_exception(failure)
+        self._came.add(request)
+        self._coming.set()
 
     async def _refuse(self) -> None:
         while self.is_running():
@@ -480,11 +484,12 @@ class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]
 class CoreServer(AioServer):  # type: ignore[misc]
     """An asyncio gRPC server that uses a :class:`Core`."""
 
-    def __init__(self, options: Sequence[tuple[str, Any]], interceptor: grpc.aio.ServerInterceptor) -> None:
-        """Create a server with this interceptor, and otherwise with the defaults of ``grpc.aio.server``."""
+    def __init__(self, options: Sequence[tuple[str, Any]], guard: CallGuard) -> None:
+        """Create a server whose calls ``guard`` checks, and otherwise with the defaults of ``grpc.aio.server``."""
         check_version()
+        self._guard = guard
         self._loop = cygrpc.get_working_loop()
-        self._server: Core = Core(self._loop, None, (), (interceptor,), tuple(options), None)
+        self._server: Core = Core(self._loop, None, (), (), tuple(options), None)
 
     @property
     def alive(self) -> bool:
@@ -495,6 +500,11 @@ class CoreServer(AioServer):  # type: ignore[misc]
     def refused(self) -> int:
         """Number of calls with unknown names that were refused since the start."""
         return int(self._server.refused)
+
+    def add_registered_method_handlers(self, service: str, handlers: Mapping[str, Handler]) -> None:
+        """Add the handlers of a service's calls, by name."""
+        guarded = {name: self._guard.guarded(f"/{service}/{name}", handler) for name, handler in handlers.items()}
+        super().add_registered_method_handlers(service, guarded)
 
     async def start(self) -> None:
         """Start serving."""
