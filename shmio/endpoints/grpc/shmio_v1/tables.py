@@ -89,12 +89,22 @@ class _NumberGroup:
     """Numeric elements of one type.
 
     ``bytes`` has the offsets of each element's bytes, the least significant byte first. Its shape
-    is (elements, size).
+    is (elements, size). ``stored`` is the type of the elements in the image. ``start`` is the
+    offset of the first element if all follow one another without gaps, otherwise None.
     """
 
     slots: slice
     bytes: Array
     kind: np.dtype[Any]
+    stored: np.dtype[Any]
+    start: int | None
+
+    def decode(self, image: bytes) -> Array:
+        """Decode the elements. Without gaps and in little-endian order, the array is a view of the image."""
+        if self.start is None:
+            return np.frombuffer(image, np.uint8)[self.bytes].view(self.kind)[:, 0]
+        found = np.frombuffer(image, self.stored, len(self.bytes), self.start)
+        return found if self.stored is self.kind else found.astype(self.kind)
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +163,13 @@ class Columns:
                 self._numbers.append((column, _numbers(chosen, code, order, where)))
             else:
                 self._others += self._others_of(members, chosen, order)
+        self._kinds = [(column, kind) for column, kind in KINDS.items() if self.sizes[column]]
+        self._whole = {
+            column: part
+            for column, part in self._numbers
+            if part.slots == slice(0, self.sizes[column]) and part.kind == KINDS[column]
+        }  # the columns whose elements all have the column's own type
+        self._parts = [(column, part) for column, part in self._numbers if column not in self._whole]
         sizes = [other.size for other in self._others]
         starts = np.repeat([other.offset for other in self._others], sizes).astype(np.intp)
         before = np.repeat(np.cumsum([0, *sizes[:-1]]), sizes) if sizes else np.zeros(0, np.intp)
@@ -197,14 +214,21 @@ class Columns:
         return {column: np.flatnonzero(hit) for column, hit in found.items() if hit.any()}
 
     def decode_numbers(self, image: bytes) -> dict[Column, Array]:
-        """Decode the columns of numbers and bits. An element that needs its own decoder becomes 0."""
-        data = np.frombuffer(image, np.uint8)
-        arrays = {column: np.zeros(self.sizes[column], kind) for column, kind in KINDS.items() if self.sizes[column]}
-        if Column.BOOL in arrays:
-            where, shifts = self._bits
-            np.bitwise_and(data[where] >> shifts, 1, out=arrays[Column.BOOL])
-        for column, part in self._numbers:
-            arrays[column][part.slots] = data[part.bytes].view(part.kind)[:, 0]
+        """Decode the columns of numbers and bits. An element that needs its own decoder becomes 0.
+
+        The array of a column without such elements may be read-only.
+        """
+        arrays = {}
+        for column, kind in self._kinds:
+            if column is Column.BOOL:
+                where, shifts = self._bits
+                arrays[column] = np.frombuffer(image, np.uint8)[where] >> shifts & 1
+            elif column in self._whole:
+                arrays[column] = self._whole[column].decode(image)
+            else:
+                arrays[column] = np.zeros(self.sizes[column], kind)
+        for column, part in self._parts:
+            arrays[column][part.slots] = part.decode(image)
         return arrays
 
     def encode(self, column: Column, slots: Array, values: Array, image: bytearray) -> Array:
@@ -334,7 +358,8 @@ def _differing(column: Column, old: Array, new: Array, deadband: float) -> Array
         with np.errstate(invalid="ignore", over="ignore"):
             distance = np.abs(new.astype(np.float64) - old.astype(np.float64))
         differs &= ~(distance <= deadband)  # NaN is never within the dead-band
-    return np.flatnonzero(differs)
+    found: Array = differs.nonzero()[0]
+    return found
 
 
 def _texts(texts: Iterable[str]) -> bytes:
@@ -343,10 +368,12 @@ def _texts(texts: Iterable[str]) -> bytes:
 
 def _numbers(registers: Sequence[Register], code: str, order: ByteOrder, slots: slice) -> _NumberGroup:
     kind = np.dtype(f"<{code}")
-    starts = [register.offset + np.arange(register.count) * register.element.stride for register in registers]
-    within = np.arange(kind.itemsize)
-    where = np.concatenate(starts)[:, None] + (within[::-1] if order == "big" else within)
-    return _NumberGroup(slots, where.astype(np.intp), kind)
+    parts = [register.offset + np.arange(register.count) * register.element.stride for register in registers]
+    starts, within = np.concatenate(parts), np.arange(kind.itemsize)
+    where = starts[:, None] + (within[::-1] if order == "big" else within)
+    stored = kind.newbyteorder(">") if order == "big" and kind.itemsize > 1 else kind
+    gapless = bool((np.diff(starts) == kind.itemsize).all())
+    return _NumberGroup(slots, where.astype(np.intp), kind, stored, int(starts[0]) if gapless else None)
 
 
 def _bits(registers: Sequence[Register]) -> tuple[Array, Array]:
