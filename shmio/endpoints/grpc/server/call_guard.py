@@ -9,12 +9,11 @@ import asyncio
 import inspect
 import logging
 from collections import Counter
-from collections.abc import AsyncIterator, Callable, Collection, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
 from contextlib import aclosing
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Final
-from weakref import WeakKeyDictionary
 
 import grpc
 from google.protobuf.message import DecodeError
@@ -245,9 +244,6 @@ class CallGuard:
     def guarded(self, method: str, handler: Handler) -> Handler:
         """Return a handler that checks a call, and then runs the call's own handler.
 
-        This is not an interceptor, because gRPC looks for the handler of each call anew if there is
-        one.
-
         Args:
             method: The full name of the call.
             handler: The call's own handler.
@@ -352,7 +348,9 @@ _NEEDED: Final[Mapping[str, str]] = {
     "is_running shutdown",
     "_ServicerContext": "abort",
     "_RequestCallError": "",
-    "asyncio": "wait",
+    "_handle_stream_stream_rpc": "",
+    "_handle_stream_unary_rpc": "",
+    "_schedule_rpc_coro": "",
     "get_working_loop": "",
 }
 _NO_CALL: Final = "there is no such call; reflection lists the services"
@@ -378,46 +376,22 @@ def check_version() -> None:
         )
 
 
-class _CoreAsyncio:
-    """What the core uses as ``asyncio``: :func:`asyncio.wait` for calls takes the same time for any number of methods.
-
-    For each call, grpcio's serving task waits for the requests of all methods, and asyncio visits each of them
-    several times. With the more than 60 methods of an endpoint, this was a tenth of the time of a short call.
-    """
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(asyncio, name)
-
-    def wait(self, futures: Collection[asyncio.Future[Any]], **options: Any) -> Any:
-        """Wait for requests of a core, or as ``asyncio.wait`` does."""
-        core = next((_requests.get(one) for one in futures), None)  # all are of the same core, or none is
-        return asyncio.wait(futures, **options) if core is None else core.wait_for_calls()
-
-
-_requests: Final[WeakKeyDictionary[asyncio.Future[Any], Core]] = WeakKeyDictionary()
-"""The core that made each request for a call."""
-
-
 class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]
-    """A gRPC core that passes to its serving task only calls of methods that exist."""
+    """A gRPC core that starts the handlers of calls itself.
+
+    grpcio's serving task would wait for the requests of all methods together, for each call anew, and then search for
+    the handler. Here it waits only for the end of the core.
+    """
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
-        self._asking: set[asyncio.Task[None]] = set()  # asyncio itself holds tasks only weakly
-        self._came: set[asyncio.Future[Any]] = set()
-        self._coming = asyncio.Event()
-        cygrpc.asyncio = _CoreAsyncio()
+        self._handlers: dict[str, Handler] = {}
+        self._tasks: set[asyncio.Task[None]] = set()  # asyncio itself holds tasks only weakly
 
-    async def wait_for_calls(self) -> tuple[set[asyncio.Future[Any]], set[asyncio.Future[Any]]]:
-        """Wait until a call has come.
-
-        Returns:
-            The requests that are done, and an empty set, as ``asyncio.wait`` returns them.
-        """
-        await self._coming.wait()
-        self._coming.clear()
-        came, self._came = self._came, set()
-        return came, set()
+    def add_registered_method_handlers(self, handlers: dict[str, Handler]) -> None:
+        """Add handlers of calls, all with streams of requests, by the calls' full names."""
+        super().add_registered_method_handlers(handlers)
+        self._handlers |= handlers
 
     def start_workers(self) -> None:
         """Start the workers that refuse calls with unknown names."""
@@ -436,31 +410,28 @@ class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]
     def _make_request_call_future(self, method: bytes | None) -> asyncio.Future[Any]:
         """Return a future for the next call; if it is cancelled, the core may still write to the request's memory."""
         request: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
-        _requests[request] = self
         if method is not None:  # the workers take calls of other methods
-            asking = asyncio.get_running_loop().create_task(self._ask(method, request))
-            self._asking.add(asking)
-            asking.add_done_callback(self._asking.discard)
+            self._start(self._take_calls(method, request))
         return request
 
-    async def _ask(self, method: bytes, request: asyncio.Future[Any]) -> None:
-        """Wait for a call of a method, and wake the serving task in the same turn of the loop."""
-        state, failure = None, None
+    async def _take_calls(self, method: bytes, request: asyncio.Future[Any]) -> None:
+        """Start the handler of each call of a method, until the core ends. Then fail the serving task's request."""
+        name = method.decode()
+        handler, loop = self._handlers[name], asyncio.get_running_loop()
+        run = cygrpc._handle_stream_stream_rpc if handler.response_streaming else cygrpc._handle_stream_unary_rpc
         try:
-            state = await self._request_registered_call(method)
-        except asyncio.CancelledError:
-            request.cancel()
-            raise
+            while True:
+                state = await self._request_registered_call(method)
+                self._start(cygrpc._schedule_rpc_coro(run(handler, state, loop), state, loop, name))
+                del state  # it keeps the call alive
         except Exception as error:  # noqa: BLE001  the serving task handles it
-            failure = error
-        if request.done():  # cancelled
-            return
-        if failure is None:
-            request.set_result(state)
-        else:
-            request.set_exception(failure)
-        self._came.add(request)
-        self._coming.set()
+            if not request.done():
+                request.set_exception(error)
+
+    def _start(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
 
     async def _refuse(self) -> None:
         while self.is_running():
