@@ -88,13 +88,13 @@ class DecodedImage(NamedTuple):
 class _NumberGroup:
     """Numeric elements of one type.
 
-    ``bytes`` has the offsets of each element's bytes, the least significant byte first. Its shape
-    is (elements, size). ``stored`` is the type of the elements in the image. ``start`` is the
+    ``offsets`` has the offset of each byte of each element, the least significant byte first. Its
+    shape is (elements, size). ``stored`` is the type of the elements in the image. ``start`` is the
     offset of the first element if all follow one another without gaps, otherwise None.
     """
 
     slots: slice
-    bytes: Array
+    offsets: Array
     kind: np.dtype[Any]
     stored: np.dtype[Any]
     start: int | None
@@ -102,8 +102,8 @@ class _NumberGroup:
     def decode(self, image: bytes) -> Array:
         """Decode the elements. Without gaps and in little-endian order, the array is a view of the image."""
         if self.start is None:
-            return np.frombuffer(image, np.uint8)[self.bytes].view(self.kind)[:, 0]
-        found = np.frombuffer(image, self.stored, len(self.bytes), self.start)
+            return np.frombuffer(image, np.uint8)[self.offsets].view(self.kind)[:, 0]
+        found = np.frombuffer(image, self.stored, len(self.offsets), self.start)
         return found if self.stored is self.kind else found.astype(self.kind)
 
 
@@ -218,7 +218,7 @@ class Columns:
 
         The array of a column without such elements may be read-only.
         """
-        arrays = {}
+        arrays: dict[Column, Array] = {}
         for column, kind in self._kinds:
             if column is Column.BOOL:
                 where, shifts = self._bits
@@ -256,7 +256,7 @@ class Columns:
             if part.kind.kind != "f":
                 mine &= (values >= np.iinfo(part.kind).min) & (values <= np.iinfo(part.kind).max)
             numbers = values[mine].astype(part.kind)[:, None]
-            data[part.bytes[slots[mine] - part.slots.start]] = numbers.view(np.uint8)
+            data[part.offsets[slots[mine] - part.slots.start]] = numbers.view(np.uint8)
             left &= ~mine
         return np.flatnonzero(left)
 
