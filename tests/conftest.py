@@ -20,7 +20,7 @@ from types import CodeType, FunctionType, MethodType
 from typing import Any, NamedTuple
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 from xdist.scheduler import LoadScopeScheduling
 
 from shmio.testing.mosquitto import missing
@@ -31,11 +31,12 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 if "PYTEST_XDIST_WORKER" in os.environ:  # under nohup, SIGHUP is ignored, too; only the main process should
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
-# No deadline, as the host may be busy. Each run uses the same examples, with --fast fewer of them;
-# --hypothesis-profile=search looks for new ones.
-settings.register_profile("repeat", deadline=None, derandomize=True)
-settings.register_profile("fast", deadline=None, derandomize=True, max_examples=20)
-settings.register_profile("search", deadline=None, max_examples=1000)
+# Neither a deadline nor the check of speed, as the host may be busy. Each run uses the same examples, with --fast
+# fewer of them; --hypothesis-profile=search looks for new ones.
+busy_host = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("repeat", busy_host, derandomize=True)
+settings.register_profile("fast", busy_host, derandomize=True, max_examples=20)
+settings.register_profile("search", busy_host, max_examples=1000)
 settings.load_profile("repeat")
 
 SHM = Path("/dev/shm")

@@ -389,13 +389,15 @@ class SourceLoop:
         doubt = self._connector.doubt
         quality = Quality.UNCERTAIN if doubt else Quality.GOOD
         self._quality_log.update(quality, doubt, asked.cycle, f", connected {self._connector.describe()}")
+        if (
+            not self._accepting
+        ):  # not before an image has confirmed the layout, and before consumers see that it is good
+            self._accepting = True
+            self.commands.open()
         self._output.publish(
             Image(raw, asked.cycle, asked.utc_ns, quality, self._connector.provenance, doubt, asked.monotonic_ns)
         )
         self.counters.polls += 1
-        if not self._accepting:  # not before an image has confirmed the layout
-            self._accepting = True
-            self.commands.open()
         if self._connected_ns is not None and self._clock.now_ns() - self._connected_ns > STABLE_NS:
             self._retries = 0
 

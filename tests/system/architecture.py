@@ -14,7 +14,7 @@ from html import escape
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from shmio.segment import instances
+from shmio.segment import running_instances
 from shmio.testing.cell import Cell
 from shmio.testing.ports import reserved_port
 
@@ -169,7 +169,7 @@ def _arrow(left: int, right: int, y: int, *, both: bool) -> str:
 
 def main(file: Path) -> int:
     """Run the instance, and write the SVG."""
-    if "a50" in instances():
+    if "a50" in running_instances():
         print("an instance a50 is running; stop it first", file=sys.stderr)
         return 1
     with tempfile.TemporaryDirectory() as folder:

@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple
 
 import pyte
 
-from shmio.segment import instances
+from shmio.segment import running_instances
 from shmio.testing.cell import BIN
 
 AXIS: Final = "cell/Robot_800/Axs1_Pos"
@@ -181,7 +181,7 @@ def _shown(pictures: list[Picture]) -> Iterator[str]:
 
 def main(file: Path) -> int:
     """Record the commands, and write the SVG."""
-    if "a50" in instances():
+    if "a50" in running_instances():
         print("an instance a50 is running; stop it first", file=sys.stderr)
         return 1
     with tempfile.TemporaryDirectory() as folder:

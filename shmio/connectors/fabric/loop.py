@@ -326,14 +326,14 @@ class MirrorLoop:
             frame.raw, frame.cycle, frame.source_ns, frame.quality, frame.provenance, frame.reason, now_ns - age_ns,
             frame.effective,
         )  # fmt: skip
+        if not self._open and not self._bad and age_ns < self._writer.block.stale_ns:
+            self._open = True
+            self.counters.connects += 1
+            self.commands.open()  # before consumers see that the source is good
         self._output.publish(image)
         self._pace.spend(now_ns)
         self.counters.polls += 1
         self.counters.round_trip_us = late_ns // 1000
-        if not self._open and not self._bad and age_ns < self._writer.block.stale_ns:
-            self._open = True
-            self.counters.connects += 1
-            self.commands.open()
         self.commands.release(frame.cycle)
 
     def _show_run(self, one: Received, late_ns: int) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import msgspec
 import pytest
@@ -15,6 +15,7 @@ from shmio.errors import ConnectorError
 from shmio.layout.model import Layout, Register
 from shmio.local.writer import CommandSender
 from shmio.segment import BlockSpec, EventKind, Frame, ProcessSpec, Quality, Segment, Write
+from shmio.segment.block import Bytes
 
 LAYOUT = Layout("DB1", 1, 4, False, (Register("count", "UDINT", (), 0, None, 4, 1),))
 PERIOD_NS = 20_000_000
@@ -431,6 +432,26 @@ def test_a_write_is_done_before_the_read_so_that_the_frame_shows_it(segment: Seg
         (EventKind.STOPPED, len(frames)),
     ]
     assert frames[3].event == 4
+
+
+def test_who_sees_a_good_frame_may_write(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    sender = CommandSender(segment.blocks["cell"], 4)
+    writer = segment.writer("cell")
+    publish = writer.publish
+
+    def published(raw: Bytes, **options: Any) -> int:
+        frame = publish(raw, **options)
+        if frame == 1:
+            sender.submit([Write(0, 0, (1000).to_bytes(4, "big"))], 10**18)
+            loop.commands._take_one(4)  # what the commands' thread does
+        return frame
+
+    monkeypatch.setattr(writer, "publish", published)
+    loop = SourceLoop(Writing(lambda *_: None), writer, Schedule(0, PERIOD_NS), VirtualClock(4 * PERIOD_NS), ["count"])
+    cursor = segment.blocks["cell"].cursor()
+    loop.run()
+    frames = list(iter(cursor.poll, None))
+    assert [(int.from_bytes(f.raw, "big"), f.quality) for f in frames[:2]] == [(1, Quality.GOOD), (1001, Quality.GOOD)]
 
 
 def test_a_write_lost_with_the_connection_is_unknown_and_never_repeated(segment: Segment) -> None:
