@@ -8,6 +8,7 @@ from typing import Final
 from urllib.parse import urlsplit
 
 from shmio.config.address import Address
+from shmio.config.masking import mask_line
 from shmio.config.model import Config, Fabric, FabricAllow
 from shmio.errors import ConfigError
 from shmio.wording import plain_text, unknown
@@ -102,8 +103,9 @@ def server_address(key: str, url: str, credentials: str, others: str = "") -> Ad
         port = parts.port or PORT
     except ValueError:
         parts, port = urlsplit(""), 0
+    key, shown = mask_line(key), mask_line(url)
     if parts.scheme not in SCHEMES or not parts.hostname or parts.path.strip("/") or parts.query or parts.fragment:
-        raise ConfigError(f"{key}: {url!r} is not a NATS server; write nats://host:{PORT}, tls://host{others}")
+        raise ConfigError(f"{key}: {shown!r} is not a NATS server; write nats://host:{PORT}, tls://host{others}")
     if parts.password or parts.username:
         raise ConfigError(f"{key}: a URL with a password is visible to others; name a file {credentials}")
     return Address(parts.hostname, port)

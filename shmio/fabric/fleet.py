@@ -61,6 +61,8 @@ def member(seen: Seen) -> Member:
     notes = []
     if entry.version != __version__:
         notes.append(f"version {entry.version}; this host has {__version__}")
+    if entry.note and state not in (STOPPED, DOWN):
+        notes.append(entry.note)
     if state not in (STOPPED, DOWN) and (bad := [one for one in entry.sources if one.quality != "good"]):
         first = bad[0]
         more = f", and {counted(len(bad) - 1, 'other source')}" if len(bad) > 1 else ""

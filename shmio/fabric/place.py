@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import urlsplit
 
+from shmio.config.fabric import server_address
+from shmio.config.masking import mask_line
 from shmio.errors import ConfigError, RecordingError
 from shmio.fabric.names import CellName
 
@@ -31,9 +33,11 @@ def parse_place(text: str) -> tuple[str, CellName]:
         RecordingError: The text is not such a URL.
 
     """
-    parts = urlsplit(text)
+    shown = mask_line(text)
     try:
-        cell = CellName.parse(parts.path.strip("/"))
-    except ConfigError as error:
-        raise RecordingError(f"{text}: {error}") from None
-    return f"{parts.scheme}://{parts.netloc}", cell
+        parts = urlsplit(text)
+        server = f"{parts.scheme}://{parts.netloc}"
+        server_address(shown, server, "with --credentials, or in fabric.credentials")
+        return server, CellName.parse(parts.path.strip("/"))
+    except (ConfigError, ValueError) as error:
+        raise RecordingError(f"{shown}: {str(error).removeprefix(f'{shown}: ')}") from None

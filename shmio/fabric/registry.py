@@ -77,6 +77,7 @@ class CellEntry(msgspec.Struct, frozen=True):
         renewed_utc_ns: Time of the last renewal on the owner's clock, UTC in ns since 1970.
         web: Address of the cell's web page; empty if it has none.
         sources: The sources that the cell offers.
+        note: What is wrong with the instance and its processes; empty if nothing is.
 
     """
 
@@ -90,6 +91,7 @@ class CellEntry(msgspec.Struct, frozen=True):
     renewed_utc_ns: int
     web: str = ""
     sources: tuple[SourceEntry, ...] = ()
+    note: str = ""
 
     def source(self, name: str) -> SourceEntry | None:
         """Return the source of this name; None if the cell does not offer it."""

@@ -189,6 +189,17 @@ def complaint(kind: str, note: str) -> str:
     return note if kind in ("fabric", "mqtt", "grpc", "opcua", "web") else ""
 
 
+def problems(status: InstanceStatus) -> list[str]:
+    """Return what is wrong with the instance and its processes, apart from the quality of sources."""
+    found = [status.note] if status.note else []
+    for one in status.processes:
+        if one.state != str(Phase.RUNNING):
+            found.append(f"{one.name} is {one.state}{f': {one.note}' if one.note else ''}")
+        elif why := complaint(one.kind, one.note):
+            found.append(f"{one.name}: {why}")
+    return found
+
+
 def assess(running: Sequence[bool], qualities: Sequence[Quality | None], note: str = "") -> InstanceState:
     """Return the state of a started instance: degraded if any part has a problem, else running.
 

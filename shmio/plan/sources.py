@@ -239,7 +239,8 @@ def _file(name: str, source: Source, config: Config) -> str:
         url, cell = parse_place(name)
         fabric = config.fabric
         access = Access((url,))
-        if fabric is not None and not fabric.embedded:  # [fabric.tls] of an embedded server is not for clients
+        # An embedded server has files of its own, which other servers may know, and asks for no credentials.
+        if fabric is not None and (not fabric.embedded or url.startswith("tls:")):
             access = Access((url,), fabric.tls, fabric.credentials)
         fetch(Place(access, cell), part, begin, end)
         part.replace(file)

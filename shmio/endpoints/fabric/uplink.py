@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
+from shmio.config.masking import mask_line
 from shmio.config.model import FabricAllow, FabricHistory, FabricRule
 from shmio.endpoints.fabric.backlog import Backlog, Kept, Row
 from shmio.endpoints.fabric.commands import CommandReceiver
@@ -26,7 +27,7 @@ from shmio.fabric.messages import Header, asks_for_state, encode_state, with_hea
 from shmio.fabric.names import CellName, source_of
 from shmio.fabric.registry import RENEW_S, CellEntry, Registry, SourceEntry
 from shmio.libraries import library
-from shmio.local.status import status_of
+from shmio.local.status import problems, status_of
 from shmio.recording.format.encoding import BlockPosition
 from shmio.segment import Block, ProcessSlot, Segment
 from shmio.segment.doorbell import Relay
@@ -47,6 +48,9 @@ LEAVE_S: Final = 2.0
 """Time limit in s for sending the last messages when the uplink stops."""
 MAX_REQUESTS: Final = 1024
 """Maximum number of requests of other cells that wait. Further requests are dropped."""
+
+MAX_NOTE: Final = 500
+"""Maximum number of characters of what the cell's entry says about problems."""
 
 log = logging.getLogger("shmio.fabric")
 
@@ -352,13 +356,15 @@ class Uplink:
 
     def _entry(self, *, stopped: bool = False) -> CellEntry:
         head = self._segment.header
-        state = str(status_of(self._segment, "", "fabric").state)
+        status = status_of(self._segment, "", "fabric")
+        state = str(status.state)
         if stopped or state == STOPPED:  # a cell that publishes is not stopped, whatever has become of its supervisor
             state = STOPPED if stopped else str(State.DEGRADED)
         return CellEntry(
             str(self.cell), socket.gethostname(), self._segment.instance, __version__, f"{head.epoch:016x}", state,
             head.started_utc_ns, self._log_time(time.monotonic_ns()), self._settings.web,
             tuple(self._source_entry(feed) for feed in self._feeds.values()),
+            "" if stopped else mask_line("; ".join(problems(status)))[:MAX_NOTE],
         )  # fmt: skip
 
     def _source_entry(self, feed: Feed) -> SourceEntry:

@@ -9,7 +9,8 @@ import pytest
 from shmio.config import load
 from shmio.config.fabric import matches_cell
 from shmio.config.model import Fabric
-from shmio.errors import ConfigError
+from shmio.errors import ConfigError, RecordingError
+from shmio.fabric.place import parse_place
 
 EMBEDDED = 'server = "embedded"\n'
 CELL = 'cell = "plant1.line3.a50"\n'
@@ -68,6 +69,19 @@ def test_sound_sections(tmp_path: Path, text: str) -> None:
 def test_refused_sections(tmp_path: Path, text: str, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         read(tmp_path, text)
+
+
+@pytest.mark.parametrize("port", ["4222", "99999"])
+def test_no_message_has_the_password_of_a_url(tmp_path: Path, port: str) -> None:
+    url = f"nats://me:hunter2@127.0.0.1:{port}"
+    with pytest.raises(ConfigError) as refused:
+        read(tmp_path, f'server = "{url}"\n')
+    with pytest.raises(RecordingError) as place:
+        parse_place(f"{url}/plant1.line3.a50")
+    with pytest.raises(RecordingError) as name:
+        parse_place(f"{url}/plant1")
+    for error in (refused, place, name):
+        assert "hunter2" not in str(error.value)
 
 
 def test_patterns_match_part_by_part() -> None:

@@ -18,7 +18,8 @@ def seen(age_s: float = 1.0, quality: str = "good", **more: Any) -> Seen:
     sources = (SourceEntry("cell", "00", 1, 1, 1, quality, "" if quality == "good" else "the PLC is off"),)
     return Seen(
         CellEntry(
-            CELL, told["host"], "a50", told["version"], "0", told["state"], told["started"], 2, sources=sources
+            CELL, told["host"], "a50", told["version"], "0", told["state"], told["started"], 2, sources=sources,
+            note=told.get("note", ""),
         ),
         age_s, 1,
     )  # fmt: skip
@@ -45,6 +46,7 @@ def test_notes_name_another_version_and_bad_sources() -> None:
     assert "0.1" in version
     assert __version__ in version
     assert "cell is bad (the PLC is off)" in source
+    assert member(seen(state="degraded", note="recorder: the disk is full")).notes == ("recorder: the disk is full",)
     assert member(seen(3600.0, quality="bad")).notes == ()  # the quality of a cell that is down is old
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from shmio.layout.model import Layout, Register
 from shmio.local import status as status_module
-from shmio.local.status import ProcessStatus, SourceStatus, read_status
+from shmio.local.status import ProcessStatus, SourceStatus, problems, read_status
 from shmio.segment import (
     Activity,
     BlockSpec,
@@ -227,4 +227,8 @@ def test_a_recorder_that_cannot_write_degrades_the_instance(cell: Cell, instance
     for note, state in (("to a.mem", "running"), ("a.mem: No space left on device", "degraded")):
         slot.report = Report(os.getpid(), Activity.RUNNING, started_ns, (), note)
         assert read_status(instance).state == state
-    assert read_status(instance).processes[2].note == "a.mem: No space left on device"
+    status = read_status(instance)
+    assert status.processes[2].note == "a.mem: No space left on device"
+    assert problems(status) == ["recorder: a.mem: No space left on device"]
+    slot.supervised = Supervised(Phase.FATAL, 0, started_ns, "it ended 5 times")
+    assert problems(read_status(instance)) == ["recorder is fatal: it ended 5 times"]

@@ -69,6 +69,7 @@ async def test_the_registry_knows_the_cell(segment: Segment, server: NatsServer)
         (source,) = seen.entry.sources
         assert (source.quality, source.registers) == ("good", 2)
         assert await registry.layout(source.layout) == LAYOUT
+        assert "supervisor died" in seen.entry.note, "the entry says what is wrong"
         await found._renew(registry)
     seen = await registry.find(CELL)
     assert seen is not None
