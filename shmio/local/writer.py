@@ -185,9 +185,7 @@ class SourceWriter:
         Raises:
             CommandError: The queue has no room. Nothing has been sent.
         """
-        layout = self.block.layout
-        paths = tuple(path_at(layout, write.offset) or f"byte {write.offset}" for write in writes)
-        return self._send(paths, writes, timeout_s)
+        return self._send(self._paths(writes), writes, timeout_s)
 
     def shadow(self, injection: int, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
         """Give values to an injection, and wait for the outcome of each value.
@@ -251,7 +249,7 @@ class SourceWriter:
         Raises:
             CommandError: The command could not be sent.
         """
-        paths = ("",) * (len(writes) if kind is CommandKind.SHADOW else 1)
+        paths = self._paths(writes) if kind is CommandKind.SHADOW else ("",)
         return self._send(paths, writes, timeout_s, kind, injection, number, **options)
 
     def inject(
@@ -409,6 +407,11 @@ class SourceWriter:
         The method raises the same errors as :meth:`submit`.
         """
         return self.outcomes(self.submit(values, timeout_s))
+
+    def _paths(self, writes: Sequence[Write]) -> tuple[str, ...]:
+        """Return a path for each write."""
+        layout = self.block.layout
+        return tuple(path_at(layout, write.offset) or f"byte {write.offset}" for write in writes)
 
     def _register(self, path: str) -> Register:
         register = find(self.block.layout, path)

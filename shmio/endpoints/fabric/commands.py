@@ -53,6 +53,9 @@ _KINDS: Final = {
     "declare": CommandKind.DECLARE,
 }
 
+_DONE: Final = frozenset({EventKind.INJECTED, EventKind.LIFTED, EventKind.SHADOWED})
+"""Successes whose text is no reason."""
+
 Answer = Callable[[CommandReply], None]
 """Function that is called once for each command, with its outcomes."""
 Refusal = tuple[OutcomeKind, str, str]
@@ -121,14 +124,17 @@ class CommandClient:
         lease = None
         if kind in (CommandKind.DECLARE, CommandKind.INJECT):
             lease = self.leases.add(number, sender, keep=request.keep)
-        self._in_flight.add(ticket, cost, partial(self._ended, number, lease, answer), attempt=attempt)
+        values = [items for _, items in ticket.values]
+        self._in_flight.add(ticket, cost, partial(self._ended, number, lease, answer, values), attempt=attempt)
 
-    def _ended(self, number: int, lease: Lease | None, answer: Answer, ends: Sequence[End]) -> None:
+    def _ended(
+        self, number: int, lease: Lease | None, answer: Answer, values: Sequence[range], ends: Sequence[End]
+    ) -> None:
         if lease is not None:
             lease.open = False
             if ends[0][0] not in (EventKind.INJECTED, EventKind.UNKNOWN):
                 self.leases.remove(number)
-        answer(CommandReply([str(kind) for kind, _ in ends], ["" if _is_done(end) else end[1] for end in ends]))
+        _report(answer, values, [(kind, "" if kind in _DONE else reason) for kind, reason in ends])
 
     def lift_expired(self) -> None:
         """Lift the injections that their cells no longer renew."""
@@ -190,7 +196,7 @@ def _report(answer: Answer, values: Sequence[range], ends: Sequence[End]) -> Non
     """Answer with one outcome for each write. Writes of one value share their outcome."""
     outcomes, reasons = list[str](), list[str]()
     for items, (kind, reason) in zip(values, ends, strict=True):
-        outcomes += [str(OutcomeKind[kind.name])] * len(items)
+        outcomes += [str(kind)] * len(items)
         reasons += [reason] * len(items)
     answer(CommandReply(outcomes, reasons))
 
@@ -368,10 +374,6 @@ class CommandReceiver:
 
 def _rejected(why: str) -> Refusal:
     return OutcomeKind.REJECTED, why, "refused"
-
-
-def _is_done(end: End) -> bool:
-    return end[0] in (EventKind.INJECTED, EventKind.LIFTED, EventKind.SHADOWED)
 
 
 def _writes(items: Sequence[WriteItem]) -> list[Write]:

@@ -1,0 +1,236 @@
+"""Injections of other cells: what a bare NATS client gets, what the source does, and when leases end."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import nats
+import pytest
+
+from shmio.audit import trail
+from shmio.audit.file import AuditSettings
+from shmio.config import Declaration
+from shmio.config.model import FabricAllow, FabricRule
+from shmio.connectors.injection_layers import Owner
+from shmio.endpoints.fabric import injections
+from shmio.endpoints.fabric.uplink import Uplink
+from shmio.fabric.messages import (
+    STATE_REQUEST,
+    CommandReply,
+    CommandRequest,
+    InjectionRequest,
+    SourceState,
+    WriteItem,
+    decode_reply,
+    decode_state,
+    encode_command,
+)
+from shmio.segment import Event, EventKind, Segment
+from tests.nats_server import NatsServer
+from tests.unit.endpoints.fabric.harness import CELL, TIMEOUT_S, Listener, decoded, in_loop, listening, until, uplink
+from tests.unit.endpoints.plant import Plant
+
+ALLOW = [FabricAllow(sender="plant1.*.twin", roles=["inject"]), FabricAllow(sender="plant1.*.*", roles=["write"])]
+TWIN = "plant1.line1.twin"
+OTHER = WriteItem(4, 0, b"\xff\xff\xff\xff")
+NUMBER = 4711 << 40 | 5
+
+
+@pytest.fixture
+def plant(segment: Segment) -> Iterator[Plant]:
+    plant = Plant(segment.writer("cell"))
+    writer = segment.processes.find("fabric").writer
+    assert writer is not None
+    plant.owners[writer] = Owner(writer, 1)
+    plant.cycle()
+    plant.run()
+    yield plant
+    plant.stop()
+
+
+class Injector:
+    """A bare NATS client that sends commands about injections to an uplink."""
+
+    def __init__(self, client: Any, found: Uplink) -> None:
+        self.client, self.uplink = client, found
+        self.block = found._feeds["cell"].block
+
+    async def send(self, kind: Any, number: int = 0, sender: str = TWIN, **more: Any) -> CommandReply:
+        """Send a command, and return its outcomes."""
+        now_ns = self.uplink._log_time(time.monotonic_ns())
+        stream, digest = self.uplink.backlog.rows["cell"].stream, self.uplink._feeds["cell"].digest[:8]
+        injection = InjectionRequest(kind, number, **more)
+        request = CommandRequest(now_ns + 60_000_000_000, stream, digest, injection=injection)
+        subject = f"shmio.{CELL}.cell.command.{sender}"
+        reply = await self.client.request(subject, encode_command(request), timeout=TIMEOUT_S)
+        return decode_reply(bytes(reply.data), request.outcomes)
+
+    async def declare(self, number: int = NUMBER, sender: str = TWIN, **more: Any) -> CommandReply:
+        """Declare an injection over the register ``other``."""
+        values = {"name": "one", "target": "cell/other", "operation": "set", "value": 9, **more}
+        declaration = msgspec.json.encode(msgspec.convert(values, Declaration))
+        return await self.send("declare", number, sender, declaration=declaration)
+
+    @property
+    def present(self) -> list[int]:
+        return [one.number for one in self.block.injections.read()]
+
+
+@asynccontextmanager
+async def injector(segment: Segment, url: str, **settings: Any) -> AsyncIterator[Injector]:
+    async with uplink(segment, url, **{"allow": ALLOW, **settings}) as found:
+        client = await nats.connect(url)
+        await until(lambda: found.publisher.up)
+        try:
+            yield Injector(client, found)
+        finally:
+            await client.close()
+
+
+async def next_state(listener: Listener) -> SourceState:
+    """Return the next state that the uplink publishes."""
+    while True:
+        message = await listener.queue.get()
+        if (state := decode_state(bytes(message.data))) is not None:
+            return state
+
+
+async def kinds_until(listener: Listener, kind: EventKind) -> list[object]:
+    """Return the states and the kinds of the events up to the first event of this kind."""
+    found: list[object] = []
+    while kind not in found:
+        message = await listener.queue.get()
+        state = decode_state(bytes(message.data))
+        found += [one.kind for one in decoded(message).entries if isinstance(one, Event)]
+        found += [] if state is None else [[one.number for one in state.injections]]
+    return found
+
+
+@in_loop
+async def test_a_shadow_of_another_cell_lives_at_the_owner(segment: Segment, server: NatsServer, plant: Plant) -> None:
+    async with injector(segment, server.url) as twin, listening(server.url) as listener:
+        assert await twin.send("inject", NUMBER, items=[OTHER], name="test") == CommandReply(["injected"], [""])
+        assert await kinds_until(listener, EventKind.INJECTED) == [[NUMBER], EventKind.INJECTED], "the list comes first"
+        values = [WriteItem(4, 0, b"\0\0\0\7"), WriteItem(0, 0, b"\1")]
+        reply = await twin.send("shadow", NUMBER + 1, injection=NUMBER, items=values[:1])
+        assert reply == CommandReply(["shadowed"], [""])
+        frame = twin.block.latest()
+        assert frame is not None
+        assert frame.image[4:] == b"\0\0\0\7"
+        reply = await twin.send("shadow", NUMBER + 2, injection=NUMBER, items=values)
+        assert reply.outcomes == ["rejected"] * 2, "the injection does not cover the other register"
+        assert await twin.send("lift", NUMBER + 3, injection=NUMBER) == CommandReply(["lifted"], [""])
+        assert (await twin.send("lift", NUMBER + 4, injection=NUMBER)).outcomes == ["rejected"]
+        assert twin.present == []
+
+
+@in_loop
+async def test_a_declared_injection_has_the_number_that_the_sender_chose(
+    segment: Segment, server: NatsServer, plant: Plant
+) -> None:
+    async with injector(segment, server.url) as twin, listening(server.url) as listener:
+        assert (await twin.declare()).outcomes == ["injected"]
+        [one] = twin.block.injections.read()
+        assert (one.number, one.name) == (NUMBER, "one")
+        assert [(one.number, one.cell) for one in (await next_state(listener)).injections] == [(NUMBER, TWIN)]
+        reply = await twin.declare()
+        assert (reply.outcomes, "exists" in reply.reasons[0]) == (["rejected"], True)
+        reply = await twin.declare(NUMBER + 1, target="cell/nothing")
+        assert (reply.outcomes, "cell/nothing" in reply.reasons[0]) == (["rejected"], True)
+
+
+@in_loop
+async def test_the_role_is_needed_and_the_audit_names_the_sender(
+    segment: Segment, server: NatsServer, plant: Plant, tmp_path: Path
+) -> None:
+    file = tmp_path / "audit.jsonl"
+    trail.open_trail(AuditSettings(str(file), 1 << 20, 2), segment.instance, "fabric")
+    try:
+        async with injector(segment, server.url) as twin:
+            reply = await twin.declare(sender="plant1.line1.writer")
+            assert reply.outcomes == ["rejected"]
+            for word in ("[[fabric.allow]]", "plant1.line1.writer", "'inject'", "supervisor.toml", CELL):
+                assert word in reply.reasons[0]
+            await twin.declare()
+            await twin.send("lift", 7, injection=NUMBER)
+    finally:
+        trail.close_trail()
+    entries = [json.loads(line) for line in file.read_text().splitlines()]
+    assert [(one["who"], one["action"], one["outcome"]) for one in entries] == [
+        ("plant1.line1.writer", "declare", "denied"),
+        (TWIN, "declare", "injected"),
+        (TWIN, "lift", "lifted"),
+    ]
+
+
+@in_loop
+async def test_an_injection_that_is_not_renewed_is_lifted(
+    segment: Segment, server: NatsServer, plant: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(injections, "LEASE_S", 0.6)
+    async with injector(segment, server.url) as twin:
+        await twin.declare(NUMBER)
+        await twin.declare(NUMBER + 1, name="renewed")
+        await twin.send("inject", NUMBER + 2, items=[OTHER], keep=True)
+        stranger = {"renewed": [NUMBER], "sender": "plant1.line2.twin"}
+        async with asyncio.timeout(TIMEOUT_S):
+            while NUMBER in twin.present:
+                assert (await twin.send("renew", renewed=[NUMBER + 1])).outcomes == []
+                await twin.send("renew", **stranger)
+        assert twin.present == [NUMBER + 1, NUMBER + 2]
+        await until(lambda: twin.present == [NUMBER + 2])
+
+
+@in_loop
+async def test_only_what_is_published_is_changed_and_read(segment: Segment, server: NatsServer, plant: Plant) -> None:
+    rule = FabricRule(match="cell", registers=["cell/other"])
+    async with injector(segment, server.url, rule=[rule]) as twin:
+        refused = [
+            await twin.declare(target="cell/count"),
+            await twin.declare(target="cell/**"),
+            await twin.declare(when="cell/count > 3"),
+            await twin.send("inject", NUMBER, items=[WriteItem(0, 0, b"\1")]),
+        ]
+        assert [one.outcomes for one in refused] == [["rejected"]] * 4
+        assert twin.present == []
+        assert (await twin.declare(when="cell/other = 0")).outcomes == ["injected"]
+
+
+@in_loop
+async def test_a_mirror_gets_the_state_that_it_asks_for(segment: Segment, server: NatsServer, plant: Plant) -> None:
+    async with injector(segment, server.url) as twin:
+        await twin.declare()
+        async with listening(server.url) as listener:
+            await listener.client.publish(f"shmio.{CELL}.cell.missing", msgspec.json.encode(STATE_REQUEST))
+            state = await next_state(listener)
+    assert [one.number for one in state.injections] == [NUMBER]
+    assert not state.virtual
+    assert state.clock_ns > 0
+
+
+@in_loop
+async def test_malformed_commands_are_counted(segment: Segment, server: NatsServer, plant: Plant) -> None:
+    async with injector(segment, server.url) as twin:
+        hostile: list[dict[str, Any]] = [
+            {"kind": "inject", "number": 0, "items": [OTHER]},
+            {"kind": "inject", "number": 1},
+            {"kind": "inject", "number": 1, "items": [OTHER], "direction": 2},
+            {"kind": "inject", "number": 1, "items": [OTHER], "priority": 1 << 40},
+            {"kind": "inject", "number": 1, "items": [OTHER], "name": "x" * 300},
+            {"kind": "declare", "number": 1},
+            {"kind": "lift", "number": 1},
+            {"kind": "renew", "renewed": list(range(1000))},
+            {"kind": "other", "number": 1},
+        ]
+        for one in hostile:
+            request = CommandRequest(1 << 62, 1, b"12345678", injection=InjectionRequest(**one))
+            await twin.client.publish(f"shmio.{CELL}.cell.command.{TWIN}", encode_command(request), reply="reply")
+        await until(lambda: twin.uplink.commands.refused == len(hostile))
+        assert twin.present == []
