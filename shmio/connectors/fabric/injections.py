@@ -173,6 +173,7 @@ class MirroredInjections:
             for one in writer.block.injections.read()
             if not (one.cell or one.configured)
         }
+        self._present = set(self._held)  # numbers in the owner's list
         self._clock: _OwnersClock | None = None
         self._shown: bytes | None = None
         self._next = first_number(os.getpid())
@@ -373,7 +374,8 @@ class MirroredInjections:
     def _hold(self, sent: _Sent) -> None:
         """Renew an injection from now on. The caller holds the lock."""
         if sent.owner is not None and sent.command.id not in self._held:
-            self._held[sent.command.id] = _Held(sent.owner, sent.command.keep, self._now_ns())
+            seen = sent.command.id in self._present
+            self._held[sent.command.id] = _Held(sent.owner, sent.command.keep, self._now_ns(), seen)
 
     def show(self, state: SourceState, late_ns: int) -> None:
         """Show the owner's injections in the list of this source.
@@ -387,7 +389,7 @@ class MirroredInjections:
         with self._lock:
             self._clock = _OwnersClock(state.clock_ns + late_ns, now_ns, state.virtual)
             entries = [self._entry(one) for one in state.injections]
-            present = {one.number for one in entries}
+            self._present = present = {one.number for one in entries}
             for number, held in self._held.items():
                 held.seen = held.seen or number in present or now_ns - held.since_ns > UNSEEN_NS
                 held.gone_ns = 0 if number in present or not held.seen else held.gone_ns or now_ns

@@ -179,11 +179,10 @@ async def test_an_injection_that_is_not_renewed_is_lifted(
         await twin.declare(NUMBER)
         await twin.declare(NUMBER + 1, name="renewed")
         await twin.send("inject", NUMBER + 2, items=[OTHER], keep=True)
-        stranger = {"renewed": [NUMBER], "sender": "plant1.line2.twin"}
         async with asyncio.timeout(TIMEOUT_S):
             while NUMBER in twin.present:
                 assert (await twin.send("renew", renewed=[NUMBER + 1])).outcomes == []
-                await twin.send("renew", **stranger)
+                await twin.send("renew", sender="plant1.line2.twin", renewed=[NUMBER])
         assert twin.present == [NUMBER + 1, NUMBER + 2]
         await until(lambda: twin.present == [NUMBER + 2])
 

@@ -1,0 +1,254 @@
+"""Injections into a mirror: what the owner gets, and what programs of the mirror's host see."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import msgspec
+import pytest
+
+from shmio.config import Declaration
+from shmio.connectors.fabric import injections
+from shmio.fabric.messages import CommandReply, CommandRequest, InjectionRequest, SourceState
+from shmio.local.writer import PendingCommand, SourceWriter
+from shmio.model.clock import ClockMode
+from shmio.model.injection import Running
+from shmio.segment import NO_WRITER, Event, EventKind, Write
+from shmio.segment.commands import Direction
+from shmio.segment.injection_list import InjectionEntry
+from tests.unit.connectors.fabric.harness import PATIENCE_S, Mirroring, S, frame
+
+WRITER: Final = 0
+OTHER: Final = [Write(2, 0, b"\xff\xff")]
+OWNERS: Final = {"writer": 3, "pid": 99}
+"""The process of the uplink, in the owner's list and events."""
+
+
+def entry(number: int, **more: Any) -> InjectionEntry:
+    """Return an injection as it is in the owner's list."""
+    values: dict[str, Any] = {"direction": "out", "priority": 0, "keep": False, "name": "one", **OWNERS}
+    return InjectionEntry(number, **{**values, "ranges": ((2, 2, 255),), **more})
+
+
+def event(kind: EventKind, command: int, text: str = "", injection: int = 0) -> Event:
+    """Return an event of the owner."""
+    return Event(
+        7,
+        kind,
+        3,
+        42,
+        S,
+        S,
+        S,
+        1,
+        frame(1, 1).quality,
+        OWNERS["writer"],
+        command,
+        0,
+        1,
+        0,
+        0,
+        0,
+        b"{}",
+        text,
+        injection,
+    )
+
+
+def writer_of(mirroring: Mirroring) -> SourceWriter:
+    """Return the writer of a program, once the mirror knows the owner."""
+    mirroring.send(frame(7, 1))
+    mirroring.next()
+    return SourceWriter(mirroring.block, WRITER)
+
+
+def sent(mirroring: Mirroring, kind: str) -> InjectionRequest:
+    """Return the next command of a kind that the owner gets."""
+    while True:
+        assert mirroring.link.sent.acquire(timeout=PATIENCE_S), f"no command {kind}"
+        request: CommandRequest = mirroring.link.commands.pop(0)
+        assert request.injection is not None
+        if request.injection.kind == kind:
+            return request.injection
+
+
+def state(*entries: InjectionEntry, clock_ns: int = S, virtual: bool = False) -> SourceState:
+    return SourceState(entries, clock_ns, virtual)
+
+
+def injected(mirroring: Mirroring, writer: SourceWriter, **options: Any) -> PendingCommand:
+    """Create an injection at the owner."""
+    mirroring.link.reply = CommandReply(["injected"], [""])
+    ticket = writer.ask_to_inject(OTHER, **options)
+    assert sent(mirroring, "inject").number == ticket.number
+    mirroring.link.send(mirroring.link.state(state(entry(ticket.number, keep=options.get("keep", False)))))
+    mirroring.send(event(EventKind.INJECTED, ticket.number, "one", ticket.number))
+    assert mirroring.event(EventKind.INJECTED).injection == ticket.number
+    return ticket
+
+
+def test_an_injection_of_a_program_is_made_by_the_owner(mirroring: Mirroring) -> None:
+    writer = writer_of(mirroring)
+    mirroring.link.reply = CommandReply(["injected"], [""])
+    ticket = writer.ask_to_inject(OTHER, priority=3, keep=True, name="one")
+    request = sent(mirroring, "inject")
+    assert (request.number, request.priority, request.keep, request.name) == (ticket.number, 3, True, "one")
+    assert [(one.offset, one.data) for one in request.items] == [(2, b"\xff\xff")]
+    assert mirroring.block.injections.read() == ()
+    mirroring.link.send(mirroring.link.state(state(entry(ticket.number))))
+    mirroring.send(event(EventKind.INJECTED, ticket.number, "one", ticket.number))
+    found = mirroring.event(EventKind.INJECTED)
+    assert (found.writer, found.command, found.injection) == (WRITER, ticket.number, ticket.number)
+    [one] = mirroring.block.injections.read()
+    assert (one.number, one.writer, one.cell) == (ticket.number, WRITER, "")
+    mirroring.send(event(EventKind.ACTIVATED, ticket.number, "", ticket.number))
+    assert mirroring.event(EventKind.ACTIVATED).writer == WRITER, "as on the owner's host"
+
+
+def test_values_and_the_end_go_to_the_owner(mirroring: Mirroring) -> None:
+    writer = writer_of(mirroring)
+    number = injected(mirroring, writer).number
+    mirroring.link.reply = CommandReply(["shadowed"], [""])
+    ticket = writer.give(number, [Write(2, 0, b"\0\5")])
+    request = sent(mirroring, "shadow")
+    assert (request.injection, request.items[0].data) == (number, b"\0\5")
+    mirroring.send(event(EventKind.SHADOWED, ticket.number, "", number))
+    assert mirroring.event(EventKind.SHADOWED).command == ticket.number
+    mirroring.link.reply = CommandReply(["lifted"], [""])
+    ticket = writer.ask_to_lift(number)
+    assert sent(mirroring, "lift").injection == number
+    mirroring.link.send(mirroring.link.state(state()))
+    mirroring.send(event(EventKind.LIFTED, ticket.number, "lifted", number))
+    found = mirroring.event(EventKind.LIFTED)
+    assert (found.writer, found.command, found.injection) == (WRITER, ticket.number, number)
+    assert mirroring.block.injections.read() == ()
+
+
+@pytest.mark.parametrize("outcome", ["rejected", "expired", "unknown"])
+def test_a_failure_is_reported_once(mirroring: Mirroring, outcome: str) -> None:
+    writer = writer_of(mirroring)
+    mirroring.link.reply = CommandReply([outcome], ["because"])
+    ticket = writer.ask_to_inject(OTHER)
+    found = mirroring.event(EventKind[outcome.upper()])
+    assert (found.writer, found.command, found.text) == (WRITER, ticket.number, "because")
+    mirroring.send(event(EventKind.REJECTED, ticket.number, "again"), event(EventKind.NOTED, 0, "after"))
+    next_one = mirroring.events.next(PATIENCE_S)
+    assert next_one is not None
+    assert next_one.text == "after"
+
+
+def test_an_outcome_whose_event_was_lost_is_reported_nevertheless(
+    mirroring: Mirroring, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(injections, "FOLLOW_NS", S // 5)
+    writer = writer_of(mirroring)
+    mirroring.link.reply = CommandReply(["injected"], [""])
+    ticket = writer.ask_to_inject(OTHER)
+    found = mirroring.event(EventKind.INJECTED)
+    assert (found.writer, found.injection) == (WRITER, ticket.number)
+
+
+def test_nothing_is_sent_to_an_owner_that_is_not_known(mirroring: Mirroring) -> None:
+    SourceWriter(mirroring.block, WRITER).ask_to_inject(OTHER)
+    assert "plant1.line3.a50" in mirroring.event(EventKind.REJECTED).text
+    assert mirroring.link.commands == []
+
+
+def test_an_injection_toward_the_device_needs_armed_here_too(mirroring: Mirroring) -> None:
+    writer_of(mirroring).ask_to_inject(OTHER, direction=Direction.IN)
+    assert "armed" in mirroring.event(EventKind.REJECTED).text
+    assert mirroring.link.commands == []
+
+
+def test_injections_are_renewed_until_their_program_ends(mirroring: Mirroring) -> None:
+    writer = writer_of(mirroring)
+    number = injected(mirroring, writer).number
+    assert sent(mirroring, "renew").renewed == [number]
+    mirroring.gone.add(WRITER)
+    assert sent(mirroring, "lift").injection == number
+    assert all(one.injection is None or one.injection.kind != "renew" for one in mirroring.link.commands)
+
+
+def test_an_injection_that_stays_is_not_renewed(mirroring: Mirroring) -> None:
+    writer = writer_of(mirroring)
+    injected(mirroring, writer, keep=True)
+    mirroring.gone.add(WRITER)
+    number = injected(mirroring, SourceWriter(mirroring.block, 1)).number
+    assert sent(mirroring, "renew").renewed == [number]
+
+
+def test_an_injection_that_the_owner_no_longer_has_is_over(
+    mirroring: Mirroring, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The owner may have been started again, so that no event comes."""
+    monkeypatch.setattr(injections, "GONE_NS", S // 10)
+    number = injected(mirroring, writer_of(mirroring)).number
+    mirroring.link.send(mirroring.link.state(state()))
+    found = mirroring.event(EventKind.LIFTED)
+    assert (found.injection, found.writer, "plant1.line3.a50" in found.text) == (number, WRITER, True)
+
+
+def test_the_list_has_the_injections_of_all_cells(mirroring: Mirroring) -> None:
+    foreign = entry(5, cell="plant1.line3.other", ranges=((2, 2, 255), (1 << 40, 1, 255), (3, 1, 999)))
+    running = Running(Declaration(name="b", target="a50/count", operation="freeze"), "waiting", 1)
+    configured = entry(6, writer=NO_WRITER, pid=0, running=running)
+    mirroring.link.send(mirroring.link.state(state(foreign, configured)))
+    mirroring.send(frame(7, 1))
+    mirroring.next()
+    first, second = mirroring.block.injections.read()
+    assert (first.number, first.cell, first.ranges) == (5, "plant1.line3.other", ((2, 2, 255),))
+    assert (second.number, second.cell, second.configured) == (6, "plant1.line3.a50", True)
+
+
+def test_the_state_is_asked_for_until_it_comes(mirroring: Mirroring) -> None:
+    writer_of(mirroring)
+    assert mirroring.link.states >= 1
+
+
+def declare(mirroring: Mirroring, **more: Any) -> SourceWriter:
+    writer = writer_of(mirroring)
+    declared = {"name": "one", "target": "other", "operation": "set", "value": 5} | more
+    writer.ask_to_declare(msgspec.convert(declared, Declaration))
+    return writer
+
+
+def test_times_are_on_the_owners_clock(mirroring: Mirroring) -> None:
+    mirroring.link.send(mirroring.link.state(state(clock_ns=1000 * S)))
+    own_s = mirroring.segment.clock.present_ns() / 1e9
+    declare(mirroring, start_s=own_s + 5, end_s=own_s + 6, when="cell/count > 3")
+    declaration = msgspec.json.decode(sent(mirroring, "declare").declaration, type=Declaration)
+    assert declaration.start_s == pytest.approx(1005, abs=0.5)
+    assert declaration.end_s is not None
+    assert declaration.start_s is not None
+    assert declaration.end_s - declaration.start_s == pytest.approx(1)
+    assert declaration.target == "cell/other"
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_times_are_rejected_if_one_clock_is_virtual(mirroring: Mirroring, *, own: bool) -> None:
+    mirroring.link.send(mirroring.link.state(state(virtual=not own)))
+    if own:
+        clock = mirroring.segment.clock
+        clock.write(clock.read()._replace(mode=ClockMode.VIRTUAL))
+    declare(mirroring, start_s=1.0)
+    found = mirroring.event(EventKind.REJECTED)
+    assert found.text.startswith("start_s: this instance" if own else "start_s: cell plant1.line3.a50")
+    assert mirroring.link.commands == []
+
+
+@pytest.mark.parametrize(
+    ("faulty", "words"),
+    [({"target": "nothing"}, "nothing"), ({"when": "cell/count >"}, "when"), ({"value": None}, "value")],
+)
+def test_a_faulty_declaration_is_rejected_here(mirroring: Mirroring, faulty: dict[str, Any], words: str) -> None:
+    declare(mirroring, **faulty)
+    assert words in mirroring.event(EventKind.REJECTED).text
+    assert mirroring.link.commands == []
+
+
+def test_a_malformed_state_changes_nothing(mirroring: Mirroring) -> None:
+    mirroring.link.send(mirroring.link.state(state(entry(5)))[:-3])
+    mirroring.link.send(mirroring.link.state(state(entry(5))).replace(b'"id":5', b'"id":"x"'))
+    mirroring.send(frame(7, 1))
+    assert mirroring.next().cycle == 1007
+    assert mirroring.block.injections.read() == ()
