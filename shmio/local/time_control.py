@@ -368,7 +368,8 @@ class Coordinator:
         Return a text about the sources that failed; empty: none failed.
         """
         begun_ns = time.monotonic_ns()
-        waiting = list(participants)
+        # Sources with remote models first: their answers come through a process that may itself wait here.
+        waiting = sorted(participants, key=lambda block: block.model_channel is None)
         problems: list[str] = []
         warned = False
         while waiting:

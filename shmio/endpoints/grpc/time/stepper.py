@@ -88,11 +88,13 @@ class StepDriver:
 def _brief(wait: StepWait, rest_ns: int) -> bool:
     """Block the event loop until the source's block has a new frame or event, at most ``rest_ns``.
 
+    Do not block it for a source with a remote model, because the model's answer needs the loop.
+
     Returns:
         True if the block had a new frame or event.
 
     """
-    if wait.block is None or rest_ns <= 0:
+    if wait.block is None or wait.block.model_channel is not None or rest_ns <= 0:
         return False
     return wait.block.ring.wait(wait.seen, min(rest_ns, wait.rest_ns)) != wait.seen
 

@@ -16,6 +16,8 @@ DONE = Step(1, 50, 50)
 class Block:
     """A block whose doorbell always rings while the event loop's thread waits for it."""
 
+    model_channel: object = None
+
     @property
     def ring(self) -> Block:
         return self
@@ -63,3 +65,23 @@ def test_a_source_that_rings_often_before_it_answers_does_not_block_the_loop() -
 
     asyncio.run(test())
     assert len(waits) < MANY
+
+
+def test_a_source_with_a_remote_model_does_not_block_the_loop() -> None:
+    class Modelled(Block):
+        model_channel = object()
+
+        def wait(self, seen: int, timeout_ns: int) -> int:
+            raise AssertionError("the loop must be free for the model's answer")
+
+    class Coordinator:
+        def stepping(self, dt_ns: int | None) -> Generator[StepWait, None, Step]:
+            block: Any = Modelled()
+            yield StepWait(block, 0, 1_000_000_000)
+            return DONE
+
+    async def test() -> None:
+        driver = StepDriver(Coordinator(), None, Bells())  # type: ignore[arg-type]  # only what the driver uses
+        assert await driver.step(None) == DONE
+
+    asyncio.run(test())
