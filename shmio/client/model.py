@@ -7,7 +7,7 @@ import time
 import traceback
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,8 @@ RETRY_S: Final = 0.25
 PATIENCE_S: Final = 10.0
 """Time in s for which a model tries again to join an instance that does not run."""
 _WHOLE: Final = frozenset({Column.INT32, Column.INT64, Column.UINT64})
+_CONVERTED: Final = _WHOLE | {Column.BOOL}
+"""Columns for which :func:`_element` converts values."""
 _FAILURE_CHARACTERS: Final = 400
 
 log = logging.getLogger("shmio.client")
@@ -85,6 +87,18 @@ class Work:
         return self.dt_ns / 1e9
 
 
+class _Output(NamedTuple):
+    """An output.
+
+    ``field`` is the name of the field with its values. ``converted`` is True if protobuf may accept
+    its values only after a conversion.
+    """
+
+    register: Register
+    field: str
+    converted: bool
+
+
 class Part:
     """Reads the requested steps of a source that a program computes, and makes the answers."""
 
@@ -99,6 +113,7 @@ class Part:
         self.source: str = self._inputs.source
         self.inputs = Values(self._inputs)
         self.outputs = Values(self._outputs)
+        self._by_path: dict[str, _Output] = {}  # by the paths that the model has used
         self.computed: bool = joined.computed
         self.clock = calls.clock(joined.clock)
         self.period_s: float = joined.period_ns / 1e9
@@ -126,24 +141,31 @@ class Part:
             PathError: There is no such output.
             ValueRangeError: A value does not fit its register.
         """
-        columns: dict[Column, tuple[list[int], list[Any]]] = {}
+        fields: dict[str, tuple[list[int], list[Any]]] = {}
         for path, value in outputs.items():
-            register = self._outputs.registers[self._place(path)]
-            slots, values = columns.setdefault(register.column, ([], []))
-            slots.extend(range(register.slot, register.slot + register.count))
-            values.extend(_flat(value, register))
+            output = self._by_path.get(path) or self._find(path)
+            register = output.register
+            slots, values = fields.get(output.field) or fields.setdefault(output.field, ([], []))
+            if register.dims:
+                slots += range(register.slot, register.slot + register.count)
+                values += _flat(value, output)
+            else:
+                slots.append(register.slot)
+                values.append(_element(value, register.column) if output.converted else value)
         try:
-            return _answer(step, columns)
+            return _answer(step, fields)
         except (TypeError, ValueError, OverflowError):
             for path, value in outputs.items():
-                _check(value, self._outputs.registers[self._place(path)])
+                _check(value, self._find(path))
             raise
 
-    def _place(self, path: str) -> int:
+    def _find(self, path: str) -> _Output:
         try:
-            return self._outputs.place(path)
+            register = self._outputs.registers[self._outputs.place(path)]
         except PathError:
             raise PathError(unknown("output", path, self.outputs, self.source)) from None
+        output = self._by_path[path] = _Output(register, FIELDS[register.column], register.column in _CONVERTED)
+        return output
 
     @staticmethod
     def failed(step: int, reason: str) -> bytes:
@@ -249,39 +271,42 @@ def explain(error: Exception) -> str:
     return _shorten(" ".join(f"{type(error).__name__}: {error}".split())) + where
 
 
-def _answer(step: int, columns: Mapping[Column, tuple[list[int], list[Any]]]) -> bytes:
+def _answer(step: int, fields: Mapping[str, tuple[list[int], list[Any]]]) -> bytes:
     request = wire.SimulateRequest()
     done = request.done
     done.step = step
     done.values.SetInParent()
-    for column, (slots, values) in columns.items():
-        part = getattr(done.values, FIELDS[column])
+    for name, (slots, values) in fields.items():
+        part = getattr(done.values, name)
         part.slots.extend(slots)
         part.values.extend(values)
     return request.SerializeToString()
 
 
-def _check(value: object, register: Register) -> None:
+def _check(value: object, output: _Output) -> None:
     """Raise ValueRangeError if protobuf cannot hold the value in its column."""
+    register = output.register
     try:
-        _answer(0, {register.column: ([], list(_flat(value, register)))})
+        _answer(0, {output.field: ([], list(_flat(value, output)))})
     except (TypeError, ValueError, OverflowError):
         raise ValueRangeError(f"{register.path}: expected {register.type}, found {_shorten(repr(value))}") from None
 
 
-def _flat(value: object, register: Register) -> Iterable[object]:
+def _flat(value: object, output: _Output) -> Iterable[object]:
     """Return the elements of a value in the order of its column.
 
     Raises:
         ValueRangeError: The value has the wrong shape.
     """
+    register = output.register
     if not register.dims:
         return (_element(value, register.column),)
     array: Array = np.frombuffer(value, np.uint8) if isinstance(value, (bytes, bytearray)) else _array(value)
     if array.shape != register.shape:
         wanted, found = _shape(register.shape), _shape(array.shape)
         raise ValueRangeError(f"{register.path}: expected {wanted} elements, found {found}")
-    return [_element(item, register.column) for item in array.ravel().tolist()]
+    items: list[object] = array.ravel().tolist()
+    return [_element(item, register.column) for item in items] if output.converted else items
 
 
 def _array(value: object) -> Array:

@@ -392,9 +392,8 @@ class ServedModel:
         """
         self._runner = ModelRunner(model, None, parameters, seed)
         layout = self._runner.layout
-        self._outputs = [
-            (register, codec(register, layout.byte_order), bits_of(register)) for register in self._runner.computed
-        ]
+        self._outputs = [(register, codec(register, layout.byte_order)) for register in self._runner.computed]
+        self._bits = _OutputBits(self._runner.computed)
         self._inputs = frozenset(self._runner.inputs)
         self._begun = False
         self._new: dict[str, None] = {}  # changed inputs that the model has not seen yet
@@ -416,13 +415,13 @@ class ServedModel:
         for path in self._runner.inputs:
             if path not in joined.inputs:
                 raise ModelError(self._lacks(path, joined, "sends to its model", "leave it out of outputs"))
-        for register, _, _ in self._outputs:
+        for register, _ in self._outputs:
             if register.path not in joined.outputs:
                 key = "inouts" if register.path in self._inputs else "outputs"
                 raise ModelError(self._lacks(register.path, joined, "receives from its model", f"name it in {key}"))
         if not self._begun and joined.computed:
             image = bytearray(self._runner.image)
-            for register, encoder, _ in self._outputs:
+            for register, encoder in self._outputs:
                 value = joined.outputs[register.path]
                 if value is not None:
                     encoder.encode_into(_plain(value), image)
@@ -454,10 +453,9 @@ class ServedModel:
 
     def _changes(self, image: bytes) -> Iterator[tuple[str, object]]:
         before = self._sent
-        for register, decoder, bits in self._outputs:
-            where = slice(register.offset, register.offset + register.size)
-            if before is None or _differ(image[where], before[where], bits):
-                yield register.path, decoder.decode(image)
+        for index in range(len(self._outputs)) if before is None else self._bits.differing(image, before):
+            register, decoder = self._outputs[index]
+            yield register.path, decoder.decode(image)
 
     def _lacks(self, path: str, joined: Source, what: str, remedy: str) -> str:
         return (
@@ -466,8 +464,21 @@ class ServedModel:
         )
 
 
-def _differ(one: bytes, other: bytes, bits: bytes) -> bool:
-    return one != other and any((a ^ b) & own for a, b, own in zip(one, other, bits, strict=True))
+class _OutputBits:
+    """The bits of a model's outputs in an image. Several outputs may share a byte."""
+
+    def __init__(self, registers: Sequence[Register]) -> None:
+        owners = np.repeat(np.arange(len(registers)), [register.size for register in registers])
+        within = [np.arange(register.offset, register.offset + register.size) for register in registers]
+        self._bytes = np.concatenate([np.zeros(0, np.intp), *within])
+        self._masks = np.frombuffer(b"".join(map(bits_of, registers)), np.uint8)
+        self._owners = owners
+
+    def differing(self, one: bytes, other: bytes) -> list[int]:
+        """Return the ascending indices of the outputs that differ between two images."""
+        differ = (np.frombuffer(one, np.uint8) ^ np.frombuffer(other, np.uint8))[self._bytes] & self._masks
+        found: list[int] = np.unique(self._owners[differ != 0]).tolist()
+        return found
 
 
 def _plain(value: Any) -> Any:
