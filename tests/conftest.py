@@ -146,8 +146,14 @@ SLOW = (
 The fast tier leaves them out.
 """
 
-APART = ("tests/system/test_benchmarks.py",)
-"""Beginnings of the names of tests that run only with --all, or if you name them."""
+APART = (
+    "tests/system/test_benchmarks.py",
+    # whole examples and the stack, each with many processes; the tests of their parts run each time
+    "tests/system/test_compose.py::test_prometheus_of_the_stack",
+    "tests/system/test_five_sources.py",
+    "tests/system/test_mtconnect_package.py",
+)
+"""Beginnings of the names of tests that run only with --all, or if you name their file."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -161,7 +167,9 @@ def left_out(config: pytest.Config) -> tuple[str, ...]:
     """Return the beginnings of the names of tests that are not in the chosen tier."""
     if config.option.fast:
         return (*START_PROCESSES, *SLOW, *APART)
-    return () if config.option.all else tuple(name for name in APART if not any(name in given for given in config.args))
+    if config.option.all:
+        return ()
+    return tuple(name for name in APART if not any(name.partition("::")[0] in given for given in config.args))
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

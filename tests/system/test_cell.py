@@ -165,26 +165,14 @@ def test_an_unplugged_plc_turns_values_bad_until_it_is_back(cell: Cell) -> None:
         assert cell.processes()["cell"]["restarts"] == 0
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("period_ms", "perid_ms", "source[0].perid_ms"),
-        ("timeout", "timeoutt", "source[0].timeoutt"),
-        ("db201.db", "nowhere.db", "nowhere.db"),
-        ('"s7"\nlayout', '"s8"\nlayout', "s8"),
-        ('program = "a50"', 'program = "a51"', "a51"),
-    ],
-)
-def test_a_mistake_in_the_config_is_one_clear_line(
-    make_cell: Callable[[], Cell], old: str, new: str, message: str
-) -> None:
+def test_a_mistake_in_the_config_is_one_clear_line(make_cell: Callable[[], Cell]) -> None:
     cell = make_cell()
     file = cell.folder / "supervisor.toml"
-    file.write_text(file.read_text().replace(old, new, 1))
+    file.write_text(file.read_text().replace("period_ms", "perid_ms", 1))
     for verb in ("check", "up"):
         done = cell.supervisor(verb)
         assert done.returncode == 1
-        assert message in done.stderr
+        assert "source[0].perid_ms" in done.stderr
         assert "Traceback" not in done.stderr
         assert done.stderr.count("\n") == 1
     assert cell.instance not in instances()
