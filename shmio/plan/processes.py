@@ -352,7 +352,7 @@ def _names(config: Config, mirror: Source) -> dict[str, str]:
     """Return the names at the owner of all sources that mirror the same cell as ``mirror``."""
     mirrors = [one for one in config.source if one.connector == "fabric"]
     return {
-        one.name: one.options.get("source", one.name)
+        one.name: one.options.get("source") or one.name
         for one in mirrors
         if one.options.get("cell") == mirror.options.get("cell")
     }
