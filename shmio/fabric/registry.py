@@ -50,6 +50,7 @@ class SourceEntry(msgspec.Struct, frozen=True):
         quality: Present quality: good, uncertain or bad.
         reason: Why the quality is not good.
         registers: Number of registers.
+        number: Number of the newest message in the stream.
 
     """
 
@@ -61,6 +62,7 @@ class SourceEntry(msgspec.Struct, frozen=True):
     quality: str = "bad"
     reason: str = ""
     registers: int = 0
+    number: int = 0
 
 
 class CellEntry(msgspec.Struct, frozen=True):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
+import time
 from collections.abc import Callable, Coroutine
 from concurrent.futures import Future
 from contextlib import suppress
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from shmio.connectors.fabric.order import Missing
+from shmio.connectors.fabric.order import Announced, Missing
 from shmio.errors import ShmioError
 from shmio.fabric.connection import INSTALL, Access, connect, is_stored
 from shmio.fabric.messages import (
@@ -24,6 +25,7 @@ from shmio.fabric.messages import (
     encode_command,
 )
 from shmio.fabric.names import CellName
+from shmio.fabric.registry import CellEntry
 from shmio.libraries import library
 from shmio.model.values import OutcomeKind
 
@@ -34,6 +36,8 @@ if TYPE_CHECKING:
 
 MAX_WAITING: Final = 65_536
 """Maximum number of messages that wait for the mirror's loop. It requests those that are dropped."""
+MAX_STATUS: Final = 16
+"""Maximum number of the owner's entries that wait."""
 IDLE_S: Final = 1.0
 """Time without an answer after which a request for missing messages has ended, in s."""
 _NOT_SENT: Final = "the connection to the fabric is lost"
@@ -44,7 +48,7 @@ log = logging.getLogger("shmio.source")
 class Link:
     """Receives the messages of one source, and sends requests and commands to its owner.
 
-    The methods may be called by any thread. ``received`` and ``answered`` are called in the link's
+    The methods may be called by any thread. ``received`` and ``told`` are called in the link's
     thread.
     """
 
@@ -56,7 +60,7 @@ class Link:
         client_name: str,
         sender: CellName | None,
         received: Callable[[bytes], None],
-        answered: Callable[[Missing], None],
+        told: Callable[[Missing | Announced], None],
     ) -> None:
         """Create the link; :meth:`start` connects it.
 
@@ -68,7 +72,8 @@ class Link:
             sender: The cell to which this instance belongs; None if it has no name in the fabric,
                 so that it can send no commands.
             received: Called with each message.
-            answered: Called when the answer to a request for missing messages is complete.
+            told: Called with a request for missing messages when its answer is complete, and with
+                what the owner's entry in the registry says.
 
         """
         self._access = access
@@ -77,7 +82,7 @@ class Link:
         self._name = client_name
         self._sender = sender
         self._received = received
-        self._answered = answered
+        self._told = told
         self._loop = asyncio.new_event_loop()
         self._client: FabricClient | None = None
         self._closing = False
@@ -146,6 +151,7 @@ class Link:
             )
             for subject in (self._cell.live(self._source), self._cell.late(self._source)):
                 await self._client.subscribe(subject, cb=self._take, pending_msgs_limit=MAX_WAITING)
+            await self._client.subscribe(self._cell.status, cb=self._on_status, pending_msgs_limit=MAX_STATUS)
             await self._client.flush()
         except ShmioError as error:
             self.problem = str(error)
@@ -175,6 +181,15 @@ class Link:
         if not is_stored(message):
             self._received(message.data)
 
+    async def _on_status(self, message: Msg) -> None:
+        if is_stored(message):
+            return
+        with suppress(msgspec.MsgspecError):  # not from shmio
+            entry = msgspec.json.decode(message.data, type=CellEntry)
+            source = entry.source(self._source)
+            if source is not None and entry.cell == str(self._cell):
+                self._told(Announced(source.stream, source.number, time.monotonic_ns()))
+
     async def _request(self, missing: Missing) -> None:
         client = self._client
         if client is None or not client.is_connected:
@@ -190,7 +205,7 @@ class Link:
                 if answer.headers and answer.headers.get("Status") == "503":
                     return  # no uplink runs: the request is repeated
                 if not answer.data:
-                    self._answered(missing)
+                    self._told(missing)
                     return
                 self._received(answer.data)
         except (TimeoutError, errors.Error):

@@ -13,7 +13,7 @@ from shmio.connectors.base import UnconfirmedError
 from shmio.connectors.commands import CommandProcessor
 from shmio.connectors.fabric.injections import BEGIN_NS, MirroredInjections
 from shmio.connectors.fabric.link import MAX_WAITING, Link
-from shmio.connectors.fabric.order import Lost, MessageOrder, Missing, Received
+from shmio.connectors.fabric.order import Announced, Lost, MessageOrder, Missing, Received
 from shmio.connectors.fabric.source import Mirror
 from shmio.connectors.injections import Blocks, OwnerOf
 from shmio.connectors.models.stepped import StepClock
@@ -70,7 +70,7 @@ _LEFT_OUT: Final = frozenset({EventKind.STARTED, EventKind.STOPPED, EventKind.QU
 
 log = logging.getLogger("shmio.source")
 
-Connect = Callable[[Callable[[bytes], None], Callable[[Missing], None]], Link]
+Connect = Callable[[Callable[[bytes], None], Callable[[Missing | Announced], None]], Link]
 """Makes the link; its arguments are those of :class:`Link` of the same names."""
 
 
@@ -144,13 +144,13 @@ class MirrorLoop:
         self.counters = Counters()
         self._order = MessageOrder()
         self._transit = _Transit()
-        self._inbox: deque[Received | Missing] = deque()
+        self._inbox: deque[Received | Missing | Announced] = deque()
         self._received_bytes = 0  # changed only by the link's thread
         self._taken_bytes = 0  # changed only by the loop's thread
         self._ready: deque[Received | Lost] = deque()
         ring = writer.block.ring
         self._pace = _Pace(max(ring.slot_count / CATCH_UP_S, 6e9 / writer.block.period_ns), ring.slot_count / 8)
-        self._link = connect(self._receive, self._answered)
+        self._link = connect(self._receive, self._told)
         self._reply: Future[CommandReply] | None = None
         self._last_ns = clock.now_ns()  # when the last frame was published
         self._open = False
@@ -188,8 +188,10 @@ class MirrorLoop:
         self._inbox.append(Received(header, data, now_ns, late_ns))
         self._clock.nudge()
 
-    def _answered(self, missing: Missing) -> None:
-        self._inbox.append(missing)
+    def _told(self, one: Missing | Announced) -> None:
+        if isinstance(one, Announced) and len(self._inbox) >= MAX_WAITING:
+            return  # another one follows
+        self._inbox.append(one)
         self._clock.nudge()
 
     # ---- in the loop's thread ------------------------------------------------------------------------------------
@@ -213,10 +215,11 @@ class MirrorLoop:
             one = self._inbox.popleft()
             if isinstance(one, Received):
                 self._taken_bytes += len(one.data)
-            found = (
-                self._order.answered(one, self._clock.now_ns()) if isinstance(one, Missing) else self._order.add(one)
-            )
-            self._ready += found
+                self._ready += self._order.add(one)
+            elif isinstance(one, Missing):
+                self._ready += self._order.answered(one, self._clock.now_ns())
+            else:
+                self._order.announce(one)
         now_ns = self._clock.now_ns()
         if self._link.connected:
             self._ready += self._order.expired(now_ns)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from typing import Final, NamedTuple
 
 from shmio.fabric.messages import Header
@@ -15,6 +14,10 @@ PATIENCE_NS: Final = 6_000_000_000
 """Time in ns without a missing message after which the mirror gives up those that are missing."""
 MAX_HELD_BYTES: Final = 32 << 20
 """Maximum size of the messages that wait for a missing one."""
+FRESH_NS: Final = 10_000_000_000
+"""Age in ns up to which a number of the registry bounds those of messages."""
+MAX_AHEAD: Final = 1 << 20
+"""How far the number of a message can be beyond the registry's: no source is that fast."""
 _OLD_STREAMS: Final = 16
 
 
@@ -50,16 +53,29 @@ class Missing(NamedTuple):
     last: int
 
 
+class Announced(NamedTuple):
+    """What the owner's entry in the registry says: its stream, the last number in it, and when this came, in ns."""
+
+    stream: int
+    number: int
+    at_ns: int
+
+
 class MessageOrder:
     """Orders the messages of one source. Each is delivered once.
 
     The first message that it gets is the first that it delivers. If an uplink was restarted, its new
     stream begins with message 1.
+
+    The registry says which stream is the owner's, and which messages of it exist. So a message that
+    another program has sent in the owner's name cannot keep the owner's own messages away.
     """
 
     def __init__(self) -> None:
         self._stream = 0
-        self._old: deque[int] = deque(maxlen=_OLD_STREAMS)
+        self._old: dict[int, int] = {}  # the next number of each earlier stream
+        self._announced: Announced | None = None
+        self._doubt: tuple[int, int] | None = None  # since when, and the number that the registry does not reach
         self._next = 0
         self._held: dict[int, Received] = {}
         self._held_bytes = 0
@@ -78,16 +94,19 @@ class MessageOrder:
         header = message.header
         found: list[Received | Lost] = []
         if header.stream != self._stream:
-            if header.stream in self._old:
+            if not self._is_owners(header.stream):
                 return []
             found = self._give_up_all()
+            begin = 1 if self._stream else header.number
             if self._stream:
-                self._old.append(self._stream)
-            self._next = 1 if self._stream else header.number
-            self._stream = header.stream
+                self._old[self._stream] = self._next
+                if len(self._old) > _OLD_STREAMS:
+                    del self._old[next(iter(self._old))]
+            self._next = self._old.pop(header.stream, begin)
+            self._stream, self._doubt = header.stream, None
             self.newest = None  # a restart of the owner may have set its clock back
             self._progress_ns, self._asked_ns = message.at_ns, None
-        if header.number < self._next or header.number in self._held:
+        if header.number < self._next or header.number in self._held or self._is_absurd(message):
             return found
         if self.newest is None or header.made_ns >= self.newest.header.made_ns:
             self.newest = message
@@ -101,6 +120,35 @@ class MessageOrder:
         while self._held_bytes > MAX_HELD_BYTES:
             found += self._give_up(message.at_ns)
         return found
+
+    def announce(self, announced: Announced) -> None:
+        """Take what the registry says about the owner's messages.
+
+        An entry may be older than the last messages. But if, later than ``PATIENCE_NS`` afterwards, the
+        owner still has not made a message that was delivered or given up, its number was false: continue
+        after those that the owner has made.
+        """
+        self._announced = announced
+        if announced.stream != self._stream or announced.number >= self._next - 1:
+            self._doubt = None
+        elif self._doubt is None or announced.number >= self._doubt[1] - 1:
+            self._doubt = announced.at_ns, self._next
+        elif announced.at_ns - self._doubt[0] >= PATIENCE_NS:
+            self._held.clear()
+            self._held_bytes = 0
+            self._next, self._doubt, self.newest = announced.number + 1, None, None
+
+    def _is_owners(self, stream: int) -> bool:
+        """Return whether to follow another stream: that of the registry, or as long as it says nothing, a new one."""
+        if self._announced is not None:
+            return stream == self._announced.stream
+        return stream not in self._old
+
+    def _is_absurd(self, message: Received) -> bool:
+        known = self._announced
+        if known is None or known.stream != self._stream or message.at_ns - known.at_ns > FRESH_NS:
+            return False
+        return message.header.number > max(known.number, self._next) + MAX_AHEAD
 
     def missing(self, now_ns: int) -> Missing | None:
         """Return the first messages to request now; None if there are none, or it is too early."""

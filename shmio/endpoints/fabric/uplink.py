@@ -371,9 +371,10 @@ class Uplink:
         block = feed.block
         frame = block.latest()
         quality, reason = ("bad", "no frame yet") if frame is None else map(str, block.assess(frame))
+        row = self.backlog.rows[block.source]
         return SourceEntry(
-            block.source, feed.digest.hex(), block.period_ns, block.stale_ns,
-            self.backlog.rows[block.source].stream, quality, reason, len(feed.layout.registers),
+            block.source, feed.digest.hex(), block.period_ns, block.stale_ns, row.stream, quality, reason,
+            len(feed.layout.registers), row.last,
         )  # fmt: skip
 
     # ---- requests ----------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from typing import Any, cast
 
 from shmio.connectors.fabric.link import Link
 from shmio.connectors.fabric.loop import MirrorLoop
-from shmio.connectors.fabric.order import Missing
+from shmio.connectors.fabric.order import Announced, Missing
 from shmio.connectors.fabric.source import Mirror
 from shmio.connectors.injection_layers import Owner
 from shmio.connectors.models.stepped import PageClock
@@ -61,7 +61,7 @@ def frame(number: int, count: int, **told: Any) -> Frame:
 class FakeLink:
     """The fabric's side of a mirror."""
 
-    def __init__(self, received: Callable[[bytes], None], answered: Callable[[Missing], None]) -> None:
+    def __init__(self, received: Callable[[bytes], None], answered: Callable[[Missing | Announced], None]) -> None:
         self.send, self.answered = received, answered
         self.problem = ""
         self.requests: list[Missing] = []
@@ -127,7 +127,7 @@ class Mirroring:
         self.changes = 0
         self.changed = threading.Event()
 
-        def connect(received: Callable[[bytes], None], answered: Callable[[Missing], None]) -> Link:
+        def connect(received: Callable[[bytes], None], answered: Callable[[Missing | Announced], None]) -> Link:
             self.link = FakeLink(received, answered)
             return cast("Link", self.link)
 

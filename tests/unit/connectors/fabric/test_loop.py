@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from shmio.connectors.fabric.order import Missing
+from shmio.connectors.fabric.order import Announced, Missing
 from shmio.errors import CommandError
 from shmio.fabric.messages import CommandReply, encode_command
 from shmio.local.writer import SourceWriter
@@ -129,6 +129,18 @@ def test_frames_that_the_owner_no_longer_has_are_reported_as_a_gap(mirroring: Mi
     assert "frames 8 to 56" in mirroring.event(EventKind.NOTED).text
     assert [mirroring.next().cycle, mirroring.next().cycle] == [1007, 1057]
     assert mirroring.loop.missing == mirroring.loop.counters.overruns == 49
+
+
+def test_a_false_message_in_the_owners_name_does_not_keep_its_messages_away(mirroring: Mirroring) -> None:
+    mirroring.send(frame(7, 1))
+    mirroring.link.answered(Announced(STREAM, 1, time.monotonic_ns()))
+    mirroring.link.send(mirroring.link.message(frame(8, 66), stream=STREAM + 1))
+    mirroring.link.number = 1 << 40
+    mirroring.link.send(mirroring.link.message(frame(9, 66)))
+    mirroring.link.number = 1
+    mirroring.send(frame(8, 2))
+    assert [mirroring.next().cycle, mirroring.next().cycle] == [1007, 1008]
+    assert not mirroring.link.requests
 
 
 def test_frames_that_the_owners_rules_leave_out_are_no_gap(mirroring: Mirroring) -> None:

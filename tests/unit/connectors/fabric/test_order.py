@@ -8,10 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmio.connectors.fabric.order import (
+    MAX_AHEAD,
     MAX_HELD_BYTES,
     PATIENCE_NS,
     REPEAT_NS,
     REQUEST_NS,
+    Announced,
     Lost,
     MessageOrder,
     Missing,
@@ -161,3 +163,52 @@ def test_an_owner_that_was_restarted_with_an_earlier_clock_has_the_newest_messag
     order.add(message(1, stream=8))
     assert order.newest is not None
     assert order.newest.header.stream == 8
+
+
+def test_a_message_of_a_stream_that_the_registry_does_not_name_is_ignored() -> None:
+    order = MessageOrder()
+    order.add(message(5))
+    order.announce(Announced(7, 5, 0))
+    assert order.add(message(1, stream=666)) == []
+    assert numbers(order.add(message(6))) == [6]
+    assert order.add(message(2, stream=8)) == []
+    order.announce(Announced(8, 2, S))
+    assert order.add(message(3, stream=8, at_ns=S)) == []
+    assert order.missing(S + REQUEST_NS) == Missing(8, 1, 2)
+
+
+def test_the_owners_stream_comes_back_after_a_false_one() -> None:
+    """Until the registry has told its stream, any is followed."""
+    order = MessageOrder()
+    order.add(message(5))
+    assert numbers(order.add(message(1, stream=666))) == [1]
+    order.announce(Announced(7, 6, 0))
+    assert numbers(order.add(message(6))) == [6]
+
+
+def test_a_number_far_beyond_the_registrys_is_ignored() -> None:
+    order = MessageOrder()
+    order.add(message(5))
+    order.announce(Announced(7, 5, 0))
+    assert order.add(message(7 + MAX_AHEAD)) == []
+    assert not order.waiting
+
+
+def test_after_a_false_number_the_owners_messages_are_delivered_again() -> None:
+    order = MessageOrder()
+    order.add(message(5))
+    order.add(message(1000))
+    assert numbers(order.expired(PATIENCE_NS)) == [(6, 999), 1000]
+    for turn in range(4):
+        assert order.add(message(6 + turn)) == []
+        order.announce(Announced(7, 6 + turn, PATIENCE_NS + turn * 2 * S))
+    assert numbers(order.add(message(10))) == [10]
+
+
+def test_an_entry_that_is_older_than_the_messages_changes_nothing() -> None:
+    order = MessageOrder()
+    order.add(message(1))
+    for turn in range(1, 8):
+        found = [one for number in range(10 * turn, 10 * turn + 10) for one in order.add(message(number - 8))]
+        assert numbers(found) == list(range(10 * turn - 8, 10 * turn + 2))
+        order.announce(Announced(7, 10 * turn - 4, turn * 2 * S))
