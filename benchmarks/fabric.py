@@ -1,11 +1,10 @@
-"""Fabric: a mirror beside bare nats-py on the same server, and the load of 1 to 200 cells on one server."""
+"""Fabric: a mirror beside bare nats-py on the same server, a history, and the load of 1 to 200 cells on one server."""
 
 from __future__ import annotations
 
 import asyncio
 import json
 import os
-import resource
 import statistics
 import struct
 import subprocess
@@ -15,19 +14,23 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import msgspec
+import nats
 from common import begin, db201, quantiles, table
 
+from shmio.config.model import FabricHistory
 from shmio.endpoints.fabric.server import find_server
 from shmio.fabric.connection import Access, connect
+from shmio.fabric.history import fetch
 from shmio.fabric.messages import Header, encode
 from shmio.fabric.names import CellName
+from shmio.fabric.place import Place
 from shmio.segment import Attributes, BlockSpec, BlockWriter, Frame, ProcessSpec, Provenance, Quality, Segment
 from shmio.testing.ports import reserved_port
 
-PERIOD_NS: Final = 100_000
+PERIOD_NS: Final = 50_000
 """The period of the source, which determines the length of the rings, and so how fast a mirror may publish."""
 CELL: Final = CellName("bench", "line", "near")
 CELLS: Final = (1, 10, 50, 100, 150, 200)
@@ -35,21 +38,26 @@ BURST: Final = 20_000
 HZ: Final = 50
 _STAMP: Final = struct.Struct("<q")
 
-BARE_PUBLISHER: Final = """
-import asyncio, struct, sys, time
-from shmio.fabric.connection import Access, connect
+WINDOW: Final = 1000
+"""Maximum number of frames on their way when they are sent as fast as possible."""
+HISTORY_ROUND: Final = 7_000
+"""Number of frames that are stored at once; the ring of their source has room for them."""
+
+BARE_PUBLISHER: Final = f"""
+import asyncio, struct, sys, time, nats
 async def main(url, count, period_s, size):
-    client = await connect(Access((url,)), "bare publisher")
+    client = await nats.connect(url)
     body = bytes(size - 8)
-    due = time.perf_counter()
+    due, used_s = time.perf_counter(), time.process_time()
     for number in range(count):
         await client.publish("bench", struct.pack("<q", time.monotonic_ns()) + body)
         if period_s:
             due += period_s
             await asyncio.sleep(max(0.0, due - time.perf_counter()))
-        elif number % 64 == 63:
+        elif number % {WINDOW} == {WINDOW} - 1:
             await client.flush()
     await client.flush()
+    print(time.process_time() - used_s)
     await client.close()
 asyncio.run(main(sys.argv[1], int(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4])))
 """
@@ -123,9 +131,19 @@ def memory_mb(pid: int) -> float:
 # -- a mirror and a bare client ----------------------------------------------------------------------------------------
 
 
-async def bare(url: str, count: int, period_s: float) -> tuple[list[float], float]:
-    """Return the delays in ms and the frames a second of a bare publisher and a bare subscriber."""
-    client = await connect(Access((url,)), "bare subscriber")
+class Run(NamedTuple):
+    """What sending some frames has shown."""
+
+    delays_ms: list[float]
+    rate_hz: float
+    cpu_us: float
+    """CPU time for each frame, of the process that sends and of the one that receives it."""
+
+
+async def bare(url: str, count: int, period_s: float) -> Run:
+    """Send frames from a publisher to a subscriber that use nats-py alone."""
+    client = await nats.connect(url)
+    used_s = time.process_time()
     delays: list[float] = []
     done = asyncio.Event()
     times: list[int] = []
@@ -141,18 +159,20 @@ async def bare(url: str, count: int, period_s: float) -> tuple[list[float], floa
     await client.flush()
     size = 2180 + 160
     publisher = await asyncio.create_subprocess_exec(
-        sys.executable, "-c", BARE_PUBLISHER, url, str(count), str(period_s), str(size)
+        sys.executable, "-c", BARE_PUBLISHER, url, str(count), str(period_s), str(size), stdout=subprocess.PIPE
     )
     await asyncio.wait_for(done.wait(), 120)
-    await publisher.wait()
+    used_s = time.process_time() - used_s
+    out, _ = await publisher.communicate()
     await client.close()
-    return delays, (len(times) - 1) / ((times[-1] - times[0]) / 1e9)
+    rate_hz = (len(times) - 1) / ((times[-1] - times[0]) / 1e9)
+    return Run(delays, rate_hz, 1e6 * (used_s + float(out)) / count)
 
 
 class Cells:
     """A segment with an uplink, and one with a mirror, whose processes a benchmark runs."""
 
-    def __init__(self, stack: ExitStack, folder: Path, url: str) -> None:
+    def __init__(self, stack: ExitStack, folder: Path, url: str, history: FabricHistory | None = None) -> None:
         mark, layout = os.getpid(), db201()
         block = BlockSpec("cell", layout, PERIOD_NS, 500_000_000, 64_000_000, Attributes("s7", ()))
         self._folder = folder
@@ -163,7 +183,9 @@ class Cells:
         self.writer: BlockWriter = self.near.writer("cell")
         self.writer.publish(bytes(layout.size), cycle=0)
         access = msgspec.to_builtins(Access((url,)))
-        uplink = {"access": access, "cell": str(CELL), "backlog_mb": 256.0}
+        uplink = {
+            "access": access, "cell": str(CELL), "backlog_mb": 256.0, "history": msgspec.to_builtins(history),
+        }  # fmt: skip
         mirror: dict[str, Any] = {
             "connector": "fabric",
             "layout": None, "options": {"cell": str(CELL), "source": "cell"}, "writable": [],
@@ -191,8 +213,9 @@ class Cells:
         stack.callback(stop)
         return running.pid
 
-    def measure(self, count: int, period_s: float) -> tuple[list[float], float]:
-        """Publish frames; return the delays in ms until the mirror has published them, and frames a second."""
+    def measure(self, count: int, period_s: float) -> Run:
+        """Publish frames, and wait until the mirror has published them."""
+        used_s = sum(map(cpu_s, self.pids))
         cursor = self.far.blocks["cell"].cursor()
         size = self.near.blocks["cell"].layout.size
         sent: dict[int, int] = {}
@@ -210,12 +233,13 @@ class Cells:
                     due += period_s
                     time.sleep(max(0.0, due - time.perf_counter()))
                 elif number % 64 == 0:  # not more than the far ring has room for
-                    while number - self._take(cursor, sent, delays, times) > 1000:
+                    while number - self._take(cursor, sent, delays, times) > WINDOW:
                         time.sleep(0.0005)
             self._take(cursor, sent, delays, times)
             if number >= last:
                 time.sleep(0.001)
-        return delays, (len(times) - 1) / ((times[-1] - times[0]) / 1e9)
+        used_s = sum(map(cpu_s, self.pids)) - used_s
+        return Run(delays, (len(times) - 1) / ((times[-1] - times[0]) / 1e9), 1e6 * used_s / count)
 
     _last_cycle = 0
 
@@ -251,28 +275,62 @@ def mirror(folder: Path, rounds: int, frames: int, burst: int) -> None:
             order = ["a mirror", "nats-py"] if turn % 2 else ["nats-py", "a mirror"]
             for name in order:
                 if name == "nats-py":
-                    used = resource.getrusage(resource.RUSAGE_CHILDREN), time.process_time()
-                    delays, _ = asyncio.run(bare(url, frames, 1 / HZ))
-                    now = resource.getrusage(resource.RUSAGE_CHILDREN)
-                    cpu = now.ru_utime + now.ru_stime - used[0].ru_utime - used[0].ru_stime
-                    cpu += time.process_time() - used[1]
-                    _, rate = asyncio.run(bare(url, burst, 0))
+                    slow, fast = asyncio.run(bare(url, frames, 1 / HZ)), asyncio.run(bare(url, burst, 0))
                 else:
-                    before = sum(map(cpu_s, cells.pids))
-                    delays, _ = cells.measure(frames, 1 / HZ)
-                    cpu = sum(map(cpu_s, cells.pids)) - before
-                    _, rate = cells.measure(burst, 0)
-                median, _, worst = quantiles(delays)
-                rows[name].append([median, worst, 1e6 * cpu / frames, rate])
-    titles = [f"{frames} frames at {HZ} Hz, then {burst} at once", "delay, ms", "99 %", "µs of CPU a frame", "frames/s"]
+                    slow, fast = cells.measure(frames, 1 / HZ), cells.measure(burst, 0)
+                median, _, worst = quantiles(slow.delays_ms)
+                rows[name].append([median, worst, slow.cpu_us, fast.rate_hz, fast.cpu_us])
+    cpu = "µs of CPU a frame"
+    titles = [f"{frames} frames at {HZ} Hz, then {burst} at once", "delay, ms", "99 %", cpu, "frames/s", cpu]
     found = []
     for name, turns in rows.items():
-        medians = [statistics.median(one[place] for one in turns) for place in range(4)]
+        medians = [statistics.median(one[place] for one in turns) for place in range(5)]
         found.append([name, *(f"{value:,.2f}" for value in medians)])
     table(titles, found)
     ratio = statistics.median(m[3] / b[3] for m, b in zip(rows["a mirror"], rows["nats-py"], strict=True))
     more = statistics.median(m[0] - b[0] for m, b in zip(rows["a mirror"], rows["nats-py"], strict=True))
     print(f"\nthe mirror's rate is {ratio:.2f} of nats-py's; its median delay is {more:.2f} ms longer")
+
+
+# -- a history ---------------------------------------------------------------------------------------------------------
+
+
+async def store(url: str, cells: Cells, rounds: int, frames: int) -> list[float]:
+    """Publish frames at once, several times; return how many a second the server has stored."""
+    client = await connect(Access((url,)), "stored")
+    size = cells.near.blocks["cell"].layout.size
+
+    async def stored_bytes() -> int:
+        return int((await client.jetstream().stream_info(CELL.history)).state.bytes)
+
+    rates = []
+    cycle = 0
+    for _ in range(rounds):
+        begun, before = time.perf_counter(), await stored_bytes()
+        for _ in range(frames):
+            cycle += 1
+            cells.writer.publish(bytes(size), cycle=cycle)
+        while await stored_bytes() < before + frames * size:  # noqa: ASYNC110  the server tells nobody
+            await asyncio.sleep(0.003)
+        rates.append(frames / (time.perf_counter() - begun))
+    await client.close()
+    return rates
+
+
+def history(folder: Path, rounds: int, frames: int) -> None:
+    with ExitStack() as stack:
+        url, _ = stack.enter_context(server(folder))
+        cells = Cells(stack, folder, url, FabricHistory())
+        cells.await_mirror()
+        used_s = cpu_s(cells.pids[0])
+        rates = asyncio.run(store(url, cells, rounds, frames))
+        used_s = cpu_s(cells.pids[0]) - used_s
+        begun = time.perf_counter()
+        found = fetch(Place(Access((url,)), CELL), folder / "fetched.mem")
+        fetched = found / (time.perf_counter() - begun)
+    own = 1e6 * used_s / rounds / frames
+    titles = [f"{frames} frames at once, {rounds} times", "frames/s", "uplink, µs of CPU a frame"]
+    table(titles, [["stored", f"{statistics.median(rates):,.0f}", f"{own:.1f}"], ["fetched", f"{fetched:,.0f}", ""]])
 
 
 # -- many cells --------------------------------------------------------------------------------------------------------
@@ -339,9 +397,11 @@ def main() -> None:
     quick = begin(__doc__.partition("\n")[0] if __doc__ else "")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        for part in ("mirror", "growth"):
+        for part in ("mirror", "history", "growth"):
             (folder / part).mkdir()
         mirror(folder / "mirror", *((1, 50, 500) if quick else (5, 500, BURST)))
+        print()
+        history(folder / "history", *((1, 500) if quick else (8, HISTORY_ROUND)))
         print()
         growth(folder / "growth", (1, 5) if quick else CELLS, 1.0 if quick else 8.0)
 
