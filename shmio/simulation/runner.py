@@ -17,7 +17,7 @@ from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import find
 from shmio.layout.values.codec import codec
-from shmio.layout.values.write import Write, bits_of
+from shmio.layout.values.write import Write
 from shmio.model.snapshot import decode_part
 from shmio.simulation.images import Ends, Images, Port, RegisterPort, port_of
 from shmio.simulation.model import (
@@ -393,7 +393,7 @@ class ServedModel:
         self._runner = ModelRunner(model, None, parameters, seed)
         layout = self._runner.layout
         self._outputs = [(register, codec(register, layout.byte_order)) for register in self._runner.computed]
-        self._bits = _OutputBits(self._runner.computed)
+        self._bytes = _OutputBytes(self._runner.computed)
         self._inputs = frozenset(self._runner.inputs)
         self._begun = False
         self._new: dict[str, None] = {}  # changed inputs that the model has not seen yet
@@ -453,7 +453,7 @@ class ServedModel:
 
     def _changes(self, image: bytes) -> Iterator[tuple[str, object]]:
         before = self._sent
-        for index in range(len(self._outputs)) if before is None else self._bits.differing(image, before):
+        for index in range(len(self._outputs)) if before is None else self._bytes.differing(image, before):
             register, decoder = self._outputs[index]
             yield register.path, decoder.decode(image)
 
@@ -464,20 +464,18 @@ class ServedModel:
         )
 
 
-class _OutputBits:
-    """The bits of a model's outputs in an image. Several outputs may share a byte."""
+class _OutputBytes:
+    """The bytes of a model's outputs in an image. In the layout of the declarations, no registers share a byte."""
 
     def __init__(self, registers: Sequence[Register]) -> None:
-        owners = np.repeat(np.arange(len(registers)), [register.size for register in registers])
+        self._owners = np.repeat(np.arange(len(registers)), [register.size for register in registers])
         within = [np.arange(register.offset, register.offset + register.size) for register in registers]
         self._bytes = np.concatenate([np.zeros(0, np.intp), *within])
-        self._masks = np.frombuffer(b"".join(map(bits_of, registers)), np.uint8)
-        self._owners = owners
 
     def differing(self, one: bytes, other: bytes) -> list[int]:
         """Return the ascending indices of the outputs that differ between two images."""
-        differ = (np.frombuffer(one, np.uint8) ^ np.frombuffer(other, np.uint8))[self._bytes] & self._masks
-        found: list[int] = np.unique(self._owners[differ != 0]).tolist()
+        differ = (np.frombuffer(one, np.uint8) != np.frombuffer(other, np.uint8))[self._bytes]
+        found: list[int] = np.unique(self._owners[differ]).tolist()
         return found
 
 
