@@ -26,7 +26,18 @@ MAX_UNSENT_BYTES: Final = 64 << 20
 ROUTE_USER: Final = "shmio"
 CLUSTER: Final = "shmio"
 
-Kind = Literal["admin", "cell", "viewer", "history-reader"]
+Kind = Literal["admin", "cell", "viewer", "history-reader", "farm-user"]
+
+
+ACCOUNTS: Final[dict[str, tuple[Kind, ...]]] = {
+    "shmio-cells": ("admin", "cell", "viewer", "history-reader"),
+    "shmio-farm": ("farm-user",),
+}
+"""The accounts, with the kinds of their users. Nothing of an account reaches the users of another one.
+
+What a farm needs of JetStream would let its users publish in the name of cells. A server takes a folder
+beside its own that has an account's name for its own, too, so none of the folders of seeds has.
+"""
 
 
 class User(NamedTuple):
@@ -84,21 +95,22 @@ def server_configuration(settings: ServerSettings, index: int, users: Sequence[U
     lines = [
         "# shmio fabric server-config wrote this file, and replaces it: run the command again instead of editing.",
         *(f"{key}: {_text(value)}" for key, value in sections.items()),
-        "authorization: {",
-        "  users: [",
+        "accounts: {",
     ]
     streams = tuple(CellName.parse(user.name).history for user in users if user.kind == "cell")
-    for user in users:
-        allowed = _permissions(user, streams)
-        entry = {
-            "nkey": user.key,
-            "permissions": {
-                "publish": {"allow": allowed.publish},
-                "subscribe": {"allow": allowed.subscribe},
-            },
-        }
-        lines += [f"    # {user.kind} {user.name}".rstrip(), f"    {_text(entry)}"]
-    return "\n".join([*lines, "  ]", "}", ""])
+    for account, kinds in ACCOUNTS.items():
+        lines += [f"  {account}: {{", "    jetstream: enabled", "    users: ["]
+        for user in users:
+            if user.kind in kinds:
+                lines += [f"      # {user.kind} {user.name}".rstrip(), f"      {_text(_entry(user, streams))}"]
+        lines += ["    ]", "  }"]
+    return "\n".join([*lines, "}", ""])
+
+
+def _entry(user: User, streams: tuple[str, ...]) -> dict[str, Any]:
+    allowed = _permissions(user, streams)
+    permissions = {"publish": {"allow": allowed.publish}, "subscribe": {"allow": allowed.subscribe}}
+    return {"nkey": user.key, "permissions": permissions}
 
 
 def _text(value: Any) -> str:

@@ -19,6 +19,7 @@ import pytest
 import trustme
 from nats.aio.client import Client
 from nats.errors import Error as NatsError
+from nats.js.errors import NotFoundError
 
 from shmio.cli.dump import main as dump
 from shmio.cli.user import main
@@ -32,6 +33,7 @@ from shmio.fabric.archive.service import Archive, ArchiveLimits
 from shmio.fabric.connection import Access, connect
 from shmio.fabric.names import CellName
 from shmio.fabric.registry import CELLS, CellEntry, Registry
+from shmio.falsification.farm.exchange import NAME, contact, open_consumer, open_store, tasks_of
 from shmio.layout.model import Layout, Register
 from shmio.testing.ports import reserved_port
 
@@ -114,7 +116,7 @@ class Fabric:
 @pytest.fixture
 def fabric(tmp_path: Path, port: int, capsys: pytest.CaptureFixture[str]) -> Iterator[Fabric]:
     folder = tmp_path / "nats"
-    assert main(["fabric", "server-config", "-o", str(folder), "--cell", A, B, "--viewer", "eye",
+    assert main(["fabric", "server-config", "-o", str(folder), "--cell", A, B, "--viewer", "eye", "--farm-user", "lab",
                  "--listen", f"127.0.0.1:{port}"]) == 0  # fmt: skip
     with running(folder / "nats-server.conf", port) as server:
         made = Fabric(folder, server)
@@ -282,6 +284,28 @@ def test_viewers_read_everything_and_write_nothing(fabric: Fabric) -> None:
             await user.close()
 
     asyncio.run(check())
+
+
+def test_a_farm_has_its_own_account(fabric: Fabric) -> None:
+    async def work() -> None:
+        admin, cell, lab = [await fabric.join(user) for user in ("admin", A, "lab")]
+        await contact(lab)
+        await open_consumer(lab, "task-x", tasks_of("x"))
+        await lab.jetstream().publish(tasks_of("x"), b"task")
+        store = await open_store(lab)
+        await store.put("bundle", b"files")
+        assert (await store.get("bundle")).data == b"files"
+        (task,) = await (await lab.jetstream().pull_subscribe_bind("task-x", NAME)).fetch(1, timeout=5)
+        assert task.data == b"task"
+        assert await received(admin, cell, CELL_A.live("*"), sender(lab, CELL_A.live("cell"))) == []
+        with pytest.raises(NotFoundError):
+            await admin.jetstream().stream_info(NAME)
+        with pytest.raises(NotFoundError):
+            await lab.jetstream().stream_info(f"KV_{CELLS}")
+        for client in (admin, cell, lab):
+            await client.close()
+
+    asyncio.run(work())
 
 
 def test_missing_messages_are_answered_across_users(fabric: Fabric) -> None:
@@ -507,7 +531,8 @@ def test_servers_of_a_cluster_share_the_registry(tmp_path: Path, capsys: pytest.
 
 def _run_cluster(folder: Path, ports: list[int], capsys: pytest.CaptureFixture[str]) -> None:
     listen = [f"127.0.0.1:{port}" for port in ports]
-    assert main(["fabric", "server-config", "-o", str(folder), "--cell", A, "--listen", *listen]) == 0
+    users = ["--cell", A, "--farm-user", "lab"]
+    assert main(["fabric", "server-config", "-o", str(folder), *users, "--listen", *listen]) == 0
     servers = [Server(folder / f"nats-server-{number}.conf", port) for number, port in enumerate(ports, 1)]
     try:
         prepare = ["fabric", "prepare", "--replicas", "3", "--credentials", str(folder / "admin.seed")]
@@ -522,6 +547,13 @@ def _run_cluster(folder: Path, ports: list[int], capsys: pytest.CaptureFixture[s
             assert await (await Registry.open(far)).find(A) is not None
             await near.close()
             await far.close()
+            seed = str(folder / "farm-users/lab.seed")
+            farm = await connect(Access((servers[1].url,), credentials=seed), "farm", patient=False)
+            await contact(farm)
+            await open_store(farm)
+            replicas = [one.config.num_replicas for one in await farm.jetstream().streams_info()]
+            assert replicas == [3, 3], "the queue and the bundles survive the loss of a server"
+            await farm.close()
 
         asyncio.run(check())
     finally:

@@ -26,7 +26,12 @@ from shmio.wording import plain_text, printable
 
 SETTINGS: Final = "settings.json"
 ADMIN: Final = "admin"
-FOLDERS: Final[dict[str, Kind]] = {"cells": "cell", "viewers": "viewer", "history-readers": "history-reader"}
+FOLDERS: Final[dict[str, Kind]] = {
+    "cells": "cell",
+    "viewers": "viewer",
+    "history-readers": "history-reader",
+    "farm-users": "farm-user",
+}
 """Folders of the seeds, with the kind of their users."""
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}\Z")
 
@@ -64,6 +69,7 @@ def _new_users(options: argparse.Namespace) -> list[Path]:
     for option, folder, names in (
         ("--viewer", "viewers", options.viewers),
         ("--history-reader", "history-readers", options.readers),
+        ("--farm-user", "farm-users", options.farm_users),
     ):
         for name in names:
             if not _NAME.match(name):

@@ -97,6 +97,7 @@ def _add_server_config(parser: argparse.ArgumentParser) -> None:
         ("--cell", "cells", "CELL", "add cells, such as plant1.line3.a50"),
         ("--viewer", "viewers", "NAME", "add users who may read everything and write nothing"),
         ("--history-reader", "readers", "NAME", "add viewers who may also read the histories of the cells"),
+        ("--farm-user", "farm_users", "NAME", "add users for searches and workers of a farm, who see no cells"),
     ):
         parser.add_argument(option, dest=dest, nargs="+", action="extend", default=[], metavar=name, help=text)
     text = "address for clients (default: 127.0.0.1:4222); several: one for each server of a cluster"

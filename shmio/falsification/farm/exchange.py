@@ -38,6 +38,8 @@ POLL_S: Final = 2.0
 """Maximum time in s that a request for messages waits at the server."""
 KEPT_S: Final = 86_400.0
 """Time in s that the server keeps what a search that was killed has left there."""
+REPLICAS: Final = 3
+"""Number of servers of a cluster that keep the queue and the bundles."""
 MAX_DELIVERIES: Final = 10
 """How often a task may be delivered until it counts as an error: perhaps it kills its workers."""
 
@@ -149,17 +151,31 @@ async def contact(client: Client) -> None:
         ) from None
 
 
+async def _replicated(create: Callable[[int], Awaitable[_Result]]) -> _Result:
+    """Create something on as many servers as survive the loss of one; on one if there are fewer servers."""
+    js = library("nats.js.errors", INSTALL)
+    try:
+        return await create(REPLICAS)
+    except js.ServiceUnavailableError:
+        raise
+    except js.APIError:
+        return await create(1)
+
+
 async def open_queue(client: Client) -> bool:
     """Create the stream, unless it exists; return whether it is new."""
     api, errors, stream = library("nats.js.api", INSTALL), library("nats.js.errors", INSTALL), client.jetstream()
     try:
         await stream.stream_info(NAME)
     except errors.NotFoundError:
-        await stream.add_stream(
-            name=NAME,
-            subjects=[tasks_of("*"), results_of("*")],
-            retention=api.RetentionPolicy.WORK_QUEUE,
-            max_age=KEPT_S,
+        await _replicated(
+            lambda replicas: stream.add_stream(
+                name=NAME,
+                subjects=[tasks_of("*"), results_of("*")],
+                retention=api.RetentionPolicy.WORK_QUEUE,
+                max_age=KEPT_S,
+                num_replicas=replicas,
+            )
         )
         return True
     return False
@@ -184,11 +200,15 @@ async def open_consumer(client: Client, name: str, subject: str) -> None:
 
 async def open_store(client: Client) -> ObjectStore:
     """Open the store of bundles, and create it if it does not exist."""
-    errors, stream = library("nats.js.errors", INSTALL), client.jetstream()
+    api, errors, stream = library("nats.js.api", INSTALL), library("nats.js.errors", INSTALL), client.jetstream()
     try:
         return await stream.object_store(NAME)
     except errors.NotFoundError:
-        return await stream.create_object_store(NAME, ttl=KEPT_S)
+        return await _replicated(
+            lambda replicas: stream.create_object_store(
+                NAME, config=api.ObjectStoreConfig(ttl=KEPT_S, replicas=replicas)
+            )
+        )
 
 
 async def insist(client: Client, call: Callable[[JetStreamContext], Awaitable[_Result]]) -> _Result:
