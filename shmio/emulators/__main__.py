@@ -14,13 +14,14 @@ from typing import TYPE_CHECKING, Any
 from shmio import worker
 from shmio.config import Address
 from shmio.emulators.device import Device, Served
-from shmio.emulators.kinds import create
+from shmio.emulators.kinds import S7, create
 from shmio.emulators.ports import reserved_port
-from shmio.emulators.programs import UserCode
+from shmio.emulators.programs import UserCode, is_user_code
 from shmio.emulators.state import DeviceKeeper
 from shmio.emulators.stepping import InstanceTime
 from shmio.errors import ShmioError
 from shmio.layout.document import load_layout
+from shmio.libraries import skip_package_code
 from shmio.local.state_requests import StateRequests
 from shmio.logs import fields
 from shmio.segment.doorbell import Relay
@@ -131,6 +132,8 @@ def _started(worker: Worker, listen: Address, cleanup: ExitStack) -> Device:
     config: dict[str, Any] = worker.config
     served = _served(config)
     code = UserCode(config["folder"], config["parameters"])
+    if config["kind"] == S7 and not is_user_code(config["program"]):
+        skip_package_code("snap7")  # else it imports asyncio and more, which takes a third of the time of the start
     device = create(config["kind"], served, config["program"], listen, db_number=config["dbNumber"], code=code)
     cleanup.callback(device.stop)
     _beating(worker, device.start)

@@ -31,7 +31,6 @@ from shmio.layout.model import Layout
 from shmio.layout.spelling import block_path, topic_path
 from shmio.layout.topic import find, look_up, names_part, near, parse_topic
 from shmio.layout.values.write import chosen
-from shmio.plan.fabric import odd_rules
 from shmio.plan.host import check_host, exposure
 from shmio.plan.layouts import LayoutFiles
 from shmio.plan.ports import check_listening
@@ -132,7 +131,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
         lambda: _odd(config, layouts, faults),
         lambda: _odd_topics(config, layouts),
         lambda: _odd_recorder(config, layouts),
-        lambda: odd_rules(config, layouts),
+        lambda: _odd_rules(config, layouts),
         lambda: _not_served(config, layouts, emulated),
         lambda: _not_emulated(config),
         lambda: _unread(emulated),
@@ -343,6 +342,13 @@ def _check_numbers(key: str, layouts: Sequence[Layout]) -> None:
             )
             why = f"the data block {layout.name!r} has no number in its name"
             raise ConfigError(f"{key}.dbNumber: this key is needed, because {why}{alone}")
+
+
+def _odd_rules(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
+    if config.fabric is not None:
+        from shmio.plan.fabric import odd_rules  # noqa: PLC0415  loads numpy
+
+        yield from odd_rules(config, layouts)
 
 
 def _odd(config: Config, layouts: dict[str, Layout], faults: Faults) -> list[str]:

@@ -69,6 +69,22 @@ def test_it_has_a_new_session_and_inherits_no_descriptors(tmp_path: Path, monkey
 
 
 @pytest.mark.parametrize(
+    ("given", "found"),
+    [({}, "1 None"), ({"OMP_NUM_THREADS": "3"}, "None 3"), ({"OPENBLAS_NUM_THREADS": "2"}, "2 None")],
+)
+def test_numpy_starts_no_threads_unless_the_user_wants_them(
+    given: dict[str, str], found: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
+    for name in (*names, "GOTO_NUM_THREADS"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in given.items():
+        monkeypatch.setenv(name, value)
+    (tmp_path / "show.py").write_text(f"import os; print(*map(os.environ.get, {names}))")
+    assert run("show", tmp_path, monkeypatch)[0].last_words() == found
+
+
+@pytest.mark.parametrize(
     ("code", "words"),
     [(0, "ended by itself"), (1, "exit status 1"), (-9, "killed by SIGKILL"), (-11, "killed by SIGSEGV")],
 )
