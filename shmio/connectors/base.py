@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 import msgspec
 
@@ -21,6 +21,9 @@ from shmio.layout.model import Layout
 from shmio.layout.values.codec import Value
 from shmio.layout.values.write import Write
 from shmio.segment import BlockWriter, Provenance
+
+TAKEN: Final = "an injection took the value in place of the device"
+"""Outcome of a write that another instance of shmio has not sent to the device, because of an injection there."""
 
 
 class Lost(Enum):

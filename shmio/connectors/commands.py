@@ -18,7 +18,7 @@ from typing import Final, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from shmio.connectors.base import Lost, WriteLostError
+from shmio.connectors.base import TAKEN, Lost, WriteLostError
 from shmio.connectors.injection_layers import DeclaredLayer, Layer, uncovered
 from shmio.connectors.injections import Blocks, InjectionProcessor, OwnerOf
 from shmio.connectors.output import Output, pieces
@@ -200,7 +200,7 @@ def ends(
         error: Why the outcomes of some writes are unknown; empty if all are known.
 
     """
-    lost = any(isinstance(outcome, Lost) for outcome in outcomes)
+    lost = any(isinstance(outcome, Lost) or outcome == TAKEN for outcome in outcomes)
     known = _WriteOutcomes((write, outcome) for write, outcome in zip(writes, outcomes, strict=True) if outcome or lost)
     found = [_end_of(known.about(item.write), error) for item in items]
     for place, item in enumerate(items):
@@ -216,7 +216,7 @@ def ends(
 class _WriteOutcomes:
     """Finds the outcomes of writes by byte range, with a binary search, because there may be many.
 
-    If no write was lost, the caller may leave out the confirmed writes.
+    If no write was lost or taken, the caller may leave out the confirmed writes.
     """
 
     def __init__(self, known: Iterable[tuple[Write, str | Lost]]) -> None:
@@ -233,7 +233,9 @@ class _WriteOutcomes:
 
 def _end_of(outcomes: Sequence[str | Lost], error: str) -> End:
     """Return the kind and text of an item's last event, from the outcomes of its writes."""
-    refusal = next((outcome for outcome in outcomes if outcome and isinstance(outcome, str)), "")
+    if outcomes and all(outcome == TAKEN for outcome in outcomes):
+        return EventKind.TAKEN, ""
+    refusal = next((outcome for outcome in outcomes if outcome and outcome != TAKEN and isinstance(outcome, str)), "")
     lost = Lost.UNSENT in outcomes
     if Lost.UNKNOWN in outcomes or (lost and "" in outcomes):  # partly written
         return EventKind.UNKNOWN, f"the write was sent, but the device did not confirm it: {error}"

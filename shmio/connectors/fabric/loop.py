@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from typing import Final, cast
 
+from shmio.connectors.base import TAKEN, UnconfirmedError
 from shmio.connectors.base import Lost as LostWrite
-from shmio.connectors.base import UnconfirmedError
 from shmio.connectors.commands import CommandProcessor
 from shmio.connectors.fabric.injections import BEGIN_NS, MirroredInjections
 from shmio.connectors.fabric.link import MAX_WAITING, Link
@@ -554,7 +554,7 @@ def _outcome(kind: OutcomeKind, reason: str) -> str | LostWrite:
     if kind is OutcomeKind.EXPIRED:
         return LostWrite.UNSENT
     if kind is OutcomeKind.TAKEN:
-        return "an injection of the owner took the value in place of the device"
+        return TAKEN
     if kind in (OutcomeKind.REFUSED, OutcomeKind.REJECTED):
         return reason or str(kind)
     return LostWrite.UNKNOWN

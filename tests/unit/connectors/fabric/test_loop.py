@@ -282,7 +282,7 @@ def test_a_write_goes_to_the_owner_before_its_time_runs_out(mirroring: Mirroring
     [
         ("refused", "refused"),
         ("rejected", "refused"),
-        ("taken", "refused"),
+        ("taken", "taken"),
         ("expired", "expired"),
         ("unknown", "unknown"),
         ("accepted", "unknown"),
