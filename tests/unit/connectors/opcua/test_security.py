@@ -88,9 +88,15 @@ def secured(authority: Authority) -> Iterator[tuple[Device, Path]]:
         yield device, certificate
 
 
+@pytest.fixture(scope="module")
+def client(authority: Authority) -> tuple[Path, Path]:
+    """The files of the client's certificate and of its key."""
+    return authority.issue("client")
+
+
 @pytest.fixture
-def keys(tmp_path: Path, authority: Authority) -> dict[str, Any]:
-    certificate, key = authority.issue("client")
+def keys(tmp_path: Path, client: tuple[Path, Path]) -> dict[str, Any]:
+    certificate, key = client
     (tmp_path / "trusted").mkdir()
     password = tmp_path / "password"
     password.write_text("secret password\n")
