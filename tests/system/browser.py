@@ -17,6 +17,7 @@ from shmio.testing.cell import CONFIG, Cell
 CHROMIUM = shutil.which("chromium")
 PATIENCE_MS = 30_000
 SOFTWARE_GL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+"""Options of Chromium for the cell in 3D, without a graphics card. They make every page slower."""
 AXIS = "cell/Robot_800/Axs1_Pos"
 ALERT = '[[alert]]\nname = "seven"\nwhen = "cell/Outputs/500 = 7"\nseverity = "critical"\n'
 HOSTILE = '<img src=x onerror="document.title=1"><script>document.title=1</script>'
@@ -36,12 +37,12 @@ def start_cell(make_cell: Callable[..., Cell], address: str, scene: str = "") ->
 
 
 @contextmanager
-def opened_browser() -> Iterator[Any]:
-    """Start Chromium."""
+def opened_browser(*options: str) -> Iterator[Any]:
+    """Start Chromium with these options."""
     playwright: Any = pytest.importorskip("playwright.sync_api")
     playwright.expect.set_options(timeout=PATIENCE_MS)
     with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *SOFTWARE_GL])
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *options])
         yield browser
         browser.close()
 

@@ -21,6 +21,7 @@ from tests.system.browser import (
     AXIS,
     CHROMIUM,
     PATIENCE_MS,
+    SOFTWARE_GL,
     keep,
     open_tab,
     opened_browser,
@@ -52,7 +53,7 @@ shape = [{{ form = "box", size_mm = [10000, 100, 2000], color = "#00ff00" }}]
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    with opened_browser() as browser:
+    with opened_browser(*SOFTWARE_GL) as browser:
         yield browser
 
 
