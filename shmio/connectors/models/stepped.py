@@ -24,7 +24,7 @@ from shmio.local.reading import holds_none, status_of
 from shmio.local.state_requests import StateRequests
 from shmio.model.clock import Clock
 from shmio.model.statuses import trusted_codec
-from shmio.segment import Block, BlockWriter, EventKind, Frame, Provenance, Quality, Record, Segment
+from shmio.segment import Block, BlockWriter, EventKind, Frame, Provenance, Quality, Record, Segment, Stamp
 from shmio.segment.clock import ClockPage
 
 NO_DATA: Final = "no data yet"
@@ -225,6 +225,7 @@ class SteppedLoop:
         self._quality_log = QualityLog(writer)
         self._handled = 0  # the last step computed or skipped
         self._time_ns: int | None = None  # instance time of the image computed last
+        self._at: Stamp | None = None  # in virtual time, the times of frames; None: now
         self._published = False
         self.counters = Counters()
         self.state_requests: StateRequests | None = None
@@ -261,7 +262,7 @@ class SteppedLoop:
             return
         crash, self._crash = self._crash, ""
         self._writer.cycle, self._handled = state.step, state.step
-        self._writer.at_ns = self._page.monotonic_ns(state.time_ns)
+        self._stand(state.time_ns)
         self._time_ns = state.time_ns
         if state.stepping and last is None:
             self._handled -= 1  # a source without a frame takes part in the present step
@@ -282,7 +283,7 @@ class SteppedLoop:
             return False
         if state.basis != self._basis:
             self._resume(state)
-        self._writer.at_ns = None
+        self._at = self._writer.at_ns = None
         due = self._schedule.next(self._clock.now_ns())
         self.counters.overruns += due.skipped
         if self._crash:  # readers then know the reason, even if this process crashes too
@@ -329,7 +330,7 @@ class SteppedLoop:
             self.step(state)
         elif not state.stepping:
             self._handled = self._writer.cycle = state.step
-            self._writer.at_ns = self._page.monotonic_ns(state.time_ns)
+            self._stand(state.time_ns)
             if self.state_requests is not None:
                 self.state_requests.serve()
             if self._source.has_changed():
@@ -344,8 +345,13 @@ class SteppedLoop:
     def step(self, state: Clock) -> str:
         """Compute a requested step; return "", or why the step failed."""
         self._handled = state.step
-        self._writer.at_ns = self._page.monotonic_ns(state.time_ns)
+        self._stand(state.time_ns)
         return self._compute(state.step, state.time_ns, state.dt_ns)
+
+    def _stand(self, time_ns: int) -> None:
+        """Give all frames and events the time ``time_ns`` of virtual time, until the next call."""
+        at_ns = self._writer.at_ns = self._page.monotonic_ns(time_ns)
+        self._at = Stamp(at_ns, time_ns, self._page.utc_ns(at_ns))
 
     def write_now(self) -> None:
         """Carry out the waiting commands. Call this between two steps."""
@@ -386,12 +392,12 @@ class SteppedLoop:
         """
         state = self._page.read()
         self._handled = self._writer.cycle = state.step
-        self._writer.at_ns = self._page.monotonic_ns(state.time_ns)
+        self._stand(state.time_ns)
         try:
             prepared = PreparedSource(self._source, self._output, self.commands, data)
             saved = prepared.saved
             self._handled = self._writer.cycle = saved.step
-            self._writer.at_ns = self._page.monotonic_ns(saved.time_ns)
+            self._stand(saved.time_ns)
             self._time_ns = saved.computed_ns
             prepared.restore(self._writer, name)
         except ShmioError as error:
@@ -428,7 +434,7 @@ class SteppedLoop:
 
     @property
     def _in_virtual_time(self) -> bool:
-        return self._writer.at_ns is not None
+        return self._at is not None
 
     def _show(self, cycle: int) -> None:
         """Publish the present image without computing a step."""
@@ -455,10 +461,10 @@ class SteppedLoop:
 
     def _publish(self, raw: bytes, asked_ns: int, doubt: str = "") -> None:
         quality = _UNCERTAIN if doubt else _GOOD
-        cycle = self._writer.cycle
+        cycle, at = self._writer.cycle, self._at
         self._quality_log.update(quality, doubt, cycle)
-        image = Image(raw, cycle, self._utc_ns(), quality, _SIMULATED, doubt, asked_ns)
-        self._output.publish(image)
+        source_ns = time.time_ns() if at is None else at.utc_ns  # in virtual time, that of the step
+        self._output.publish(Image(raw, cycle, source_ns, quality, _SIMULATED, doubt, asked_ns, None, at))
         self._published = True
         self.counters.polls += 1
 
@@ -468,7 +474,3 @@ class SteppedLoop:
         if new or self._in_virtual_time:
             raw, source_ns = self._output.raw, self._output.source_ns
             self._output.publish(Image(raw, cycle, source_ns, Quality.BAD, Provenance.SIMULATED, reason))
-
-    def _utc_ns(self) -> int:
-        """Return the UTC time of the present image in ns; in virtual time, the time of its step."""
-        return time.time_ns() if self._writer.at_ns is None else self._page.utc_ns(self._writer.at_ns)
