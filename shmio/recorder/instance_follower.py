@@ -175,7 +175,7 @@ class InstanceFollower:
 
     def _watch_block(self, block: Block) -> None:
         place = BlockPosition(block.ring.head(), block.events.head())
-        self._watching.append(BlockFollower(block, 0, place, Reason.OVERTAKEN, self.log_time))
+        self._watching.append(BlockFollower(block, 0, place, Reason.OVERTAKEN, self.segment.header.started_utc_ns))
 
     def log_time(self, monotonic_ns: int) -> int:
         """Convert CLOCK_MONOTONIC to log time, in ns.
@@ -199,7 +199,7 @@ class InstanceFollower:
         more, most = False, 0
         for follower in (*self.followers, *self._watching):
             batch = max(16, BATCH_BYTES // (follower.block.layout.size + EVENT_SIZE))
-            taken = list(follower.take(batch))
+            taken = follower.take(batch)
             more |= len(taken) >= batch
             if follower.done:
                 taken += follower.remaining()
@@ -268,5 +268,7 @@ class InstanceFollower:
                 continue
             self._blocks += 1
             self.followers.append(
-                BlockFollower(block, self._blocks, place, reason, self.log_time, over=over, part=part)
+                BlockFollower(
+                    block, self._blocks, place, reason, self.segment.header.started_utc_ns, over=over, part=part
+                )
             )

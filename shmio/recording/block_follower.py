@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from typing import Generic, NamedTuple, TypeVar
 
 from shmio.recording.format.encoding import BlockPosition, Gap, Reason
 from shmio.recording.selection import RecordedRegisters
 from shmio.segment import Block, Cursor, Event, Frame
+from shmio.segment.block import read_frames
 
 Item = TypeVar("Item", bound=Frame | Event)
 
@@ -49,7 +50,7 @@ class BlockFollower:
         number: int,
         place: BlockPosition,
         reason: Reason,
-        log_time: Callable[[int], int],
+        started_utc_ns: int,
         *,
         over: bool = False,
         part: RecordedRegisters | None = None,
@@ -61,7 +62,7 @@ class BlockFollower:
             number: Number of the block in the recording.
             place: The position after which to start.
             reason: Reason for a gap at the start.
-            log_time: Converts CLOCK_MONOTONIC to log time.
+            started_utc_ns: Log time when the instance's clock was 0, in ns.
             over: True if a reload has already retired the block.
             part: The registers to record; None for all.
         """
@@ -71,7 +72,7 @@ class BlockFollower:
         self.over = over
         self.part = part or RecordedRegisters(block.layout)
         self.done = False
-        self._log_time = log_time
+        self._started_utc_ns = started_utc_ns
         self._log_ns = place.log_ns
         self._frames = _Stream("frames", block.cursor(after=place.frame), place.log_ns, reason)
         self._events = _Stream("events", block.events.cursor(after=place.event), place.log_ns, reason)
@@ -85,16 +86,50 @@ class BlockFollower:
         """Let the log time go back: give the next entries their own times, even if earlier ones have later times."""
         self._log_ns = 0
 
-    def take(self, limit: int) -> Iterator[BlockEntry]:
-        """Yield unread entries that were published so far: about ``limit`` at most."""
+    def take(self, limit: int) -> list[BlockEntry]:
+        """Return unread entries that were published so far: about ``limit`` at most."""
         retired = self.block.retired  # before the read, so that the last entries are read, too
-        for _ in range(limit):
+        entries: list[BlockEntry] = []
+        while limit > 0:
+            if frames := self._frames_before_event(limit):
+                limit -= len(frames)
+                entries += self._consecutive(frames)
+                continue
             side = self._next()
             if side is None:
                 self.done = retired
                 self._frames.reason = self._events.reason = Reason.OVERTAKEN  # later entries are new
-                return
-            yield from self._entries(side)
+                break
+            limit -= 1
+            entries += self._entries(side)
+        return entries
+
+    def _frames_before_event(self, limit: int) -> list[Frame]:
+        """Return up to ``limit`` unread frames without gaps that come before the next event.
+
+        The list is empty if the next entry is not such a frame, or if it is not known.
+        """
+        side = self._frames
+        if side.held is not None or side.cursor.last != side.last:
+            return []
+        newest = self.block.ring.head()  # before the events: an event that is published now comes after these frames
+        event = self._events.peek()
+        until = newest if event is None else min(newest, event.frame)
+        frames = read_frames(self.block.ring, side.last + 1, min(limit, until - side.last))
+        if frames:
+            side.cursor.resume(after=frames[-1].number)
+        return frames
+
+    def _consecutive(self, frames: Sequence[Frame]) -> list[BlockEntry]:
+        """Return the entries for frames that follow the last one without a gap."""
+        entries, log_ns, utc_ns = [], self._log_ns, self._started_utc_ns
+        for frame in frames:
+            log_ns = max(log_ns, utc_ns + frame.clock_ns)  # as in _entries()
+            entries.append(BlockEntry(log_ns, self, frame))
+        side = self._frames
+        side.last, side.log_ns, side.reason = frames[-1].number, log_ns, Reason.OVERTAKEN
+        self._log_ns = log_ns
+        return entries
 
     def pack(self, limit: int) -> bytearray:
         """Read frames as entries of a message of the fabric: ``limit`` at most, up to the next event.
@@ -108,7 +143,7 @@ class BlockFollower:
             return bytearray()
         entries, last, clock_ns = self.block.ring.pack(frames.last, events.last, limit)
         if entries:
-            self._log_ns = max(self._log_ns, self._log_time(self.block.clock.monotonic_ns(clock_ns)))
+            self._log_ns = max(self._log_ns, self._started_utc_ns + clock_ns)
             frames.last, frames.log_ns = last, self._log_ns
             frames.cursor.resume(after=last)
         return entries
@@ -138,7 +173,7 @@ class BlockFollower:
         item = side.held
         assert item is not None  # noqa: S101  _next has polled it
         # The time never decreases, so that entries stay in order even if the block's clock goes back.
-        self._log_ns = log_ns = max(self._log_ns, self._log_time(self.block.clock.monotonic_ns(item.clock_ns)))
+        self._log_ns = log_ns = max(self._log_ns, self._started_utc_ns + item.clock_ns)
         if item.number > side.last + 1:
             yield BlockEntry(log_ns, self, self._gap(side, item.number - 1, log_ns))
         side.held, side.last, side.log_ns, side.reason = None, item.number, log_ns, Reason.OVERTAKEN

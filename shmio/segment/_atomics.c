@@ -138,9 +138,23 @@ static PyObject *Ring_head(Ring *self, PyObject *unused)
     return PyLong_FromUnsignedLongLong(atomic_load_explicit(&ring_head(&self->ring)->head, memory_order_acquire));
 }
 
-/* Returns a frame as a tuple: (frame, cycle, publish_ns, clock_ns, source_ns, incarnation, quality, provenance,
- * event, delay_us, reason, raw, effective). None if the ring does not have it. */
-static PyObject *Ring_copy(Ring *self, bool latest, uint64_t frame)
+/* What a copy of a frame becomes in Python: a tuple, or an object of a subclass with decoded fields. */
+typedef struct {
+    PyTypeObject *type;
+    PyObject *qualities, *provenances; /* tuples of 256 values; NULL: the numbers themselves */
+} frame_form;
+
+static PyObject *decoded(PyObject *values, uint8_t number)
+{
+    if (!values) return PyLong_FromLong(number);
+    PyObject *value = PyTuple_GetItem(values, number);
+    Py_XINCREF(value);
+    return value;
+}
+
+/* Copies a frame: (frame, cycle, publish_ns, clock_ns, source_ns, incarnation, quality, provenance, event,
+ * delay_us, reason, raw, effective). Returns None if the ring does not have the frame. */
+static PyObject *Ring_copy(Ring *self, const frame_form *form, bool latest, uint64_t frame)
 {
     slot_info info;
     uint8_t reason[REASON_SIZE];
@@ -155,42 +169,83 @@ static PyObject *Ring_copy(Ring *self, bool latest, uint64_t frame)
         Py_DECREF(raw);
         Py_RETURN_NONE;
     }
-    PyObject *effective;
-    if (info.flags & FLAG_EFFECTIVE) {
+    PyObject *effective = Py_None;
+    if (info.flags & FLAG_EFFECTIVE)
         effective = PyBytes_FromStringAndSize((const char *)self->scratch, self->ring.frame_size);
-        if (!effective) {
-            Py_DECREF(raw);
-            return NULL;
-        }
-    } else {
+    else
         Py_INCREF(Py_None);
-        effective = Py_None;
+    PyObject *fields[] = {
+        PyLong_FromUnsignedLongLong(frame),
+        PyLong_FromUnsignedLongLong(info.cycle),
+        PyLong_FromLongLong(info.publish_ns),
+        PyLong_FromLongLong(info.clock_ns),
+        PyLong_FromLongLong(info.source_ns),
+        PyLong_FromUnsignedLong(info.incarnation),
+        decoded(form->qualities, info.quality),
+        decoded(form->provenances, info.provenance),
+        PyLong_FromUnsignedLongLong(info.event),
+        PyLong_FromUnsignedLong(info.delay_us),
+        PyUnicode_DecodeUTF8((const char *)reason, info.reason_size, "replace"),
+        raw,
+        effective,
+    };
+    Py_ssize_t count = sizeof fields / sizeof *fields;
+    PyObject *copy = form->type == &PyTuple_Type ? PyTuple_New(count) : PyType_GenericAlloc(form->type, count);
+    for (Py_ssize_t i = 0; i < count; i++) {
+        if (copy && fields[i])
+            PyTuple_SetItem(copy, i, fields[i]);
+        else {
+            Py_XDECREF(fields[i]);
+            Py_CLEAR(copy);
+        }
     }
-    PyObject *text = PyUnicode_DecodeUTF8((const char *)reason, info.reason_size, "replace");
-    if (!text) {
-        Py_DECREF(raw);
-        Py_DECREF(effective);
-        return NULL;
-    }
-    return Py_BuildValue("KKLLLIBBKINNN", (unsigned long long)frame, (unsigned long long)info.cycle,
-                         (long long)info.publish_ns, (long long)info.clock_ns, (long long)info.source_ns,
-                         (unsigned int)info.incarnation, info.quality, info.provenance, (unsigned long long)info.event,
-                         (unsigned int)info.delay_us, text, raw, effective);
+    return copy;
 }
+
+static const frame_form plain = {&PyTuple_Type, NULL, NULL};
 
 static PyObject *Ring_latest(Ring *self, PyObject *unused)
 {
     (void)unused;
-    return Ring_ready(self) ? Ring_copy(self, true, 0) : NULL;
+    return Ring_ready(self) ? Ring_copy(self, &plain, true, 0) : NULL;
 }
+
+static bool exists(unsigned long long frame) { return frame != 0 && frame <= UINT64_MAX / 2 - 1; }
 
 static PyObject *Ring_read(Ring *self, PyObject *number)
 {
     if (!Ring_ready(self)) return NULL;
     unsigned long long frame = PyLong_AsUnsignedLongLong(number);
     if (PyErr_Occurred()) return NULL;
-    if (frame == 0 || frame > UINT64_MAX / 2 - 1) Py_RETURN_NONE;
-    return Ring_copy(self, false, frame);
+    if (!exists(frame)) Py_RETURN_NONE;
+    return Ring_copy(self, &plain, false, frame);
+}
+
+static PyObject *Ring_read_many(Ring *self, PyObject *args)
+{
+    unsigned long long first;
+    Py_ssize_t count;
+    frame_form form;
+    PyObject *type;
+    if (!PyArg_ParseTuple(args, "KnO!O!O!", &first, &count, &PyType_Type, &type, &PyTuple_Type, &form.qualities,
+                          &PyTuple_Type, &form.provenances) ||
+        !Ring_ready(self))
+        return NULL;
+    form.type = (PyTypeObject *)type;
+    if (!PyType_IsSubtype(form.type, &PyTuple_Type) || PyTuple_Size(form.qualities) != 256 ||
+        PyTuple_Size(form.provenances) != 256) {
+        PyErr_SetString(PyExc_TypeError, "a subclass of tuple and two tuples of 256 values are needed");
+        return NULL;
+    }
+    PyObject *copies = PyList_New(0);
+    for (unsigned long long frame = first; copies && count > 0 && exists(frame); count--, frame++) {
+        PyObject *copy = Ring_copy(self, &form, false, frame);
+        bool gone = copy == Py_None;
+        if (!copy || (!gone && PyList_Append(copies, copy) < 0)) Py_CLEAR(copies);
+        Py_XDECREF(copy);
+        if (gone) break;
+    }
+    return copies;
 }
 
 /* Returns (entries, last, clock_ns). If there are no entries, last is `after`, and clock_ns is 0. */
@@ -345,6 +400,7 @@ static PyMethodDef Ring_methods[] = {
     METHOD(Ring, read, METH_O, "Return a validated copy of one frame; None if it is not in the ring."),
     METHOD(Ring, pack, METH_VARARGS, "Return plain frames after a number and an event as entries, last number and clock."),
     METHOD(Ring, publish_packed, METH_VARARGS, "Write the plain frames at a position; return how many, last position, end."),
+    METHOD(Ring, read_many, METH_VARARGS, "Return copies of the frames from `first` on, up to one that is not in the ring."),
     METHOD(Ring, doorbell, METH_NOARGS, "Return the value of the futex word. Read it before you check for changes."),
     METHOD(Ring, wake, METH_NOARGS, "Ring the doorbell without a new frame, for another change."),
     METHOD(Ring, wait, METH_VARARGS, "Wait until the doorbell is not `seen`, at most `timeout_ns`; return its value."),

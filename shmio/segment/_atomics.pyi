@@ -1,6 +1,6 @@
 """Types of the C extension; see _atomics.c, ring.h, frames.h, relay.h and queue.h."""
 
-from typing import TypeAlias, final
+from typing import Any, TypeAlias, TypeVar, final
 
 from typing_extensions import Buffer
 
@@ -13,6 +13,8 @@ RELAY_SIZE: int
 # frame, cycle, publish_ns, clock_ns, source_ns, incarnation, quality, provenance, event, delay_us,
 # reason, raw, effective
 FrameTuple: TypeAlias = tuple[int, int, int, int, int, int, int, int, int, int, str, bytes, bytes | None]
+
+_Frame = TypeVar("_Frame", bound=tuple[Any, ...])
 
 @final
 class Ring:
@@ -59,6 +61,15 @@ class Ring:
         late_ns: int,
         /,
     ) -> tuple[int, int, int]: ...
+    def read_many(
+        self,
+        first: int,
+        count: int,
+        kind: type[_Frame],
+        qualities: tuple[object, ...],
+        provenances: tuple[object, ...],
+        /,
+    ) -> list[_Frame]: ...
     def doorbell(self) -> int: ...
     def wake(self) -> None: ...
     def wait(self, seen: int, timeout_ns: int, /) -> int: ...

@@ -97,8 +97,9 @@ class Frame(NamedTuple):
         return self.quality, self.reason
 
 
-_QUALITIES: Final = tuple(Quality)
-_PROVENANCES: Final = tuple(Provenance)
+# The bytes come from another process: an unknown quality counts as bad.
+_QUALITIES: Final = (*Quality, *[Quality.BAD] * 256)[:256]
+_PROVENANCES: Final = (*Provenance, *[Provenance.SIMULATED] * 256)[:256]
 
 
 def decode_frame(fields: FrameTuple) -> Frame:
@@ -106,12 +107,17 @@ def decode_frame(fields: FrameTuple) -> Frame:
     (number, cycle, publish_ns, clock_ns, source_ns, incarnation, quality, provenance, event, delay_us, reason,
      raw, effective) = fields  # fmt: skip
     return Frame(
-        number, cycle, publish_ns, clock_ns, source_ns, incarnation,
-        # The bytes come from another process: an unknown quality counts as bad.
-        _QUALITIES[quality] if quality < len(_QUALITIES) else Quality.BAD,
-        _PROVENANCES[provenance] if provenance < len(_PROVENANCES) else Provenance.SIMULATED,
+        number, cycle, publish_ns, clock_ns, source_ns, incarnation, _QUALITIES[quality], _PROVENANCES[provenance],
         event, delay_us, reason, raw, effective,
     )  # fmt: skip
+
+
+def read_frames(ring: Ring, first: int, count: int) -> list[Frame]:
+    """Return copies of up to ``count`` consecutive frames, before the first one that is not in the ring.
+
+    For many frames, this is faster than :meth:`Block.read`.
+    """
+    return ring.read_many(first, count, Frame, _QUALITIES, _PROVENANCES)
 
 
 Entry = TypeVar("Entry")

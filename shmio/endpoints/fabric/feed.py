@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from fnmatch import fnmatchcase
 from typing import Final, NamedTuple
 
@@ -50,7 +50,7 @@ class Feed:
         block: Block,
         rule: FabricRule,
         sources: Collection[str],
-        log_time: Callable[[int], int],
+        started_utc_ns: int,
         place: BlockPosition,
     ) -> None:
         """Create the feed. For a large layout this takes seconds.
@@ -59,7 +59,7 @@ class Feed:
             block: The block to follow.
             rule: What to publish.
             sources: Names of all sources of the instance.
-            log_time: Converts CLOCK_MONOTONIC to the time of messages.
+            started_utc_ns: Time of messages when the instance's clock was 0, in ns.
             place: Position after which to begin.
 
         """
@@ -79,7 +79,7 @@ class Feed:
         self._rule = rule
         self._changes = rule.send == "changes"
         self._pause_ns = 0 if rule.max_rate_hz is None else round(1e9 / rule.max_rate_hz)
-        self._follower = BlockFollower(block, 1, place, Reason.OVERTAKEN, log_time, part=part)
+        self._follower = BlockFollower(block, 1, place, Reason.OVERTAKEN, started_utc_ns, part=part)
         self._last: Frame | None = None
         self._published_ns = 0
         self._held: Frame | None = None
@@ -129,7 +129,7 @@ class Feed:
         """Read new entries; return them in batches, and whether more are waiting."""
         if self._all and (packed := self._follower.pack(self._limit)):
             return [Batch(packed, 0)], self._follower.behind
-        taken = list(self._follower.take(MAX_ENTRIES))
+        taken = self._follower.take(MAX_ENTRIES)
         if self._follower.done:
             taken += self._follower.remaining()
         entries: list[tuple[Entry, int]] = []

@@ -174,7 +174,8 @@ class Uplink:
     def _new_feed(self, block: Block, sources: Sequence[str]) -> Feed:
         # A block of a reload is published from its first frame on.
         place = BlockPosition(block.ring.head(), block.events.head()) if self._first else BlockPosition()
-        return Feed(block, rule_for(self._settings.rule, block.source), sources, self._log_time, place)
+        rule = rule_for(self._settings.rule, block.source)
+        return Feed(block, rule, sources, self._segment.header.started_utc_ns, place)
 
     def _add(self, feeds: list[Feed]) -> None:
         self._first = False
