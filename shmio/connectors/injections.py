@@ -35,7 +35,7 @@ from shmio.connectors.injection_state import LayerState, check_configured, make_
 from shmio.connectors.output import Image, LayerPublisher, Output, in_parts, layer_event, lost, pieces
 from shmio.errors import ConfigError, SegmentError, SnapshotError
 from shmio.injection import Program, compile_program
-from shmio.injection._numbers import evaluate, read
+from shmio.injection._numbers import hold
 from shmio.injection.activation import State
 from shmio.injection.program import NEVER, compile_condition
 from shmio.layout.values.write import Write, apply
@@ -99,11 +99,11 @@ class Conditions:
             blocks: The blocks of all sources.
 
         """
-        self._conditions = [
+        self._conditions = tuple(
             None if (condition := layer.program.condition) is None
             else (condition.expression.codes, condition.expression.operands, condition.reads, layer.memory.seen)
             for layer in layers
-        ]  # fmt: skip
+        )  # fmt: skip
         self._own = own
         self._blocks = blocks
         self.foreign = frozenset(source for layer in layers for source in layer.program.foreign)
@@ -122,9 +122,7 @@ class Conditions:
         images: dict[str, bytes | None] = {self._own: image.raw if known else None}
         for source in self.foreign:
             images[source] = self._fetch(source, before)
-        return [
-            one is None or evaluate(one[0], one[1], read(one[2], images), one[3]) is True for one in self._conditions
-        ]
+        return hold(self._conditions, images)
 
     def _fetch(self, source: str, before: int | None) -> bytes | None:
         block = self._blocks.get(source)

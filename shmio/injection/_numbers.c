@@ -202,19 +202,14 @@ static PyType_Spec Number_spec = {"shmio.injection._numbers.Number", sizeof(Numb
 
 /* Reads the values for a condition: `reads` has pairs of a source and a Number, or another object with decode();
  * `images` has the image of each source, or None. */
-static PyObject *numbers_read(PyObject *module, PyObject *const *args, Py_ssize_t given)
+static PyObject *read_values(PyTypeObject *own, PyObject *reads, PyObject *images)
 {
-    PyTypeObject *own = *(PyTypeObject **)PyModule_GetState(module);
-    if (given != 2 || !PyTuple_Check(args[0]) || !PyDict_Check(args[1])) {
-        PyErr_SetString(PyExc_TypeError, "a tuple and a dict are needed");
-        return NULL;
-    }
-    Py_ssize_t count = PyTuple_Size(args[0]);
-    PyObject *values = PyList_New(count);
+    Py_ssize_t count = PyTuple_Size(reads);
+    PyObject *values = count < 0 ? NULL : PyList_New(count);
     for (Py_ssize_t i = 0; values && i < count; i++) {
-        PyObject *pair = PyTuple_GetItem(args[0], i), *value = NULL;
+        PyObject *pair = PyTuple_GetItem(reads, i), *value = NULL;
         PyObject *source = PyTuple_GetItem(pair, 0), *place = source ? PyTuple_GetItem(pair, 1) : NULL;
-        PyObject *image = place ? PyDict_GetItemWithError(args[1], source) : NULL;
+        PyObject *image = place ? PyDict_GetItemWithError(images, source) : NULL;
         if (image == Py_None) {
             Py_INCREF(image);
             value = image;
@@ -314,25 +309,24 @@ failed:
 
 /* Evaluates a condition by its codes (bytes), operands (a tuple), values (a sequence) and last arguments (a dict).
  * Returns True, False, or None if a value is None or the arithmetic fails, which clears the last arguments. */
-static PyObject *numbers_evaluate(PyObject *module, PyObject *const *args, Py_ssize_t given)
+static PyObject *evaluate(PyObject *codes, PyObject *operands, PyObject *values, PyObject *seen)
 {
-    (void)module;
     PyObject *stack[MAX_STEPS];
-    char *codes;
+    char *steps;
     Py_ssize_t count;
-    if (given != 4 || !PyTuple_Check(args[1]) || !PyDict_Check(args[3])) {
+    if (PyBytes_AsStringAndSize(codes, &steps, &count) < 0) return NULL;
+    if (!PyTuple_Check(operands) || !PyDict_Check(seen)) {
         PyErr_SetString(PyExc_TypeError, "bytes, a tuple, a sequence and a dict are needed");
         return NULL;
     }
-    if (PyBytes_AsStringAndSize(args[0], &codes, &count) < 0) return NULL;
-    int unknown = PySequence_Contains(args[2], Py_None);
+    int unknown = PySequence_Contains(values, Py_None);
     if (unknown < 0) return NULL;
     if (!unknown) {
-        if (count == 0 || count > MAX_STEPS || PyTuple_Size(args[1]) != count) {
+        if (count == 0 || count > MAX_STEPS || PyTuple_Size(operands) != count) {
             PyErr_SetString(PyExc_ValueError, "not the steps of a condition");
             return NULL;
         }
-        Py_ssize_t left = run((const uint8_t *)codes, args[1], count, args[2], args[3], stack);
+        Py_ssize_t left = run((const uint8_t *)steps, operands, count, values, seen, stack);
         if (left > 0) {
             int truth = PyObject_IsTrue(stack[left - 1]);
             while (left) Py_DECREF(stack[--left]);
@@ -341,15 +335,56 @@ static PyObject *numbers_evaluate(PyObject *module, PyObject *const *args, Py_ss
         if (!PyErr_ExceptionMatches(PyExc_ArithmeticError)) return NULL;
         PyErr_Clear();
     }
-    PyDict_Clear(args[3]);
+    PyDict_Clear(seen);
     Py_RETURN_NONE;
+}
+
+static PyObject *numbers_evaluate(PyObject *module, PyObject *const *args, Py_ssize_t given)
+{
+    (void)module;
+    if (given == 4) return evaluate(args[0], args[1], args[2], args[3]);
+    PyErr_SetString(PyExc_TypeError, "bytes, a tuple, a sequence and a dict are needed");
+    return NULL;
+}
+
+/* Evaluates a condition that also has its reads: (codes, operands, reads, seen). Returns 1 if it is true; 0 if not, or
+ * if that is unknown; -1 with an exception. */
+static int holds(PyTypeObject *own, PyObject *condition, PyObject *images)
+{
+    if (condition == Py_None) return 1;
+    if (!PyTuple_Check(condition) || PyTuple_Size(condition) != 4) {
+        PyErr_SetString(PyExc_TypeError, "a condition is None or a tuple of codes, operands, reads and a dict");
+        return -1;
+    }
+    PyObject *values = read_values(own, PyTuple_GetItem(condition, 2), images);
+    if (!values) return -1;
+    PyObject *result = evaluate(PyTuple_GetItem(condition, 0), PyTuple_GetItem(condition, 1), values, PyTuple_GetItem(condition, 3));
+    Py_DECREF(values);
+    Py_XDECREF(result);
+    return !result ? -1 : result == Py_True;
+}
+
+static PyObject *numbers_hold(PyObject *module, PyObject *const *args, Py_ssize_t given)
+{
+    PyTypeObject *own = *(PyTypeObject **)PyModule_GetState(module);
+    if (given != 2 || !PyTuple_Check(args[0]) || !PyDict_Check(args[1])) {
+        PyErr_SetString(PyExc_TypeError, "a tuple of conditions and a dict of images are needed");
+        return NULL;
+    }
+    Py_ssize_t count = PyTuple_Size(args[0]);
+    PyObject *results = PyList_New(count);
+    for (Py_ssize_t i = 0; results && i < count; i++) {
+        int truth = holds(own, PyTuple_GetItem(args[0], i), args[1]);
+        if (truth < 0 || PyList_SetItem(results, i, PyBool_FromLong(truth)) < 0) Py_CLEAR(results);
+    }
+    return results;
 }
 
 /* ---- module ---------------------------------------------------------------------------------------------------------- */
 
 static PyMethodDef functions[] = {
-    METHOD(numbers, read, METH_FASTCALL, "Return the values that a condition reads from images; None for each unknown one."),
     METHOD(numbers, evaluate, METH_FASTCALL, "Return whether a condition is true; None if that is unknown."),
+    METHOD(numbers, hold, METH_FASTCALL, "Return for each condition whether it is true for the images of sources."),
     {0},
 };
 

@@ -18,9 +18,6 @@ class Number:
     def add(self, image: Image, by: float, /) -> None: ...
     def multiply(self, image: Image, by: float, /) -> None: ...
 
-def read(
-    reads: tuple[tuple[str, Decoder], ...], images: dict[str, bytes | None], /
-) -> list[bool | int | float | None]: ...
 def evaluate(
     codes: bytes,
     operands: tuple[bool | float, ...],
@@ -28,3 +25,7 @@ def evaluate(
     seen: dict[int, bool | int | float],
     /,
 ) -> bool | None: ...
+
+Condition = tuple[bytes, tuple[bool | int | float, ...], tuple[tuple[str, Decoder], ...], dict[int, bool | int | float]]
+
+def hold(conditions: tuple[Condition | None, ...], images: dict[str, bytes | None], /) -> list[bool]: ...

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmio.injection._numbers import Number, evaluate, read
+from shmio.injection._numbers import Number, evaluate, hold
+from shmio.injection.condition import parse
 
 CODES = "bBhHiIqQfd"
 formats = st.builds("{}{}".format, st.sampled_from("<>"), st.sampled_from(CODES))
@@ -79,14 +80,26 @@ def test_touches_no_byte_outside_the_image() -> None:
         cast("Any", Number).__new__(Number).decode(bytes(4))
 
 
-def test_reads_the_values_of_a_condition() -> None:
-    reads = (("a", Number("<h", 0)), ("b", Number("<h", 2)), ("a", Number("<?", 2, 1)))
-    assert read(reads, {"a": b"\1\0\2", "b": None}) == [1, None, True]
-    for wrong in ((), ("a",), "ab", 1):
-        with pytest.raises((IndexError, SystemError, KeyError, AttributeError, TypeError)):
-            cast("Any", read)((wrong,), {})
+def test_conditions_read_the_images_of_sources() -> None:
+    small, flag = ("a", Number("<h", 0)), ("b", Number("<?", 0, 1))
+    conditions: Any = (
+        None,
+        (*parse("x > 2")[:2], (small,), {}),
+        (*parse("x")[:2], (flag,), {}),
+        (*parse("not x")[:2], (("c", Number("<b", 0)),), {}),
+    )
+    assert hold(conditions, {"a": b"\3\0", "b": b"\2", "c": None}) == [True, True, True, False]
+    assert hold(conditions, {"a": b"\2\0", "b": b"\5", "c": b"\0"}) == [True, False, False, True]
     with pytest.raises(KeyError):
-        read(reads, {"a": bytes(3)})
+        hold(conditions, {"a": bytes(3)})
+    with pytest.raises(ValueError, match="outside"):
+        hold(conditions, {"a": b"", "b": b"", "c": b""})
+
+
+@pytest.mark.parametrize("wrong", [(), ("a",), "ab", 1, (b"\0", (1,), ("a",), {}), (b"\0", (1,), (), ())])
+def test_refuses_what_is_no_condition(wrong: Any) -> None:
+    with pytest.raises((IndexError, SystemError, TypeError)):
+        hold((wrong,), {})
 
 
 @given(st.binary(max_size=300), st.data())
