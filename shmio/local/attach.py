@@ -546,9 +546,7 @@ class Attachment:
         dt_ns = _ns(dt_s)
         if count < 1:
             raise ValueRangeError(f"the number of steps must be at least 1, not {count}")
-        step = self._time.step
-        for _ in range(count):
-            step(dt_ns)
+        self._time.step(dt_ns, count)
         return self.clock
 
     def play(self, rate: float = 1.0, dt_s: float | None = None) -> Clock:

@@ -454,8 +454,8 @@ class Timekeeper:
         self._player: threading.Thread | None = None
         self._failure: ShmioError | None = None
 
-    def step(self, dt_ns: int | None = None) -> Step:
-        """Move time by one step, as :meth:`Coordinator.step` does.
+    def step(self, dt_ns: int | None = None, count: int = 1) -> Step:
+        """Move time by ``count`` steps, each as :meth:`Coordinator.step` does; return the last one.
 
         Raises:
             TimeError: As for :meth:`Coordinator.step`; or time is being played.
@@ -464,7 +464,11 @@ class Timekeeper:
         if self._player is not None:
             raise TimeError("time is playing; pause it before you step it")
         self._take_over()
-        return self._coordinator.step(dt_ns)
+        step = self._coordinator.step(dt_ns)
+        for _ in range(count - 1):
+            self._segment.require_running()
+            step = self._coordinator.step(dt_ns)
+        return step
 
     @contextmanager
     def still(self) -> Iterator[Coordinator]:

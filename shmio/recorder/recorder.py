@@ -9,8 +9,9 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import groupby
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, cast
 
 from shmio.backoff import Backoff
 from shmio.config import Recorder as Settings
@@ -296,12 +297,16 @@ class Recorder:
         if self._unaware and not full:
             self._unaware = False
             entries = [*(entry for entry in entries if not is_process_change(entry)), *self.tap.present()]
-        for entry in entries:
-            if full:
+        if full:
+            for entry in entries:
                 self._lose(entry)
-            else:
-                self._write(entry)
-        if not full:
+        else:
+            for source, group in groupby(entries, _frame_of):
+                if source is None:
+                    for entry in group:
+                        self._write(entry)
+                else:
+                    self._write_frames(source, cast("Iterable[BlockEntry]", group))
             for followed in self._followed.values():
                 if followed.lost and followed.follower.done:  # no later entry will record the gap
                     self._tell_lost(followed, 0)
@@ -416,20 +421,32 @@ class Recorder:
             self.counters.missed += item.count
             self._writer.gap(item, log_ns)
             followed.come_to(item.what, item.last, log_ns)
-            return
+        elif isinstance(item, Event):
+            self.counters.events += 1
+            self._writer.event(self._channels(followed), item, log_ns)
+            followed.come_to("events", item.number, log_ns)
+
+    def _write_frames(self, follower: BlockFollower, entries: Iterable[BlockEntry]) -> None:
+        """Record consecutive entries of one block, which are all frames."""
+        self.empty = False
+        keep = follower.part.keep
+        frames = [(log_ns, keep(item)) for log_ns, _, item in entries if isinstance(item, Frame)]
+        followed = self._known(follower)
+        if followed.lost:
+            self._tell_lost(followed, frames[0][0])
+        self.counters.frames += len(frames)
+        self._writer.frames(self._channels(followed), frames)
+        log_ns, last = frames[-1]
+        followed.come_to("frames", last.number, log_ns)
+
+    def _channels(self, followed: RecordedBlock) -> Channels:
+        """Return the channels of a block; create them for its first entry."""
         if followed.channels is None:
-            after = followed.begin
+            follower, after = followed.follower, followed.begin
             followed.channels = self._writer.open_block(
                 follower.block, follower.number, after.frame, after.event, follower.part.layout
             )
-        if isinstance(item, Frame):
-            self.counters.frames += 1
-            self._writer.frame(followed.channels, follower.part.keep(item), log_ns)
-            followed.come_to("frames", item.number, log_ns)
-        else:
-            self.counters.events += 1
-            self._writer.event(followed.channels, item, log_ns)
-            followed.come_to("events", item.number, log_ns)
+        return followed.channels
 
     def _aside(self, aside: InstanceEntry) -> None:
         if isinstance(aside.item, ProcessChange):
@@ -452,6 +469,11 @@ class Recorder:
             log_ns = before_ns or self.tap.now()
             self._writer.gap(gap, log_ns)
             followed.come_to(gap.what, gap.last, log_ns)
+
+
+def _frame_of(entry: BlockEntry | InstanceEntry) -> BlockFollower | None:
+    """Return the follower of the block if an entry is a frame, else None."""
+    return entry.follower if isinstance(entry, BlockEntry) and isinstance(entry.item, Frame) else None
 
 
 def is_process_change(entry: BlockEntry | InstanceEntry) -> bool:

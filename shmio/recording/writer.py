@@ -6,7 +6,7 @@ changes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import IO, Final, Protocol, cast
 
@@ -163,10 +163,15 @@ class Writer:
 
     def frame(self, channels: Channels, frame: Frame, log_ns: int) -> None:
         """Add a frame with the log time ``log_ns``."""
-        told_ns = frame.source_ns if frame.source_ns > 0 else log_ns
-        sequence = frame.number & 0xFFFFFFFF
-        data = encode_frame_v2(frame, sequence, log_ns, told_ns)
-        self._mcap.add_message(channels.frames, log_ns, data, told_ns, sequence)
+        self.frames(channels, [(log_ns, frame)])
+
+    def frames(self, channels: Channels, frames: Iterable[tuple[int, Frame]]) -> None:
+        """Add frames, each with its log time."""
+        channel, add = channels.frames, self._mcap.add_message
+        for log_ns, frame in frames:
+            told_ns = frame.source_ns if frame.source_ns > 0 else log_ns
+            sequence = frame.number & 0xFFFFFFFF
+            add(channel, log_ns, encode_frame_v2(frame, sequence, log_ns, told_ns), told_ns, sequence)
 
     def event(self, channels: Channels, event: Event, log_ns: int) -> None:
         """Add an event with the log time ``log_ns``."""

@@ -475,6 +475,33 @@ static PyObject *atomics_cell_write(PyObject *module, PyObject *args)
     Py_RETURN_NONE;
 }
 
+static PyObject *atomics_cells_write(PyObject *module, PyObject *const *args, Py_ssize_t given)
+{
+    (void)module;
+    Py_buffer buffer, data;
+    if (given != 3 || !PyTuple_Check(args[1])) {
+        PyErr_SetString(PyExc_TypeError, "a buffer, a tuple of offsets and data are needed");
+        return NULL;
+    }
+    if (PyObject_GetBuffer(args[0], &buffer, PyBUF_WRITABLE) < 0) return NULL;
+    if (PyObject_GetBuffer(args[2], &data, PyBUF_SIMPLE) < 0) {
+        PyBuffer_Release(&buffer);
+        return NULL;
+    }
+    for (Py_ssize_t i = 0; i < PyTuple_Size(args[1]); i++) {
+        Py_ssize_t offset = PyLong_AsSsize_t(PyTuple_GetItem(args[1], i)), most = buffer.len - 8;
+        if (offset == -1 && PyErr_Occurred()) break;
+        uint8_t *cell = data.len > most ? place(&buffer, 0, PY_SSIZE_T_MAX, 8)
+                                        : place(&buffer, offset, 8 + (Py_ssize_t)align8((uint64_t)data.len), 8);
+        if (!cell) break;
+        cell_write(cell, data.buf, (size_t)data.len);
+    }
+    PyBuffer_Release(&buffer);
+    PyBuffer_Release(&data);
+    if (PyErr_Occurred()) return NULL;
+    Py_RETURN_NONE;
+}
+
 static PyObject *atomics_cell_read(PyObject *module, PyObject *args)
 {
     (void)module;
@@ -707,6 +734,7 @@ static PyMethodDef functions[] = {
     METHOD(atomics, load64, METH_VARARGS, "Acquire load of an aligned 64-bit word."),
     METHOD(atomics, store64, METH_VARARGS, "Release store of an aligned 64-bit word."),
     METHOD(atomics, cell_write, METH_VARARGS, "Write a cell. It may have only one writer."),
+    METHOD(atomics, cells_write, METH_FASTCALL, "Write the same data to several cells, one after another."),
     METHOD(atomics, cell_read, METH_VARARGS, "Return a consistent copy of a cell; None while it is being written."),
     METHOD(atomics, bell, METH_VARARGS, "Return the value of a futex word. Read it before you check for changes."),
     METHOD(atomics, bell_ring, METH_VARARGS, "Increment a futex word, and wake all that wait on it."),

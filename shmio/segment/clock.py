@@ -99,11 +99,12 @@ class DoubleBuffer:
         """
         self._memory = memory
         self._copies = copies
+        self._attempts = copies * _ATTEMPTS
         self._complaint = complaint
 
     def read(self, size: int) -> bytes:
         """Return the first ``size`` bytes of the value; raise SegmentError if both copies are corrupt."""
-        for at in self._copies * _ATTEMPTS:
+        for at in self._attempts:
             data = _atomics.cell_read(self._memory, at, size)
             if data is not None:
                 return data
@@ -111,8 +112,7 @@ class DoubleBuffer:
 
     def write(self, data: bytes) -> None:
         """Write the value to one copy, then to the other. Only the value's owner may call this."""
-        for at in self._copies:
-            _atomics.cell_write(self._memory, at, data)
+        _atomics.cells_write(self._memory, self._copies, data)
 
 
 class ClockPage:
