@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import threading
 from collections.abc import Callable
+from typing import Any, cast
 
 import pytest
 from hypothesis import given
@@ -80,6 +81,30 @@ def test_an_overwritten_frame_is_gone() -> None:
     assert oldest is not None
     assert oldest[1] == 6
     assert ring.read(11) is None
+
+
+class Copy(tuple[object, ...]):
+    __slots__ = ()
+
+
+def test_many_frames_are_read_at_once_up_to_one_that_is_missing() -> None:
+    memory = ring_memory()
+    ring = Ring(memory, 0, len(memory))
+    ring.begin()
+    for cycle in range(1, 12):
+        publish(ring, bytes([cycle] * 20), cycle, bytes([100 + cycle] * 20) if cycle % 2 else None, b"why")
+    qualities, provenances = tuple(f"q{number}" for number in range(256)), tuple(range(1000, 1256))
+    many = ring.read_many(6, 3, Copy, qualities, provenances)
+    assert [type(frame) for frame in many] == [Copy] * 3
+    for frame, single in zip(many, (ring.read(6), ring.read(7), ring.read(8)), strict=True):
+        assert single is not None
+        assert frame == (*single[:6], "q2", 1000, *single[8:])
+    assert [frame[0] for frame in ring.read_many(4, 99, Copy, qualities, provenances)] == list(range(4, 12))
+    for first, count in ((3, 9), (12, 9), (0, 9), (5, 0), (5, -1), (2**64 - 1, 2)):
+        assert ring.read_many(first, count, Copy, qualities, provenances) == []
+    for wrong in ((object, qualities, provenances), (Copy, (), provenances), (Copy, qualities, provenances[1:])):
+        with pytest.raises(TypeError, match="256"):
+            cast("Any", ring).read_many(5, 1, *wrong)
 
 
 def test_a_half_written_slot_is_never_read_and_is_reused() -> None:
@@ -222,6 +247,17 @@ def test_a_cell_returns_the_last_written_value(first: bytes, second: bytes) -> N
     assert _atomics.cell_read(memory, 8, len(first)) is None
     _atomics.cell_write(memory, 8, second)
     assert _atomics.cell_read(memory, 8, len(second)) == second
+
+
+def test_several_cells_are_written_at_once() -> None:
+    memory = bytearray(64)
+    _atomics.cells_write(memory, (0, 32), b"0123456789")
+    assert [_atomics.cell_read(memory, at, 10) for at in (0, 32)] == [b"0123456789"] * 2
+    for offsets, data in (((0, 48), bytes(10)), ((-8,), b""), ((4,), b""), ((0,), bytes(64)), ((2**62,), b"")):
+        with pytest.raises(ValueError, match=r"buffer|aligned"):
+            _atomics.cells_write(memory, offsets, data)
+    with pytest.raises(BufferError):
+        _atomics.cells_write(bytes(64), (0,), b"")
 
 
 @pytest.mark.parametrize(("offset", "size"), [(-8, 8), (0, 10_000), (4, 8), (250, 8), (1 << 62, 8), (0, -1)])
