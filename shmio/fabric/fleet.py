@@ -32,6 +32,7 @@ class Member(msgspec.Struct, frozen=True):
         web: Address of its web page; empty if it has none.
         notes: What is remarkable about it.
         sources: Its sources. If the cell is late or down, their qualities are the last known ones.
+        machine: A text that tells hosts of the same name apart; empty if it is unknown.
 
     """
 
@@ -45,6 +46,7 @@ class Member(msgspec.Struct, frozen=True):
     web: str
     notes: tuple[str, ...]
     sources: tuple[SourceEntry, ...]
+    machine: str = ""
 
     @property
     def alive(self) -> bool:
@@ -70,7 +72,7 @@ def member(seen: Seen) -> Member:
         notes.append(f"{first.name} is {first.quality}{why}{more}")
     return Member(
         entry.cell, state, entry.host, entry.instance, entry.version, round(seen.age_s, 1), entry.started_utc_ns,
-        entry.web, tuple(notes), entry.sources,
+        entry.web, tuple(notes), entry.sources, entry.machine,
     )  # fmt: skip
 
 
@@ -98,7 +100,7 @@ def _changes(old: Member, new: Member) -> list[str]:
     if old.state != new.state:
         age = f" for {new.age_s:.0f} s" if new.state in (LATE, DOWN) else ""
         texts.append(f"{new.state}{age}, was {old.state}")
-    if (old.host, old.instance) != (new.host, new.instance):
+    if (old.host, old.machine, old.instance) != (new.host, new.machine, new.instance):
         texts.append(f"moved from {old.instance} on {old.host} to {new.instance} on {new.host}")
     elif old.started_utc_ns != new.started_utc_ns:
         texts.append("started again")

@@ -80,6 +80,7 @@ class CellEntry(msgspec.Struct, frozen=True):
         web: Address of the cell's web page; empty if it has none.
         sources: The sources that the cell offers.
         note: What is wrong with the instance and its processes; empty if nothing is.
+        machine: A text that tells hosts of the same name apart; empty if it is unknown.
 
     """
 
@@ -94,10 +95,16 @@ class CellEntry(msgspec.Struct, frozen=True):
     web: str = ""
     sources: tuple[SourceEntry, ...] = ()
     note: str = ""
+    machine: str = ""
 
     def source(self, name: str) -> SourceEntry | None:
         """Return the source of this name; None if the cell does not offer it."""
         return next((source for source in self.sources if source.name == name), None)
+
+
+def on_same_host(one: CellEntry, other: CellEntry) -> bool:
+    """Return whether two cells run on the same host, as far as known."""
+    return one.host == other.host and (one.machine == other.machine or not (one.machine and other.machine))
 
 
 class Seen(msgspec.Struct, frozen=True):
@@ -151,7 +158,7 @@ class Registry:
                 if seen is None:
                     return await self._cells.create(entry.cell, data)
                 other = seen.entry
-                own = (other.host, other.instance) == (entry.host, entry.instance)
+                own = on_same_host(other, entry) and other.instance == entry.instance
                 if seen.alive and not own and other.state != "stopped":
                     raise ConflictError(
                         f"the fabric already has a cell {entry.cell}: instance {other.instance} on host {other.host}, "

@@ -23,6 +23,7 @@ from shmio.endpoints.fabric.history import History
 from shmio.endpoints.fabric.publisher import Publisher
 from shmio.errors import ConfigError, ConflictError, RemoteError, SegmentError
 from shmio.fabric.connection import INSTALL, Access, connect, is_stored, reason, refusal, wants_reply
+from shmio.fabric.machine import machine
 from shmio.fabric.messages import Header, asks_for_state, encode_state, with_header
 from shmio.fabric.names import CellName, source_of
 from shmio.fabric.registry import RENEW_S, CellEntry, Registry, SourceEntry
@@ -365,7 +366,7 @@ class Uplink:
             str(self.cell), socket.gethostname(), self._segment.instance, __version__, f"{head.epoch:016x}", state,
             head.started_utc_ns, self._log_time(time.monotonic_ns()), self._settings.web,
             tuple(self._source_entry(feed) for feed in self._feeds.values()),
-            "" if stopped else mask_line("; ".join(problems(status)))[:MAX_NOTE],
+            "" if stopped else mask_line("; ".join(problems(status)))[:MAX_NOTE], machine(),
         )  # fmt: skip
 
     def _source_entry(self, feed: Feed) -> SourceEntry:

@@ -111,7 +111,9 @@ class Cells:
         }
 
     def _row(self, member: Member, page_host: str) -> dict[str, Any]:
-        here = member.host == self._host
+        from shmio.fabric.machine import machine  # noqa: PLC0415  pages of instances without a fabric do not need it
+
+        here = member.host == self._host and member.machine in ("", machine())
         found = Counter(one.quality if one.quality in _QUALITIES else "bad" for one in member.sources)
         own = here and member.instance == self._instance
         url, why = ("", "this page") if own else page_address(member.web, member.host, page_host, here=here)

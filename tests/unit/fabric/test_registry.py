@@ -56,6 +56,11 @@ def test_a_second_living_cell_of_the_same_name_is_refused_naming_both_hosts(run:
         revision = await registry.claim(first)
         with pytest.raises(ConflictError, match=r"(?s)host1.*host2"):
             await registry.claim(named("twice", host="host2"))
+        one = named("thrice", machine="11")
+        await registry.claim(one)
+        with pytest.raises(ConflictError, match=r"(?s)host1.*host1"):
+            await registry.claim(named("thrice", machine="22"))
+        await registry.claim(one)
         await registry.renew(first, revision)
 
     run(work)
