@@ -240,7 +240,19 @@ def test_the_role_is_needed(cells: tuple[Cell, Cell], attached: tuple[Attachment
     finally:
         file.write_text(text)
         near.output("shmio-supervisor", "reload")
+    assert "denied" in {one["outcome"] for one in audited(near)}
+
+
+def test_the_audit_names_the_far_cell(cells: tuple[Cell, Cell], attached: tuple[Attachment, Attachment]) -> None:
+    _, mirror = attached
+    with mirror.inject("mirrored/speed") as shadow:
+        shadow.set({"speed": 1.0})
+    with mirror.declare([{"name": "a", "target": "mirrored/speed", "operation": "freeze"}]):
+        pass
+    assert {one["action"] for one in audited(cells[0])} >= {"inject", "lift", "declare", "feed"}
+
+
+def audited(near: Cell) -> list[dict[str, Any]]:
+    """Return what the owner's audit log has of the far cell."""
     audit = [json.loads(line) for line in near.output("shmio-supervisor", "audit", "--json").splitlines()]
-    mine = [one for one in audit if one["who"] == "plant1.line3.far"]
-    assert {one["action"] for one in mine} >= {"inject", "lift", "declare", "feed"}
-    assert any(one["outcome"] == "denied" for one in mine)
+    return [one for one in audit if one["who"] == "plant1.line3.far"]
