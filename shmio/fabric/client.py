@@ -7,15 +7,18 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from contextlib import suppress
 from typing import Final
 
 from nats.aio.client import PING_PROTO, Client, Srv
 from nats.errors import ConnectionReconnectingError, Error
 
+from shmio.fabric.tasks import end
+
 CLOSE_S: Final = 1.0
 FLUSH_S: Final = 10
 _VIOLATION: Final = "permissions violation"
+
+log = logging.getLogger("shmio.fabric")
 
 
 def _matters(record: logging.LogRecord) -> bool:
@@ -89,12 +92,20 @@ class FabricClient(Client):
         await self._send_command(PING_PROTO)
         await self._flush_pending()
 
+    async def leave(self, timeout_s: float) -> None:
+        """Close the connection. If the server does not take what waits within a time in s, drop that."""
+        closing = asyncio.get_running_loop().create_task(self.close())
+        await asyncio.wait((closing,), timeout=timeout_s)
+        if not closing.done():
+            self._abort()
+            await end(closing)
+        if not closing.cancelled() and (error := closing.exception()) is not None:
+            log.debug("the connection has ended: %s", error)
+
     async def abandon(self) -> None:
         """Close a connection that was not established. After a failed TLS handshake, close() waits for ever."""
         self._abort()
-        with suppress(TimeoutError):
-            async with asyncio.timeout(CLOSE_S):
-                await self.close()
+        await self.leave(CLOSE_S)
 
     def _abort(self) -> None:
         self._pending = []

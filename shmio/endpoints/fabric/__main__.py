@@ -12,6 +12,7 @@ import msgspec
 from shmio import worker
 from shmio.endpoints.fabric.server import NatsServer, ServerSettings
 from shmio.endpoints.server_process import serve
+from shmio.fabric.tasks import end
 from shmio.logs import LogRateLimit
 from shmio.worker import BEAT_S, Worker
 
@@ -67,9 +68,7 @@ async def _publish(worker: Worker) -> None:
             with suppress(TimeoutError):
                 await asyncio.wait_for(stopping.wait(), BEAT_S)
     finally:
-        running.cancel()
-        with suppress(asyncio.CancelledError, Exception):
-            await running
+        await end(running)
         await uplink.close()
     worker.report(uplink.counters, note="")
     log.info("the uplink has stopped; it sent %d messages", uplink.publisher.sent)

@@ -16,6 +16,7 @@ from nats.aio.msg import Msg
 from shmio.endpoints.fabric.uplink import Uplink, UplinkSettings
 from shmio.fabric.connection import Access
 from shmio.fabric.messages import Entry, Header, decode_entries, decode_header
+from shmio.fabric.tasks import end
 from shmio.layout.model import Layout, Register
 from shmio.segment import BlockWriter, Frame, Segment
 
@@ -112,8 +113,7 @@ async def uplink(segment: Segment, url: str, **settings: Any) -> AsyncIterator[U
     try:
         yield found
     finally:
-        task.cancel()
-        await asyncio.wait((task,))
+        await end(task)
         await found.close()
         if not task.cancelled() and (error := task.exception()) is not None:
             raise error
