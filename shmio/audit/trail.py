@@ -47,7 +47,7 @@ MAX_BATCH: Final = 500
 MERGED: Final = frozenset({"feed", "read", "sign in", "step"})
 """Actions that a client can repeat many times a second. Repetitions within a second share one entry.
 
-A ``read`` is recorded only if it is denied.
+The same holds for all actions that are denied. A ``read`` is recorded only if it is denied.
 """
 MERGE_S: Final = 1.0
 MAX_MERGED: Final = 1000
@@ -162,7 +162,7 @@ class _Waiting(NamedTuple):
     @property
     def kind(self) -> tuple[object, ...] | None:
         """Key that all repetitions of an action share; None if repetitions are not merged."""
-        if self.action not in MERGED or not isinstance(self.what, Mapping):
+        if (self.action not in MERGED and self.outcome != "denied") or not isinstance(self.what, Mapping):
             return None
         return self.acting.actor, self.acting.endpoint, self.action, self.outcome, self.reason, *self.what
 

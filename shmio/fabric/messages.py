@@ -325,10 +325,10 @@ class CommandRequest(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @property
     def outcomes(self) -> int:
-        """Number of outcomes in the reply: one for each write, and one for an injection."""
+        """Number of outcomes in the reply: one for each write or shadowed value, otherwise one."""
         if self.injection is None:
             return len(self.writes)
-        return {"shadow": len(self.injection.items), "renew": 0}.get(self.injection.kind, 1)
+        return len(self.injection.items) if self.injection.kind == "shadow" else 1
 
 
 class CommandReply(msgspec.Struct, frozen=True):
@@ -377,6 +377,25 @@ def decode_request(data: bytes) -> CommandRequest:
         if item.offset < 0 or not item.data or (item.mask and not bit):
             raise ValueError("a write of the command is malformed")
     return request
+
+
+def outcomes_of(data: bytes) -> int:
+    """Return the number of outcomes in the reply to a command that cannot be decoded; 0 if it is no command.
+
+    For example, a newer version of shmio may have sent it.
+    """
+    try:
+        found = msgspec.msgpack.decode(data)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+        return 0
+    if not isinstance(found, dict):
+        return 0
+    injection = found.get("injection")
+    if isinstance(injection, dict):
+        items = injection.get("items") if injection.get("kind") == "shadow" else [None]
+    else:
+        items = found.get("writes")
+    return len(items) if isinstance(items, list) and len(items) <= MAX_ITEMS else 0
 
 
 def _check_injection(injection: InjectionRequest) -> None:

@@ -114,13 +114,19 @@ class ListCell(Generic[_Item]):
         return _atomics.load64(self._memory, self._offset)
 
     def read(self) -> tuple[_Item, ...]:
-        """Read all items. Return an empty tuple if the section is corrupt."""
+        """Read all items. Return an empty tuple if the section is being written or corrupt."""
+        return self.try_read() or ()
+
+    def try_read(self) -> tuple[_Item, ...] | None:
+        """Read all items. Return None if the section is being written or corrupt."""
         data = _atomics.cell_read(self._memory, self._offset, LIST_SIZE)
-        document = (data or b"").rstrip(b"\0")
+        if data is None:
+            return None
+        document = data.rstrip(b"\0")
         try:
             return self._decoder.decode(document) if document else ()
         except msgspec.MsgspecError:
-            return ()
+            return None
 
     def write(self, document: bytes) -> None:
         """Write a document made by :func:`encode`."""

@@ -22,6 +22,7 @@ from shmio.endpoints.fabric.injections import (
     StateFeed,
     covers_only_published,
     declaration_refusal,
+    decode_declaration,
 )
 from shmio.errors import CommandError, ConfigError
 from shmio.fabric.messages import (
@@ -32,6 +33,7 @@ from shmio.fabric.messages import (
     WriteItem,
     decode_request,
     encode_command,
+    outcomes_of,
 )
 from shmio.fabric.names import CellName
 from shmio.layout.values.write import Write, paths_of
@@ -43,6 +45,8 @@ from shmio.segment.commands import Direction, End, apply, decode_writes
 EXPIRED: Final = "the command came after its deadline; the source did not begin it"
 RESTARTED: Final = "the uplink was restarted after the command was sent; the source did not begin it"
 OTHER_LAYOUT: Final = "the layout of the source has changed; read the new layout before you write"
+DENIED: Final = "denied"
+"""Outcome in the audit log of a command whose sender has no role."""
 MAX_CHECKS: Final = 32
 """Maximum number of declarations that are checked at the same time; others are rejected."""
 _ACTIONS: Final = {"inject": "inject", "shadow": "feed", "lift": "lift", "declare": "declare"}
@@ -69,7 +73,7 @@ class CommandClient:
 
     def __init__(self, feed: Feed, writer: int) -> None:
         self.block = feed.block
-        self.leases = Leases(feed.block)
+        self.leases = Leases(feed.block, writer)
         self.state = StateFeed(feed, self.leases)
         self._source_writer = SourceWriter(feed.block, writer)
         self._in_flight = InFlightTable(writer)
@@ -112,6 +116,8 @@ class CommandClient:
         number, kind = request.number, _KINDS[request.kind]
         if number in self._in_flight:
             raise CommandError(f"command {number} is in flight already; send it again under another number")
+        if number in self.leases:
+            raise CommandError(f"injection {number} exists already; send the command again under another number")
         options: dict[str, Any] = {}
         writes = _writes(request.items)
         if kind is CommandKind.DECLARE:
@@ -139,7 +145,8 @@ class CommandClient:
     def lift_expired(self) -> None:
         """Lift the injections that their cells no longer renew."""
         for number, lease in self.leases.expired():
-            reason = f"cell {lease.sender} has not renewed the injection for {LEASE_S:g} s"
+            who = f"cell {lease.sender} has not" if lease.sender else "no cell has"
+            reason = f"{who} renewed the injection for {LEASE_S:g} s"
             what = {"source": self.block.source, "injection": number}
             with acting(Actor("process", "fabric", reason), "fabric"), Attempt("lift", what) as attempt:
                 try:
@@ -252,6 +259,9 @@ class CommandReceiver:
         except (ConfigError, ValueError) as error:
             self.refused += 1
             log.warning("a command of %s to source %s is malformed: %s", sender[:120], source, error)
+            if reply and (count := outcomes_of(data)):
+                why = f"cell {self._cell} does not understand the command: {error}"
+                self._answer(reply, CommandReply([str(OutcomeKind.REJECTED)] * count, [why] * count))
             return
         if not reply:  # nobody would know the outcome
             self.refused += 1
@@ -262,9 +272,12 @@ class CommandReceiver:
         if request.injection is not None and request.injection.kind == "renew":
             if refusal is None and feed is not None:
                 self.client(feed).leases.renew(request.injection.renewed, sender)
-            answer(CommandReply([], []))
+            kind, why, _ = refusal or (OutcomeKind.ACCEPTED, "", "")
+            answer(CommandReply([str(kind)], [why]))
             return
-        what: Any = {"source": source} if feed is None else partial(_described, feed.block, request)
+        what: Any = {"source": source}
+        if feed is not None and (refusal is None or refusal[2] != DENIED):  # others may not fill the log
+            what = partial(_described, feed.block, request)
         with acting(Actor("cell", sender, f"server {self._server}"), "fabric"):
             attempt = Attempt("write" if request.injection is None else _ACTIONS[request.injection.kind], what)
         if refusal is not None or feed is None:
@@ -284,7 +297,7 @@ class CommandReceiver:
                 f"no [[fabric.allow]] of cell {self._cell} gives {sender} the role {role}; to allow it, add {role!r} "
                 f"to its roles in the supervisor.toml of {self._cell}, and reload that instance"
             )
-            return OutcomeKind.REJECTED, why, "denied"
+            return OutcomeKind.REJECTED, why, DENIED
         if feed is None:
             return _rejected(f"cell {self._cell} has no source {source!r}")
         if request.stream != stream:
@@ -321,7 +334,12 @@ class CommandReceiver:
 
         async def check() -> None:
             assert request.injection is not None  # noqa: S101  take() has checked it
-            why = await asyncio.to_thread(declaration_refusal, request.injection.declaration, feed, dict(self._feeds))
+            own, feeds = request.injection.declaration, dict(self._feeds)
+            try:
+                why = await asyncio.to_thread(declaration_refusal, own, feed, feeds)
+            except Exception as error:  # the sender must get an outcome
+                log.exception("source %s: a declaration of %s cannot be checked", feed.block.source, sender)
+                why = f"the declaration cannot be checked: {type(error).__name__}"
             if why:
                 self._refuse(request, attempt, answer, _rejected(why))
             elif self._rest_s(request) <= 0:
@@ -392,10 +410,10 @@ def _described(block: Block, request: CommandRequest) -> Mapping[str, Any]:
         return _values(block, _writes(injection.items))
     if injection.kind == "declare":
         try:
-            declared = msgspec.json.decode(injection.declaration, type=dict[str, Any])
+            declared = msgspec.to_builtins(decode_declaration(injection.declaration))
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
             declared = {}
-        return what | declared | {"keep": injection.keep}
+        return what | {"declaration": declared, "keep": injection.keep}
     inside = [write for write in _writes(injection.items) if write.offset + len(write.data) <= block.layout.size]
     paths = [f"{block.source}/{path}" for path in paths_of(block.layout, inside, MAX_NAMED)]
     direction = Direction(injection.direction).name.lower()

@@ -23,8 +23,10 @@ LEASE_S: Final = 5.0
 """Time in s without a renewal after which an injection of another cell is lifted."""
 CHECK_S: Final = 0.4
 """Interval in s for checking the leases."""
+ASKED_S: Final = 1.0
+"""Minimum interval in s between two states that mirrors have asked for: each goes to all mirrors."""
 
-_DECLARATIONS: Final = msgspec.json.Decoder(Declaration)  # created before there are threads
+decode_declaration: Final = msgspec.json.Decoder(Declaration).decode  # created before there are threads
 
 
 @dataclass
@@ -32,7 +34,7 @@ class Lease:
     """An injection that another cell has created.
 
     Attributes:
-        sender: The cell.
+        sender: The cell; empty if it is not known until the first renewal.
         keep: True if the injection needs no renewals.
         renewed_s: Time of the last renewal, in s of the monotonic clock.
         open: True while the outcome of the command that creates or lifts the injection is not known.
@@ -49,13 +51,20 @@ class Leases:
     """The injections that other cells have created on one source, by number.
 
     Its source lifts them if this process ends, except those with ``keep``. While the process runs, it
-    must lift those that their cells no longer renew, because a cell or the connection to it is down.
+    must lift those that their cells no longer renew, because a cell or the connection to it is down. An
+    injection in the source's list that has no lease, for example after a snapshot was restored, gets
+    one that begins when it is found.
     """
 
-    def __init__(self, block: Block) -> None:
-        self._block = block
+    def __init__(self, block: Block, writer: int) -> None:
+        """Create the leases of a source; ``writer`` is the number of this process's command queue."""
+        self._block, self._writer = block, writer
         self._leases: dict[int, Lease] = {}
         self._checked_s = 0.0
+        self._sequence = 0  # of the list at the last check; 0: the source has had no injections
+
+    def __contains__(self, number: int) -> bool:
+        return number in self._leases
 
     def add(self, number: int, sender: str, *, keep: bool) -> Lease:
         """Add an injection that a command is about to create."""
@@ -70,8 +79,8 @@ class Leases:
         """Renew those injections that the cell ``sender`` has created."""
         for number in numbers:
             lease = self._leases.get(number)
-            if lease is not None and lease.sender == sender:
-                lease.renewed_s = time.monotonic()
+            if lease is not None and lease.sender in ("", sender):
+                lease.sender, lease.renewed_s = sender, time.monotonic()
 
     def sender_of(self, number: int) -> str:
         """Return the cell that has created an injection; empty if it is not known, or none has."""
@@ -81,11 +90,19 @@ class Leases:
     def expired(self) -> list[tuple[int, Lease]]:
         """Return the injections to lift now, at most each ``CHECK_S``. Forget those that are lifted."""
         now_s = time.monotonic()
-        if not self._leases or now_s - self._checked_s < CHECK_S:
+        sequence = self._block.injections.sequence
+        if (not self._leases and sequence == self._sequence) or now_s - self._checked_s < CHECK_S:
             return []
         self._checked_s = now_s
-        present = {one.number for one in self._block.injections.read()}
+        entries = self._block.injections.try_read()
+        if entries is None:  # it says nothing about what is lifted
+            return []
+        self._sequence = sequence
+        present = {one.number for one in entries}
         self._leases = {number: one for number, one in self._leases.items() if one.open or number in present}
+        for one in entries:
+            if one.writer == self._writer and not one.keep and one.number not in self._leases:
+                self._leases[one.number] = Lease("", keep=False, open=False)
         return [
             (number, one)
             for number, one in self._leases.items()
@@ -100,6 +117,7 @@ class StateFeed:
         self._feed, self._leases = feed, leases
         self._block = feed.block
         self._seen: tuple[int, bool] = (0, False)  # a source that has no injection yet publishes nothing
+        self._asked_s = -ASKED_S
         self.wanted = False
         """True if a mirror has asked for the state."""
 
@@ -111,12 +129,19 @@ class StateFeed:
         """
         virtual = self._block.clock.last_written().virtual
         seen = self._block.injections.sequence, virtual  # before the list: a change meanwhile is noticed next time
-        if seen == self._seen and not self.wanted:
+        now_s = time.monotonic()
+        asked = self.wanted and now_s - self._asked_s >= ASKED_S
+        if seen == self._seen and not asked:
             return None
-        self._seen, self.wanted = seen, False
+        present = self._block.injections.try_read()
+        if present is None:
+            return None
+        if asked:
+            self._asked_s = now_s
+        self._seen, self.wanted = seen, self.wanted and not asked
         entries = [
             msgspec.structs.replace(one, cell=self._leases.sender_of(one.number))
-            for one in self._block.injections.read()
+            for one in present
             if self._feed.shows(one.ranges)
         ]
         return SourceState(tuple(entries), self._block.clock.present_ns(), virtual)
@@ -135,7 +160,7 @@ def declaration_refusal(data: bytes, own: Feed, feeds: Mapping[str, Feed]) -> st
 
     """
     try:
-        declaration = _DECLARATIONS.decode(data)
+        declaration = decode_declaration(data)
         check_declarations([declaration])
         periods_ns = {source: feed.block.period_ns for source, feed in feeds.items()}
         program = compile_program(declaration, {source: feed.layout for source, feed in feeds.items()}, periods_ns)

@@ -57,6 +57,8 @@ class Publisher:
         self.late = 0
         """Number of messages that were sent as late."""
         self._backlog = backlog
+        self.begun = asyncio.Event()
+        """Set while messages are being sent."""
         self._client: FabricClient | None = None
         self._due = asyncio.Event()
         self._asked = asyncio.Event()
@@ -78,6 +80,7 @@ class Publisher:
         for row in self._backlog.rows.values():
             row.begin_again()
         self._client = client
+        self.begun.set()
         loop = asyncio.get_running_loop()
         self._tasks = [loop.create_task(self._send_all(client)), loop.create_task(self._confirm_all(client))]
         self._due.set()
@@ -85,6 +88,7 @@ class Publisher:
     def end(self) -> None:
         """Stop sending, because the connection was lost."""
         self._client = None
+        self.begun.clear()
         for task in self._tasks:
             task.cancel()
         self._tasks = []

@@ -384,15 +384,18 @@ class Uplink:
     async def _on_missing(self, message: Msg) -> None:
         source = source_of(message.subject.split(".")[4])
         await self.publisher.answer(self.backlog.rows.get(source), message)
-        if (feed := self._feeds.get(source)) is not None and asks_for_state(message.data):
-            self.commands.client(feed).state.wanted = True
+        if (feed := self._feeds.get(source)) is None or not asks_for_state(message.data):
+            return
+        state = self.commands.client(feed).state
+        if not state.wanted:
+            state.wanted = True
             self._poll_on(feed)
 
     async def _on_command(self, message: Msg) -> None:
         if is_stored(message):
             return
-        if not self.publisher.up:  # another instance may own the name of this cell: only its owner carries out commands
-            return
+        # Another instance may own the name of this cell: only its owner carries out commands, and answers.
+        await self.publisher.begun.wait()
         tokens = message.subject.split(".")
         source, sender = source_of(tokens[4]), ".".join(tokens[6:])
         reply = message.reply if wants_reply(message) else ""
@@ -435,9 +438,7 @@ class Uplink:
                         await client.publish(self.cell.status, msgspec.json.encode(entry))
         self.publisher.end()
         if client is not None:
-            with suppress(self._errors.Error, OSError, TimeoutError):
-                async with asyncio.timeout(LEAVE_S):
-                    await client.close()
+            await client.leave(LEAVE_S)
         if self._reading is not None:
             await asyncio.wait((self._reading,))
         for relay in self._stopped:

@@ -10,6 +10,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import nats
 import pytest
 from nats.errors import TimeoutError as NatsTimeoutError
@@ -174,11 +175,15 @@ async def test_registers_that_are_not_published_are_not_written(
 async def test_malformed_commands_are_counted(segment: Segment, server: NatsServer, plant: Plant) -> None:
     request = CommandRequest(1 << 62, 7, LAYOUT.hash[:8], [WriteItem(0, 0x81, b"\1")])
     async with commander(segment, server.url) as client:
-        hostile = [b"", b"\xff" * 100, encode_command(request), b"\x81\xa6writes\xdd\xff\xff\xff\xff"]
+        hostile = [b"", b"\xff" * 100, b"\x81\xa6writes\xdd\xff\xff\xff\xff"]
         for data in hostile:
             with pytest.raises(NatsTimeoutError):
                 await client.send(data, timeout_s=0.05)
         assert client.uplink.commands.refused == len(hostile)
+        newer = msgspec.msgpack.encode({"injection": {"kind": "pause", "number": 1}})
+        for data in (encode_command(request), newer):
+            reply = decode_reply(await client.send(data), 1)
+            assert (reply.outcomes, CELL in reply.reasons[0]) == (["rejected"], True)
         assert (await client.write((0, 0, b"\1"))).outcomes == ["written"], "others are served"
 
 
@@ -194,14 +199,18 @@ async def test_many_commands_at_once_each_have_an_outcome(segment: Segment, serv
 async def test_only_the_owner_of_the_name_carries_out_commands(
     segment: Segment, server: NatsServer, plant: Plant
 ) -> None:
-    """An uplink that has not claimed the cell yet may be a second one of the same name."""
+    """An uplink that has not claimed the cell yet may be a second one of the same name: its commands wait."""
     async with commander(segment, server.url) as client:
         found = client.uplink
         nats_client = found.publisher._client
         assert nats_client is not None
         found.publisher.end()
-        with pytest.raises(TimeoutError):
-            await asyncio.wait_for(client.write((0, 0, b"\1")), 0.5)
+        writing = asyncio.create_task(client.write((0, 0, b"\1")))
+        expiring = asyncio.create_task(client.write((1, 0, b"\1"), expires_ns=100_000_000))
+        await asyncio.wait((writing, expiring), timeout=0.3)
+        assert not writing.done()
+        assert not expiring.done()
         assert plant.memory == bytes(8)
         found.publisher.begin(nats_client)
-        assert (await client.write((0, 0, b"\1"))).outcomes == ["written"]
+        assert (await writing).outcomes == ["written"]
+        assert (await expiring).outcomes == ["expired"]

@@ -19,7 +19,7 @@ from shmio.audit.file import AuditSettings
 from shmio.config import Declaration
 from shmio.config.model import FabricAllow, FabricRule
 from shmio.connectors.injection_layers import Owner
-from shmio.endpoints.fabric import injections
+from shmio.endpoints.fabric import commands, injections
 from shmio.endpoints.fabric.uplink import Uplink
 from shmio.fabric.messages import (
     STATE_REQUEST,
@@ -77,6 +77,10 @@ class Injector:
         values = {"name": "one", "target": "cell/other", "operation": "set", "value": 9, **more}
         declaration = msgspec.json.encode(msgspec.convert(values, Declaration))
         return await self.send("declare", number, sender, declaration=declaration)
+
+    @property
+    def leases(self) -> injections.Leases:
+        return self.uplink.commands.client(self.uplink._feeds["cell"]).leases
 
     @property
     def present(self) -> list[int]:
@@ -181,7 +185,7 @@ async def test_an_injection_that_is_not_renewed_is_lifted(
         await twin.send("inject", NUMBER + 2, items=[OTHER], keep=True)
         async with asyncio.timeout(TIMEOUT_S):
             while NUMBER in twin.present:
-                assert (await twin.send("renew", renewed=[NUMBER + 1])).outcomes == []
+                assert (await twin.send("renew", renewed=[NUMBER + 1])).outcomes == ["accepted"]
                 await twin.send("renew", sender="plant1.line2.twin", renewed=[NUMBER])
         assert twin.present == [NUMBER + 1, NUMBER + 2]
         await until(lambda: twin.present == [NUMBER + 2])
@@ -233,3 +237,136 @@ async def test_malformed_commands_are_counted(segment: Segment, server: NatsServ
             await twin.client.publish(f"shmio.{CELL}.cell.command.{TWIN}", encode_command(request), reply="reply")
         await until(lambda: twin.uplink.commands.refused == len(hostile))
         assert twin.present == []
+
+
+@in_loop
+async def test_a_number_is_used_once(
+    segment: Segment, server: NatsServer, plant: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A second command of the same number, also of another cell, leaves the injection and its lease as they are."""
+    monkeypatch.setattr(injections, "LEASE_S", 0.6)
+    async with injector(segment, server.url, allow=[FabricAllow(sender="*.*.*", roles=["inject"])]) as twin:
+        await twin.declare(NUMBER)
+        reply = await twin.declare(NUMBER, sender="plant1.line9.other", name="two")
+        assert (reply.outcomes, "exists" in reply.reasons[0]) == (["rejected"], True)
+        reply = await twin.send("inject", NUMBER, "plant1.line9.other", items=[OTHER])
+        assert (reply.outcomes, "exists" in reply.reasons[0]) == (["rejected"], True)
+        assert twin.leases.sender_of(NUMBER) == TWIN
+        await until(lambda: twin.present == [])
+
+
+@in_loop
+async def test_a_list_that_cannot_be_read_ends_no_lease(
+    segment: Segment, server: NatsServer, plant: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The source may be interrupted while it writes its list."""
+    async with injector(segment, server.url) as twin:
+        await twin.declare()
+        state = twin.uplink.commands.client(twin.uplink._feeds["cell"]).state
+        monkeypatch.setattr(type(twin.block.injections), "try_read", lambda _: None)
+        monkeypatch.setattr(injections, "CHECK_S", 0.0)
+        state.wanted = True
+        assert twin.leases.expired() == []
+        assert state.read() is None, "no empty list is published"
+        monkeypatch.undo()
+        assert twin.leases.sender_of(NUMBER) == TWIN
+        shown = state.read()
+        assert shown is not None
+        assert [one.number for one in shown.injections] == [NUMBER]
+
+
+@in_loop
+async def test_a_restored_injection_is_lifted_unless_a_cell_renews_it(
+    segment: Segment, server: NatsServer, plant: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A snapshot brings back injections that the uplink knows nothing of any more."""
+    monkeypatch.setattr(injections, "LEASE_S", 0.6)
+    async with injector(segment, server.url) as twin:
+        await twin.send("inject", NUMBER, items=[OTHER])
+        await twin.send("inject", NUMBER + 1, items=[OTHER])
+        processor = plant.commands.injections
+        with plant.output.lock:
+            saved = processor.save()
+        await until(lambda: twin.present == [])
+        restore = processor.prepare_restore(saved, processor.injections.now, plant.output.base)
+        with plant.output.lock:
+            restore()
+        assert len(twin.present) == 2
+        async with asyncio.timeout(TIMEOUT_S):
+            while NUMBER in twin.present:
+                await twin.send("renew", renewed=[NUMBER + 1])
+        assert twin.present == [NUMBER + 1]
+        assert twin.leases.sender_of(NUMBER + 1) == TWIN
+        await until(lambda: twin.present == [])
+
+
+@in_loop
+async def test_requests_for_the_state_cannot_push_messages_out(
+    segment: Segment, server: NatsServer, plant: Plant
+) -> None:
+    async with injector(segment, server.url) as twin, listening(server.url) as listener:
+        await twin.declare()
+        row = twin.uplink.backlog.rows["cell"]
+        made = 0
+        put = twin.uplink.backlog.put
+
+        def counted(row: Any, kept: Any) -> None:
+            nonlocal made
+            made += decode_state(bytes(kept.data)) is not None
+            put(row, kept)
+
+        twin.uplink.backlog.put = counted  # type: ignore[method-assign]
+        begun_s = time.monotonic()
+        for _ in range(300):
+            await listener.client.publish(f"shmio.{CELL}.cell.missing", msgspec.json.encode(STATE_REQUEST))
+        await listener.client.flush()
+        await twin.send("renew", renewed=[NUMBER])  # the uplink has had all requests
+        state = twin.uplink.commands.client(twin.uplink._feeds["cell"]).state
+        await until(lambda: not state.wanted)
+        assert 1 <= made <= 2 + (time.monotonic() - begun_s) / injections.ASKED_S
+        assert row.find(1) is not None, "nothing was pushed out"
+
+
+@in_loop
+async def test_a_refused_renewal_says_why(segment: Segment, server: NatsServer, plant: Plant) -> None:
+    async with injector(segment, server.url) as twin:
+        reply = await twin.send("renew", sender="plant1.line1.writer", renewed=[NUMBER])
+        assert (reply.outcomes, "'inject'" in reply.reasons[0]) == (["rejected"], True)
+
+
+@in_loop
+async def test_a_check_that_fails_is_answered(
+    segment: Segment, server: NatsServer, plant: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object) -> str:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(commands, "declaration_refusal", broken)
+    async with injector(segment, server.url) as twin:
+        reply = await twin.declare()
+        assert (reply.outcomes, "ZeroDivisionError" in reply.reasons[0]) == (["rejected"], True)
+
+
+@in_loop
+async def test_a_cell_without_the_role_cannot_fill_the_audit_log(
+    segment: Segment, server: NatsServer, plant: Plant, tmp_path: Path
+) -> None:
+    file = tmp_path / "audit.jsonl"
+    trail.open_trail(AuditSettings(str(file), 1 << 20, 2), segment.instance, "fabric")
+    try:
+        async with injector(segment, server.url) as twin:
+            false = msgspec.json.encode({"source": "press", "paths": ["press/force"], "x": "y" * 100})
+            for number in range(50):
+                await twin.send("declare", number + 1, "plant1.line1.writer", declaration=false)
+            await twin.send("declare", 99, declaration=false)
+            await twin.declare()
+    finally:
+        trail.close_trail()
+    entries = [json.loads(line) for line in file.read_text().splitlines()]
+    denied = [one for one in entries if one["outcome"] == "denied"]
+    assert {json.dumps(one["what"]) for one in denied} == {'{"source": "cell"}'}
+    assert sum(one["count"] for one in denied) == 50
+    assert len(denied) < 25
+    wrong, right = (one["what"] for one in entries if one["outcome"] != "denied")
+    assert wrong == {"source": "cell", "declaration": {}, "keep": False}
+    assert (right["source"], right["declaration"]["target"]) == ("cell", "cell/other")
