@@ -302,7 +302,7 @@ async def test_a_restored_injection_is_lifted_unless_a_cell_renews_it(
 
 @in_loop
 async def test_requests_for_the_state_cannot_push_messages_out(
-    segment: Segment, server: NatsServer, plant: Plant
+    segment: Segment, server: NatsServer, plant: Plant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async with injector(segment, server.url) as twin, listening(server.url) as listener:
         await twin.declare()
@@ -315,7 +315,7 @@ async def test_requests_for_the_state_cannot_push_messages_out(
             made += decode_state(bytes(kept.data)) is not None
             put(row, kept)
 
-        twin.uplink.backlog.put = counted  # type: ignore[method-assign]
+        monkeypatch.setattr(twin.uplink.backlog, "put", counted)
         begun_s = time.monotonic()
         for _ in range(300):
             await listener.client.publish(f"shmio.{CELL}.cell.missing", msgspec.json.encode(STATE_REQUEST))
