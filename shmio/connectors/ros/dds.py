@@ -222,11 +222,11 @@ class Ros2Connector(Connector):
             raise ConnectorError(f"all publishers and subscribers of this source's topics have left DDS {self._where}")
         for name in joined.discover(DISCOVERIES):
             self._report(joined, self._topics.by_name[name])
-        lost = joined.lost()
+        without_publisher = joined.without_publisher()
         for topic in self._topics.by_name.values():
             topic.fault = GOOD
             if topic.received_ns:
-                if topic.name in lost and not topic.writable:
+                if topic.name in without_publisher and not topic.writable:
                     topic.fault = BAD_NO_COMMUNICATION
             elif topic.name in self._obstructed and not joined.publishers(topic.name):
                 topic.fault = BAD_CONFIGURATION_ERROR

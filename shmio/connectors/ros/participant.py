@@ -181,7 +181,9 @@ class Participant:
         self._domain = self._participant = None
         self._changes: Any = None
         """The readers and writers whose publishers or subscribers have changed since they were counted."""
-        self._lost: frozenset[str] = frozenset()
+        self._counted = False
+        """Whether all readers and writers that exist now were counted; their deletion is no change that DDS reports."""
+        self._without_publisher: frozenset[str] = frozenset()
         self.discovery = Discovery()
         try:
             before = set(_sockets())
@@ -210,6 +212,7 @@ class Participant:
         """
         for topic in topics:
             if topic.name not in self._endpoints:
+                self._counted = False
                 try:
                     self._endpoints[topic.name] = _Endpoint(self._participant, self._changes, topic, self._blocking_ns)
                 except DDSException as error:
@@ -230,6 +233,7 @@ class Participant:
 
         """
         wanted = {topic.name: topic for topic in topics}
+        self._counted = False
         try:
             for name, endpoint in list(self._endpoints.items()):
                 topic = wanted.get(name)
@@ -252,11 +256,12 @@ class Participant:
         self._changes = self._participant = self._domain = None
 
     def _count(self) -> None:
-        """Count publishers and subscribers again if they have changed."""
-        if self._changes.wait(0):
+        """Count publishers and subscribers again if they, or the readers and writers, have changed."""
+        if not self._counted or self._changes.wait(0):
+            self._counted = True
             for endpoint in self._endpoints.values():
                 endpoint.count()
-            self._lost = frozenset(name for name, endpoint in self._endpoints.items() if not endpoint.alive)
+            self._without_publisher = frozenset(name for name, one in self._endpoints.items() if not one.alive)
 
     def publishers(self, topic: str) -> int:
         """Return how many publishers a topic has, not counting this participant."""
@@ -273,10 +278,10 @@ class Participant:
         self._count()
         return any(endpoint.publishers or endpoint.subscribers for endpoint in self._endpoints.values())
 
-    def lost(self) -> frozenset[str]:
-        """Return the topics that have had a publisher, and now have none that is alive; others may be among them."""
+    def without_publisher(self) -> frozenset[str]:
+        """Return the topics that have no publisher that is alive."""
         self._count()
-        return self._lost
+        return self._without_publisher
 
     def discover(self, most: int) -> set[str]:
         """Process at most ``most`` discovered changes of each kind; return the names of the topics with changes."""

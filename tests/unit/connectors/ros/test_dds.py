@@ -255,3 +255,20 @@ def test_a_reload_may_give_a_topic_another_type(peer: Peer) -> None:
         source.reload({"mode": tags_of(peer)["mode"], "j1": tags_of(peer)["j1"]}, latched=[f"/{peer.prefix}/mode"])
         source.until(lambda: source.code("mode") == 0)
         assert source.value("mode") == "auto"
+
+
+def test_a_reload_with_a_qos_that_no_publisher_offers_makes_the_last_value_bad(peer: Peer) -> None:
+    tags = {name: tags_of(peer)[name] for name in ("j1", "mode")}
+    with connected(peer, tags, max_age=0) as source:
+        seen(source, peer, ["j1"], [1.5])
+        source.reload(tags, topic_qos={f"/{peer.prefix}/states": {"liveliness": "manual_by_topic"}})
+        source.read()
+        assert source.code("j1") == statuses.BAD_NO_COMMUNICATION
+
+
+def test_a_topic_that_a_reload_makes_read_only_has_no_subscribers(peer: Peer) -> None:
+    peer.ask("request", "heard", "Float64", {})
+    heard = {"type": "LREAL", "address": peer.address("heard", "std_msgs/Float64 data"), "writable": True}
+    with connected(peer, {"heard": heard}) as source, pytest.raises(ConnectorError, match="no publisher or subscriber"):
+        source.reload({"heard": heard | {"writable": False}}, timeout=100)
+    peer.ask("withdraw", "heard")
