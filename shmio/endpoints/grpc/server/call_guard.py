@@ -13,6 +13,7 @@ from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequenc
 from contextlib import aclosing
 from dataclasses import dataclass
 from importlib import import_module
+from operator import attrgetter
 from typing import Any, Final
 
 import grpc
@@ -335,7 +336,7 @@ async def _parsed(method: str, decode: Decode | None, data: bytes, context: Cont
 # task, and its cleanup frees memory that the core still writes to. All unregistered calls also share one queue. So
 # the server registers every method: the core matches names by their bytes, and each method has its own queue. A few
 # workers refuse all other calls. This needs private names of grpcio. The server does not start with a version that
-# lacks them.
+# lacks them, or whose functions have other parameters.
 
 cygrpc: Any = import_module("grpc._cython.cygrpc")
 AioServer: Any = import_module("grpc.aio._server").Server
@@ -343,37 +344,45 @@ AioServer: Any = import_module("grpc.aio._server").Server
 WORKERS: Final = 8
 """Maximum number of calls with unknown names that are refused at the same time."""
 
-_NEEDED: Final[Mapping[str, str]] = {
-    "AioServer": "_make_request_call_future _request_call _request_registered_call add_registered_method_handlers "
-    "is_running shutdown",
-    "_ServicerContext": "abort",
-    "_RequestCallError": "",
-    "_handle_stream_stream_rpc": "",
-    "_handle_stream_unary_rpc": "",
-    "_schedule_rpc_coro": "",
-    "get_working_loop": "",
-}
+_NEEDED: Final = (
+    "AioServer._make_request_call_future(self, method_bytes)",
+    "AioServer._request_call(self)",
+    "AioServer._request_registered_call(self, method)",
+    "AioServer.add_registered_method_handlers(self, method_handlers)",
+    "AioServer.is_running(self)",
+    "AioServer.shutdown(self, grace)",
+    "_ServicerContext.abort(self, code, details, trailing_metadata)",
+    "_RequestCallError",
+    "_handle_stream_stream_rpc(method_handler, rpc_state, loop)",
+    "_handle_stream_unary_rpc(method_handler, rpc_state, loop)",
+    "_schedule_rpc_coro(rpc_coro, rpc_state, loop, method_name)",
+    "get_working_loop()",
+)
+"""The private names that this module uses, those of functions with their parameters."""
 _NO_CALL: Final = "there is no such call; reflection lists the services"
 
 
 def check_version() -> None:
-    """Check that grpcio has the private names that this module uses.
+    """Check that grpcio has the private names that this module uses, and that its functions have these parameters.
 
     Raises:
         EndpointError: This version of grpcio lacks some of them.
 
     """
-    missing = [
-        f"{name}.{member}".rstrip(".")
-        for name, members in _NEEDED.items()
-        for member in members.split() or [""]
-        if not hasattr(getattr(cygrpc, name, None), member or "__name__")
-    ]
-    if missing:
+    if missing := [needed for needed in _NEEDED if not _provided(needed)]:
         raise EndpointError(
             f"grpcio {grpc.__version__} does not have {', '.join(missing)}, without which unknown calls could stop the "
             "endpoint; install another version (tested: 1.84.0 to 1.85.3)"
         )
+
+
+def _provided(needed: str) -> bool:
+    name, _, parameters = needed.partition("(")
+    try:
+        found = attrgetter(name)(cygrpc)
+        return not parameters or ", ".join(inspect.signature(found).parameters) == parameters.removesuffix(")")
+    except (AttributeError, TypeError, ValueError):  # it is not there, or its parameters are unknown
+        return False
 
 
 class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]

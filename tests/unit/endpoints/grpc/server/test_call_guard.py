@@ -11,7 +11,8 @@ import grpc
 import pytest
 
 from shmio.endpoints.grpc.server.access import NEEDS, client_of
-from shmio.endpoints.grpc.server.call_guard import LINES, CallLimits, Refusals
+from shmio.endpoints.grpc.server.call_guard import LINES, CallLimits, Refusals, check_version, cygrpc
+from shmio.errors import EndpointError
 from shmio.segment import Segment
 from shmio.wire import simlog_v1_pb2 as wire
 from tests.unit.endpoints import http2
@@ -257,3 +258,11 @@ def test_bytes_of_answers_and_streams_are_counted(segment: Segment) -> None:
             stream.cancel()
 
     serve(segment, test)
+
+
+def test_a_version_of_grpcio_with_other_private_functions_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    check_version()
+    monkeypatch.setattr(cygrpc, "_schedule_rpc_coro", lambda rpc_coro, loop: None)
+    monkeypatch.delattr(cygrpc, "get_working_loop")
+    with pytest.raises(EndpointError, match=r"_schedule_rpc_coro\(rpc_coro, rpc_state.*get_working_loop.*tested"):
+        check_version()
