@@ -389,9 +389,8 @@ class SourceLoop:
         doubt = self._connector.doubt
         quality = Quality.UNCERTAIN if doubt else Quality.GOOD
         self._quality_log.update(quality, doubt, asked.cycle, f", connected {self._connector.describe()}")
-        if (
-            not self._accepting
-        ):  # not before an image has confirmed the layout, and before consumers see that it is good
+        # Not before an image has confirmed the layout, but before consumers see that it is good.
+        if not self._accepting:
             self._accepting = True
             self.commands.open()
         self._output.publish(

@@ -169,14 +169,14 @@ class Writer:
         """Add frames, each with its log time."""
         channel, add = channels.frames, self._mcap.add_message
         for log_ns, frame in frames:
-            told_ns = frame.source_ns if frame.source_ns > 0 else log_ns
+            publish_ns = frame.source_ns if frame.source_ns > 0 else log_ns
             sequence = frame.number & 0xFFFFFFFF
-            add(channel, log_ns, encode_frame_v2(frame, sequence, log_ns, told_ns), told_ns, sequence)
+            add(channel, log_ns, encode_frame_v2(frame, sequence, log_ns, publish_ns), publish_ns, sequence)
 
     def event(self, channels: Channels, event: Event, log_ns: int) -> None:
         """Add an event with the log time ``log_ns``."""
-        told_ns = event.utc_ns if event.utc_ns > 0 else log_ns
-        self._mcap.add_message(channels.events, log_ns, encode_event(event), told_ns, event.number & 0xFFFFFFFF)
+        publish_ns = event.utc_ns if event.utc_ns > 0 else log_ns
+        self._mcap.add_message(channels.events, log_ns, encode_event(event), publish_ns, event.number & 0xFFFFFFFF)
 
     def gap(self, gap: Gap, log_ns: int) -> None:
         """Add a gap. Call this before you add the entry that follows the gap."""

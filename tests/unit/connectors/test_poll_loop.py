@@ -434,7 +434,7 @@ def test_a_write_is_done_before_the_read_so_that_the_frame_shows_it(segment: Seg
     assert frames[3].event == 4
 
 
-def test_who_sees_a_good_frame_may_write(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_readers_of_the_first_good_frame_may_write(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
     sender = CommandSender(segment.blocks["cell"], 4)
     writer = segment.writer("cell")
     publish = writer.publish

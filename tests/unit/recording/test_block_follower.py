@@ -48,7 +48,7 @@ def in_runs(of: BlockFollower, limit: int) -> Iterator[Entry]:
     st.lists(st.sampled_from(["good", "good", "good", "bad", "event", "flood", "read", "read one"]), max_size=40),
     st.integers(1, 5),
 )
-def test_runs_leave_nothing_out(actions: list[str], limit: int) -> None:
+def test_packed_entries_are_those_that_take_returns(actions: list[str], limit: int) -> None:
     block = BlockSpec("cell", LAYOUT, 20_000_000, 500_000_000, 1 << 16, Attributes("s7", ()))
     with Segment.create(f"followed{os.getpid()}", [block], []) as segment:
         try:
