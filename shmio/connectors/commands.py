@@ -508,7 +508,10 @@ class CommandProcessor:
             while taken and not self._stopped:
                 taken = False
                 for writer in range(queues.writers):  # round robin
-                    taken |= self._take_one(writer)
+                    if self._take_one(writer):
+                        taken = True
+                        if self._injections.patience_ns == 0:  # each command may take long
+                            self._injections.follow_changes()
             self._expire(self._take(lambda item: self._now_ns() > item.command.deadline_ns))
             self._injections.follow_changes()
             self._output.flush()

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from shmio.connectors.base import Lost, WriteLostError
 from shmio.connectors.commands import MAX_WAITING, CommandProcessor, Item, coalesce
+from shmio.connectors.injection_layers import DeclaredLayer
 from shmio.connectors.output import Output
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout, Register
@@ -494,3 +495,45 @@ def test_commands_of_one_writer_are_judged_in_order(writer: BlockWriter) -> None
     finally:
         bench.stop()
     assert seen == numbers
+
+
+class SlowInjections:
+    """Takes commands so slowly that the next one has come meanwhile, and changes must be followed after each."""
+
+    overload = ""
+    patience_ns = 0
+
+    def __init__(self, sender: CommandSender) -> None:
+        self._sender = sender
+        self.stop: Callable[[], None] = lambda: None
+        self.calls: list[str] = []
+
+    def toward_device(self, _command: Command) -> None:
+        return None
+
+    def take(self, _command: Command) -> str:
+        self.calls.append("take")
+        if self.calls.count("take") < 4:
+            self._sender.submit([], FAR, kind=CommandKind.LIFT, injection=1)
+        else:
+            self.stop()
+        return ""
+
+    def release(self, _cycle: int) -> list[tuple[DeclaredLayer, Write]]:
+        return []
+
+    def forget(self, reason: str) -> None:
+        raise AssertionError(reason)
+
+    def follow_changes(self) -> None:
+        self.calls.append("follow")
+
+
+def test_commands_that_come_without_pause_do_not_delay_following_changes(writer: BlockWriter) -> None:
+    sender = CommandSender(writer.block, 4)
+    slow = SlowInjections(sender)
+    processor = CommandProcessor(Output(writer), WRITABLE, lambda: 0, injections=lambda *_: slow)
+    slow.stop = processor.stop
+    sender.submit([], FAR, kind=CommandKind.LIFT, injection=1)
+    processor.run()
+    assert slow.calls[:8] == ["take", "follow"] * 4
