@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Iterator
-from typing import Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import msgspec
 
@@ -196,6 +196,7 @@ class SourceState(msgspec.Struct, frozen=True):
     virtual: bool
 
 
+_STATE_NAMES: Final = frozenset({"waiting", "active", "over", "lifted"})
 _STATES: Final = msgspec.json.Decoder(SourceState)  # created before there are threads, as in layout/document.py
 
 
@@ -209,16 +210,44 @@ def decode_state(data: bytes) -> SourceState | None:
     """Return the state of a source if the message has one.
 
     Raises:
-        ValueError: The state is malformed.
+        ValueError: The state is malformed, or a number in it is too large.
 
     """
     start = _HEADER.size + _ENTRY.size
     if len(data) < start or _ENTRY.unpack_from(data, _HEADER.size)[0] != _STATE:
         return None
     try:
-        return _STATES.decode(memoryview(data)[start:])
+        state = _STATES.decode(memoryview(data)[start:])
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"the state is malformed: {error}") from None
+    if not (-(1 << 63) <= state.clock_ns < 1 << 63 and all(map(_is_sound, state.injections))):
+        raise ValueError("the state is malformed: a number or a word in it is none that an injection can have")
+    return state
+
+
+def _is_sound(one: InjectionEntry) -> bool:
+    """Return whether the fields of an injection are in their ranges. JSON itself limits no number."""
+    running = one.running
+    return (
+        0 <= one.writer < 1 << 32
+        and 0 <= one.pid < 1 << 31
+        and -(1 << 31) <= one.priority < 1 << 31
+        and 0 <= one.number < 1 << 64
+        and one.direction in ("in", "out")
+        and _fits(msgspec.to_builtins(one))
+        and (running is None or (running.state in _STATE_NAMES and min(running.seed, running.runs, running.cycle) >= 0))
+        and (running is None or 0 <= running.time_ns < 1 << 63)
+        and (running is None or all(bit < 1 << 32 for bit in running.declaration.bits or ()))
+    )
+
+
+def _fits(value: Any) -> bool:
+    """Return whether all integers in a value have at most 64 bits."""
+    if isinstance(value, int):
+        return -(1 << 63) <= value < 1 << 64
+    if isinstance(value, dict):
+        return all(map(_fits, value.values()))
+    return not isinstance(value, list | tuple) or all(map(_fits, value))
 
 
 class MissingRequest(msgspec.Struct, frozen=True):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 from datetime import datetime
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import msgspec
 import zstandard
@@ -50,7 +50,7 @@ class SourceEntry(msgspec.Struct, frozen=True):
         quality: Present quality: good, uncertain or bad.
         reason: Why the quality is not good.
         registers: Number of registers.
-        number: Number of the newest message in the stream.
+        number: Number of the newest message in the stream; None if the uplink does not tell it.
 
     """
 
@@ -62,7 +62,7 @@ class SourceEntry(msgspec.Struct, frozen=True):
     quality: str = "bad"
     reason: str = ""
     registers: int = 0
-    number: int = 0
+    number: Annotated[int, msgspec.Meta(ge=0)] | None = None
 
 
 class CellEntry(msgspec.Struct, frozen=True):

@@ -6,10 +6,12 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Final
 
 import msgspec
@@ -32,7 +34,8 @@ from shmio.segment import NO_WRITER, BlockWriter, Command, CommandKind, Directio
 from shmio.segment.block import Layouts
 from shmio.segment.commands import CommandOutcomes, first_number
 from shmio.segment.events import EVENT_DATA_SIZE
-from shmio.segment.injection_list import InjectionEntry, encode
+from shmio.segment.injection_list import LIST_SIZE, InjectionEntry, encode
+from shmio.wording import counted
 
 BEGIN_NS: Final = 1_000_000_000
 """Time in ns after which the owner no longer begins a command."""
@@ -46,6 +49,12 @@ GONE_NS: Final = 2_000_000_000
 """Time in ns for which the event about the end of an injection may come after the end itself."""
 UNSEEN_NS: Final = 30_000_000_000
 """Time in ns for which an injection may be missing in the owner's list after its creation."""
+MAX_TIME_NS: Final = (1 << 63) - 1
+"""Latest time that a command or an injection can have; a faulty owner may send later ones."""
+REPORT_NS: Final = 60_000_000_000
+"""Shortest time in ns between two reports of the same kind."""
+MAX_S: Final = 1e9
+"""Latest start and end of an injection, in s."""
 MAX_SENT: Final = 256
 """Maximum number of commands whose outcomes are not known yet."""
 
@@ -176,6 +185,7 @@ class MirroredInjections:
         self._present = set(self._held)  # numbers in the owner's list
         self._clock: _OwnersClock | None = None
         self._shown: bytes | None = None
+        self._reported_ns = self._refused_ns = -REPORT_NS
         self._next = first_number(os.getpid())
         self._look_ns = self._renew_ns = 0
 
@@ -220,14 +230,16 @@ class MirroredInjections:
         now_ns = self._now_ns()
         sent = _Sent(command, owner, CommandOutcomes(items), now_ns + FOLLOW_NS)
         with self._lock:
-            if len(self._sent) >= MAX_SENT or command.id in self._sent:
+            if command.id in self._sent:
+                return f"command {command.id} was sent already; send it again under another number"
+            if len(self._sent) >= MAX_SENT:
                 return f"too many commands wait for cell {self._cell}; wait for their outcomes"
             self._sent[command.id] = sent  # first, because events about it may come at once
         reply = self._ask(request, min(BEGIN_NS, command.deadline_ns - now_ns))
         if reply is None:
             with self._lock:
                 del self._sent[command.id]
-            return f"no message of cell {self._cell} has come yet; shmio fabric cells shows its state"
+            return f"no new message of cell {self._cell} has come yet; shmio fabric cells shows its state"
         sent.reply = reply
         reply.add_done_callback(lambda _: self._wake())
         return ""
@@ -347,7 +359,19 @@ class MirroredInjections:
         alive = [number for number, _ in some if number not in gone]
         if alive and now_ns >= self._renew_ns:
             self._renew_ns = now_ns + RENEW_NS
-            self._ask(InjectionRequest("renew", renewed=alive), BEGIN_NS)
+            reply = self._ask(InjectionRequest("renew", renewed=alive), BEGIN_NS)
+            if reply is not None:
+                reply.add_done_callback(self._on_renewed)
+
+    def _on_renewed(self, reply: Future[CommandReply]) -> None:
+        """Tell why the owner will end injections of this instance. The link's thread calls this."""
+        if reply.cancelled() or reply.exception() is not None or OutcomeKind.REJECTED not in reply.result().outcomes:
+            return
+        now_ns = time.monotonic_ns()
+        if now_ns - self._refused_ns >= REPORT_NS:
+            self._refused_ns = now_ns
+            why = next(filter(None, reply.result().reasons), "it gives no reason")
+            log.warning("cell %s does not renew the injections of this instance, so it ends them: %s", self._cell, why)
 
     # ---- in the loop's thread ------------------------------------------------------------------------------------
 
@@ -393,14 +417,23 @@ class MirroredInjections:
             for number, held in self._held.items():
                 held.seen = held.seen or number in present or now_ns - held.since_ns > UNSEEN_NS
                 held.gone_ns = 0 if number in present or not held.seen else held.gone_ns or now_ns
-        try:
-            document = encode(msgspec.json.encode(one) for one in entries)
-        except ValueError as error:
-            log.warning("the list of injections of cell %s is not shown: %s", self._cell, error)
-            return
+        document = self._document(entries)
         if document != self._shown:
             self._shown = document
             self._block.injections.write(document)
+
+    def _document(self, entries: Sequence[InjectionEntry]) -> bytes:
+        """Encode the list. If it is too long, leave out its last injections, which the owner's list still has."""
+        items = [msgspec.json.encode(one) for one in entries]
+        ends = list(accumulate(len(item) + 1 for item in items))
+        fit = bisect_right(ends, LIST_SIZE - 1)  # each item has a comma or a bracket after it, and the list one before
+        if fit < len(items) and (now_ns := self._now_ns()) - self._reported_ns >= REPORT_NS:
+            self._reported_ns = now_ns
+            log.warning(
+                "only %d of %s of cell %s are shown here, because their list is too long",
+                fit, counted(len(items), "injection"), self._cell,
+            )  # fmt: skip
+        return encode(items[:fit])
 
     def _entry(self, one: InjectionEntry) -> InjectionEntry:
         """Return an entry of the owner's list as this instance shows it. The caller holds the lock."""
@@ -428,11 +461,11 @@ class MirroredInjections:
             return running
         declaration = running.declaration
         start_s, end_s = (
-            None if time_s is None else round(max(0.0, time_s - ahead_ns / 1e9), 3)
+            None if time_s is None else round(min(max(0.0, time_s - ahead_ns / 1e9), MAX_S), 3)
             for time_s in (declaration.start_s, declaration.end_s)
         )
         declaration = msgspec.structs.replace(declaration, start_s=start_s, end_s=end_s)
-        time_ns = running.time_ns and max(1, running.time_ns - ahead_ns)
+        time_ns = running.time_ns and min(max(1, running.time_ns - ahead_ns), MAX_TIME_NS)
         return msgspec.structs.replace(running, declaration=declaration, time_ns=time_ns)
 
     def turn(self) -> None:

@@ -11,7 +11,7 @@ from typing import Final, cast
 from shmio.connectors.base import TAKEN, UnconfirmedError
 from shmio.connectors.base import Lost as LostWrite
 from shmio.connectors.commands import CommandProcessor
-from shmio.connectors.fabric.injections import BEGIN_NS, MirroredInjections
+from shmio.connectors.fabric.injections import BEGIN_NS, MAX_TIME_NS, MirroredInjections
 from shmio.connectors.fabric.link import MAX_WAITING, Link
 from shmio.connectors.fabric.order import Announced, Lost, MessageOrder, Missing, Received
 from shmio.connectors.fabric.source import Mirror
@@ -51,8 +51,6 @@ MAX_WAITING_BYTES: Final = 64 << 20
 """Maximum size of the messages that wait for the loop. It requests those that are dropped."""
 MAX_READY: Final = 64
 """Number of messages that wait to be published, after which the loop takes no further ones."""
-MAX_TIME_NS: Final = (1 << 63) - 1
-"""Latest time that a command can have; a faulty owner may send later ones."""
 MAX_MISSING: Final = (1 << 63) - 1
 """Maximum number of missing frames that is counted; a faulty owner may name larger numbers."""
 NEVER_NS: Final = -(1 << 63)
@@ -183,9 +181,7 @@ class MirrorLoop:
             self._report(error)
             return
         self._received_bytes += len(data)
-        now_ns = self._clock.now_ns()
-        late_ns = header.age_ns + self._transit.excess_ns(header, now_ns)
-        self._inbox.append(Received(header, data, now_ns, late_ns))
+        self._inbox.append(Received(header, data, self._clock.now_ns()))
         self._clock.nudge()
 
     def _told(self, one: Missing | Announced) -> None:
@@ -269,7 +265,7 @@ class MirrorLoop:
         if one.header.layout != self._layout:
             self._refuse_layout()
             return
-        late_ns = one.late_ns + (self._clock.now_ns() - one.at_ns)
+        late_ns = one.header.age_ns + self._transit.excess_ns(one.header, one.at_ns) + self._clock.now_ns() - one.at_ns
         if one.header.zero_ns != self._zero_ns:
             # The owner was started again, and numbers its frames from 1.
             self._zero_ns, self._number = one.header.zero_ns, 0
@@ -433,9 +429,11 @@ class MirrorLoop:
     # ---- commands ------------------------------------------------------------------------------------------------
 
     def _ask_state(self, now_ns: int) -> None:
-        """Ask for the owner's injections until they are known: there may be some that do not change."""
-        newest = self._order.newest
-        known = newest is not None and newest.header.stream == self._state_of
+        """Ask for the owner's injections until they are known: there may be some that do not change.
+
+        The answer also tells the clock of an uplink that was restarted and has nothing else to publish.
+        """
+        known = self._state_of == self._order.stream != 0
         if not known and self._link.connected and now_ns - self._state_ns >= STATE_NS:
             self._state_ns = now_ns
             self._link.request_state()
@@ -447,14 +445,13 @@ class MirrorLoop:
     def _command(
         self, writes: list[WriteItem], injection: InjectionRequest | None = None, begin_ns: int = BEGIN_NS
     ) -> Future[CommandReply] | None:
-        """Send a command; return None if no message of the owner has come yet."""
-        newest = self._order.newest
-        if newest is None:
+        """Send a command; return None if the owner's clock is not known yet."""
+        usual = self._transit.usual
+        if usual is None:
             return None
-        header = newest.header
-        owner_ns = header.made_ns + header.age_ns + self._clock.now_ns() - newest.at_ns
-        expires_ns = min(owner_ns + begin_ns, MAX_TIME_NS)
-        return self._link.command(CommandRequest(expires_ns, header.stream, self._layout, writes, injection), ANSWER_S)
+        stream, taken_ns = usual
+        expires_ns = min(self._clock.now_ns() - taken_ns + begin_ns, MAX_TIME_NS)
+        return self._link.command(CommandRequest(expires_ns, stream, self._layout, writes, injection), ANSWER_S)
 
     def _carry_out(self) -> None:
         try:
@@ -465,7 +462,7 @@ class MirrorLoop:
     def _send(self, writes: Sequence[Write]) -> Sequence[str] | None:
         self._reply = self._command([WriteItem(*write) for write in writes])
         if self._reply is None:
-            return ["no message of the owner has come yet"] * len(writes)
+            return ["no new message of the owner has come yet"] * len(writes)
         self._reply.add_done_callback(lambda _: self._clock.nudge())
         return None
 
@@ -494,28 +491,50 @@ class _Transit:
     """Finds how much longer than usual a message was on its way, without equal clocks on both hosts.
 
     The usual time is the shortest of the last ``WINDOW_NS`` to twice that. If the owner's clock is set
-    back, messages seem to be late for that long.
+    back, messages seem to be late for that long. One message that is much faster than usual does not
+    count, because it may be false; if the next one is as fast, the owner's clock was set forward.
     """
 
     WINDOW_NS: Final = 30_000_000_000
+    STEP_NS: Final = 500_000_000
 
     def __init__(self) -> None:
         self._stream = 0
         self._begun_ns = 0
         self._before: int | None = None  # shortest time in the window before
         self._least: int | None = None  # shortest time in this window
+        self._doubtful: int | None = None  # the time of the last message, if it did not count
+        self.usual: tuple[int, int] | None = None
+        """The stream of the last message that counted, and the usual time, in ns.
+
+        The owner's clock is this clock less that time. None: no new message has come yet.
+        """
 
     def excess_ns(self, header: Header, at_ns: int) -> int:
-        """Return the extra time in ns of a message that came at ``at_ns``."""
+        """Return the extra time in ns of a message of the owner that came at ``at_ns``."""
         taken_ns = at_ns - header.made_ns - header.age_ns
         if header.stream != self._stream:
             self._stream, self._begun_ns, self._before, self._least = header.stream, at_ns, None, None
+            self._doubtful = None
         elif at_ns - self._begun_ns >= self.WINDOW_NS:
             self._begun_ns, self._before, self._least = at_ns, self._least, None
         if not header.age_ns:  # the age of a late message is not that exact
-            self._least = taken_ns if self._least is None else min(self._least, taken_ns)
-        known = [least for least in (self._before, self._least) if least is not None]
-        return max(0, taken_ns - min(known)) if known else 0
+            self._measure(taken_ns)
+        usual_ns = self._usual_ns
+        return 0 if usual_ns is None else max(0, taken_ns - usual_ns)
+
+    @property
+    def _usual_ns(self) -> int | None:
+        return min((least for least in (self._before, self._least) if least is not None), default=None)
+
+    def _measure(self, taken_ns: int) -> None:
+        usual_ns, doubtful, self._doubtful = self._usual_ns, self._doubtful, None
+        fast = usual_ns is not None and taken_ns < usual_ns - self.STEP_NS
+        if fast and (doubtful is None or abs(taken_ns - doubtful) > self.STEP_NS):
+            self._doubtful = taken_ns
+            return
+        self._least = taken_ns if self._least is None else min(self._least, taken_ns)
+        self.usual = self._stream, taken_ns if usual_ns is None else min(usual_ns, taken_ns)
 
 
 class _Pace:

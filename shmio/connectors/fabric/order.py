@@ -28,14 +28,12 @@ class Received(NamedTuple):
         header: Its header.
         data: All its bytes.
         at_ns: When it was received, on CLOCK_MONOTONIC, in ns.
-        late_ns: Its age in ns when it was received.
 
     """
 
     header: Header
     data: bytes
     at_ns: int
-    late_ns: int = 0
 
 
 class Lost(NamedTuple):
@@ -54,10 +52,13 @@ class Missing(NamedTuple):
 
 
 class Announced(NamedTuple):
-    """What the owner's entry in the registry says: its stream, the last number in it, and when this came, in ns."""
+    """What the owner's entry in the registry says: its stream, the last number in it, and when this came, in ns.
+
+    The number is None if the entry does not tell it.
+    """
 
     stream: int
-    number: int
+    number: int | None
     at_ns: int
 
 
@@ -81,8 +82,11 @@ class MessageOrder:
         self._held_bytes = 0
         self._progress_ns = 0
         self._asked_ns: int | None = None
-        self.newest: Received | None = None
-        """The last message that was made; None before the first."""
+
+    @property
+    def stream(self) -> int:
+        """The owner's stream: that of the registry, or as long as it says nothing, that of the messages; 0: none."""
+        return self._stream if self._announced is None else self._announced.stream
 
     @property
     def waiting(self) -> bool:
@@ -104,12 +108,9 @@ class MessageOrder:
                     del self._old[next(iter(self._old))]
             self._next = self._old.pop(header.stream, begin)
             self._stream, self._doubt = header.stream, None
-            self.newest = None  # a restart of the owner may have set its clock back
             self._progress_ns, self._asked_ns = message.at_ns, None
         if header.number < self._next or header.number in self._held or self._is_absurd(message):
             return found
-        if self.newest is None or header.made_ns >= self.newest.header.made_ns:
-            self.newest = message
         if not self._held:
             self._progress_ns = message.at_ns
         if header.number < max(self._held, default=header.number):
@@ -129,6 +130,8 @@ class MessageOrder:
         after those that the owner has made.
         """
         self._announced = announced
+        if announced.number is None:
+            return
         if announced.stream != self._stream or announced.number >= self._next - 1:
             self._doubt = None
         elif self._doubt is None or announced.number >= self._doubt[1] - 1:
@@ -136,7 +139,7 @@ class MessageOrder:
         elif announced.at_ns - self._doubt[0] >= PATIENCE_NS:
             self._held.clear()
             self._held_bytes = 0
-            self._next, self._doubt, self.newest = announced.number + 1, None, None
+            self._next, self._doubt = announced.number + 1, None
 
     def _is_owners(self, stream: int) -> bool:
         """Return whether to follow another stream: that of the registry, or as long as it says nothing, a new one."""
@@ -146,7 +149,9 @@ class MessageOrder:
 
     def _is_absurd(self, message: Received) -> bool:
         known = self._announced
-        if known is None or known.stream != self._stream or message.at_ns - known.at_ns > FRESH_NS:
+        if known is None or known.number is None:
+            return False
+        if known.stream != self._stream or message.at_ns - known.at_ns > FRESH_NS:
             return False
         return message.header.number > max(known.number, self._next) + MAX_AHEAD
 

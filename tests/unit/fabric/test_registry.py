@@ -14,7 +14,7 @@ import zstandard
 from shmio.errors import ConflictError, RemoteError
 from shmio.fabric import registry as module
 from shmio.fabric.connection import Access, connect
-from shmio.fabric.registry import LAYOUTS, MAX_LAYOUT_BYTES, CellEntry, Registry
+from shmio.fabric.registry import LAYOUTS, MAX_LAYOUT_BYTES, CellEntry, Registry, SourceEntry
 from shmio.layout.model import Layout, Register
 from tests.nats_server import nats_server
 
@@ -134,3 +134,10 @@ def test_damaged_layouts_are_refused(run: Run, url: str, data: bytes, why: str) 
             await registry.layout(digest)
 
     run(work)
+
+
+def test_a_source_of_an_uplink_that_numbers_nothing_has_no_number() -> None:
+    entry = {"name": "cell", "layout": "00", "period_ns": 1, "stale_ns": 2, "stream": 7}
+    assert msgspec.convert(entry, SourceEntry).number is None
+    with pytest.raises(msgspec.ValidationError, match="number"):
+        msgspec.convert(entry | {"number": -1}, SourceEntry)

@@ -71,6 +71,7 @@ class FakeLink:
         self.sent = threading.Semaphore(0)
         self.silent = False
         self.number = self.states = 0
+        self.states_asked = threading.Event()
 
     @property
     def connected(self) -> bool:
@@ -88,6 +89,7 @@ class FakeLink:
 
     def request_state(self) -> None:
         self.states += 1
+        self.states_asked.set()
 
     def command(self, request: CommandRequest, timeout_s: float) -> Future[CommandReply]:
         assert timeout_s > 0

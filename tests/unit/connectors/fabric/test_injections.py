@@ -13,15 +13,16 @@ from shmio.fabric.messages import CommandReply, CommandRequest, InjectionRequest
 from shmio.local.writer import PendingCommand, SourceWriter
 from shmio.model.clock import ClockMode
 from shmio.model.injection import Running
-from shmio.segment import NO_WRITER, Event, EventKind, Write
+from shmio.segment import NO_WRITER, CommandKind, Event, EventKind, Write
 from shmio.segment.commands import Direction
-from shmio.segment.injection_list import InjectionEntry
+from shmio.segment.injection_list import LIST_SIZE, InjectionEntry
 from tests.unit.connectors.fabric.harness import PATIENCE_S, Mirroring, S, frame
 
 WRITER: Final = 0
 OTHER: Final = [Write(2, 0, b"\xff\xff")]
 OWNERS: Final = {"writer": 3, "pid": 99}
 """The process of the uplink, in the owner's list and events."""
+RUNNING: Final = Running(Declaration(name="b", target="a50/count", operation="flip", start_s=1.0), "active", 1)
 
 
 def entry(number: int, **more: Any) -> InjectionEntry:
@@ -169,6 +170,18 @@ def test_injections_are_renewed_until_their_program_ends(mirroring: Mirroring) -
     assert all(one.injection is None or one.injection.kind != "renew" for one in mirroring.link.commands)
 
 
+def test_refused_renewals_are_reported_once(
+    mirroring: Mirroring, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(injections, "RENEW_NS", 0)
+    number = injected(mirroring, writer_of(mirroring)).number
+    mirroring.link.reply = CommandReply(["rejected"], ["the role is missing"])
+    for _ in range(2):
+        assert sent(mirroring, "renew").renewed == [number]
+    assert sent(mirroring, "renew").renewed == [number]  # the second reply was evaluated
+    assert ["the role is missing" in one for one in caplog.messages].count(True) == 1
+
+
 def test_an_injection_that_stays_is_not_renewed(mirroring: Mirroring) -> None:
     writer = writer_of(mirroring)
     injected(mirroring, writer, keep=True)
@@ -200,9 +213,35 @@ def test_the_list_has_the_injections_of_all_cells(mirroring: Mirroring) -> None:
     assert (second.number, second.cell, second.configured) == (6, "plant1.line3.a50", True)
 
 
+def test_as_many_injections_as_fit_are_shown(mirroring: Mirroring, caplog: pytest.LogCaptureFixture) -> None:
+    many = [entry(number, name="n" * 500) for number in range(5, 105)]
+    for _ in range(2):
+        mirroring.link.send(mirroring.link.state(state(*many)))
+    mirroring.send(frame(7, 1))
+    mirroring.next()
+    found = mirroring.block.injections.read()
+    assert [one.number for one in found] == list(range(5, 5 + len(found)))
+    assert len(msgspec.json.encode(found)) <= LIST_SIZE < len(msgspec.json.encode([*found, found[0]]))
+    assert [f"only {len(found)} of 100 injections" in one for one in caplog.messages].count(True) == 1
+
+
+def test_a_number_is_sent_once(mirroring: Mirroring) -> None:
+    writer = writer_of(mirroring)
+    ticket = writer.ask_to_inject(OTHER)
+    sent(mirroring, "inject")
+    writer.forward(ticket.number, CommandKind.INJECT, OTHER, 1.0)
+    found = mirroring.event(EventKind.REJECTED)
+    assert (found.command, "another number" in found.text) == (ticket.number, True)
+
+
 def test_the_state_is_asked_for_until_it_comes(mirroring: Mirroring) -> None:
     writer_of(mirroring)
     assert mirroring.link.states >= 1
+
+
+def declared(**more: Any) -> Declaration:
+    """Return a declaration as a faulty owner may send it."""
+    return msgspec.structs.replace(RUNNING.declaration, **more)
 
 
 def declare(mirroring: Mirroring, **more: Any) -> SourceWriter:
@@ -244,6 +283,43 @@ def test_a_faulty_declaration_is_rejected_here(mirroring: Mirroring, faulty: dic
     declare(mirroring, **faulty)
     assert words in mirroring.event(EventKind.REJECTED).text
     assert mirroring.link.commands == []
+
+
+@pytest.mark.parametrize(
+    "faulty",
+    [
+        {"number": 1 << 64},
+        {"writer": 1 << 32},
+        {"pid": -1},
+        {"priority": 1 << 31},
+        {"direction": "up"},
+        {"running": msgspec.structs.replace(RUNNING, state="unheard of")},
+        {"running": msgspec.structs.replace(RUNNING, runs=10**400)},
+        {"running": msgspec.structs.replace(RUNNING, time_ns=1 << 63)},
+        {"running": msgspec.structs.replace(RUNNING, declaration=declared(times=10**400))},
+        {"running": msgspec.structs.replace(RUNNING, declaration=declared(bits=[1 << 32]))},
+        {"clock_ns": 10**400},
+    ],
+    ids=lambda faulty: next(iter(faulty)),
+)
+def test_a_state_with_a_number_that_is_too_large_changes_nothing(mirroring: Mirroring, faulty: dict[str, Any]) -> None:
+    more: dict[str, Any] = {"number": 5, "running": RUNNING, "clock_ns": S} | faulty
+    clock_ns, number = more.pop("clock_ns"), more.pop("number")
+    one = entry(number, **more)
+    mirroring.link.send(mirroring.link.state(state(one, clock_ns=clock_ns)))
+    mirroring.send(frame(7, 1))
+    assert mirroring.next().cycle == 1007
+    assert mirroring.block.injections.read() == ()
+
+
+def test_a_clock_far_away_gives_times_that_the_list_can_have(mirroring: Mirroring) -> None:
+    running = msgspec.structs.replace(RUNNING, time_ns=(1 << 63) - 1)
+    mirroring.link.send(mirroring.link.state(state(entry(5, running=running), clock_ns=-(1 << 63))))
+    mirroring.send(frame(7, 1))
+    mirroring.next()
+    [found] = mirroring.block.injections.read()
+    assert found.running is not None
+    assert (found.running.declaration.start_s, found.running.time_ns) == (1e9, (1 << 63) - 1)
 
 
 def test_a_malformed_state_changes_nothing(mirroring: Mirroring) -> None:

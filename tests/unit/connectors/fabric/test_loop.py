@@ -8,7 +8,7 @@ import pytest
 
 from shmio.connectors.fabric.order import Announced, Missing
 from shmio.errors import CommandError
-from shmio.fabric.messages import CommandReply, encode_command
+from shmio.fabric.messages import CommandReply, SourceState, encode_command
 from shmio.local.writer import SourceWriter
 from shmio.recording.format.encoding import Gap, Reason
 from shmio.segment import (
@@ -73,6 +73,52 @@ def test_messages_that_were_long_on_their_way_are_late(mirroring: Mirroring) -> 
     assert mirroring.block.assess(late)[0] is Quality.BAD
     mirroring.send(frame(11, 3), made_ns=time.time_ns() + ahead_ns)
     assert mirroring.next().delay_us < 1_000_000
+
+
+def test_false_times_in_the_owners_name_change_neither_ages_nor_deadlines(mirroring: Mirroring) -> None:
+    later_ns = time.time_ns() + 3600 * S
+    mirroring.send(frame(7, 1))
+    mirroring.next()
+    mirroring.event(EventKind.QUALITY)
+    mirroring.link.answered(Announced(STREAM, 1, time.monotonic_ns()))
+    mirroring.link.number = 0
+    mirroring.send(frame(8, 66), made_ns=later_ns)  # its number was delivered
+    mirroring.send(frame(8, 66), made_ns=1, stream=STREAM + 1)  # the owner has another stream
+    mirroring.link.number = 1
+    mirroring.send(frame(8, 2), made_ns=later_ns)  # only its time is false
+    mirroring.send(frame(9, 3))
+    mirroring.send(frame(10, 4), made_ns=time.time_ns() - 20 * S)
+    assert [mirroring.next().delay_us < 1_000_000 for _ in range(3)] == [True, True, False]
+    mirroring.link.reply = CommandReply(["written"], [""])
+    SourceWriter(mirroring.block, 0).write({"count": 77})
+    assert mirroring.link.commands[0].expires_ns < later_ns
+
+
+def test_an_owner_whose_clock_was_set_forward_is_up_to_date(mirroring: Mirroring) -> None:
+    mirroring.send(frame(7, 1))
+    for number in range(8, 11):
+        mirroring.send(frame(number, 1), made_ns=time.time_ns() + 3600 * S)
+    mirroring.send(frame(11, 1))
+    assert [mirroring.next().delay_us < 1_000_000 for _ in range(5)] == [True, True, True, True, False]
+
+
+def test_a_restarted_uplink_that_publishes_nothing_is_asked_for_its_state(
+    mirroring: Mirroring, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without it, commands would name the stream of the earlier uplink."""
+    monkeypatch.setattr("shmio.connectors.fabric.loop.STATE_NS", 0)
+    mirroring.send(frame(7, 1))
+    mirroring.link.send(mirroring.link.state(SourceState((), S, False)))
+    mirroring.next()
+    mirroring.send(frame(8, 1))
+    mirroring.next()
+    states = mirroring.link.states
+    mirroring.link.states_asked.clear()
+    mirroring.send(frame(9, 1))
+    mirroring.next()
+    assert mirroring.link.states == states  # the state of this stream is known
+    mirroring.link.answered(Announced(STREAM + 1, 0, time.monotonic_ns()))
+    assert mirroring.link.states_asked.wait(PATIENCE_S)
 
 
 def test_late_frames_do_not_open_the_source_for_writes(mirroring: Mirroring) -> None:

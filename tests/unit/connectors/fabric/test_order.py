@@ -157,12 +157,22 @@ def test_any_order_of_arrival_is_delivered_in_order_once_with_exact_losses(seed:
     assert {one for one in numbers(found) if isinstance(one, int)} == {1, *kept}
 
 
-def test_an_owner_that_was_restarted_with_an_earlier_clock_has_the_newest_message() -> None:
+def test_the_registry_names_the_owners_stream_before_its_first_message() -> None:
     order = MessageOrder()
+    assert order.stream == 0
     order.add(message(9000))
-    order.add(message(1, stream=8))
-    assert order.newest is not None
-    assert order.newest.header.stream == 8
+    assert order.stream == 7
+    order.announce(Announced(8, 0, 0))
+    assert order.stream == 8
+
+
+def test_an_entry_without_a_number_does_not_repeat_messages() -> None:
+    order = MessageOrder()
+    for turn in range(8):
+        assert numbers(order.add(message(1 + turn, at_ns=turn * 2 * S))) == [1 + turn]
+        order.announce(Announced(7, None, turn * 2 * S))
+    assert order.add(message(1, at_ns=16 * S)) == []
+    assert order.add(message(1 << 40, at_ns=16 * S)) == []  # nothing bounds the numbers
 
 
 def test_a_message_of_a_stream_that_the_registry_does_not_name_is_ignored() -> None:
