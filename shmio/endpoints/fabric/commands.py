@@ -20,7 +20,6 @@ from shmio.endpoints.fabric.injections import (
     Lease,
     Leases,
     StateFeed,
-    covers_only_published,
     declaration_refusal,
     decode_declaration,
 )
@@ -71,10 +70,10 @@ log = logging.getLogger("shmio.fabric")
 class CommandClient:
     """Sends commands to one source. Use it only in the event loop's thread."""
 
-    def __init__(self, feed: Feed, writer: int) -> None:
+    def __init__(self, feed: Feed, writer: int, feeds: Mapping[str, Feed]) -> None:
         self.block = feed.block
         self.leases = Leases(feed.block, writer)
-        self.state = StateFeed(feed, self.leases)
+        self.state = StateFeed(feed, self.leases, feeds)
         self._source_writer = SourceWriter(feed.block, writer)
         self._in_flight = InFlightTable(writer)
         self._events = feed.block.events.cursor()
@@ -317,7 +316,7 @@ class CommandReceiver:
             return "the injection covers registers that this cell does not publish of the source"
         if request.kind in ("lift", "shadow") and feed.partial:
             found = [one for one in feed.block.injections.read() if one.number == request.injection]
-            if not all(covers_only_published(one, feed) for one in found):
+            if not all(feed.covers(one.ranges) for one in found):
                 return (
                     "the injection also covers registers that this cell does not publish; only its owner can change it"
                 )
@@ -381,7 +380,7 @@ class CommandReceiver:
         """Return the client that sends commands to a source, and knows its injections."""
         section = feed.block.section
         if section not in self._clients:
-            self._clients[section] = CommandClient(feed, self._writer)
+            self._clients[section] = CommandClient(feed, self._writer, self._feeds)
         return self._clients[section]
 
     def remove(self, block: Block) -> None:

@@ -5,7 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from fnmatch import fnmatchcase
+from itertools import islice, pairwise
 from typing import Final, NamedTuple
+
+import numpy as np
 
 from shmio.config.model import FabricRule
 from shmio.fabric.messages import MAX_ENTRY_BYTES, PREFERRED_BYTES, Entry, encode_entries
@@ -14,13 +17,17 @@ from shmio.layout.values.write import Write, covering
 from shmio.recording.block_follower import BlockFollower
 from shmio.recording.format.encoding import BlockPosition, Gap, Reason
 from shmio.recording.selection import Selection
-from shmio.segment import Block, Frame
+from shmio.segment import Block, Event, EventKind, Frame
 from shmio.segment.doorbell import TURN_NS
 
+MAX_RANGES: Final = 256
+"""Maximum number of ranges that are published of an injection if only some registers are published."""
 MAX_ENTRIES: Final = 32
 """Maximum number of entries that are read before the uplink does other work."""
 FIRST_RULE: Final = FabricRule(match="*")
 """The rule for sources that no rule of the configuration matches: publish all frames."""
+
+Ranges = Sequence[tuple[int, int, int]]
 
 
 def rule_for(rules: Sequence[FabricRule], source: str) -> FabricRule:
@@ -52,6 +59,7 @@ class Feed:
         sources: Collection[str],
         started_utc_ns: int,
         place: BlockPosition,
+        writer: int,
     ) -> None:
         """Create the feed. For a large layout this takes seconds.
 
@@ -61,9 +69,10 @@ class Feed:
             sources: Names of all sources of the instance.
             started_utc_ns: Time of messages when the instance's clock was 0, in ns.
             place: Position after which to begin.
+            writer: Number of the command queue for the commands of other cells.
 
         """
-        self.block = block
+        self.block, self._writer = block, writer
         part = Selection(None, rule.registers).part(block, sources)
         self.empty = part is None
         """True if the rule publishes no register of the source."""
@@ -118,12 +127,36 @@ class Feed:
         """True if only some registers are published."""
         return self._visible is not None
 
-    def shows(self, ranges: Iterable[tuple[int, int, int]]) -> bool:
-        """Return whether any of these bits are published. A range is (offset, size in bytes, mask)."""
-        visible = self._visible
-        return visible is None or any(
-            mask & bits for offset, size, mask in ranges for bits in visible[offset : offset + size]
-        )
+    def published(self, ranges: Ranges) -> Ranges:
+        """Return the bits of these that are published. A range is (offset, size in bytes, mask).
+
+        These are at most the first ``MAX_RANGES`` ranges.
+        """
+        if self._visible is None:
+            return ranges
+        bits = np.zeros(len(self._visible), np.uint8)
+        for offset, size, mask in ranges:
+            bits[offset : offset + size] |= mask
+        bits &= np.frombuffer(self._visible, np.uint8)
+        places = [0, *map(int, np.flatnonzero(np.diff(bits)) + 1), len(bits)]
+        found = ((start, stop - start, int(bits[start])) for start, stop in pairwise(places))
+        return tuple(islice((one for one in found if one[2]), MAX_RANGES))
+
+    def covers(self, ranges: Ranges) -> bool:
+        """Return whether all of these bits are published."""
+        return all(self.publishes([Write(offset, mask, bytes(size))]) for offset, size, mask in ranges)
+
+    def _cleared(self, event: Event) -> Event:
+        """Return an event without what it says about registers that are not published.
+
+        Other cells know the data and the reasons of their own commands.
+        """
+        if self._visible is None or event.writer == self._writer:
+            return event
+        if event.kind == EventKind.INJECTED:  # its data describe the injection; the state has what is published
+            return event._replace(data=b"", size=0)
+        shown = not event.size or self.covers([(event.offset, event.size, event.mask or 0xFF)])
+        return event if shown else event._replace(data=b"", text="")
 
     def read(self) -> tuple[list[Batch], bool]:
         """Read new entries; return them in batches, and whether more are waiting."""
@@ -140,6 +173,8 @@ class Feed:
             else:
                 if isinstance(item, Gap):
                     self.missed += item.count
+                else:
+                    item = self._cleared(item)  # noqa: PLW2901
                 entries.append((item, self._before))
         if not taken and self._held is not None and time.monotonic_ns() - self._published_ns >= self._pause_ns:
             entries += ((frame, self._before) for frame in self._publish(self._held))

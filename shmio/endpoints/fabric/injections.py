@@ -12,10 +12,12 @@ import msgspec
 from shmio.config import Declaration
 from shmio.config.declaration import check_declarations
 from shmio.endpoints.fabric.feed import Feed
-from shmio.errors import ConfigError
+from shmio.errors import ConfigError, PathError
 from shmio.fabric.messages import SourceState
 from shmio.injection import compile_program
-from shmio.layout.values.write import Write
+from shmio.injection.language import Reference, nodes, parse_condition
+from shmio.layout.topic import find, parse_topic
+from shmio.layout.values.write import Write, paths_of
 from shmio.segment import Block
 from shmio.segment.injection_list import InjectionEntry
 
@@ -23,6 +25,8 @@ LEASE_S: Final = 5.0
 """Time in s without a renewal after which an injection of another cell is lifted."""
 CHECK_S: Final = 0.4
 """Interval in s for checking the leases."""
+MAX_TARGETS: Final = 64
+"""Maximum number of registers that an incomplete declaration names."""
 ASKED_S: Final = 1.0
 """Minimum interval in s between two states that mirrors have asked for: each goes to all mirrors."""
 
@@ -113,8 +117,9 @@ class Leases:
 class StateFeed:
     """Follows the list of a source's injections and the mode of the clock."""
 
-    def __init__(self, feed: Feed, leases: Leases) -> None:
-        self._feed, self._leases = feed, leases
+    def __init__(self, feed: Feed, leases: Leases, feeds: Mapping[str, Feed]) -> None:
+        """Follow the source of a feed; ``feeds`` are those of all published sources."""
+        self._feed, self._leases, self._feeds = feed, leases, feeds
         self._block = feed.block
         self._seen: tuple[int, bool] = (0, False)  # a source that has no injection yet publishes nothing
         self._asked_s = -ASKED_S
@@ -139,12 +144,40 @@ class StateFeed:
         if asked:
             self._asked_s = now_s
         self._seen, self.wanted = seen, self.wanted and not asked
-        entries = [
-            msgspec.structs.replace(one, cell=self._leases.sender_of(one.number))
-            for one in present
-            if self._feed.shows(one.ranges)
-        ]
+        entries = [entry for one in present if (entry := self._published(one)) is not None]
         return SourceState(tuple(entries), self._block.clock.present_ns(), virtual)
+
+    def _published(self, one: InjectionEntry) -> InjectionEntry | None:
+        """Return what other cells may know of an injection; None: nothing.
+
+        These are the published bits that it covers, and the declaration if it names only what is
+        published. Otherwise the declaration says only which published registers the injection changes.
+        """
+        feed, running, cell = self._feed, one.running, self._leases.sender_of(one.number)
+        ranges = tuple(feed.published(one.ranges))
+        if not ranges:
+            return None
+        if running is not None and not cell and not (feed.covers(one.ranges) and self._knows(running.declaration)):
+            own = running.declaration
+            covered = [Write(offset, 0 if mask == 0xFF else mask, bytes(size)) for offset, size, mask in ranges]
+            paths = [f"{self._block.source}/{path}" for path in paths_of(feed.layout, covered, MAX_TARGETS)]
+            shown = Declaration(name=own.name, target=paths, operation=own.operation, priority=own.priority)
+            running = msgspec.structs.replace(running, declaration=shown)
+        return msgspec.structs.replace(one, cell=cell, ranges=ranges, running=running)
+
+    def _knows(self, declaration: Declaration) -> bool:
+        """Return whether a condition reads only registers that are published."""
+        if declaration.when is None:
+            return True
+        default = self._block.source if len(self._feeds) == 1 else None
+        try:
+            for one in nodes(parse_condition(declaration.when)):
+                if isinstance(one, Reference):
+                    topic = parse_topic(one.path, self._feeds, default)
+                    find(self._feeds[topic.source].layout, topic.path)
+        except (ConfigError, PathError, KeyError):
+            return False
+        return True
 
 
 def declaration_refusal(data: bytes, own: Feed, feeds: Mapping[str, Feed]) -> str:
@@ -175,8 +208,3 @@ def declaration_refusal(data: bytes, own: Feed, feeds: Mapping[str, Feed]) -> st
     if not own.publishes(Write(at, bits, bits.to_bytes()) for at, bits in enumerate(cover) if bits):
         return "target: it covers registers that this cell does not publish; name the registers one by one"
     return ""
-
-
-def covers_only_published(one: InjectionEntry, feed: Feed) -> bool:
-    """Return whether an injection covers only registers that are published, so that other cells may change it."""
-    return all(feed.publishes([Write(offset, mask, bytes(size))]) for offset, size, mask in one.ranges)

@@ -94,6 +94,7 @@ class Uplink:
         self._segment, self._settings = segment, settings
         if slot.writer is None:
             raise SegmentError("the segment has no command queue for this process")
+        self._writer = slot.writer
         self._feeds: dict[str, Feed] = {}
         self.commands = CommandReceiver(
             self.cell,
@@ -176,7 +177,7 @@ class Uplink:
         # A block of a reload is published from its first frame on.
         place = BlockPosition(block.ring.head(), block.events.head()) if self._first else BlockPosition()
         rule = rule_for(self._settings.rule, block.source)
-        return Feed(block, rule, sources, self._segment.header.started_utc_ns, place)
+        return Feed(block, rule, sources, self._segment.header.started_utc_ns, place, self._writer)
 
     def _add(self, feeds: list[Feed]) -> None:
         self._first = False

@@ -32,10 +32,12 @@ from shmio.fabric.messages import (
     decode_state,
     encode_command,
 )
-from shmio.segment import Event, EventKind, Segment
+from shmio.layout.values.write import Write
+from shmio.local.writer import SourceWriter
+from shmio.segment import CommandKind, Event, EventKind, Segment
 from tests.nats_server import NatsServer
 from tests.unit.endpoints.fabric.harness import CELL, TIMEOUT_S, Listener, decoded, in_loop, listening, until, uplink
-from tests.unit.endpoints.plant import Plant
+from tests.unit.endpoints.plant import GUEST, Plant
 
 ALLOW = [FabricAllow(sender="plant1.*.twin", roles=["inject"]), FabricAllow(sender="plant1.*.*", roles=["write"])]
 TWIN = "plant1.line1.twin"
@@ -207,6 +209,42 @@ async def test_only_what_is_published_is_changed_and_read(segment: Segment, serv
 
 
 @in_loop
+async def test_what_is_not_published_does_not_leave_through_injections(
+    segment: Segment, server: NatsServer, plant: Plant
+) -> None:
+    """A program of the owner's host injects into registers of which only one is published."""
+    rule = FabricRule(match="cell", registers=["cell/other"])
+    own = SourceWriter(segment.blocks["cell"], GUEST)
+    values = {"name": "one", "target": "cell/**", "operation": "set", "value": 9, "when": "cell/count = 4711"}
+    declaration = msgspec.json.encode(msgspec.convert(values, Declaration))
+    async with injector(segment, server.url, rule=[rule]), listening(server.url) as listener:
+        own.forward(NUMBER, CommandKind.DECLARE, [Write(0, 0, declaration)], 20.0, 0, keep=True)
+        [entry] = (await next_state(listener)).injections
+        assert (entry.name, entry.ranges) == ("one", ((4, 4, 0xFF),))
+        assert entry.running is not None
+        assert msgspec.json.encode(entry.running.declaration) == msgspec.json.encode(
+            Declaration(name="one", target=["cell/other"], operation="set")
+        )
+        for number, when in enumerate(("cell/count = 4711", "cell/other = 4711"), NUMBER + 10):
+            more = {"name": f"n{number}", "target": "cell/other", "when": when}
+            declaration = msgspec.json.encode(msgspec.convert(values | more, Declaration))
+            own.forward(number, CommandKind.DECLARE, [Write(0, 0, declaration)], 20.0, 0, keep=True)
+        while len(entries := (await next_state(listener)).injections) < 3:
+            pass
+        shown = {one.number: one.running.declaration.when for one in entries if one.running is not None}
+        assert shown == {NUMBER: None, NUMBER + 10: None, NUMBER + 11: "cell/other = 4711"}
+        own.forward(NUMBER + 1, CommandKind.INJECT, [Write(0, 0, b"\xff" * 8)], 20.0, 0, name="two", keep=True)
+        shadow = [Write(0, 0, b"\0\0\x12\x67"), Write(4, 0, b"\0\0\0\7")]
+        own.forward(NUMBER + 2, CommandKind.SHADOW, shadow, 20.0, NUMBER + 1)
+        data: dict[tuple[int, int], bytes] = {}
+        while (EventKind.SHADOWED, 4) not in data:
+            message = decoded(await listener.queue.get())
+            data |= {(one.kind, one.offset): one.data for one in message.entries if isinstance(one, Event)}
+        assert data[EventKind.INJECTED, 0] == b""
+        assert (data[EventKind.SHADOWED, 0], data[EventKind.SHADOWED, 4]) == (b"", b"\0\0\0\7")
+
+
+@in_loop
 async def test_a_mirror_gets_the_state_that_it_asks_for(segment: Segment, server: NatsServer, plant: Plant) -> None:
     async with injector(segment, server.url) as twin:
         await twin.declare()
@@ -287,7 +325,8 @@ async def test_a_restored_injection_is_lifted_unless_a_cell_renews_it(
         processor = plant.commands.injections
         with plant.output.lock:
             saved = processor.save()
-        await until(lambda: twin.present == [])
+        await until(lambda: NUMBER not in twin.leases and NUMBER + 1 not in twin.leases)
+        assert twin.present == []
         restore = processor.prepare_restore(saved, processor.injections.now, plant.output.base)
         with plant.output.lock:
             restore()

@@ -9,12 +9,14 @@ from dataclasses import replace
 
 import nats
 import pytest
+from nats.aio.msg import Msg
 
 from shmio.config.model import FabricRule
 from shmio.endpoints.fabric.uplink import Uplink
 from shmio.errors import ConfigError
 from shmio.fabric.connection import Access, connect
 from shmio.fabric.registry import Registry
+from shmio.fabric.tasks import end
 from shmio.segment import BlockSpec, Frame, ProcessSpec, Quality, Segment
 from tests.nats_server import NatsServer, link
 from tests.unit.endpoints.fabric.harness import (
@@ -315,3 +317,31 @@ async def test_a_reply_that_the_server_does_not_take_does_not_keep_the_uplink_fr
         monkeypatch.setattr(Uplink, "_send_reply", never)
         found._reply("_INBOX.any", b"")
     assert not found._replies
+
+
+@in_loop
+async def test_a_cancellation_that_comes_with_a_reply_ends_the_uplink(
+    segment: Segment, server: NatsServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Python 3.11 loses such a cancellation."""
+    found = new_uplink(segment, server.url)
+    await found.start()
+    task = asyncio.create_task(found.run())
+    await until(lambda: found.publisher.up and not found.problem)
+    client = found._client
+    assert client is not None
+    ended = asyncio.Event()
+    take = client._request_sub_callback
+
+    async def end_too(message: Msg) -> None:
+        await take(message)
+        await end(task)
+        ended.set()
+
+    for one in client._subs.values():
+        if one._cb == take:
+            monkeypatch.setattr(one, "_cb", end_too)
+    found._changed.set()  # the uplink renews its entry
+    async with asyncio.timeout(TIMEOUT_S):
+        await ended.wait()
+    await found.close()
