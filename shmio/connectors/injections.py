@@ -12,7 +12,7 @@ import secrets
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 import numpy as np
@@ -35,15 +35,19 @@ from shmio.connectors.injection_state import LayerState, check_configured, make_
 from shmio.connectors.output import Image, LayerPublisher, Output, in_parts, layer_event, lost, pieces
 from shmio.errors import ConfigError, SegmentError, SnapshotError
 from shmio.injection import Program, compile_program
-from shmio.injection._numbers import hold
+from shmio.injection._numbers import evaluate_all
 from shmio.injection.activation import State
-from shmio.injection.program import NEVER, compile_condition
+from shmio.injection.program import NEVER, Condition, compile_condition
+from shmio.layout.model import Layout
 from shmio.layout.values.write import Write, apply
 from shmio.model.injection import Running
 from shmio.segment import NO_WRITER, Block, Command, CommandKind, Direction, EventKind, Frame, Quality, Record, Segment
 from shmio.segment.block import Layouts
 from shmio.segment.events import EVENT_SLOTS
 from shmio.segment.injection_list import InjectionEntry
+
+if TYPE_CHECKING:
+    from shmio.injection._numbers import Steps
 
 LOOK_NS: Final = 400_000_000
 """Interval in ns for checking owners, so short that an injection ends within 1 s after its client."""
@@ -88,6 +92,7 @@ class Conditions:
 
     Injections are not applied to the images that conditions read, so that no injection can influence
     its own condition. A value is unknown if its source has bad quality or its register has a bad status.
+    After a reload, a condition is unknown until it is compiled for the new layouts.
     """
 
     def __init__(self, layers: Sequence[DeclaredLayer], own: str, blocks: Mapping[str, Block]) -> None:
@@ -99,17 +104,14 @@ class Conditions:
             blocks: The blocks of all sources.
 
         """
-        self._conditions = tuple(
-            None if (condition := layer.program.condition) is None
-            else (condition.expression.codes, condition.expression.operands, condition.reads, layer.memory.seen)
-            for layer in layers
-        )  # fmt: skip
+        layouts = Layouts(blocks)
+        self._conditions = tuple(_steps(layer, layouts) for layer in layers)
         self._own = own
         self._blocks = blocks
-        self.foreign = frozenset(source for layer in layers for source in layer.program.foreign)
+        self.foreign = frozenset(source for steps in self._conditions if steps for source, _ in steps[2]) - {own}
         """The names of the other sources that conditions read."""
 
-    def hold(self, image: Image, before: int | None) -> list[bool]:
+    def evaluate_all(self, image: Image, before: int | None) -> list[bool]:
         """Return for each injection whether its condition is true; True if it has no condition.
 
         Args:
@@ -122,7 +124,7 @@ class Conditions:
         images: dict[str, bytes | None] = {self._own: image.raw if known else None}
         for source in self.foreign:
             images[source] = self._fetch(source, before)
-        return hold(self._conditions, images)
+        return evaluate_all(self._conditions, images)
 
     def _fetch(self, source: str, before: int | None) -> bytes | None:
         block = self._blocks.get(source)
@@ -133,6 +135,16 @@ class Conditions:
         if block is None or frame is None or block.retired or frame.source_ns == 0:
             return None
         return None if block.assess(frame)[0] is Quality.BAD else frame.raw
+
+
+def _steps(layer: DeclaredLayer, layouts: Mapping[str, Layout]) -> Steps | None:
+    """Return the condition of a layer as :func:`evaluate_all` expects it; None if the layer has no condition."""
+    condition = layer.program.condition
+    if condition is None:
+        return None
+    if not condition.fits(layouts):
+        condition = NEVER
+    return condition.expression.codes, condition.expression.operands, condition.reads, layer.memory.seen
 
 
 def newest(block: Block, before: int | None) -> Frame | None:
@@ -160,7 +172,7 @@ class DeclaredInjections:
         self._output = publisher.output
         self._own = publisher.output.writer.block
         self._blocks_of = blocks
-        self._blocks = dict(blocks())
+        self._blocks = self._present_blocks()
         self._configuration: int | None = None
         self._layers: list[DeclaredLayer] = []
         self._conditions = Conditions((), self._own.source, self._blocks)
@@ -175,8 +187,8 @@ class DeclaredInjections:
 
     @property
     def reads_other_sources(self) -> bool:
-        """True if a condition reads registers of other sources, which may change on a reload."""
-        return bool(self._conditions.foreign)
+        """True if a condition names registers of other sources, which may change on a reload."""
+        return any(layer.program.foreign for layer in self._layers)
 
     def seen(self, frame: Frame) -> None:
         """Continue from ``frame``, the last frame of the source's previous process."""
@@ -303,7 +315,7 @@ class DeclaredInjections:
             ConfigError: The declaration is wrong or targets another source.
 
         """
-        self._blocks = dict(self._blocks_of())
+        self.rebind()
         layouts = Layouts(self._blocks)
         periods_ns = {source: block.period_ns for source, block in self._blocks.items()}
         program = compile_program(declaration, layouts, periods_ns)
@@ -314,24 +326,33 @@ class DeclaredInjections:
         return program
 
     def rebind(self) -> None:
-        """Compile conditions again if they read a source that a reload has changed."""
-        if not self.reads_other_sources:
-            return
-        blocks = dict(self._blocks_of())
-        before, self._blocks = self._blocks, blocks
+        """Find the present blocks, and compile conditions again if a reload has changed a source that they name."""
+        blocks = self._present_blocks()
         layouts = Layouts(blocks)
-        for layer in self._layers:
-            if all(before.get(source) is blocks.get(source) for source in layer.program.foreign):
-                continue
-            try:
-                condition = compile_condition(layer.program.declaration.when or "", layouts)
-            except ConfigError as error:
-                log.warning("injection %s cannot start until the configuration is changed: %s", layer.name, error)
-                condition = NEVER
-            with self._output.lock:
+        compiled = [
+            (layer, self._compiled_again(layer, condition, layouts))
+            for layer in self._layers
+            if (condition := layer.program.condition) is not None and not condition.fits(layouts)
+        ]
+        if not compiled and blocks == self._blocks:
+            return
+        with self._output.lock:
+            for layer, condition in compiled:
                 layer.program = replace(layer.program, condition=condition)
                 layer.memory.seen.clear()
-                self._collect()
+            self._blocks = blocks
+            self._collect()
+
+    def _compiled_again(self, layer: DeclaredLayer, before: Condition, layouts: Mapping[str, Layout]) -> Condition:
+        try:
+            return compile_condition(layer.program.declaration.when or "", layouts)
+        except ConfigError as error:
+            log.warning("injection %s cannot start until the configuration is changed: %s", layer.name, error)
+            return replace(NEVER, layouts={source: layouts.get(source) for source in before.layouts})
+
+    def _present_blocks(self) -> dict[str, Block]:
+        """Return the blocks of all sources by source name; of this source, the block that this process writes."""
+        return {**self._blocks_of(), self._own.source: self._own}
 
     # -- called by the loop's thread -----------------------------------------------------------------------------------
 
@@ -349,7 +370,7 @@ class DeclaredInjections:
         if cycle == looked:
             return []
         conditions = self._conditions
-        holds = conditions.hold(image, self._step() if conditions.foreign else None)
+        holds = conditions.evaluate_all(image, self._step() if conditions.foreign else None)
         steady = self._steady
         if steady is None or steady[0] != holds or not steady[1] <= time_ns < steady[2]:
             events, over = self._change(holds)

@@ -349,7 +349,7 @@ static PyObject *numbers_evaluate(PyObject *module, PyObject *const *args, Py_ss
 
 /* Evaluates a condition that also has its reads: (codes, operands, reads, seen). Returns 1 if it is true; 0 if not, or
  * if that is unknown; -1 with an exception. */
-static int holds(PyTypeObject *own, PyObject *condition, PyObject *images)
+static int evaluate_one(PyTypeObject *own, PyObject *condition, PyObject *images)
 {
     if (condition == Py_None) return 1;
     if (!PyTuple_Check(condition) || PyTuple_Size(condition) != 4) {
@@ -364,7 +364,7 @@ static int holds(PyTypeObject *own, PyObject *condition, PyObject *images)
     return !result ? -1 : result == Py_True;
 }
 
-static PyObject *numbers_hold(PyObject *module, PyObject *const *args, Py_ssize_t given)
+static PyObject *numbers_evaluate_all(PyObject *module, PyObject *const *args, Py_ssize_t given)
 {
     PyTypeObject *own = *(PyTypeObject **)PyModule_GetState(module);
     if (given != 2 || !PyTuple_Check(args[0]) || !PyDict_Check(args[1])) {
@@ -374,7 +374,7 @@ static PyObject *numbers_hold(PyObject *module, PyObject *const *args, Py_ssize_
     Py_ssize_t count = PyTuple_Size(args[0]);
     PyObject *results = PyList_New(count);
     for (Py_ssize_t i = 0; results && i < count; i++) {
-        int truth = holds(own, PyTuple_GetItem(args[0], i), args[1]);
+        int truth = evaluate_one(own, PyTuple_GetItem(args[0], i), args[1]);
         if (truth < 0 || PyList_SetItem(results, i, PyBool_FromLong(truth)) < 0) Py_CLEAR(results);
     }
     return results;
@@ -384,7 +384,7 @@ static PyObject *numbers_hold(PyObject *module, PyObject *const *args, Py_ssize_
 
 static PyMethodDef functions[] = {
     METHOD(numbers, evaluate, METH_FASTCALL, "Return whether a condition is true; None if that is unknown."),
-    METHOD(numbers, hold, METH_FASTCALL, "Return for each condition whether it is true for the images of sources."),
+    METHOD(numbers, evaluate_all, METH_FASTCALL, "Return for each condition whether it is true for the images of sources."),
     {0},
 };
 

@@ -26,6 +26,7 @@ def evaluate(
     /,
 ) -> bool | None: ...
 
-Condition = tuple[bytes, tuple[bool | int | float, ...], tuple[tuple[str, Decoder], ...], dict[int, bool | int | float]]
+Steps = tuple[bytes, tuple[bool | int | float, ...], tuple[tuple[str, Decoder], ...], dict[int, bool | int | float]]
+"""The codes, operands and reads of a condition, and the last arguments of its edge functions."""
 
-def hold(conditions: tuple[Condition | None, ...], images: dict[str, bytes | None], /) -> list[bool]: ...
+def evaluate_all(conditions: tuple[Steps | None, ...], images: dict[str, bytes | None], /) -> list[bool]: ...

@@ -78,9 +78,15 @@ class Condition:
 
     expression: Expression
     reads: tuple[tuple[str, Decoder], ...]
+    layouts: Mapping[str, Layout | None]
+    """The layout of each source that the condition names, for which it was compiled; None: no such source."""
+
+    def fits(self, layouts: Mapping[str, Layout]) -> bool:
+        """Return whether the sources still have the layouts for which the condition was compiled."""
+        return all(layouts.get(source) is layout for source, layout in self.layouts.items())
 
 
-NEVER: Final = Condition(parse("false"), ())
+NEVER: Final = Condition(parse("false"), (), {})
 
 
 @dataclass(frozen=True)
@@ -97,9 +103,8 @@ class Program:
 
     @cached_property
     def foreign(self) -> frozenset[str]:
-        """The names of the sources that the condition reads, without the source of the injection."""
-        reads = self.condition.reads if self.condition else ()
-        return frozenset(source for source, _ in reads if source != self.source)
+        """The names of the sources that the condition names, without the source of the injection."""
+        return frozenset(self.condition.layouts if self.condition else ()) - {self.source}
 
 
 def compile_program(declaration: Declaration, layouts: Mapping[str, Layout], periods_ns: Mapping[str, int]) -> Program:
@@ -142,7 +147,8 @@ def compile_condition(text: str, layouts: Mapping[str, Layout]) -> Condition:
         expression = parse(text)
         if len(expression.references) > _MAX_REFERENCES:
             raise ConfigError(f"a condition may read at most {_MAX_REFERENCES} registers")
-        return Condition(expression, tuple(_read(path, layouts) for path in expression.references))
+        reads = tuple(_read(path, layouts) for path in expression.references)
+        return Condition(expression, reads, {source: layouts[source] for source, _ in reads})
     except (ConfigError, PathError) as error:
         raise ConfigError(f"when: {error}") from None
 

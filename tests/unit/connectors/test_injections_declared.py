@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import Any
 
 import msgspec
@@ -17,6 +17,7 @@ from shmio.connectors.injection_layers import MAX_HELD, Owner
 from shmio.connectors.output import Image, Output
 from shmio.errors import CommandError
 from shmio.injection.draw import SeededRandom
+from shmio.layout.model import Layout
 from shmio.layout.values.codec import Value, codec
 from shmio.local.writer import CommandSender
 from shmio.model.clock import Clock
@@ -258,6 +259,66 @@ def test_condition_on_this_source_and_another(make: Callable[..., Rig]) -> None:
     assert seen(8) == 0
     rig.poll(quality=Quality.BAD)
     assert rig.value("speed") == 9
+
+
+def layout_of(*names: str) -> Layout:
+    return tag_layout("".join(f'\n{name} = "INT"' for name in names))
+
+
+class TestReloads:
+    """A condition reads a source that reloads replace."""
+
+    @pytest.fixture
+    def rig(self, make: Callable[..., Rig]) -> Rig:
+        return make(declaration("stuck", "cell/speed", "set", value=-1, when="other/speed > 5"))
+
+    def replace_other(self, rig: Rig, layout: Layout | None) -> None:
+        """Do what a reload does, which gives the source ``other`` another layout, or removes it."""
+        add = [] if layout is None else [block(layout, ["**"], "other")]
+        rig.segment.change(add=add, retire=[name for name in ("other",) if name in rig.segment.blocks])
+
+    def publish(self, rig: Rig, **values: Value) -> None:
+        layout = rig.segment.blocks["other"].layout
+        image = bytearray(layout.size)
+        for path, value in values.items():
+            codec(layout.registers[layout.by_path[path]], layout.byte_order).encode_into(value, image)
+        rig.segment.writer("other").publish(image, cycle=1)
+
+    def stuck(self, rig: Rig) -> bool:
+        rig.poll()
+        return rig.value("speed") == -1
+
+    @pytest.mark.parametrize("when", ["other/speed > 1000", "other/nothing"])
+    @pytest.mark.parametrize("names", [("position", "speed"), ("speed",), ("load", "more", "speed")])
+    def test_a_declaration_between_a_reload_and_the_look_at_it(
+        self, rig: Rig, when: str, names: tuple[str, ...]
+    ) -> None:
+        self.replace_other(rig, layout_of(*names))
+        late = declaration("late", "cell/axis/1", "set", value=1, when=when)
+        with suppress(CommandError):
+            rig.client.declare(late)
+        self.publish(rig, speed=6)
+        assert self.stuck(rig)
+        self.publish(rig, **dict.fromkeys(names, 6) | {"speed": 5})
+        assert not self.stuck(rig)
+
+    @pytest.mark.parametrize("without", [layout_of("load", "more"), None])
+    def test_a_condition_waits_for_its_register(
+        self, rig: Rig, without: Layout | None, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        self.publish(rig, speed=6)
+        assert self.stuck(rig)
+        self.replace_other(rig, without)
+        if without is not None:
+            self.publish(rig, load=6, more=6)
+        assert not self.stuck(rig)
+        until(lambda: "injection stuck cannot start" in caplog.text, "warning")
+        assert not self.stuck(rig)
+        self.replace_other(rig, layout_of("more", "speed"))
+        self.publish(rig, speed=6)
+        until(lambda: self.stuck(rig), "injection")
+        self.publish(rig, speed=5, more=6)
+        assert not self.stuck(rig)
 
 
 def test_condition_reads_the_devices_value_not_the_injected_one(make: Callable[..., Rig]) -> None:

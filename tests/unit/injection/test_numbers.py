@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmio.injection._numbers import Number, evaluate, hold
+from shmio.injection._numbers import Number, evaluate, evaluate_all
 from shmio.injection.condition import parse
 
 CODES = "bBhHiIqQfd"
@@ -88,18 +88,18 @@ def test_conditions_read_the_images_of_sources() -> None:
         (*parse("x")[:2], (flag,), {}),
         (*parse("not x")[:2], (("c", Number("<b", 0)),), {}),
     )
-    assert hold(conditions, {"a": b"\3\0", "b": b"\2", "c": None}) == [True, True, True, False]
-    assert hold(conditions, {"a": b"\2\0", "b": b"\5", "c": b"\0"}) == [True, False, False, True]
+    assert evaluate_all(conditions, {"a": b"\3\0", "b": b"\2", "c": None}) == [True, True, True, False]
+    assert evaluate_all(conditions, {"a": b"\2\0", "b": b"\5", "c": b"\0"}) == [True, False, False, True]
     with pytest.raises(KeyError):
-        hold(conditions, {"a": bytes(3)})
+        evaluate_all(conditions, {"a": bytes(3)})
     with pytest.raises(ValueError, match="outside"):
-        hold(conditions, {"a": b"", "b": b"", "c": b""})
+        evaluate_all(conditions, {"a": b"", "b": b"", "c": b""})
 
 
 @pytest.mark.parametrize("wrong", [(), ("a",), "ab", 1, (b"\0", (1,), ("a",), {}), (b"\0", (1,), (), ())])
 def test_refuses_what_is_no_condition(wrong: Any) -> None:
     with pytest.raises((IndexError, SystemError, TypeError)):
-        hold((wrong,), {})
+        evaluate_all((wrong,), {})
 
 
 @given(st.binary(max_size=300), st.data())
