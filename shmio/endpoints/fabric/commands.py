@@ -412,7 +412,7 @@ def _described(block: Block, request: CommandRequest) -> Mapping[str, Any]:
             declared = msgspec.to_builtins(decode_declaration(injection.declaration))
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
             declared = {}
-        return what | {"declaration": declared, "keep": injection.keep}
+        return {**declared, **what, "keep": injection.keep}  # as other endpoints record a declaration
     inside = [write for write in _writes(injection.items) if write.offset + len(write.data) <= block.layout.size]
     paths = [f"{block.source}/{path}" for path in paths_of(block.layout, inside, MAX_NAMED)]
     direction = Direction(injection.direction).name.lower()

@@ -407,5 +407,5 @@ async def test_a_cell_without_the_role_cannot_fill_the_audit_log(
     assert sum(one["count"] for one in denied) == 50
     assert len(denied) < 25
     wrong, right = (one["what"] for one in entries if one["outcome"] != "denied")
-    assert wrong == {"source": "cell", "declaration": {}, "keep": False}
-    assert (right["source"], right["declaration"]["target"]) == ("cell", "cell/other")
+    assert wrong == {"source": "cell", "keep": False}
+    assert (right["source"], right["target"]) == ("cell", "cell/other")
