@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import signal
 import socket
@@ -11,8 +12,13 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
+
+import pytest
+from nats.aio.msg import Msg
 
 from shmio.endpoints.fabric.server import find_server
+from shmio.fabric.client import FabricClient
 from shmio.testing.ports import reserved_port
 
 START_S = 20.0
@@ -149,6 +155,25 @@ class Link:
         if self._open.is_set():  # a thread may still read from it, so do not close it here
             with suppress(OSError):
                 target.shutdown(socket.SHUT_RDWR)
+
+
+def lose_cancellation(monkeypatch: pytest.MonkeyPatch, word: str) -> threading.Event:
+    """Let the first answer to a request with a word in its subject come together with its task's cancellation.
+
+    Python 3.11 loses the cancellation then. Returns an event that is set when the task waits.
+    """
+    waits, ask = threading.Event(), FabricClient.request
+
+    async def request(client: FabricClient, subject: str, *arguments: Any, **options: Any) -> Msg:
+        answer = await ask(client, subject, *arguments, **options)
+        if word in subject and not waits.is_set():
+            waits.set()
+            with suppress(asyncio.CancelledError):
+                await asyncio.Event().wait()
+        return answer
+
+    monkeypatch.setattr(FabricClient, "request", request)
+    return waits
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import re
 import ssl
@@ -16,6 +17,7 @@ from shmio.config.credentials import read_secret
 from shmio.config.model import Fabric, MqttTls
 from shmio.config.tls import client_context
 from shmio.errors import ConfigError, RemoteError
+from shmio.fabric.tasks import end
 from shmio.libraries import library
 
 if TYPE_CHECKING:
@@ -153,6 +155,36 @@ async def connect(
         raise RemoteError(attempts.why or _why(access, error)) from None
     attempts.clear()
     return client
+
+
+async def connect_or_stop(
+    access: Access,
+    name: str,
+    stop: asyncio.Event,
+    *,
+    lost: Callable[[], Awaitable[None]] | None = None,
+    back: Callable[[], Awaitable[None]] | None = None,
+) -> FabricClient | None:
+    """Connect as :func:`connect` does, but only until ``stop`` is set; return None then.
+
+    Raises:
+        ConfigError: A TLS or credentials file cannot be used.
+        MissingLibraryError: nats-py is not installed.
+
+    """
+    connecting = asyncio.create_task(connect(access, name, lost=lost, back=back))
+    stopping = asyncio.create_task(stop.wait())
+    try:
+        await asyncio.wait((connecting, stopping), return_when=asyncio.FIRST_COMPLETED)
+        if connecting.done():
+            return connecting.result()
+        await end(connecting)
+        if not connecting.cancelled() and connecting.exception() is None:
+            await connecting.result().close()  # it connected at the same moment
+        return None
+    finally:
+        await end(stopping)
+        await end(connecting)
 
 
 def is_stored(message: Msg) -> bool:

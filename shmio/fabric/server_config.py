@@ -25,13 +25,19 @@ MAX_UNSENT_BYTES: Final = 64 << 20
 """Maximum size of what waits for a slow client. Beyond it, the server disconnects the client."""
 ROUTE_USER: Final = "shmio"
 CLUSTER: Final = "shmio"
+FARM: Final = "shmio-farm"
 
 Kind = Literal["admin", "cell", "viewer", "history-reader", "farm-user"]
 
 
+FARM_LIMITS: Final = {"max_file": 2 << 30, "max_mem": 64 << 20, "max_streams": 2, "max_consumers": 1000}
+"""What a farm may keep at a server, in bytes: its workers run programs of others, and the cells need the disk, too.
+
+The streams are the queue and the bundles.
+"""
 ACCOUNTS: Final[dict[str, tuple[Kind, ...]]] = {
     "shmio-cells": ("admin", "cell", "viewer", "history-reader"),
-    "shmio-farm": ("farm-user",),
+    FARM: ("farm-user",),
 }
 """The accounts, with the kinds of their users. Nothing of an account reaches the users of another one.
 
@@ -99,7 +105,8 @@ def server_configuration(settings: ServerSettings, index: int, users: Sequence[U
     ]
     streams = tuple(CellName.parse(user.name).history for user in users if user.kind == "cell")
     for account, kinds in ACCOUNTS.items():
-        lines += [f"  {account}: {{", "    jetstream: enabled", "    users: ["]
+        stored = _text(FARM_LIMITS) if account == FARM else "enabled"
+        lines += [f"  {account}: {{", f"    jetstream: {stored}", "    users: ["]
         for user in users:
             if user.kind in kinds:
                 lines += [f"      # {user.kind} {user.name}".rstrip(), f"      {_text(_entry(user, streams))}"]

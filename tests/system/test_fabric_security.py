@@ -19,7 +19,7 @@ import pytest
 import trustme
 from nats.aio.client import Client
 from nats.errors import Error as NatsError
-from nats.js.errors import NotFoundError
+from nats.js.errors import APIError, NotFoundError
 
 from shmio.cli.dump import main as dump
 from shmio.cli.user import main
@@ -33,6 +33,7 @@ from shmio.fabric.archive.service import Archive, ArchiveLimits
 from shmio.fabric.connection import Access, connect
 from shmio.fabric.names import CellName
 from shmio.fabric.registry import CELLS, CellEntry, Registry
+from shmio.fabric.server_config import FARM_LIMITS
 from shmio.falsification.farm.exchange import NAME, contact, open_consumer, open_store, tasks_of
 from shmio.layout.model import Layout, Register
 from shmio.testing.ports import reserved_port
@@ -302,6 +303,10 @@ def test_a_farm_has_its_own_account(fabric: Fabric) -> None:
             await admin.jetstream().stream_info(NAME)
         with pytest.raises(NotFoundError):
             await lab.jetstream().stream_info(f"KV_{CELLS}")
+        assert (await admin.jetstream().account_info()).limits.max_storage == -1, "cells are not limited"
+        assert (await lab.jetstream().account_info()).limits.max_storage == FARM_LIMITS["max_file"]
+        with pytest.raises(APIError, match="maximum number of streams"):
+            await lab.jetstream().add_stream(name="more")
         for client in (admin, cell, lab):
             await client.close()
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -23,7 +23,7 @@ import msgspec
 from shmio.errors import RemoteError
 from shmio.fabric.archive.cell_files import CellFiles, ClosedFile
 from shmio.fabric.archive.folder import ArchiveFolder
-from shmio.fabric.connection import INSTALL, Access, connect, reason, refusal
+from shmio.fabric.connection import INSTALL, Access, connect_or_stop, reason, refusal
 from shmio.fabric.messages import decode_header
 from shmio.fabric.names import ROOT, CellName, source_of
 from shmio.fabric.registry import Registry
@@ -113,12 +113,12 @@ class Archive:
             RemoteError: The server has no JetStream.
 
         """
-        client = await self._connected()
+        client = await connect_or_stop(self._access, "shmio archive", self._stopping)
         if client is None:
             return
         try:
             async with asyncio.TaskGroup() as tasks:
-                await self._find_cells(client, tasks)
+                await self._or_stop(self._find_cells(client, tasks))
         except BaseExceptionGroup as group:
             raise group.exceptions[0] from None
         finally:
@@ -127,18 +127,13 @@ class Archive:
             self._worker.shutdown()
             await client.close()
 
-    async def _connected(self) -> FabricClient | None:
-        """Wait for a server; return None if the archive is stopped before."""
-        connecting = asyncio.ensure_future(connect(self._access, "shmio archive"))
-        stopping = asyncio.ensure_future(self._stopping.wait())
-        await asyncio.wait((connecting, stopping), return_when=asyncio.FIRST_COMPLETED)
-        stopping.cancel()
-        if connecting.done():
-            return connecting.result()
-        connecting.cancel()
-        with suppress(asyncio.CancelledError):
-            await connecting
-        return None
+    async def _or_stop(self, part: Coroutine[Any, Any, None]) -> None:
+        """Do a part of the work. If it fails, stop the others: the group's cancellation can be lost in a request."""
+        try:
+            await part
+        except BaseException:
+            self._stopping.set()
+            raise
 
     async def _work(self, task: Callable[[], T]) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._worker, task)
@@ -156,7 +151,7 @@ class Archive:
             try:
                 for cell in await self._cells(client):
                     if cell not in running or running[cell].done():
-                        running[cell] = tasks.create_task(self._follow(client, cell))
+                        running[cell] = tasks.create_task(self._or_stop(self._follow(client, cell)))
                 problem = ""
             except self._errors.NoRespondersError:
                 raise RemoteError(f"{self._access}: the NATS server has no JetStream, and so no histories") from None

@@ -40,6 +40,10 @@ KEPT_S: Final = 86_400.0
 """Time in s that the server keeps what a search that was killed has left there."""
 REPLICAS: Final = 3
 """Number of servers of a cluster that keep the queue and the bundles."""
+_NO_CLUSTER: Final = 10_074
+"""Error code of a server that is alone, and so cannot keep more than one replica."""
+_NO_PEERS: Final = 10_005
+"""Error code of a cluster that has too few servers, or too few that run or have space."""
 MAX_DELIVERIES: Final = 10
 """How often a task may be delivered until it counts as an error: perhaps it kills its workers."""
 
@@ -132,7 +136,7 @@ async def contact(client: Client) -> None:
     """Check that the server has JetStream and gives access to the queue. Create the queue if it is missing.
 
     Raises:
-        RemoteError: It does not.
+        RemoteError: It does not, or its cluster has too few servers.
 
     """
     errors, js = library("nats.errors", INSTALL), library("nats.js.errors", INSTALL)
@@ -152,13 +156,23 @@ async def contact(client: Client) -> None:
 
 
 async def _replicated(create: Callable[[int], Awaitable[_Result]]) -> _Result:
-    """Create something on as many servers as survive the loss of one; on one if there are fewer servers."""
+    """Create something on as many servers of a cluster as survive the loss of one; on a server that is alone, there.
+
+    Raises:
+        RemoteError: The cluster has too few servers.
+
+    """
     js = library("nats.js.errors", INSTALL)
     try:
         return await create(REPLICAS)
-    except js.ServiceUnavailableError:
-        raise
-    except js.APIError:
+    except js.APIError as error:
+        if error.err_code == _NO_PEERS:
+            raise RemoteError(
+                f"the NATS cluster cannot keep {NAME} on {REPLICAS} servers: {error.description}; start its servers, "
+                f"or use a server without a cluster"
+            ) from None
+        if error.err_code != _NO_CLUSTER:
+            raise
         return await create(1)
 
 

@@ -16,6 +16,7 @@ from msgspec.structs import replace
 
 from shmio.errors import RemoteError, ShmioError
 from shmio.fabric.connection import INSTALL, Access, call_once, connect
+from shmio.fabric.tasks import end
 from shmio.falsification.farm.bundle import Bundle
 from shmio.falsification.farm.exchange import (
     BEAT_S,
@@ -308,7 +309,7 @@ class FarmPool:
         """Take the results."""
         errors, client = library("nats.errors", INSTALL), self._connected()
         consumer = await client.jetstream().pull_subscribe_bind(result_consumer(self._offer.search), NAME)
-        while not self._offer.over:  # nats-py can swallow a cancellation
+        while not self._offer.over:  # a cancellation can be lost
             try:
                 messages = await consumer.fetch(BATCH, timeout=POLL_S)
             except TimeoutError:
@@ -331,9 +332,7 @@ class FarmPool:
     async def _end(self) -> None:
         """Say that the search is over, and remove its part of the queue."""
         client, self._offer = self._client, replace(self._offer, over=True)
-        for task in list(self._tasks):
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await asyncio.gather(*map(end, self._tasks))
         while not self._orders.empty():
             self._orders.get_nowait().close()
         if client is None:

@@ -26,7 +26,8 @@ import msgspec
 from msgspec.structs import replace
 
 from shmio.errors import RemoteError, ShmioError
-from shmio.fabric.connection import INSTALL, Access, call_once, connect
+from shmio.fabric.connection import INSTALL, Access, call_once, connect_or_stop
+from shmio.fabric.tasks import end
 from shmio.falsification.farm.bundle import MAX_BYTES, place_in, unpack
 from shmio.falsification.farm.environment import differences
 from shmio.falsification.farm.exchange import (
@@ -148,13 +149,10 @@ class Worker:
             await call_once(self._access, contact)
         except RemoteError as error:
             self._tell(f"{error}; trying again")
-        waiting = asyncio.create_task(connect(self._access, "shmio-campaign worker", lost=self._lost, back=self._back))
-        stopped = asyncio.create_task(stop.wait())
-        await asyncio.wait([waiting, stopped], return_when=asyncio.FIRST_COMPLETED)
-        if not waiting.done():
-            waiting.cancel()
+        client = await connect_or_stop(self._access, "shmio-campaign worker", stop, lost=self._lost, back=self._back)
+        if client is None:
             return
-        self._client = await waiting
+        self._client = client
         try:
             await contact(self._client)
             for slot in self._all:
@@ -169,7 +167,6 @@ class Worker:
                 with suppress(TimeoutError):
                     await asyncio.wait_for(stop.wait(), BEAT_S)
         finally:
-            stopped.cancel()
             await self._close()
 
     async def _lost(self) -> None:
@@ -223,8 +220,8 @@ class Worker:
     async def _clear(self, search: _Search) -> None:
         """Wait for the end of a search's trials, and remove its processes and files."""
         if search.serving is not None:
-            search.serving.cancel()
-            await asyncio.gather(search.serving, *search.running, return_exceptions=True)
+            await end(search.serving)
+            await asyncio.gather(*search.running, return_exceptions=True)
         for slot in self._all:
             await asyncio.get_running_loop().run_in_executor(slot.thread, slot.forget, search.offer.search)
         await asyncio.to_thread(shutil.rmtree, search.place, ignore_errors=True)
@@ -281,7 +278,7 @@ class Worker:
         consumer = await self._client.jetstream().pull_subscribe_bind(task_consumer(search.offer.search), NAME)
         slot: _Slot | None = None
         try:
-            while not (search.over or self._stop.is_set()):  # nats-py can swallow a cancellation
+            while not (search.over or self._stop.is_set()):  # a cancellation can be lost
                 slot = await self._slots.get()
                 try:
                     served = sum(not one.problem for one in self._searches.values())
@@ -361,10 +358,10 @@ class Worker:
         self._stop.set()
         for search in list(self._searches.values()):
             if search.serving is not None:
-                search.serving.cancel()
-                with suppress(TimeoutError):
-                    async with asyncio.timeout(BEAT_S * 5):
-                        await asyncio.gather(search.serving, *search.running, return_exceptions=True)
+                await end(search.serving)
+                if search.running:
+                    await asyncio.wait(search.running, timeout=BEAT_S * 5)
+                    await asyncio.gather(*map(end, search.running))
             await self._answer(search, 0)
         await asyncio.gather(*self._clearing, return_exceptions=True)
         for slot in self._all:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import suppress
 
 import pytest
 from nats.errors import Error
 
 from shmio.config.model import MqttTls
 from shmio.errors import RemoteError
-from shmio.fabric.connection import Access, connect
+from shmio.fabric.client import FabricClient
+from shmio.fabric.connection import Access, connect, connect_or_stop
 
 TIMEOUT_S = 20
 
@@ -95,3 +97,32 @@ def test_a_server_without_tls_gets_nothing_if_tls_is_required(scheme: str, tls: 
 
     asyncio.run(work())
     assert set(received) == {b""}
+
+
+@pytest.mark.parametrize("connects", [True, False])
+def test_waiting_for_a_server_can_be_stopped_although_a_cancellation_is_lost(
+    connects: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clients: list[FabricClient] = []
+
+    async def work() -> None:
+        stop = asyncio.Event()
+
+        async def connect(client: FabricClient, **_: object) -> None:
+            clients.append(client)
+            stop.set()
+            with suppress(asyncio.CancelledError):
+                await asyncio.Event().wait()
+            if not connects:
+                await asyncio.Event().wait()
+
+        async def close(client: FabricClient) -> None:
+            clients.remove(client)
+
+        monkeypatch.setattr(FabricClient, "connect", connect)
+        monkeypatch.setattr(FabricClient, "close", close)
+        assert await asyncio.wait_for(connect_or_stop(Access(("nats://127.0.0.1:1",)), "x", stop), TIMEOUT_S) is None
+        assert stop.is_set()
+        assert len(clients) == (not connects), "a connection that was made is closed"
+
+    asyncio.run(work())

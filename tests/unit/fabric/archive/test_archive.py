@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import signal
 import subprocess
 import sys
@@ -16,10 +17,15 @@ import polars
 import pytest
 
 from shmio.cli.user import main
+from shmio.fabric.archive.cell_files import ClosedFile
+from shmio.fabric.archive.folder import ArchiveFolder
+from shmio.fabric.archive.service import Archive, ArchiveLimits
+from shmio.fabric.connection import Access
 from shmio.fabric.messages import decode_entries, encode
 from shmio.fabric.names import CellName
 from shmio.segment import Segment
 from shmio.testing.cell import until
+from tests.nats_server import lose_cancellation
 from tests.unit.fabric.stored import CELL, History, Stored, Uplink, late
 from tests.unit.recorder.harness import LAYOUT, OTHER, publish, spec
 
@@ -228,6 +234,37 @@ def test_a_source_name_cannot_leave_the_folder(segment: Segment, history: Histor
     work = read_to_end(folder, history)
     assert "not the name of a source" in work.errors
     assert not list(tmp_path.rglob("*.parquet"))
+
+
+def test_the_archive_ends_if_a_file_cannot_be_written_although_a_cancellation_is_lost(
+    segment: Segment, history: History, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other cells stop, too."""
+    other = CellName("plant1", "line3", "b60")
+    waits = lose_cancellation(monkeypatch, f"STREAM.INFO.{other.history}")
+    history.create()
+    History(history.url, other).create()
+    publish(segment.writer("cell"), 5)
+    messages = Uplink(segment).messages()
+
+    def fail(_file: ClosedFile) -> None:
+        raise OSError("the disk is full")
+
+    async def work() -> None:
+        archive = Archive(
+            Access((history.url,)), folder, ["*"], ArchiveLimits(max_age_s=0.1), fail, asyncio.Event()
+        )  # fmt: skip
+        running = asyncio.create_task(archive.run())
+        assert await asyncio.to_thread(waits.wait, 30)
+        await asyncio.to_thread(history.publish, *messages)
+        await asyncio.wait_for(running, 30)
+
+    folder = ArchiveFolder(tmp_path / "archive")
+    try:
+        with pytest.raises(OSError, match="disk is full"):
+            asyncio.run(work())
+    finally:
+        folder.close()
 
 
 def test_a_damaged_state_is_named(segment: Segment, history: History, tmp_path: Path) -> None:

@@ -20,15 +20,18 @@ import nats
 import nkeys  # type: ignore[import-untyped]
 import pytest
 from msgspec.structs import replace
+from nats.aio.msg import Msg
 
 from shmio.cli.campaign import main
 from shmio.errors import ConfigError, RemoteError
+from shmio.fabric.client import FabricClient
 from shmio.fabric.connection import Access
 from shmio.falsification.farm.bundle import Bundle, make_bundle
 from shmio.falsification.farm.environment import environment_of, own
 from shmio.falsification.farm.pool import FarmPool
+from shmio.falsification.farm.worker import Worker
 from shmio.falsification.trial import Result, Task
-from tests.nats_server import NatsServer, nats_server
+from tests.nats_server import NatsServer, lose_cancellation, nats_server
 
 CONFIG = """
 [instance]
@@ -95,6 +98,11 @@ TRIAL = {
     "step_ms": 20.0,
     "expect": [{"name": "low", "always": "lift/height < 0.5"}],
 }
+OFFER: dict[str, Any] = {
+    "search": "0" * 16, "host": "h", "campaign": "c", "digest": "0" * 64, "root": "/", "config": "../../etc/x",
+    "folder": ".", "limit_s": 1.0, "environment": {},
+}  # fmt: skip
+"""An offer of a search that has no files."""
 
 
 @pytest.fixture
@@ -368,15 +376,61 @@ def test_a_result_that_comes_again_does_not_count_again(server: NatsServer, bund
         assert farm.idle == 2
 
 
+def test_a_search_ends_although_a_cancellation_is_lost(
+    server: NatsServer, bundle: Bundle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits = lose_cancellation(monkeypatch, "PURGE")
+    with pool(server, bundle, []) as farm:
+        farm.cancel()
+        assert waits.wait(30)
+
+
+def test_a_worker_ends_although_a_cancellation_is_lost(
+    server: NatsServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The request for its files fails, and would be repeated for ever."""
+
+    async def work() -> None:
+        stop, ready = asyncio.Event(), asyncio.Event()
+
+        def tell(line: str) -> None:
+            if "waiting for searches" in line:
+                ready.set()
+
+        running = asyncio.create_task(Worker(Access((server.url,)), 1, tmp_path / "work", tell).run(stop))
+        await asyncio.wait_for(ready.wait(), 30)
+        waits = lose_cancellation(monkeypatch, "STREAM.INFO.OBJ_")
+        await publish(server.url, "shmio_farm.offer", json.dumps(OFFER).encode())
+        assert await asyncio.to_thread(waits.wait, 30)
+        stop.set()
+        await asyncio.wait_for(running, 30)
+
+    asyncio.run(work())
+
+
+@pytest.mark.parametrize(("code", "said"), [(10_005, "on 3 servers: no suitable.*start"), (10_023, "no space")])
+def test_a_cluster_that_cannot_keep_the_queue_is_named(
+    code: int, said: str, server: NatsServer, bundle: Bundle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The queue on one server would not survive its loss."""
+    ask = FabricClient.request
+    error = {"code": 400, "err_code": code, "description": "no suitable peers" if code == 10_005 else "no space"}
+
+    async def request(client: FabricClient, subject: str, data: bytes, *arguments: Any, **options: Any) -> Msg:
+        if "STREAM.CREATE" in subject and json.loads(data)["num_replicas"] == 3:
+            return Msg(client, data=json.dumps({"error": error}).encode())
+        return await ask(client, subject, data, *arguments, **options)
+
+    monkeypatch.setattr(FabricClient, "request", request)
+    with pytest.raises(RemoteError, match=said), pool(server, bundle, []):
+        pass
+
+
 def test_hostile_messages_do_not_stop_a_worker(server: NatsServer, bundle: Bundle) -> None:
     """Offers are checked, and a bundle must have its digest."""
-    good = {
-        "search": "0" * 16, "host": "h", "campaign": "c", "digest": "0" * 64, "root": "/", "config": "../../etc/x",
-        "folder": ".", "limit_s": 1.0, "environment": {},
-    }  # fmt: skip
-    bad: list[Any] = [None, [], {**good, "search": "../../x"}, {**good, "digest": 1}, {**good, "limit_s": -1}]
+    bad: list[Any] = [None, [], {**OFFER, "search": "../../x"}, {**OFFER, "digest": 1}, {**OFFER, "limit_s": -1}]
     with worker(server) as one:
-        offers = [json.dumps(offer).encode() for offer in [*bad, good]]
+        offers = [json.dumps(offer).encode() for offer in [*bad, OFFER]]
         asyncio.run(publish(server.url, "shmio_farm.offer", b"\xff", *offers))
         assert "its files cannot be fetched" in until(one, "is not served")
         with pool(server, bundle, []) as farm:
