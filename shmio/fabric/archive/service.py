@@ -46,6 +46,8 @@ _PAUSE_S: Final = 0.5
 """Pause before another request to a stream that had no more messages, in s."""
 _WAIT_S: Final = 1.0
 _RETRY_S: Final = 1.0
+_LEAVE_S: Final = 5.0
+"""Maximum time until the server has taken the last acknowledgements, in s."""
 _ANY_TIME: Final = datetime.fromtimestamp(0, UTC)
 _LAYOUT_S: Final = 60.0
 """Longest wait for the registry to have the layout of a message, in s."""
@@ -125,7 +127,7 @@ class Archive:
             for files in self._files.values():
                 await self._work(files.discard)
             self._worker.shutdown()
-            await client.close()
+            await client.leave(_LEAVE_S)
 
     async def _or_stop(self, part: Coroutine[Any, Any, None]) -> None:
         """Do a part of the work. If it fails, stop the others: the group's cancellation can be lost in a request."""

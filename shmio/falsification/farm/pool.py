@@ -43,9 +43,10 @@ from shmio.falsification.trial import Result, Task
 from shmio.libraries import library
 
 if TYPE_CHECKING:
-    from nats.aio.client import Client
     from nats.aio.msg import Msg
     from nats.js import JetStreamContext
+
+    from shmio.fabric.client import FabricClient
 
 NOBODY_S: Final = 3.0
 """Time in s without a worker after which the user is told."""
@@ -113,7 +114,7 @@ class FarmPool:
         self._tasks: list[asyncio.Task[None]] = []
         self._orders: asyncio.Queue[Coroutine[Any, Any, None]] = asyncio.Queue()
         """What the search wants, which is done in its order."""
-        self._client: Client | None = None
+        self._client: FabricClient | None = None
 
     # -- the interface of Pool -----------------------------------------------------------------------------------------
 
@@ -345,10 +346,9 @@ class FarmPool:
                 await stream.delete_consumer(NAME, result_consumer(search))
                 for subject in (tasks_of(search), results_of(search)):
                     await stream.purge_stream(NAME, subject=subject)
-        with suppress(Exception):
-            await client.close()
+        await client.leave(END_S)
 
-    def _connected(self) -> Client:
+    def _connected(self) -> FabricClient:
         assert self._client is not None  # noqa: S101  for mypy
         return self._client
 

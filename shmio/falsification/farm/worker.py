@@ -52,9 +52,10 @@ from shmio.falsification.trial import Result, Task
 from shmio.libraries import library
 
 if TYPE_CHECKING:
-    from nats.aio.client import Client
     from nats.aio.msg import Msg
     from nats.js import JetStreamContext
+
+    from shmio.fabric.client import FabricClient
 
 PREFIX: Final = "shmio-farm-"
 """Beginning of the name of a worker's folder."""
@@ -63,6 +64,8 @@ MANY_S: Final = 0.5
 """Maximum time in s that a slot waits for a task of one search, while there are others."""
 FETCH_S: Final = 300.0
 """Maximum time in s to fetch a bundle."""
+LEAVE_S: Final = 5.0
+"""Maximum time in s until the server has taken what waits at the end."""
 LOOK_S: Final = 0.25
 """Maximum time in s between two checks whether a trial is still wanted."""
 
@@ -135,7 +138,7 @@ class Worker:
         self._all = [_Slot() for _ in range(jobs)]
         self._stop = asyncio.Event()
         self._clearing: set[asyncio.Task[None]] = set()
-        self._client: Client
+        self._client: FabricClient
 
     async def run(self, stop: asyncio.Event) -> None:
         """Serve until ``stop`` is set. Then give the running trials back to the queue.
@@ -367,8 +370,7 @@ class Worker:
         for slot in self._all:
             await asyncio.get_running_loop().run_in_executor(slot.thread, slot.close)
             slot.thread.shutdown()
-        with suppress(Exception):
-            await self._client.close()
+        await self._client.leave(LEAVE_S)
 
 
 class _Bounded(RawIOBase):
