@@ -9,7 +9,7 @@
 #include <stdint.h>
 #include <string.h>
 
-/* ---- numbers in images ----------------------------------------------------------------------------------------------- */
+/* ---- numbers in images --------------------------------------------------------------------------------------------- */
 
 typedef struct {
     PyObject_HEAD
@@ -17,8 +17,31 @@ typedef struct {
     char code;       /* as in Python's struct; ?: one bit */
     uint8_t mask;    /* the bit, for ? */
     bool big;        /* the byte order in the image */
-    double least, most; /* the range for add() and multiply() */
+    double minimum, maximum; /* the range for add() and multiply() */
 } Number;
+
+#define REAL_MAX 3.4028234663852886e38
+#define LREAL_MAX 1.7976931348623157e308
+
+/* The types of numbers. A double cannot represent the range of those with the range 0. */
+static const struct {
+    char code;
+    Py_ssize_t size;
+    double minimum, maximum;
+} types[] = {
+    {'?', 1, 0, 0},
+    {'b', 1, INT8_MIN, INT8_MAX},
+    {'B', 1, 0, UINT8_MAX},
+    {'h', 2, INT16_MIN, INT16_MAX},
+    {'H', 2, 0, UINT16_MAX},
+    {'i', 4, INT32_MIN, INT32_MAX},
+    {'I', 4, 0, UINT32_MAX},
+    {'q', 8, 0, 0},
+    {'Q', 8, 0, 0},
+    {'f', 4, -REAL_MAX, REAL_MAX},
+    {'d', 8, -LREAL_MAX, LREAL_MAX},
+};
+enum { TYPE_COUNT = sizeof types / sizeof *types };
 
 static void Number_dealloc(PyObject *self)
 {
@@ -29,11 +52,6 @@ static void Number_dealloc(PyObject *self)
 
 static int Number_init(Number *self, PyObject *args, PyObject *kwargs)
 {
-    static const char codes[] = "?bBhHiIqQfd";
-    static const Py_ssize_t sizes[] = {1, 1, 1, 2, 2, 4, 4, 8, 8, 4, 8};
-    static const double least[] = {0, INT8_MIN, 0, INT16_MIN, 0, INT32_MIN, 0, 0, 0, -3.4028234663852886e38, -1.7976931348623157e308};
-    static const double most[] = {0, INT8_MAX, UINT8_MAX, INT16_MAX, UINT16_MAX, INT32_MAX, UINT32_MAX, 0, 0,
-                                  3.4028234663852886e38, 1.7976931348623157e308};
     const char *format;
     Py_ssize_t offset;
     int bit = 0;
@@ -42,16 +60,22 @@ static int Number_init(Number *self, PyObject *args, PyObject *kwargs)
         return -1;
     }
     if (!PyArg_ParseTuple(args, "sn|i", &format, &offset, &bit)) return -1;
-    const char *found = strlen(format) == 2 && (format[0] == '<' || format[0] == '>') ? strchr(codes, format[1]) : NULL;
-    if (!found || offset < 0 || bit < 0 || bit > 7) {
-        PyErr_SetString(PyExc_ValueError, "not the format, offset or bit of a number");
+    size_t type = 0;
+    bool ordered = format[0] == '<' || format[0] == '>';
+    while (type < TYPE_COUNT && !(ordered && format[1] == types[type].code && !format[2])) type++;
+    if (type == TYPE_COUNT) {
+        PyErr_Format(PyExc_ValueError, "the format is not < or > and one of ?bBhHiIqQfd: %s", format);
+        return -1;
+    }
+    if (offset < 0 || bit < 0 || bit > 7) {
+        PyErr_Format(PyExc_ValueError, "the offset is negative, or the bit is not in 0..7: %zd, %d", offset, bit);
         return -1;
     }
     self->offset = offset;
-    self->size = sizes[found - codes];
-    self->least = least[found - codes];
-    self->most = most[found - codes];
-    self->code = *found;
+    self->size = types[type].size;
+    self->minimum = types[type].minimum;
+    self->maximum = types[type].maximum;
+    self->code = types[type].code;
     self->big = format[0] == '>';
     self->mask = (uint8_t)(1u << bit);
     return 0;
@@ -122,11 +146,11 @@ static double as_double(const Number *self, const uint8_t *at)
 }
 
 /* Writes a number, clamped to the range of its type and, for integers, rounded half to even. A float may be NaN. */
-static void put(const Number *self, uint8_t *at, double value)
+static void store_clamped(const Number *self, uint8_t *at, double value)
 {
     uint64_t word = 0;
-    if (value < self->least) value = self->least;
-    if (value > self->most) value = self->most;
+    if (value < self->minimum) value = self->minimum;
+    if (value > self->maximum) value = self->maximum;
     if (self->code == 'f') {
         float single = (float)value;
         uint32_t half;
@@ -136,9 +160,9 @@ static void put(const Number *self, uint8_t *at, double value)
         memcpy(&word, &value, 8);
     } else {
         int64_t whole = (int64_t)value; /* towards 0 */
-        double rest = value - (double)whole;
-        if (rest > 0.5 || (rest == 0.5 && whole % 2)) whole++;
-        if (rest < -0.5 || (rest == -0.5 && whole % 2)) whole--;
+        double fraction = value - (double)whole;
+        if (fraction > 0.5 || (fraction == 0.5 && whole % 2)) whole++;
+        if (fraction < -0.5 || (fraction == -0.5 && whole % 2)) whole--;
         word = (uint64_t)whole;
     }
     store(self, at, word);
@@ -166,7 +190,7 @@ static PyObject *change(Number *self, PyObject *const *args, Py_ssize_t count, b
             PyErr_SetString(PyExc_ValueError, "an integer cannot be NaN");
             at = NULL;
         } else {
-            put(self, at, value);
+            store_clamped(self, at, value);
         }
     }
     PyBuffer_Release(&image);
@@ -174,7 +198,10 @@ static PyObject *change(Number *self, PyObject *const *args, Py_ssize_t count, b
     Py_RETURN_NONE;
 }
 
-static PyObject *Number_add(Number *self, PyObject *const *args, Py_ssize_t count) { return change(self, args, count, false); }
+static PyObject *Number_add(Number *self, PyObject *const *args, Py_ssize_t count)
+{
+    return change(self, args, count, false);
+}
 
 static PyObject *Number_multiply(Number *self, PyObject *const *args, Py_ssize_t count)
 {
@@ -196,9 +223,10 @@ static PyType_Slot Number_slots[] = {
     {Py_tp_methods, Number_methods},
     {0, NULL},
 };
-static PyType_Spec Number_spec = {"shmio.injection._numbers.Number", sizeof(Number), 0, Py_TPFLAGS_DEFAULT, Number_slots};
+static PyType_Spec Number_spec = {"shmio.injection._numbers.Number", sizeof(Number), 0, Py_TPFLAGS_DEFAULT,
+                                  Number_slots};
 
-/* ---- conditions ------------------------------------------------------------------------------------------------------ */
+/* ---- conditions ---------------------------------------------------------------------------------------------------- */
 
 /* Reads the values for a condition: `reads` has pairs of a source and a Number, or another object with decode();
  * `images` has the image of each source, or None. */
@@ -214,7 +242,8 @@ static PyObject *read_values(PyTypeObject *own, PyObject *reads, PyObject *image
             Py_INCREF(image);
             value = image;
         } else if (image) {
-            value = Py_TYPE(place) == own ? Number_decode((Number *)place, image) : PyObject_CallMethod(place, "decode", "O", image);
+            value = Py_TYPE(place) == own ? Number_decode((Number *)place, image)
+                                          : PyObject_CallMethod(place, "decode", "O", image);
         } else if (!PyErr_Occurred()) {
             PyErr_SetObject(PyExc_KeyError, source);
         }
@@ -242,7 +271,7 @@ static int edge(int code, PyObject *seen, PyObject *place, PyObject *now)
     return found < 0 || PyDict_SetItem(seen, place, now) < 0 ? -1 : found;
 }
 
-static PyObject *one(int code, PyObject *seen, PyObject *place, PyObject *value)
+static PyObject *apply_unary(int code, PyObject *seen, PyObject *place, PyObject *value)
 {
     int truth;
     switch (code) {
@@ -254,7 +283,7 @@ static PyObject *one(int code, PyObject *seen, PyObject *place, PyObject *value)
     return truth < 0 ? NULL : PyBool_FromLong(truth);
 }
 
-static PyObject *two(int code, PyObject *left, PyObject *right)
+static PyObject *apply_binary(int code, PyObject *left, PyObject *right)
 {
     static const int compared[] = {Py_LT, Py_LE, Py_EQ, Py_NE, Py_GT, Py_GE};
     switch (code) {
@@ -283,7 +312,8 @@ static Py_ssize_t run(const uint8_t *codes, PyObject *operands, Py_ssize_t count
         PyObject *operand = PyTuple_GetItem(operands, i), *result;
         Py_ssize_t taken = code <= LOAD ? 0 : code <= CHANGED ? 1 : 2;
         if (code > MOD || depth < taken) {
-            PyErr_SetString(PyExc_ValueError, "not the steps of a condition");
+            const char *wrong = code > MOD ? "there is no such code" : "there are too few values for it";
+            PyErr_Format(PyExc_ValueError, "step %zd of the condition has code %d: %s", i, code, wrong);
             goto failed;
         }
         if (code == PUSH) {
@@ -293,9 +323,9 @@ static Py_ssize_t run(const uint8_t *codes, PyObject *operands, Py_ssize_t count
             Py_ssize_t place = PyLong_AsSsize_t(operand);
             result = place == -1 && PyErr_Occurred() ? NULL : PySequence_GetItem(values, place);
         } else if (taken == 1) {
-            result = one(code, seen, operand, stack[depth - 1]);
+            result = apply_unary(code, seen, operand, stack[depth - 1]);
         } else {
-            result = two(code, stack[depth - 2], stack[depth - 1]);
+            result = apply_binary(code, stack[depth - 2], stack[depth - 1]);
         }
         if (!result) goto failed;
         while (taken-- > 0) Py_DECREF(stack[--depth]);
@@ -323,7 +353,8 @@ static PyObject *evaluate(PyObject *codes, PyObject *operands, PyObject *values,
     if (unknown < 0) return NULL;
     if (!unknown) {
         if (count == 0 || count > MAX_STEPS || PyTuple_Size(operands) != count) {
-            PyErr_SetString(PyExc_ValueError, "not the steps of a condition");
+            PyErr_Format(PyExc_ValueError, "a condition has 1 to %d steps, each with one operand; not %zd with %zd",
+                         MAX_STEPS, count, PyTuple_Size(operands));
             return NULL;
         }
         Py_ssize_t left = run((const uint8_t *)steps, operands, count, values, seen, stack);
@@ -358,7 +389,8 @@ static int evaluate_one(PyTypeObject *own, PyObject *condition, PyObject *images
     }
     PyObject *values = read_values(own, PyTuple_GetItem(condition, 2), images);
     if (!values) return -1;
-    PyObject *result = evaluate(PyTuple_GetItem(condition, 0), PyTuple_GetItem(condition, 1), values, PyTuple_GetItem(condition, 3));
+    PyObject *result = evaluate(PyTuple_GetItem(condition, 0), PyTuple_GetItem(condition, 1), values,
+                                PyTuple_GetItem(condition, 3));
     Py_DECREF(values);
     Py_XDECREF(result);
     return !result ? -1 : result == Py_True;
@@ -380,11 +412,11 @@ static PyObject *numbers_evaluate_all(PyObject *module, PyObject *const *args, P
     return results;
 }
 
-/* ---- module ---------------------------------------------------------------------------------------------------------- */
+/* ---- module -------------------------------------------------------------------------------------------------------- */
 
 static PyMethodDef functions[] = {
     METHOD(numbers, evaluate, METH_FASTCALL, "Return whether a condition is true; None if that is unknown."),
-    METHOD(numbers, evaluate_all, METH_FASTCALL, "Return for each condition whether it is true for the images of sources."),
+    METHOD(numbers, evaluate_all, METH_FASTCALL, "Return for each condition whether it is true for images of sources."),
     {0},
 };
 

@@ -292,11 +292,8 @@ class Noise(Operation):
         self._draw = draw
         self._amplitude = amplitude
         self._gaussian = gaussian
-        self._addends: tuple[int, int, list[float]] = (
-            0,
-            0,
-            [],
-        )  # for BATCH places: the run, the first place, the numbers
+        self._addends: tuple[int, int, list[float]] = 0, 0, []
+        """The numbers to add at BATCH places: the run, the first place, the numbers."""
         if self._count == 1 and (number := places[0].single) is not None:
             self._number = number
             self.single = self._add

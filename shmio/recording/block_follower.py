@@ -144,7 +144,7 @@ class BlockFollower:
         entries, last, clock_ns = self.block.ring.pack(frames.last, events.last, limit)
         if entries:
             self._log_ns = max(self._log_ns, self._started_utc_ns + clock_ns)
-            frames.last, frames.log_ns = last, self._log_ns
+            frames.last, frames.log_ns, frames.reason = last, self._log_ns, Reason.OVERTAKEN
             frames.cursor.resume(after=last)
         return entries
 

@@ -152,6 +152,17 @@ static PyObject *decoded(PyObject *values, uint8_t number)
     return value;
 }
 
+/* Returns a tuple as an object of a subclass, and releases the tuple. */
+static PyObject *as_type(PyTypeObject *type, PyObject *tuple)
+{
+    newfunc make = (newfunc)PyType_GetSlot(&PyTuple_Type, Py_tp_new);
+    PyObject *args = PyTuple_Pack(1, tuple);
+    PyObject *object = args ? make(type, args, NULL) : NULL;
+    Py_XDECREF(args);
+    Py_DECREF(tuple);
+    return object;
+}
+
 /* Copies a frame: (frame, cycle, publish_ns, clock_ns, source_ns, incarnation, quality, provenance, event,
  * delay_us, reason, raw, effective). Returns None if the ring does not have the frame. */
 static PyObject *Ring_copy(Ring *self, const frame_form *form, bool latest, uint64_t frame)
@@ -190,7 +201,9 @@ static PyObject *Ring_copy(Ring *self, const frame_form *form, bool latest, uint
         effective,
     };
     Py_ssize_t count = sizeof fields / sizeof *fields;
-    PyObject *copy = form->type == &PyTuple_Type ? PyTuple_New(count) : PyType_GenericAlloc(form->type, count);
+    /* Since Python 3.14, a tuple caches its hash, and only tuple.__new__ prepares that; before, this is faster. */
+    bool direct = form->type == &PyTuple_Type || Py_Version < 0x030E0000;
+    PyObject *copy = direct && form->type != &PyTuple_Type ? PyType_GenericAlloc(form->type, count) : PyTuple_New(count);
     for (Py_ssize_t i = 0; i < count; i++) {
         if (copy && fields[i])
             PyTuple_SetItem(copy, i, fields[i]);
@@ -199,26 +212,24 @@ static PyObject *Ring_copy(Ring *self, const frame_form *form, bool latest, uint
             Py_CLEAR(copy);
         }
     }
-    return copy;
+    return copy && !direct ? as_type(form->type, copy) : copy;
 }
 
-static const frame_form plain = {&PyTuple_Type, NULL, NULL};
+static const frame_form undecoded = {&PyTuple_Type, NULL, NULL};
 
 static PyObject *Ring_latest(Ring *self, PyObject *unused)
 {
     (void)unused;
-    return Ring_ready(self) ? Ring_copy(self, &plain, true, 0) : NULL;
+    return Ring_ready(self) ? Ring_copy(self, &undecoded, true, 0) : NULL;
 }
-
-static bool exists(unsigned long long frame) { return frame != 0 && frame <= UINT64_MAX / 2 - 1; }
 
 static PyObject *Ring_read(Ring *self, PyObject *number)
 {
     if (!Ring_ready(self)) return NULL;
     unsigned long long frame = PyLong_AsUnsignedLongLong(number);
     if (PyErr_Occurred()) return NULL;
-    if (!exists(frame)) Py_RETURN_NONE;
-    return Ring_copy(self, &plain, false, frame);
+    if (!ring_may_have(frame)) Py_RETURN_NONE;
+    return Ring_copy(self, &undecoded, false, frame);
 }
 
 static PyObject *Ring_read_many(Ring *self, PyObject *args)
@@ -238,7 +249,7 @@ static PyObject *Ring_read_many(Ring *self, PyObject *args)
         return NULL;
     }
     PyObject *copies = PyList_New(0);
-    for (unsigned long long frame = first; copies && count > 0 && exists(frame); count--, frame++) {
+    for (unsigned long long frame = first; copies && count > 0 && ring_may_have(frame); count--, frame++) {
         PyObject *copy = Ring_copy(self, &form, false, frame);
         bool gone = copy == Py_None;
         if (!copy || (!gone && PyList_Append(copies, copy) < 0)) Py_CLEAR(copies);

@@ -32,14 +32,14 @@ static inline size_t frames_entry_size(const ring_view *ring)
 
 /* Copies the plain frames after `*last` into `data`: those that follow each other without an event after `event`.
  * Stops at any other frame, or when a further entry might need more than `room` bytes. Returns the number of bytes;
- * `*last` and `*clock_ns` are then those of the last frame. */
+ * `*last` is then the last frame, and `*clock_ns` the latest time of all of them on the instance's clock. */
 static inline size_t frames_pack(const ring_view *ring, uint64_t event, uint8_t *data, size_t room, uint64_t *last,
                                  int64_t *clock_ns)
 {
     uint64_t head = atomic_load_explicit(&ring_head(ring)->head, memory_order_acquire);
     uint8_t reason[REASON_SIZE];
     size_t size = 0;
-    while (*last < head && room - size >= frames_entry_size(ring)) {
+    while (*last < head && ring_may_have(*last + 1) && room - size >= frames_entry_size(ring)) {
         slot_info info;
         uint8_t *raw = data + size + ENTRY_HEADER_SIZE + FRAME_HEADER_SIZE;
         if (!ring_read(ring, *last + 1, &info, reason, raw, raw + ring->frame_size)) break;
@@ -53,8 +53,8 @@ static inline size_t frames_pack(const ring_view *ring, uint64_t event, uint8_t 
         data[size] = ENTRY_FRAME;
         memcpy(data + size + 1, &length, sizeof length);
         memcpy(data + size + ENTRY_HEADER_SIZE, &header, FRAME_HEADER_SIZE);
+        if (!size || info.clock_ns > *clock_ns) *clock_ns = info.clock_ns;
         size += ENTRY_HEADER_SIZE + length;
-        *clock_ns = info.clock_ns;
     }
     return size;
 }

@@ -50,7 +50,7 @@ typedef struct {
     int64_t stale_ns;
     uint64_t reserved1[2];
     a64 head;     /* number of the last complete frame; 0: none yet */
-    a32 doorbell; /* futex word: incremented after every frame */
+    a32 doorbell; /* futex word: incremented after a frame, or after a run of frames */
     a32 incarnation;
     uint64_t reserved2[6];
 } ring_header;
@@ -199,8 +199,11 @@ static inline uint64_t ring_publish(const ring_view *ring, slot_info info, const
     return frame;
 }
 
-/* Copies one frame. Returns false if the slot no longer has it, or is being overwritten. `reason` has
- * REASON_SIZE bytes. */
+/* Returns false for numbers that no frame can have, because their sequence would wrap. */
+static inline bool ring_may_have(uint64_t frame) { return frame != 0 && frame <= UINT64_MAX / 2 - 1; }
+
+/* Copies one frame; its number must satisfy ring_may_have(). Returns false if the slot no longer has it, or is being
+ * overwritten. `reason` has REASON_SIZE bytes. */
 static inline bool ring_read(const ring_view *ring, uint64_t frame, slot_info *info, uint8_t *reason, uint8_t *raw,
                              uint8_t *effective)
 {
@@ -214,7 +217,7 @@ static inline bool ring_read(const ring_view *ring, uint64_t frame, slot_info *i
     words_load(raw, base + RAW_OFFSET, ring->frame_size);
     if (!ring->effective_offset) info->flags &= (uint16_t)~FLAG_EFFECTIVE;
     if (info->flags & FLAG_EFFECTIVE) words_load(effective, base + ring->effective_offset, ring->frame_size);
-    /* Pairs with the release fence in ring_publish. */
+    /* Pairs with the release fence in ring_write. */
     atomic_thread_fence(memory_order_acquire);
     return atomic_load_explicit(&slot->sequence, memory_order_relaxed) == whole;
 }

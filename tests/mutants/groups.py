@@ -53,6 +53,10 @@ GROUPS: Final = {
             "tests/unit/segment/test_segment_change.py",
         ),
     ),
+    "injection": Group(
+        ("shmio/injection/*.py", "shmio/injection/_numbers.c"),
+        ("tests/unit/injection", "tests/unit/connectors/test_injections*.py"),
+    ),
     "streams": Group(
         (
             "shmio/endpoints/grpc/encoding.py",

@@ -264,16 +264,17 @@ class Judge:
         ]
         if subprocess.run(command, capture_output=True, check=False).returncode:
             return False
-        (self._tree / "built").mkdir(exist_ok=True)
-        for built in (self._tree / "lib").rglob("_atomics*.so"):
-            whole = self._tree / "shmio/segment" / built.name
-            whole.replace(self._tree / "built" / built.name)
-            built.replace(whole)
+        for built in (self._tree / "lib").rglob("*.so"):
+            place = built.relative_to(self._tree / "lib")
+            whole = self._tree / "built" / place
+            whole.parent.mkdir(parents=True, exist_ok=True)
+            (self._tree / place).replace(whole)
+            built.replace(self._tree / place)
         return True
 
     def _restore_build(self) -> None:
-        for built in list((self._tree / "built").glob("*.so")):
-            built.replace(self._tree / "shmio/segment" / built.name)
+        for built in list((self._tree / "built").rglob("*.so")):
+            built.replace(self._tree / built.relative_to(self._tree / "built"))
 
 
 class _Told:

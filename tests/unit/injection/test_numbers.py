@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import operator
 import struct
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import pytest
@@ -61,7 +62,7 @@ def test_an_integer_cannot_become_nan() -> None:
     ("format_", "offset", "bit"), [("f", 0, 0), ("=f", 0, 0), ("<x", 0, 0), ("<", 0, 0), ("<f", -1, 0), ("<?", 0, 8)]
 )
 def test_refuses_what_is_no_number(format_: str, offset: int, bit: int) -> None:
-    with pytest.raises(ValueError, match="format"):
+    with pytest.raises(ValueError, match=r"format|offset|bit"):
         Number(format_, offset, bit)
 
 
@@ -96,15 +97,80 @@ def test_conditions_read_the_images_of_sources() -> None:
         evaluate_all(conditions, {"a": b"", "b": b"", "c": b""})
 
 
+@pytest.mark.parametrize(
+    ("codes", "operands", "error"),
+    [(b"\1", (3,), IndexError), (b"\1", (0.5,), TypeError), (b"\0", (), ValueError), (b"", (), ValueError)],
+)
+def test_refuses_wrong_operands(codes: bytes, operands: tuple[Any, ...], error: type[Exception]) -> None:
+    assert evaluate(codes, operands, [1, None], {}) is None
+    with pytest.raises(error):
+        evaluate(codes, operands, [1], {})
+
+
 @pytest.mark.parametrize("wrong", [(), ("a",), "ab", 1, (b"\0", (1,), ("a",), {}), (b"\0", (1,), (), ())])
 def test_refuses_what_is_no_condition(wrong: Any) -> None:
     with pytest.raises((IndexError, SystemError, TypeError)):
         evaluate_all((wrong,), {})
 
 
-@given(st.binary(max_size=300), st.data())
-def test_any_steps_are_run_or_refused(codes: bytes, data: st.DataObject) -> None:
-    numbers = st.integers(-2, 2) | st.floats() | st.booleans()
-    operands = tuple(data.draw(st.lists(numbers, min_size=len(codes), max_size=len(codes))))
-    with suppress(ValueError, IndexError, TypeError):
-        assert evaluate(codes, operands, data.draw(st.lists(numbers, max_size=3)), {}) in (True, False, None)
+OPERATORS: list[Callable[..., object]] = [
+    operator.not_, operator.neg, abs,
+    lambda before, now: not before and bool(now), lambda before, now: bool(before) and not now, operator.ne,
+    lambda left, right: bool(left) or bool(right), lambda left, right: bool(left) and bool(right),
+    operator.lt, operator.le, operator.eq, operator.ne, operator.gt, operator.ge,
+    operator.add, operator.sub, operator.mul, operator.truediv, operator.mod,
+]  # fmt: skip
+"""What the codes from 2 on mean: three with one value, three edges, then those with two values."""
+
+
+def evaluate_slowly(codes: bytes, operands: Sequence[Any], values: Sequence[Any], seen: dict[Any, Any]) -> bool | None:
+    """Do what :func:`evaluate` does, for the test to compare."""
+    if not 1 <= len(codes) <= 256:
+        raise ValueError
+    stack: list[Any] = []
+    try:
+        for code, operand in zip(codes, operands, strict=True):
+            if code > 20 or len(stack) < (code > 1) + (code > 7):
+                raise ValueError
+            if code < 2:
+                stack.append(values[operand] if code else operand)
+            elif code in (5, 6, 7):
+                now = stack.pop()
+                stack.append(operand in seen and OPERATORS[code - 2](seen[operand], now))
+                seen[operand] = now
+            else:
+                right = [stack.pop() for _ in range(1 if code < 5 else 2)]
+                stack.append(OPERATORS[code - 2](*reversed(right)))
+    except ArithmeticError:
+        seen.clear()
+        return None
+    return bool(stack[-1])
+
+
+numbers = st.integers(-2, 2) | st.floats() | st.booleans()
+
+
+@st.composite
+def whole_programs(draw: st.DrawFn) -> bytes:
+    """Codes of which each finds enough values on the stack."""
+    codes, depth = bytearray(), 0
+    for _ in range(draw(st.integers(1, 20))):
+        codes.append(draw(st.sampled_from(range([2, 8, 21][min(depth, 2)]))))
+        depth += 1 if codes[-1] < 2 else -(codes[-1] > 7)
+    return bytes(codes)
+
+
+@given(whole_programs() | st.lists(st.sampled_from(range(22)), max_size=300).map(bytes), st.data())
+def test_any_steps_mean_the_same_as_in_python_or_are_refused(codes: bytes, data: st.DataObject) -> None:
+    operands = tuple(data.draw(st.integers(0, 2) if code == 1 else numbers) for code in codes)
+    seen: tuple[dict[Any, Any], dict[Any, Any]] = {}, {}
+    for _ in range(3):  # the edges compare
+        values = data.draw(st.lists(numbers, min_size=1, max_size=3))
+        try:
+            expected = evaluate_slowly(codes, operands, values, seen[0])
+        except (ValueError, IndexError) as error:
+            with pytest.raises(type(error)):
+                evaluate(codes, operands, values, seen[1])
+        else:
+            assert evaluate(codes, operands, values, seen[1]) is expected
+        assert repr(seen[0]) == repr(seen[1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Final
 
 from hypothesis import given
@@ -76,7 +77,8 @@ def test_packed_frames_are_those_that_python_encodes(
         expected.append(frame)
     entries, last, clock_ns = near.pack(after, event, limit)
     assert entries == encode_entries(expected)
-    assert (last, clock_ns) == ((expected[-1].number, expected[-1].clock_ns) if expected else (after, 0))
+    latest_ns = max((frame.clock_ns for frame in expected), default=0)
+    assert (last, clock_ns) == (expected[-1].number if expected else after, latest_ns)
 
 
 @given(st.lists(frames, max_size=8), st.integers(0, 12), times, st.integers(0, LARGEST), st.booleans())
@@ -129,9 +131,13 @@ def test_of_damaged_entries_those_before_the_damage_are_published(owned: list[Fr
     assert at == end
 
 
-@given(st.binary(max_size=300), st.integers(0, LARGEST))
-def test_any_bytes_publish_whole_frames_or_none(data: bytes, number: int) -> None:
-    far = ring()
-    count, last, end = far.publish_packed(data, 0, number, 1000, 2000, 9, 0, LARGEST)
-    assert far.head() == count
-    assert 0 <= last <= end <= len(data)
+def test_a_damaged_head_packs_no_frames_that_do_not_exist() -> None:
+    memory = ring_memory(size=SIZE)
+    near = Ring(memory, 0, len(memory))
+    near.begin()
+    for cycle in range(3):
+        near.publish(bytes(SIZE), None, cycle, 0, 0, 0, Quality.GOOD, Provenance.LIVE, 0, 0, b"")
+    struct.pack_into("<Q", memory, 64, LARGEST)
+    assert near.head() == LARGEST
+    for after in (LARGEST // 2 - 1, LARGEST // 2, LARGEST // 2 + 1, LARGEST - 1):  # their sequences wrap
+        assert near.pack(after, LARGEST, 4) == (b"", after, 0)

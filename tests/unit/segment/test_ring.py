@@ -99,6 +99,7 @@ def test_many_frames_are_read_at_once_up_to_one_that_is_missing() -> None:
     for frame, single in zip(many, (ring.read(6), ring.read(7), ring.read(8)), strict=True):
         assert single is not None
         assert frame == (*single[:6], "q2", 1000, *single[8:])
+        assert hash(frame) == hash(tuple(frame))
     assert [frame[0] for frame in ring.read_many(4, 99, Copy, qualities, provenances)] == list(range(4, 12))
     for first, count in ((3, 9), (12, 9), (0, 9), (5, 0), (5, -1), (2**64 - 1, 2)):
         assert ring.read_many(first, count, Copy, qualities, provenances) == []
