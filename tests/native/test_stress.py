@@ -12,7 +12,7 @@ COMPILER = shutil.which("cc") or shutil.which("gcc") or "cc"
 
 
 @pytest.mark.parametrize("sanitizers", ["thread", "address,undefined"])
-@pytest.mark.parametrize("name", ["ring_stress", "queue_stress"])
+@pytest.mark.parametrize("name", ["ring_stress", "frames_stress", "queue_stress"])
 def test_sanitizers_find_nothing(name: str, sanitizers: str, tmp_path: Path) -> None:
     source, program = Path(__file__).with_name(f"{name}.c"), tmp_path / name
     # -Wno-tsan: the thread sanitizer does not model fences. All shared words are atomic, so it misses no race.

@@ -18,7 +18,7 @@ LAYOUT = Layout("DB1", 1, 4, False, (Register("count", "INT", (), 0, None, 2, 1)
 
 
 def follower(segment: Segment) -> BlockFollower:
-    return BlockFollower(segment.blocks["cell"], 1, BlockPosition(), Reason.OVERTAKEN, segment.header.started_utc_ns)
+    return BlockFollower(segment.blocks["cell"], 1, BlockPosition(), Reason.NOT_RUNNING, segment.header.started_utc_ns)
 
 
 def publish(writer: BlockWriter, action: str, cycle: int) -> None:

@@ -140,4 +140,4 @@ def test_a_damaged_head_packs_no_frames_that_do_not_exist() -> None:
     struct.pack_into("<Q", memory, 64, LARGEST)
     assert near.head() == LARGEST
     for after in (LARGEST // 2 - 1, LARGEST // 2, LARGEST // 2 + 1, LARGEST - 1):  # their sequences wrap
-        assert near.pack(after, LARGEST, 4) == (b"", after, 0)
+        assert near.pack(after, LARGEST, 4) == (bytearray(), after, 0)
