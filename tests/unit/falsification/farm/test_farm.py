@@ -391,17 +391,21 @@ def test_a_worker_ends_although_a_cancellation_is_lost(
     """The request for its files fails, and would be repeated for ever."""
 
     async def work() -> None:
-        stop, ready = asyncio.Event(), asyncio.Event()
+        stop, ready, refused = asyncio.Event(), asyncio.Event(), asyncio.Event()
 
         def tell(line: str) -> None:
             if "waiting for searches" in line:
                 ready.set()
+            if "is not served" in line:
+                refused.set()
 
         running = asyncio.create_task(Worker(Access((server.url,)), 1, tmp_path / "work", tell).run(stop))
         await asyncio.wait_for(ready.wait(), 30)
         waits = lose_cancellation(monkeypatch, "STREAM.INFO.OBJ_")
         await publish(server.url, "shmio_farm.offer", json.dumps(OFFER).encode())
         assert await asyncio.to_thread(waits.wait, 30)
+        await publish(server.url, "shmio_farm.offer", json.dumps({**OFFER, "over": True}).encode())
+        await asyncio.wait_for(refused.wait(), 30)
         stop.set()
         await asyncio.wait_for(running, 30)
 
