@@ -71,3 +71,20 @@ def test_packed_entries_are_those_that_take_returns(actions: list[str], limit: i
             assert frames + sum(hasattr(entry, "raw") for entry in found) == one.last
         finally:
             segment.unlink()
+
+
+def test_a_gap_after_packed_frames_is_one_after_taken_frames() -> None:
+    block = BlockSpec("cell", LAYOUT, 20_000_000, 500_000_000, 1 << 16, Attributes("s7", ()))
+    with Segment.create(f"followed{os.getpid()}", [block], []) as segment:
+        try:
+            writer = segment.writer("cell")
+            one, other = follower(segment), follower(segment)
+            assert one.take(1)[0].item == other.take(1)[0].item  # the event that the source has started
+            publish(writer, "good", 1)
+            assert [item for _, _, item in one.take(1)] == list(decode_entries(bytes(other.pack(1)), 0))
+            publish(writer, "flood", 2)
+            taken, after_packed = one.take(1)[0], other.take(1)[0]
+            assert isinstance(taken.item, Gap)
+            assert (after_packed.log_ns, after_packed.item) == (taken.log_ns, taken.item)
+        finally:
+            segment.unlink()
