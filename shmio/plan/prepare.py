@@ -184,12 +184,14 @@ def _spelled(config: Config, layouts: dict[str, Layout]) -> Config:
 def _spelled_source(source: Source, layout: Layout) -> Source:
     """Return the source with patterns spelled as in the layout.
 
-    Registers that a tag table makes writable are added to the key ``writable``.
+    Registers that a tag table makes writable are added to the key ``writable``, except for a mirror: its table
+    is the owner's, which does not decide what this instance's programs may write.
     """
     patterns = dict.fromkeys(block_path(pattern, layout) for pattern in source.writable)
+    tables = () if source.connector == "fabric" else layout.registers
     return replace(
         source,
-        writable=[*patterns, *(one.path for one in layout.registers if one.writable and one.path not in patterns)],
+        writable=[*patterns, *(one.path for one in tables if one.writable and one.path not in patterns)],
         allow_nonfinite=tuple(block_path(pattern, layout) for pattern in source.allow_nonfinite),
     )
 

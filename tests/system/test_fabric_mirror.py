@@ -15,7 +15,7 @@ from shmio.testing.ports import reserved_port
 TAGS = """
 [registers]
 speed = { type = "REAL", comment = "of the belt" }
-count = { type = "DINT" }
+count = { type = "DINT", writable = true }
 """
 NEAR = """
 [instance]
@@ -88,6 +88,10 @@ def test_a_mirror_shows_what_the_owner_has_and_passes_writes_on(cells: tuple[Cel
         assert (outcome.kind, outcome.text) == (OutcomeKind.WRITTEN, "")
         assert owner.get("belt/speed")[0].value == 2.5
         until(lambda: mirror.get("mirrored/speed")[0].value == 2.5, "the mirror shows its own write")
+        [outcome] = owner.set({"belt/count": 3})
+        assert outcome.kind is OutcomeKind.WRITTEN, "the owner's table makes it writable at the owner"
+        with pytest.raises(shmio.errors.CommandError, match=r"count is not writable.*`writable`"):
+            mirror.set({"mirrored/count": 4})
 
 
 def test_a_mirror_is_bad_while_the_owner_is_away(cells: tuple[Cell, Cell]) -> None:

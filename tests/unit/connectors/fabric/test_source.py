@@ -37,17 +37,22 @@ def owner(tmp_path: Path) -> BlockSpec:
 @pytest.fixture
 def server(tmp_path: Path, owner: BlockSpec) -> Iterator[NatsServer]:
     with nats_server(tmp_path / "nats") as server:
-
-        async def offer() -> None:
-            client = await connect(Access((server.url,)), "test", patient=False)
-            registry = await Registry.open(client)
-            await registry.put_layout(owner.layout)
-            source = SourceEntry("cell", owner.layout.hash.hex(), owner.period_ns, owner.stale_ns, 1)
-            await registry.claim(CellEntry(NEAR, "host1", "near", "0.1", "1", "running", 1, 2, "", (source,)))
-            await client.close()
-
-        asyncio.run(offer())
+        offer(server, owner)
         yield server
+
+
+def offer(server: NatsServer, owner: BlockSpec) -> None:
+    """Tell the registry that the cell ``NEAR`` has this source."""
+
+    async def claim() -> None:
+        client = await connect(Access((server.url,)), "test", patient=False)
+        registry = await Registry.open(client)
+        await registry.put_layout(owner.layout)
+        source = SourceEntry(owner.source, owner.layout.hash.hex(), owner.period_ns, owner.stale_ns, 1)
+        await registry.claim(CellEntry(NEAR, "host1", "near", "0.1", "1", "running", 1, 2, "", (source,)))
+        await client.close()
+
+    asyncio.run(claim())
 
 
 def plan(folder: Path, url: str, layout: str = "", cell: str = NEAR) -> Plan:
@@ -77,6 +82,21 @@ def test_another_layout_than_the_owners_is_refused(tmp_path: Path, server: NatsS
         ConfigError, match=rf"source\[0\]\.layout: {NEAR}/cell has another layout; use the owner's file"
     ):
         plan(tmp_path, server.url, other)
+
+
+def test_the_owners_table_makes_nothing_writable_here(tmp_path: Path, server: NatsServer) -> None:
+    table = '[registers]\nlamp = { type = "BOOL", writable = true }\nspeed = { type = "REAL", writable = true }\n'
+    (tmp_path / "belt.toml").write_text(table)
+    (tmp_path / "owner.toml").write_text(
+        '[instance]\nname = "near"\n[[source]]\nname = "belt"\nconnector = "memory"\ntags = "belt.toml"\n'
+    )
+    (owner,) = prepare(tmp_path / "owner.toml").plan.blocks
+    assert owner.attributes.writable == ("lamp", "speed")
+    offer(server, owner)
+    for own, writable in (("", ()), ('writable = ["speed"]\n', ("speed",)), ('layout = "belt.toml"\n', ())):
+        (tmp_path / "far.toml").write_text(MIRROR.format(server.url, NEAR).replace('"cell"', '"belt"', 1) + own)
+        (mirror,) = prepare(tmp_path / "far.toml").plan.blocks
+        assert (mirror.layout.hash, mirror.attributes.writable) == (owner.layout.hash, writable), own
 
 
 def test_a_malformed_and_an_absent_cell_are_named_with_their_key(tmp_path: Path, server: NatsServer) -> None:
