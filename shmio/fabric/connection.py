@@ -37,6 +37,9 @@ MAX_CREDENTIALS_BYTES: Final = 1 << 16
 MAX_REASONS: Final = 32
 """Maximum number of reasons that are remembered because they were logged."""
 
+FARM: Final = "shmio_farm"
+"""Name of the stream and of the object store of a farm, and first token of its subjects."""
+
 _UNTRUSTED: Final = (18, 19, 20, 21)
 """OpenSSL's codes for a certificate whose authority is unknown."""
 
@@ -45,6 +48,10 @@ _VIOLATION: Final = re.compile(
 )
 
 log = logging.getLogger("shmio.fabric")
+
+
+class RefusedError(RemoteError):
+    """The user needs other credentials: there are none, or they do not permit what was asked."""
 
 
 class Access(msgspec.Struct, frozen=True):
@@ -114,6 +121,7 @@ async def connect(
     Raises:
         ConfigError: A TLS or credentials file cannot be used.
         MissingLibraryError: nats-py is not installed.
+        RefusedError: With ``patient`` False, a server asks for credentials, and there are none.
         RemoteError: With ``patient`` False, no server can be reached, or a server refuses the
             credentials.
 
@@ -121,7 +129,7 @@ async def connect(
     errors = library("nats.errors", INSTALL)
     from shmio.fabric.client import FabricClient  # noqa: PLC0415  it needs the extra
 
-    attempts = _Attempts(access, failed)
+    attempts = _Attempts(access, failed, patient=patient)
 
     async def on_error(error: BaseException) -> None:
         attempts.add(error, up=client.is_connected)
@@ -152,7 +160,8 @@ async def connect(
         await client.connect(**options)
     except (OSError, errors.Error) as error:  # a time-out is an OSError
         await client.abandon()
-        raise RemoteError(attempts.why or _why(access, error)) from None
+        missing = access.credentials is None and (attempts.refused or _is_refusal(error))
+        raise (RefusedError if missing else RemoteError)(attempts.why or _why(access, error)) from None
     attempts.clear()
     return client
 
@@ -209,16 +218,32 @@ async def call_once(access: Access, work: Callable[[FabricClient], Coroutine[Any
     """Connect once, and return the result of ``work`` with the connection.
 
     Raises:
+        RefusedError: The user needs other credentials.
         RemoteError: No server can be reached, or it does not answer.
 
     """
     client = await connect(access, "shmio", patient=False)
     try:
-        return await work(client)
+        return await call(access, client, work)
     except (TimeoutError, library("nats.errors", INSTALL).Error) as error:
-        raise RemoteError(f"{access}: {refusal(access, client.refused) or reason(error)}") from None
+        raise RemoteError(f"{access}: {reason(error)}") from None
     finally:
         await client.close()
+
+
+async def call(access: Access, client: FabricClient, work: Callable[[FabricClient], Coroutine[Any, Any, Any]]) -> Any:
+    """Return the result of ``work``. If it fails since the server refuses something to this user, say so.
+
+    Raises:
+        RefusedError: The server refuses what ``work`` asks.
+
+    """
+    try:
+        return await work(client)
+    except (TimeoutError, RemoteError, library("nats.errors", INSTALL).Error):
+        if not (why := refusal(access, client.refused)):
+            raise
+        raise RefusedError(f"{access}: {why}") from None
 
 
 def _tls(access: Access) -> dict[str, Any]:
@@ -292,32 +317,38 @@ def inbox_prefix(key: str) -> str:
 
 
 class _Attempts:
-    """The reasons why attempts to connect fail. Each is logged once until there is a connection."""
+    """The reasons why attempts to connect fail.
 
-    def __init__(self, access: Access, failed: Callable[[str], object] | None) -> None:
-        self._access, self._failed = access, failed
+    A patient client logs each once until there is a connection. Others raise an error with the
+    reason, so only refused subscriptions are logged: these fail without an error.
+    """
+
+    def __init__(self, access: Access, failed: Callable[[str], object] | None, *, patient: bool) -> None:
+        self._access, self._failed, self._patient = access, failed, patient
         self._logged: set[str] = set()
-        self._refused = False
+        self.refused = False
         self.why = ""
 
     def add(self, error: BaseException, *, up: bool) -> None:
         """Take an error; ``up`` is True if there is a connection, so that the error has not ended it."""
+        if not up and self.refused and not _is_refusal(error):
+            return  # a server that refuses a client may also reset its connection
         text = (refusal(self._access, str(error)) or reason(error)) if up else _why(self._access, error)
-        if text not in self._logged:
+        if text not in self._logged and (self._patient or "subscription" in str(error).lower()):
             if len(self._logged) >= MAX_REASONS:
                 self._logged.clear()
             self._logged.add(text)
             log.warning("fabric: %s", text)
-        if up or (self._refused and not _is_refusal(error)):
+        if up:
             return
-        self._refused, self.why = _is_refusal(error), text
+        self.refused, self.why = _is_refusal(error), text
         if self._failed is not None:
             self._failed(text)
 
     def clear(self) -> None:
         """Forget the reasons: there is a connection."""
         self._logged.clear()
-        self._refused, self.why = False, ""
+        self.refused, self.why = False, ""
 
 
 def _is_refusal(error: BaseException) -> bool:
@@ -366,17 +397,30 @@ def refusal(access: Access, text: str, cell: object = None) -> str:
     subject = found["subject"]
     parts = subject.split(".")
     if subject.lower().startswith("$js."):
-        return (
-            f"{who} may not use histories; reading them needs the seed of a history reader, and creating them that of "
-            "the administrator"
-        )
+        return f"{who} may not {_refused_request(subject.lower())}"
     if parts[0] == "shmio" and len(parts) > 5:
         own = parts[6:9] if parts[5] == "command" and found["verb"] == "publish" else parts[1:4]
     elif parts[0].lower() == "$kv" and len(parts) == 5:
         own = parts[2:5]
     else:
-        return f"{who} may not {found['verb']} {subject}"
+        return f"{who} may not {'publish to' if found['verb'] == 'publish' else 'subscribe to'} {subject}"
     return f"{who} may not publish as {cell or '.'.join(own)}; use the seed of this cell"
+
+
+def _refused_request(subject: str) -> str:
+    """Return what a request to JetStream would do, and which credentials may; its subject is in lower case."""
+    if FARM in subject:
+        return "use a farm; use the seed of a farm user"
+    if ".kv_" in subject:
+        if subject.startswith(("$js.api.stream.info.", "$js.api.stream.msg.get.")):
+            return "read the registry; use the seed of a cell or viewer"
+        return "create the registry; run shmio fabric prepare once with admin.seed, the administrator's seed"
+    if subject.startswith("$js.api.stream.create."):
+        return "create histories; use admin.seed, the administrator's seed"
+    return (
+        "use histories; reading them needs the seed of a history reader, and creating them admin.seed, the "
+        "administrator's seed"
+    )
 
 
 def reason(error: BaseException) -> str:

@@ -18,14 +18,17 @@ _ANY = f"{ROOT}.*.*.*"
 
 
 class Permissions(NamedTuple):
-    """The subjects to which a user may publish, and those that it may subscribe to."""
+    """The subjects to which a user may publish, but for some, and those that it may subscribe to."""
 
     publish: tuple[str, ...]
     subscribe: tuple[str, ...]
+    publish_not: tuple[str, ...] = ()
 
 
 EVERYTHING = Permissions((">",), (">",))
 """For the administrator, who creates what the servers keep."""
+FARM_USER = Permissions((">",), (">",), tuple(f"$JS.API.STREAM.*.KV_{bucket}" for bucket in BUCKETS))
+"""For the users of a farm's account: a command that looks for cells there would create an empty registry."""
 _REGISTRY = tuple(
     f"$JS.API.{request}.KV_{bucket}" for bucket in BUCKETS for request in ("STREAM.INFO", "STREAM.MSG.GET")
 )

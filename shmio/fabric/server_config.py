@@ -13,6 +13,7 @@ from shmio.fabric.messages import MAX_MESSAGE_BYTES
 from shmio.fabric.names import CellName
 from shmio.fabric.permissions import (
     EVERYTHING,
+    FARM_USER,
     Permissions,
     cell_permissions,
     history_reader_permissions,
@@ -116,7 +117,8 @@ def server_configuration(settings: ServerSettings, index: int, users: Sequence[U
 
 def _entry(user: User, streams: tuple[str, ...]) -> dict[str, Any]:
     allowed = _permissions(user, streams)
-    permissions = {"publish": {"allow": allowed.publish}, "subscribe": {"allow": allowed.subscribe}}
+    publish = {"allow": allowed.publish} | ({"deny": allowed.publish_not} if allowed.publish_not else {})
+    permissions = {"publish": publish, "subscribe": {"allow": allowed.subscribe}}
     return {"nkey": user.key, "permissions": permissions}
 
 
@@ -130,7 +132,9 @@ def _permissions(user: User, streams: tuple[str, ...]) -> Permissions:
         return cell_permissions(cell, user.key, cell.history)
     if user.kind == "viewer":
         return viewer_permissions(user.key)
-    return history_reader_permissions(user.key, streams) if user.kind == "history-reader" else EVERYTHING
+    if user.kind == "history-reader":
+        return history_reader_permissions(user.key, streams)
+    return FARM_USER if user.kind == "farm-user" else EVERYTHING
 
 
 def _tls(tls: MqttTls) -> dict[str, Any]:

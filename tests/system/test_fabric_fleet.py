@@ -90,6 +90,8 @@ def test_an_unreachable_server_is_named(server: NatsServer, capsys: pytest.Captu
     server.stop()
     assert run(server, "cells", "--json") == 1
     assert f"{server.url}: no NATS server can be reached" in json.loads(capsys.readouterr().out)["error"]
+    assert run(server, "cells") == 1
+    assert len(capsys.readouterr().err.splitlines()) == 1
 
 
 def test_the_configuration_names_the_server(

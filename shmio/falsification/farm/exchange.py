@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Final, TypeVar
 
 import msgspec
 
-from shmio.errors import RemoteError
-from shmio.fabric.connection import INSTALL, RETRY_S
+from shmio.errors import ConfigError, RemoteError
+from shmio.fabric.connection import FARM, INSTALL, RETRY_S, Access, RefusedError, call_once
 from shmio.libraries import library
 
 if TYPE_CHECKING:
@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from nats.js import JetStreamContext
     from nats.js.object_store import ObjectStore
 
-NAME: Final = "shmio_farm"
-"""Name of the stream and of the object store, and first token of all subjects."""
+NAME: Final = FARM
 OFFERS: Final = f"{NAME}.offer"
 BEAT_S: Final = 1.0
 """Interval in s between two offers of a search, two answers of a worker, and two signs of life of a task."""
@@ -130,6 +129,20 @@ def task_consumer(search: str) -> str:
 def result_consumer(search: str) -> str:
     """Return the name of the consumer from which a search takes its results."""
     return f"result-{search}"
+
+
+async def try_access(access: Access) -> None:
+    """Connect once, and check as :func:`contact` does.
+
+    Raises:
+        ConfigError: The user needs other credentials.
+        RemoteError: No server can be reached, or it refuses access.
+
+    """
+    try:
+        await call_once(access, contact)
+    except RefusedError as error:
+        raise ConfigError(str(error)) from None
 
 
 async def contact(client: Client) -> None:

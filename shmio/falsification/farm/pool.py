@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import queue
 import secrets
+import shlex
 import threading
 import time
 from collections.abc import Callable, Coroutine
@@ -15,7 +16,7 @@ import msgspec
 from msgspec.structs import replace
 
 from shmio.errors import RemoteError, ShmioError
-from shmio.fabric.connection import INSTALL, Access, call_once, connect
+from shmio.fabric.connection import INSTALL, Access, connect
 from shmio.fabric.tasks import end
 from shmio.falsification.farm.bundle import Bundle
 from shmio.falsification.farm.exchange import (
@@ -27,7 +28,6 @@ from shmio.falsification.farm.exchange import (
     SILENT_S,
     Offer,
     Presence,
-    contact,
     host_name,
     insist,
     open_consumer,
@@ -37,6 +37,7 @@ from shmio.falsification.farm.exchange import (
     results_of,
     task_consumer,
     tasks_of,
+    try_access,
     workers_of,
 )
 from shmio.falsification.trial import Result, Task
@@ -194,10 +195,7 @@ class FarmPool:
             self._lonely_s = now_s + SILENT_S  # it may be silent for so long until it is gone
         elif self._lonely_s is not None and now_s - self._lonely_s > NOBODY_S:
             self._lonely_s = None
-            self._tell(
-                f"{self._access}: there is no worker; start one on any host: "
-                f"shmio-campaign worker --farm {','.join(self._access.servers)}"
-            )
+            self._tell(f"{self._access}: there is no worker; start one on any host: {_worker_command(self._access)}")
 
     async def _answered(self, message: Msg) -> None:
         try:
@@ -235,7 +233,7 @@ class FarmPool:
             self._found.put(RemoteError(f"{self._access}: {type(error).__name__}: {error}"))
 
     async def _begin(self) -> None:
-        await call_once(self._access, contact)  # fails at once, while the other connection would wait for a server
+        await try_access(self._access)  # fails at once, while the other connection would wait for a server
         self._client = await connect(self._access, "shmio-campaign falsify", lost=self._lost)
         await self._provide()
         search = self._offer.search
@@ -358,3 +356,13 @@ class FarmPool:
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._loop.close()
+
+
+def _worker_command(access: Access) -> str:
+    """Return the command that starts a worker for the same servers."""
+    words = ["shmio-campaign", "worker", "--farm", ",".join(access.servers)]
+    files = msgspec.structs.asdict(access.tls) if access.tls is not None else {}
+    for name, file in {"credentials": access.credentials, **files}.items():
+        if file is not None:
+            words += [f"--{name}", file]
+    return shlex.join(words)

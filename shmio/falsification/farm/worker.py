@@ -26,7 +26,7 @@ import msgspec
 from msgspec.structs import replace
 
 from shmio.errors import RemoteError, ShmioError
-from shmio.fabric.connection import INSTALL, Access, call_once, connect_or_stop
+from shmio.fabric.connection import INSTALL, Access, call, connect_or_stop
 from shmio.fabric.tasks import end
 from shmio.falsification.farm.bundle import MAX_BYTES, place_in, unpack
 from shmio.falsification.farm.environment import differences
@@ -45,6 +45,7 @@ from shmio.falsification.farm.exchange import (
     open_store,
     results_of,
     task_consumer,
+    try_access,
     workers_of,
 )
 from shmio.falsification.pool import Pool
@@ -144,12 +145,12 @@ class Worker:
         """Serve until ``stop`` is set. Then give the running trials back to the queue.
 
         Raises:
-            ConfigError: A file of the access cannot be used.
+            ConfigError: A file of the access cannot be used, or the user needs other credentials.
             RemoteError: The server refuses access.
 
         """
         try:
-            await call_once(self._access, contact)
+            await try_access(self._access)
         except RemoteError as error:
             self._tell(f"{error}; trying again")
         client = await connect_or_stop(self._access, "shmio-campaign worker", stop, lost=self._lost, back=self._back)
@@ -157,7 +158,7 @@ class Worker:
             return
         self._client = client
         try:
-            await contact(self._client)
+            await call(self._access, self._client, contact)
             for slot in self._all:
                 self._slots.put_nowait(slot)
             await self._client.subscribe(OFFERS, cb=self._hear)

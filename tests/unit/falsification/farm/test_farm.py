@@ -311,6 +311,20 @@ def test_workers_that_are_missing_or_different_are_named(server: NatsServer, bun
         pass
 
 
+def test_the_command_for_a_worker_has_the_credentials(
+    tmp_path: Path, bundle: Bundle, credentials: tuple[str, str]
+) -> None:
+    told: list[str] = []
+    seed, key = credentials
+    with nats_server(tmp_path / "nats", authorization={"users": [{"nkey": key}]}) as server:
+        with pool(server, bundle, told, seed) as farm:
+            while not told:
+                assert farm.wait(0.1) == []
+        assert told[0].endswith(f"worker --farm {server.url} --credentials {seed}")
+        with pytest.raises(ConfigError, match="asks for credentials"), pool(server, bundle, told):
+            pass
+
+
 def test_wrong_options_are_named_before_the_search(
     server: NatsServer, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
