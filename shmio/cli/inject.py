@@ -10,7 +10,8 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Final
+from types import TracebackType
+from typing import Any, Final, Self
 
 import msgspec
 
@@ -25,6 +26,7 @@ from shmio.layout.values.codec import Value
 from shmio.layout.values.typed import read_value
 from shmio.layout.values.write import Write, paths_of
 from shmio.model.cell import Campaign, Cell
+from shmio.model.event import Event, EventKind
 from shmio.model.injection import InjectionEvent
 from shmio.wording import printable, unknown
 
@@ -72,7 +74,9 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
     Raises:
         PathError: A path names no register.
         ValueRangeError: A value does not fit its register.
-        CommandError: The options contradict each other, or a source refused the injection.
+        CommandError: The options contradict each other, a source refused the injection, or somebody
+            else lifted it.
+        NotRunningError: The instance has stopped.
     """
     if options.lift_all or options.lift is not None:
         return _lift(cell, options)
@@ -89,7 +93,9 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
         topic, value = _read(layouts, path, text)
         wanted.setdefault((topic.source, topic.direction or "out"), {})[f"{topic.source}/{topic.path}"] = value
     with ExitStack() as stack:
-        for (_, direction), values in wanted.items():
+        watch = None if options.keep else stack.enter_context(_Watch(cell, [source for source, _ in wanted]))
+        created: dict[tuple[str, int], str] = {}
+        for (source, direction), values in wanted.items():
             paths = [f"{path}/{direction}" for path in values]
             shadow = stack.enter_context(
                 cell.inject(*paths, priority=options.priority, keep=options.keep, name=options.name)
@@ -97,9 +103,10 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
             for path, outcome in zip(paths, shadow.set(values), strict=True):
                 if not outcome.done:
                     raise CommandError(f"{path}: {outcome.text}")
-            print(f"{shadow.number}: {', '.join(map(printable, paths))}", flush=True)
-        if not options.keep:
-            _wait(options.for_s)
+            created[source, shadow.number] = f"{shadow.number}: {', '.join(map(printable, paths))}"
+            print(created[source, shadow.number], flush=True)
+        if watch is not None:
+            watch.wait(created, options.for_s)
     return 0
 
 
@@ -121,10 +128,92 @@ def _read(layouts: Mapping[str, Layout], path: str, text: str) -> tuple[Topic, V
         raise ValueRangeError(f"{path}: {str(error).removeprefix(f'{register.path}: ')}") from None
 
 
-def _wait(for_s: float | None) -> None:
-    """Wait for Ctrl-C, SIGTERM or SIGHUP, for at most ``for_s`` seconds; None sets no limit."""
-    with stop_on_signals() as over:
-        over.wait(for_s)
+class _Watch:
+    """Waits while the injections of this command exist, and notices if they end before it lifts them.
+
+    Leave the ``with`` block after the injections were lifted, so that no signal interrupts that.
+    """
+
+    def __init__(self, cell: Cell, sources: Sequence[str]) -> None:
+        self._cell = cell
+        self._sources = list(dict.fromkeys(sources))
+        self._left: dict[tuple[str, int], str] = {}
+        self._lifted: list[str] = []
+        self._error: ShmioError | None = None
+        self._thread = threading.Thread(target=self._follow, daemon=True)
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            self._over = stack.enter_context(stop_on_signals())
+            self._events = stack.enter_context(self._cell.events(*self._sources))  # from before the injections
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._events.close()
+        if self._thread.ident is not None:
+            self._thread.join()
+        self._stack.close()
+
+    def wait(self, created: Mapping[tuple[str, int], str], for_s: float | None) -> None:
+        """Wait for Ctrl-C, SIGTERM or SIGHUP, for at most ``for_s`` seconds; None sets no limit.
+
+        Args:
+            created: A text for each injection, by source and number.
+            for_s: Longest time in s.
+
+        Raises:
+            CommandError: Somebody else lifted injections.
+            NotRunningError: The instance has stopped.
+
+        """
+        self._left.update(created)
+        self._thread.start()
+        self._over.wait(for_s)
+        self._over.set()  # what is lifted from now on, this command lifts
+        if self._error is not None:
+            raise self._error
+        if self._lifted:
+            raise CommandError("; ".join(self._lifted))
+
+    def _follow(self) -> None:
+        """Set ``over`` when no injection is left, or when the instance stops."""
+        try:
+            for event in self._events:
+                if self._over.is_set():
+                    return
+                if event.kind == EventKind.LIFTED:
+                    self._drop(event.source, event.injection, event)
+                elif event.missed or event.kind in (EventKind.STARTED, EventKind.REMOVED):
+                    self._drop_absent(event)
+                if not self._left:
+                    return
+        except ShmioError as error:
+            if not self._over.is_set():
+                self._error = error
+        finally:
+            self._over.set()
+
+    def _drop_absent(self, event: Event) -> None:
+        """Drop the injections of a source that have ended without an event, as in a block that a reload replaced."""
+        source = event.source
+        removed = event.kind == EventKind.REMOVED
+        present = () if removed else {one.number for one in self._cell.injections(source)}
+        for number in [number for of, number in self._left if of == source and number not in present]:
+            self._drop(source, number, event if removed else None)
+
+    def _drop(self, source: str, number: int, event: Event | None) -> None:
+        """Take note that one of the injections has ended, and say so at once if others remain."""
+        if (created := self._left.pop((source, number), None)) is None:
+            return
+        text = f"{created} was lifted{f' by {event.by}' if event is not None and event.by else ''}"
+        if event is not None and event.text not in ("", "lifted"):
+            text += f": {printable(event.text)}"
+        if self._left:
+            print(text, file=sys.stderr, flush=True)
+        self._lifted.append(text)
 
 
 def _lift(cell: Cell, options: argparse.Namespace) -> int:

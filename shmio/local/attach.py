@@ -404,7 +404,10 @@ class Attachment:
         patterns = [topic.path or "**" for topic in topics]
         number = source_writer.inject(patterns, direction=direction, priority=priority, keep=keep, name=name)
         names = names_in(block.layout, patterns)
-        return Shadow(source_writer, number, direction, events, partial(self._next, block), keep=keep, names=names)
+        return Shadow(
+            source_writer, number, direction, events, partial(self._next, block), keep=keep, names=names,
+            running=self._segment.shared.current,
+        )  # fmt: skip
 
     def written(self, *paths: str, timeout_s: float | None = None) -> Iterator[ObservedWrite]:
         """Iterate over the commands that write to registers of one source from now on.

@@ -81,6 +81,7 @@ class Shadow:
         *,
         keep: bool,
         names: Sequence[Register] = (),
+        running: Callable[[], bool] = lambda: True,
     ) -> None:
         """Wrap an existing injection.
 
@@ -92,6 +93,7 @@ class Shadow:
             next_event: Waits for the cursor's next event.
             keep: Whether the injection stays when it is closed.
             names: The registers of tag tables over the block whose names the program gave.
+            running: Returns whether the instance still runs.
         """
         self.source = source_writer.block.source
         self.number = number
@@ -107,6 +109,7 @@ class Shadow:
         self._next_event = next_event
         self._keep = keep
         self._names = names
+        self._running = running
 
     def set(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
         """Give values: to consumers if the shadow is over ``/out``, to the device if it is over ``/in``.
@@ -174,12 +177,12 @@ class Shadow:
         self._source_writer.lift(self.number)
 
     def close(self) -> None:
-        """Lift the shadow, unless it was created with ``keep`` or a program has lifted it.
+        """Lift the shadow, unless it was created with ``keep``, or has ended.
 
         Raises:
             CommandError: The source does not answer.
         """
-        if not self._keep:
+        if not self._keep and self._running():
             lift_all([(self._source_writer, self.number)])
 
     def __enter__(self) -> Self:
@@ -411,7 +414,7 @@ class Campaign(Following[InjectionEvent]):
     def close(self) -> None:
         """Lift the remaining injections, unless they were created with ``keep``."""
         super().close()
-        for one in () if self._keep else self._left.values():
+        for one in () if self._keep or not self._segment.shared.current() else self._left.values():
             with suppress(CommandError):  # the injection is over, or another program has lifted it
                 one.lift()
         self._left.clear()
@@ -424,7 +427,7 @@ def lift_all(injections: Iterable[tuple[SourceWriter, int]]) -> None:
         CommandError: Some injections could not be lifted. The message gives the reasons.
     """
     asked: list[tuple[SourceWriter, PendingCommand]] = []
-    chosen, reasons = list(injections), dict[str, None]()
+    chosen, reasons = [one for one in injections if _is_present(*one)], dict[str, None]()
     for source_writer, number in chosen:
         try:
             asked.append((source_writer, source_writer.ask_to_lift(number)))
@@ -435,13 +438,13 @@ def lift_all(injections: Iterable[tuple[SourceWriter, int]]) -> None:
             source_writer.expect_lifted(ticket)
         except CommandError as error:
             reasons[str(error)] = None
-    left = [
-        number
-        for source_writer, number in chosen
-        if any(one.number == number and not one.lifted for one in source_writer.block.injections.read())
-    ]
+    left = sum(_is_present(*one) for one in chosen)
     if left:
-        raise CommandError(f"{len(left)} of {len(chosen)} injections were not lifted: {'; '.join(reasons)}")
+        raise CommandError(f"{left} of {len(chosen)} injections were not lifted: {'; '.join(reasons)}")
+
+
+def _is_present(source_writer: SourceWriter, number: int) -> bool:
+    return any(one.number == number and not one.lifted for one in source_writer.block.injections.read())
 
 
 def by_path(topics: Iterable[Topic], values: Mapping[str, object]) -> dict[str, object]:
