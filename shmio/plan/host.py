@@ -198,17 +198,20 @@ def exposure(config: Config) -> str | None:
         *_open_grpc(config),
         *_open_mqtt(config),
         *_open_opcua(config),
-        *_open_fabric(config),
         *_open_web(config),
     ]
-    users = other_users() if ways else []
+    by_nats = list(_open_fabric(config))
+    users = other_users() if ways or by_nats else []
     if not users:
         return None
     more = len(users) - MAX_NAMES
     names = ", ".join(users[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
+    remedies = ["a UNIX socket, tokens or accounts prevent this (see SECURITY.md)"] if ways else []
+    if by_nats:
+        remedies.append("for NATS, fabric.tls.ca or a server of shmio fabric server-config prevents this")
     return (
-        f"note: other users of this host ({names}) may {'; and '.join(ways)} without logging in: "
-        "a UNIX socket, tokens or accounts prevent this (see SECURITY.md)"
+        f"note: other users of this host ({names}) may {'; and '.join(ways + by_nats)} without logging in: "
+        f"{'; '.join(remedies)}"
     )
 
 

@@ -532,7 +532,12 @@ def test_the_printed_command_reaches_the_server(
     folder = tmp_path / "nats"
     given = ["--certificate", pem["certificate"], "--key", pem["key"], "--listen", f"127.0.0.1:{port}"]
     assert main(["fabric", "server-config", "-o", str(folder), *given]) == 0
-    command = capsys.readouterr().out.partition("then run shmio ")[2].partition(" once")[0].split()
+    assert main(["fabric", "server-config", "-o", str(tmp_path / "farm"), "--farm-user", "lab", *given]) == 0
+    out, _, farm = capsys.readouterr().out.partition(f"wrote {tmp_path / 'farm'}")
+    assert f"--credentials of shmio-campaign worker --farm tls://127.0.0.1:{port}" in farm
+    assert "prepare" not in farm, "a farm needs no registry"
+    assert "fabric.credentials" not in farm
+    command = out.partition("then run shmio ")[2].partition(" once")[0].split()
     with running(folder / "nats-server.conf", port):
         assert main(command) == 0, capsys.readouterr().err
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 from collections.abc import Sequence
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -53,14 +53,16 @@ def table(found: Sequence[Member]) -> list[str]:
 async def _follow(registry: Registry, found: Sequence[Member], *, as_json: bool) -> None:
     before = {one.cell: one for one in found}
     for one in found if as_json else ():
-        say(dumps({"cell": one.cell, "event": one.state, "at": _now()}))
+        say(dumps({"cell": one.cell, "event": one.state, "at": _utc(datetime.now(UTC))}))
     while True:
         await asyncio.sleep(RENEW_S)
         now = {one.cell: one for one in await members(registry)}
         for cell, text in changes(before, now):
-            say(dumps({"cell": cell, "event": text, "at": _now()}) if as_json else f"{_now()}  {cell}  {text}")
+            at = datetime.now(UTC)
+            local = at.astimezone().isoformat(" ", timespec="seconds")[:19]
+            say(dumps({"cell": cell, "event": text, "at": _utc(at)}) if as_json else f"{local}  {cell}  {text}")
         before = now
 
 
-def _now() -> str:
-    return datetime.now().astimezone().isoformat(timespec="seconds")
+def _utc(at: datetime) -> str:
+    return at.isoformat(timespec="seconds").replace("+00:00", "Z")

@@ -196,9 +196,18 @@ def _report(
         here = str(address)
     prepare = f"shmio fabric prepare --server {scheme}://{here} {_tls_options(settings.tls)}"
     prepare += f"--credentials {folder / ADMIN}.seed{replicas}"
+    farm = any(user.kind == "farm-user" for user in users)
+    cells = not farm or any(user.kind not in ("admin", "farm-user") for user in users)
+    start = f"next: start {' and '.join(f'nats-server -c {file}' for file in written)}"
+    lines.append(f"{start}, then run {prepare} once" if cells else start)
+    if cells:
+        lines.append("copy each seed to its host: a cell names it in fabric.credentials, a command in --credentials")
+    if farm:
+        lines.append(
+            "copy the seeds of farm users to the hosts of the farm, and name them in --credentials of "
+            f"shmio-campaign worker --farm {scheme}://{here} and of shmio-campaign falsify"
+        )
     lines += [
-        f"next: start {' and '.join(f'nats-server -c {file}' for file in written)}, then run {prepare} once",
-        "copy each seed to its host, and name it there in fabric.credentials",
         "nats-server --signal reload=PID makes a running server read the file again",
     ]
     print("\n".join(map(printable, lines)))

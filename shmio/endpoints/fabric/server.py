@@ -30,7 +30,7 @@ MAX_UNSENT_BYTES: Final = 64 << 20
 MAX_MEMORY_BYTES: Final = 256 << 20
 """Maximum size of the streams that the server keeps in memory, in bytes. The fabric keeps all streams on the disk."""
 _STAMP: Final = re.compile(r"^\[\d+\] (?:\d{4}/\d\d/\d\d \d\d:\d\d:\d\d\.\d+ )?")
-_LEVEL: Final = re.compile(r"^\[(INF|WRN|ERR|FTL|DBG|TRC)\] ")
+_LEVEL: Final = re.compile(r"^\[(INF|WRN|ERR|FTL|DBG|TRC)\](?: |$)")
 
 log = logging.getLogger("shmio.fabric")
 

@@ -28,6 +28,7 @@ TOKEN = f'[[grpc.token]]\nname = "a"\nroles = ["read", "write"]\nsha256 = "{"0" 
 GRPC = '[grpc]\nlisten = ["127.0.0.1:8089", "[::1]:8090"]\n'
 MQTT = '[mqtt]\nbroker = "embedded"\nlisten = "127.0.0.1:1883"\nprefix = "x"\n'
 WEB = '[web]\nlisten = "127.0.0.1:8080"\n'
+FABRIC = '[fabric]\nserver = "embedded"\n'
 FREE = '[[mqtt.account]]\nroles = ["read", "write"]\n'
 
 
@@ -64,6 +65,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (MQTT + FREE, "[]", None),
         (MQTT, '["**"]', None),
         (MQTT + 'password_file = "accounts"\n', '["**"]', None),
+        (FABRIC, "[]", "by NATS at 127.0.0.1:4222 without logging in: for NATS, fabric.tls.ca or a server of"),
+        (FABRIC + WEB, "[]", "prevent this (see SECURITY.md); for NATS, fabric.tls.ca"),
         ("", '["**"]', None),
     ],
 )

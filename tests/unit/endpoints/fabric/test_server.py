@@ -59,7 +59,8 @@ def section(address: Address, folder: Path, tls: MqttTls | None = None) -> Fabri
 
 
 @in_loop
-async def test_it_serves_jetstream(address: Address, tmp_path: Path) -> None:
+async def test_it_serves_jetstream(address: Address, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("DEBUG", "shmio.fabric")
     fabric = section(address, tmp_path)
     with embedded(fabric):
         client = await connect(Access.of(fabric), "test", patient=False)
@@ -70,6 +71,9 @@ async def test_it_serves_jetstream(address: Address, tmp_path: Path) -> None:
             NatsServer(ServerSettings("127.0.0.1:0", fabric.directory), "test")
     assert (tmp_path / "fabric").stat().st_mode & 0o077 == 0
     assert (tmp_path / "fabric" / "jetstream").is_dir(), "the streams are kept"
+    logged = [one for one in caplog.records if one.getMessage().startswith("nats-server: ")]
+    assert logged
+    assert [one.getMessage() for one in logged if one.levelname == "ERROR"] == []
 
 
 @pytest.mark.parametrize("mutual", [False, True])
