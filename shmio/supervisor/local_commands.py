@@ -5,6 +5,9 @@ and a source must not wait for a disk. Therefore, a thread of the supervisor rea
 events. An event about a command has the command's number, which contains the pid of the program. The
 instance's own processes write entries about their commands themselves. If such a process was killed
 before it knew the outcome of a command, this module writes the entry.
+
+A mirror also shows the events of another host, and a replay those of a recording. The pids in them
+name no process of this host, so they get no entries.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ import msgspec
 from shmio.audit import trail
 from shmio.audit.trail import MAX_NAMED, Acting, Actor, uid_actor
 from shmio.model.clock import Clock
-from shmio.segment import Block, Event, EventKind, Segment
+from shmio.segment import NO_WRITER, Block, Event, EventKind, Segment
 from shmio.segment.clock import StateAction
 from shmio.segment.commands import pid_of, worst
 from shmio.segment.events import ENDS, EVENT_DATA_SIZE
@@ -147,6 +150,7 @@ class BlockCommands:
         self._explainer: Explainer | None = None
         self._asked = 0 if block.playhead is None else block.playhead.asked()
         self._present = block.events.head()
+        self._reproduces = block.attributes.connector == "fabric" or block.attributes.replay
 
     @property
     def over(self) -> bool:
@@ -178,7 +182,7 @@ class BlockCommands:
         if event.kind == EventKind.STARTED:
             self._end([key for key in self._open if key[0] != event.incarnation], RESTARTED)
             self._ending.clear()
-        if not event.command:
+        if not event.command or (self._reproduces and event.writer == NO_WRITER):
             return
         key = event.command_key
         known = self._open.get(key)

@@ -16,7 +16,18 @@ from shmio.audit import trail
 from shmio.audit.file import AuditSettings
 from shmio.audit.reading import last_events
 from shmio.layout.model import Layout, Register
-from shmio.segment import Activity, BlockSpec, BlockWriter, EventKind, ProcessSpec, Record, Report, Segment
+from shmio.segment import (
+    NO_WRITER,
+    Activity,
+    BlockSpec,
+    BlockWriter,
+    EventKind,
+    ProcessSpec,
+    Record,
+    Report,
+    Segment,
+)
+from shmio.segment.block import Attributes
 from shmio.segment.commands import first_number
 from shmio.segment.events import EVENT_SLOTS
 from shmio.supervisor.local_commands import RESTARTED, LocalCommands
@@ -121,6 +132,23 @@ def test_the_next_supervisor_goes_on_where_the_last_one_ended(case: Case) -> Non
     case.ended(EventKind.REJECTED, 0, text="second", number=case.number + 1)
     known = last_events(case.path, "")
     assert [entry["reason"] for entry in case.entries(known)] == ["first", "by an endpoint", "second"]
+
+
+@pytest.mark.parametrize("attributes", [Attributes("fabric"), Attributes("replay", replay=True), Attributes("memory")])
+def test_what_happened_elsewhere_is_not_taken_for_an_act_of_a_local_program(
+    instance: str, tmp_path: Path, attributes: Attributes
+) -> None:
+    block = BlockSpec("cell", LAYOUT, 20_000_000, 10**9, 1 << 22, attributes)
+    with Segment.create(instance, [block], [ProcessSpec("cell", "source")]) as segment:
+        case = Case(segment, tmp_path / "audit.jsonl")
+        case.accepted(0, 7)
+        case.accepted(0, 7, NO_WRITER, number=case.number + 1)  # the pid is that of a process of this host, too
+        case.ended(EventKind.WRITTEN, 0, writer=NO_WRITER, number=case.number + 1)
+        case.ended(EventKind.WRITTEN, 0)
+        commands = {entry["command"] for entry in case.entries()}
+        segment.unlink()
+    delayed = {case.number + 1} if attributes.connector == "memory" else set()  # a write that an injection delayed
+    assert commands == {case.number} | delayed
 
 
 def test_injections_and_notes_have_what_they_are_about(case: Case) -> None:
