@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -252,7 +253,25 @@ def test_the_audit_names_the_far_cell(cells: tuple[Cell, Cell], attached: tuple[
     assert {one["action"] for one in audited(cells[0])} >= {"inject", "lift", "declare", "feed"}
 
 
-def audited(near: Cell) -> list[dict[str, Any]]:
-    """Return what the owner's audit log has of the far cell."""
-    audit = [json.loads(line) for line in near.output("shmio-supervisor", "audit", "--json").splitlines()]
-    return [one for one in audit if one["who"] == "plant1.line3.far"]
+def test_the_far_audit_has_only_what_programs_there_did(
+    cells: tuple[Cell, Cell], attached: tuple[Attachment, Attachment]
+) -> None:
+    owner, mirror = attached
+    with owner.inject("belt/count", name="of the owner") as shadow:
+        shadow.set({"count": 12})
+        until(lambda: seen(mirror, "mirrored/count") == (12, "injected"), "the mirror shows the injection")
+    until(lambda: not mirror.injections(), "the mirror shows its end")
+    with mirror.inject("mirrored/speed", name="of the mirror"):
+        pass
+
+    def names() -> set[str]:
+        return {one["what"].get("name", "") for one in audited(cells[1], str(os.getuid()))}
+
+    until(lambda: "of the mirror" in names(), "the audit log has the far injection")
+    assert "of the owner" not in names()
+
+
+def audited(cell: Cell, who: str = "plant1.line3.far") -> list[dict[str, Any]]:
+    """Return what a cell's audit log has of an actor; of the far cell, if you name none."""
+    audit = [json.loads(line) for line in cell.output("shmio-supervisor", "audit", "--json").splitlines()]
+    return [one for one in audit if one["who"] == who]
