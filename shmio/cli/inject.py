@@ -28,6 +28,7 @@ from shmio.layout.values.write import Write, paths_of
 from shmio.model.cell import Campaign, Cell
 from shmio.model.event import Event, EventKind
 from shmio.model.injection import InjectionEvent
+from shmio.segment import NO_WRITER
 from shmio.wording import printable, unknown
 
 TURN_S: Final = 0.2
@@ -256,7 +257,8 @@ def _list(cell: Cell, *, as_json: bool) -> None:
         paths = _targets(one_found)
         more = f" and {len(paths) - 3} more" if paths[3:] else ""
         keep = ", kept" if one_found["keep"] else ""
-        by = f"pid {one_found['pid']}" if one_found["pid"] else "supervisor.toml"
+        other = "supervisor.toml" if one_found["writer"] == NO_WRITER else "a program"
+        by = f"pid {one_found['pid']}" if one_found["pid"] else other
         if "cell" in one_found:
             by += f" of {one_found['cell']}"
         print(

@@ -42,7 +42,8 @@ class Injection(msgspec.Struct, Generic[DeclarationT], frozen=True, omit_default
         name: Name of the injection.
         writer: Number of the command queue through which the injection was created; 4294967295: the
             configuration declares the injection.
-        pid: Process that created the injection; 0: the configuration declares the injection.
+        pid: Process that created the injection; 0: the configuration declares the injection, or only
+            ``cell`` knows the process.
         ranges: The covered bits, as (offset in bytes, size in bytes, mask).
         running: State of a declared injection; None: a program gives the values.
         source: Name of the source; empty in the segment, where the injection's block has the name.

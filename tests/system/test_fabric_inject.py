@@ -185,7 +185,8 @@ def test_an_injection_ends_if_its_host_is_gone(cells: tuple[Cell, Cell]) -> None
         far.up()
         with shmio.attach(far.instance) as mirror:
             until(lambda: [one.number for one in mirror.injections()] == [kept.number], "the new mirror shows it")
-            assert only(mirror).cell == "plant1.line3.far"
+            assert (only(mirror).cell, only(mirror).pid) == ("plant1.line3.far", 0), "its program has no pid here"
+            assert "a program of plant1.line3.far, kept" in far.output("shmio", "inject")
             owner.lift("belt", kept.number)
             until(lambda: not mirror.injections(), "the mirror sees the end")
 

@@ -451,7 +451,10 @@ class MirroredInjections:
         held, sent = self._held.get(one.number), self._sent.get(one.number)
         owner = held.owner if held is not None else sent.owner if sent is not None else None
         if owner is None:
-            return msgspec.structs.replace(one, ranges=ranges, running=running, cell=one.cell or str(self._cell))
+            pid = 0 if one.cell else one.pid  # if a cell is named, this is the pid of the owner's uplink
+            return msgspec.structs.replace(
+                one, ranges=ranges, running=running, cell=one.cell or str(self._cell), pid=pid
+            )
         return msgspec.structs.replace(one, ranges=ranges, running=running, cell="", writer=owner.writer, pid=owner.pid)
 
     def _on_own_clock(self, running: Running[Declaration]) -> Running[Declaration]:

@@ -185,7 +185,8 @@ class Injections(FollowedTab):
 def _creator(one: InjectionEntry, names: Mapping[int, str]) -> str:
     """Return what has created an injection; ``names`` are the names of the instance's processes by pid."""
     if one.cell:
-        return f"{one.cell} (configuration)" if one.configured else f"process {one.pid} of {one.cell}"
+        who = f"process {one.pid}" if one.pid else "a program"
+        return f"{one.cell} (configuration)" if one.configured else f"{who} of {one.cell}"
     return "configuration" if one.configured else names.get(one.pid) or f"process {one.pid}"
 
 

@@ -210,6 +210,7 @@ def test_the_list_has_the_injections_of_all_cells(mirroring: Mirroring) -> None:
     mirroring.next()
     first, second = mirroring.block.injections.read()
     assert (first.number, first.cell, first.ranges) == (5, "plant1.line3.other", ((2, 2, 255),))
+    assert first.pid == 0, "its pid at the owner is that of the owner's uplink"
     assert (second.number, second.cell, second.configured) == (6, "plant1.line3.a50", True)
 
 
