@@ -51,7 +51,7 @@ log = logging.getLogger("shmio.fabric")
 
 
 class RefusedError(RemoteError):
-    """The user needs other credentials: there are none, or they do not permit what was asked."""
+    """The user needs other credentials: the server does not know them, or they do not permit what was asked."""
 
 
 class Access(msgspec.Struct, frozen=True):
@@ -121,9 +121,8 @@ async def connect(
     Raises:
         ConfigError: A TLS or credentials file cannot be used.
         MissingLibraryError: nats-py is not installed.
-        RefusedError: With ``patient`` False, a server asks for credentials, and there are none.
-        RemoteError: With ``patient`` False, no server can be reached, or a server refuses the
-            credentials.
+        RefusedError: With ``patient`` False, a server refuses the credentials, or asks for some.
+        RemoteError: With ``patient`` False, no server can be reached.
 
     """
     errors = library("nats.errors", INSTALL)
@@ -160,8 +159,8 @@ async def connect(
         await client.connect(**options)
     except (OSError, errors.Error) as error:  # a time-out is an OSError
         await client.abandon()
-        missing = access.credentials is None and (attempts.refused or _is_refusal(error))
-        raise (RefusedError if missing else RemoteError)(attempts.why or _why(access, error)) from None
+        refused = attempts.refused or _is_refusal(error)
+        raise (RefusedError if refused else RemoteError)(attempts.why or _why(access, error)) from None
     attempts.clear()
     return client
 
@@ -338,7 +337,7 @@ class _Attempts:
             if len(self._logged) >= MAX_REASONS:
                 self._logged.clear()
             self._logged.add(text)
-            log.warning("fabric: %s", text)
+            log.warning("fabric: %s%s", text, "" if up else "; trying again")
         if up:
             return
         self.refused, self.why = _is_refusal(error), text

@@ -312,12 +312,20 @@ def test_a_farm_has_its_own_account(fabric: Fabric) -> None:
     asyncio.run(work())
 
 
-def test_seeds_of_cells_and_farms_are_told_apart(fabric: Fabric, capsys: pytest.CaptureFixture[str]) -> None:
+def test_seeds_of_cells_and_farms_are_told_apart(
+    fabric: Fabric, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A command that looks for cells in a farm's account must not create a registry there."""
     url, cell, lab = fabric.server.url, str(fabric.seed(A)), str(fabric.seed("lab"))
     assert main(["fabric", "cells", "--server", url, "--credentials", lab]) == 1
     assert "may not read the registry; use the seed of a cell or viewer" in one_line(capsys)
-    for given, words in (([], "asks for credentials"), (["--credentials", cell], "use the seed of a farm user")):
+    assert main(["fabric", "server-config", "-o", str(tmp_path / "other"), "--farm-user", "stranger"]) == 0
+    stranger = tmp_path / "other/farm-users/stranger.seed"
+    for given, words in (
+        ([], "asks for credentials"),
+        (["--credentials", str(stranger)], "does not know the credentials"),
+        (["--credentials", cell], "use the seed of a farm user"),
+    ):
         assert campaign(["worker", "--farm", url, *given]) == 2
         assert words in one_line(capsys)
 

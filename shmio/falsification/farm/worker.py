@@ -149,10 +149,8 @@ class Worker:
             RemoteError: The server refuses access.
 
         """
-        try:
+        with suppress(RemoteError):  # the other connection tries again, and logs why
             await try_access(self._access)
-        except RemoteError as error:
-            self._tell(f"{error}; trying again")
         client = await connect_or_stop(self._access, "shmio-campaign worker", stop, lost=self._lost, back=self._back)
         if client is None:
             return

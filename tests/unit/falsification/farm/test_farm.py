@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import os
 import re
 import signal
@@ -424,6 +425,30 @@ def test_a_worker_ends_although_a_cancellation_is_lost(
         await asyncio.wait_for(running, 30)
 
     asyncio.run(work())
+
+
+def test_a_worker_says_once_why_it_waits(server: NatsServer, tmp_path: Path) -> None:
+    server.stop()
+    told: list[str] = []
+
+    async def work() -> None:
+        stop = asyncio.Event()
+
+        def hear(record: logging.LogRecord) -> bool:
+            told.append(record.getMessage())
+            stop.set()
+            return False
+
+        log = logging.getLogger("shmio.fabric")
+        log.addFilter(hear)
+        try:
+            await asyncio.wait_for(Worker(Access((server.url,)), 1, tmp_path / "work", told.append).run(stop), 30)
+        finally:
+            log.removeFilter(hear)
+
+    asyncio.run(work())
+    (line,) = told
+    assert re.search("no NATS server can be reached.*trying again", line)
 
 
 @pytest.mark.parametrize(("code", "said"), [(10_005, "on 3 servers: no suitable.*start"), (10_023, "no space")])
