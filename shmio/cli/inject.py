@@ -34,6 +34,8 @@ from shmio.wording import printable, unknown
 TURN_S: Final = 0.2
 """Interval in s at which the command checks for events, signals and the end of its time."""
 SEED_BITS: Final = 32
+_REPLACING: Final = (EventKind.STARTED, EventKind.REMOVED, EventKind.RESTORED)
+"""Kinds of the events after which a source may have other injections, without an event about each."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -187,7 +189,7 @@ class _Watch:
                     return
                 if event.kind == EventKind.LIFTED:
                     self._drop(event.source, event.injection, event)
-                elif event.missed or event.kind in (EventKind.STARTED, EventKind.REMOVED):
+                elif event.missed or event.kind in _REPLACING:
                     self._drop_absent(event)
                 if not self._left:
                     return

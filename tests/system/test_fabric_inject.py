@@ -17,7 +17,7 @@ from shmio.errors import CommandError, PathError
 from shmio.local.attach import Attachment
 from shmio.model.injection import Injection
 from shmio.model.values import Quality
-from shmio.testing.cell import Cell, until
+from shmio.testing.cell import BIN, PATIENCE_S, Cell, until
 from shmio.testing.ports import reserved_port
 
 TAGS = """
@@ -171,6 +171,27 @@ def test_an_injection_ends_with_its_program(attached: tuple[Attachment, Attachme
         assert only(owner).number == number
         child.kill()
     until(lambda: not owner.injections(), "the owner has lifted the injection")
+
+
+def test_the_command_ends_when_the_owner_lifts_its_injection(
+    attached: tuple[Attachment, Attachment], cells: tuple[Cell, Cell]
+) -> None:
+    owner, mirror = attached
+    command = [str(BIN / "shmio"), "inject", "mirrored/speed", "8"]
+    with subprocess.Popen(
+        command, cwd=cells[1].folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as popen:
+        try:
+            assert popen.stdout is not None
+            number = int(popen.stdout.readline().partition(":")[0])
+            cells[1].output("shmio-supervisor", "restart", "mirrored")
+            until(lambda: seen(mirror, "mirrored/speed") == (8.0, "injected"), "it survives a restart of the mirror")
+            owner.lift("belt", number)
+            _, error = popen.communicate(timeout=PATIENCE_S)
+        finally:
+            popen.kill()
+    assert popen.returncode == 1
+    assert f"{number}: mirrored/speed/out was lifted" in error
 
 
 def test_an_injection_ends_if_its_host_is_gone(cells: tuple[Cell, Cell]) -> None:

@@ -104,6 +104,7 @@ def test_injections_end_with_their_client_but_survive_a_killed_source(cell: Cell
         until(lambda: cell.processes()["cell"]["pid"] not in (pid, None), "another process")
         until(lambda: get(cell, POSITION)["quality"] == "good", "good again")
         assert get(cell, POSITION)["value"] == 55.5
+        assert command.poll() is None, "it knows that its injection is still there"
         command.kill()
         command.wait()
         until(lambda: get(cell, POSITION)["value"] != 55.5, "lifted")
