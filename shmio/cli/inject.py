@@ -178,8 +178,10 @@ class _Watch:
         self._over.set()  # what is lifted from now on, this command lifts
         if self._error is not None:
             raise self._error
+        if self._lifted and self._left:
+            raise CommandError(f"{len(self._lifted)} of {len(created)} injections were lifted before the command ended")
         if self._lifted:
-            raise CommandError("; ".join(self._lifted))
+            raise CommandError(self._lifted[-1])  # the others were printed
 
     def _follow(self) -> None:
         """Set ``over`` when no injection is left, or when the instance stops."""
@@ -189,7 +191,7 @@ class _Watch:
                     return
                 if event.kind == EventKind.LIFTED:
                     self._drop(event.source, event.injection, event)
-                elif event.missed or event.kind in _REPLACING:
+                if event.missed or event.kind in _REPLACING:
                     self._drop_absent(event)
                 if not self._left:
                     return
