@@ -10,6 +10,8 @@ import msgspec
 from shmio.errors import ConfigError
 
 UNIX: Final = "unix:"
+_LOOPBACK: Final = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104  keys
+"""The loopback address for each address that stands for all addresses of a host."""
 MAX_PATH_BYTES: Final = 107
 """Maximum length in bytes of a UNIX socket's path: ``sun_path`` holds 108, including a final zero (unix(7))."""
 
@@ -39,6 +41,16 @@ class Address(msgspec.Struct, frozen=True):
 
     def __str__(self) -> str:
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+    @property
+    def wildcard(self) -> bool:
+        """True if the address stands for all addresses of this host."""
+        return self.host in _LOOPBACK
+
+    @property
+    def here(self) -> Address:
+        """The address at which this host itself reaches a server that listens at this address."""
+        return Address(_LOOPBACK.get(self.host, self.host), self.port)
 
     @property
     def loopback(self) -> bool:

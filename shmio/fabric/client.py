@@ -92,7 +92,7 @@ class FabricClient(Client):
         await self._send_command(PING_PROTO)
         await self._flush_pending()
 
-    async def leave(self, timeout_s: float) -> None:
+    async def leave(self, timeout_s: float = CLOSE_S) -> None:
         """Close the connection. If the server does not take what waits within a time in s, drop that."""
         closing = asyncio.get_running_loop().create_task(self.close())
         await asyncio.wait((closing,), timeout=timeout_s)
@@ -105,7 +105,7 @@ class FabricClient(Client):
     async def abandon(self) -> None:
         """Close a connection that was not established. After a failed TLS handshake, close() waits for ever."""
         self._abort()
-        await self.leave(CLOSE_S)
+        await self.leave()
 
     def _abort(self) -> None:
         self._pending = []

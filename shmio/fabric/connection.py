@@ -80,8 +80,7 @@ class Access(msgspec.Struct, frozen=True):
         if not fabric.embedded:
             return cls(tuple(fabric.servers), fabric.tls, fabric.credentials)
         listen = Address.parse(str(fabric.listen))
-        here = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(listen.host, listen.host)  # noqa: S104  a key
-        url = f"nats://{Address(here, listen.port)}"
+        url = f"nats://{listen.here}"
         if fabric.tls is None:
             return cls((url,))
         shown = fabric.tls if fabric.tls.ca is not None else None  # the server asks its clients for certificates
@@ -188,7 +187,7 @@ async def connect_or_stop(
             return connecting.result()
         await end(connecting)
         if not connecting.cancelled() and connecting.exception() is None:
-            await connecting.result().close()  # it connected at the same moment
+            await connecting.result().leave()  # it connected at the same moment
         return None
     finally:
         await end(stopping)
@@ -213,21 +212,23 @@ def wants_reply(message: Msg) -> bool:
     return bool(message.reply) and not message.reply.startswith(("shmio.", "$"))
 
 
-async def call_once(access: Access, work: Callable[[FabricClient], Coroutine[Any, Any, Any]]) -> Any:
-    """Connect once, and return the result of ``work`` with the connection.
+async def call_once(
+    access: Access, work: Callable[[FabricClient], Coroutine[Any, Any, Any]], name: str = "shmio"
+) -> Any:
+    """Connect once, and return the result of ``work`` with the connection; the server knows it by ``name``.
 
     Raises:
         RefusedError: The user needs other credentials.
         RemoteError: No server can be reached, or it does not answer.
 
     """
-    client = await connect(access, "shmio", patient=False)
+    client = await connect(access, name, patient=False)
     try:
         return await call(access, client, work)
     except (TimeoutError, library("nats.errors", INSTALL).Error) as error:
         raise RemoteError(f"{access}: {reason(error)}") from None
     finally:
-        await client.close()
+        await client.leave()
 
 
 async def call(access: Access, client: FabricClient, work: Callable[[FabricClient], Coroutine[Any, Any, Any]]) -> Any:

@@ -11,13 +11,14 @@ import logging
 import os
 import time
 from collections.abc import AsyncIterator, Iterator
+from functools import partial
 from itertools import chain, count
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from shmio.errors import RecordingError, RemoteError
-from shmio.fabric.connection import INSTALL, connect, reason, refusal
+from shmio.fabric.connection import INSTALL, call_once
 from shmio.fabric.entries import SourceEntries
 from shmio.fabric.messages import Header, decode_header
 from shmio.fabric.names import CellName, source_of
@@ -67,7 +68,8 @@ def fetch(place: Place, file: Path, begin_ns: int | None = None, end_ns: int | N
     """
     begin, end = begin_ns or 0, MAX_NS if end_ns is None else end_ns
     with new_file(file) as stream, _Spool(file.parent) as spool:
-        layouts, seen = asyncio.run(_read(place, spool, begin, end))
+        reading = partial(_read, place=place, spool=spool, begin_ns=begin, end_ns=end)
+        layouts, seen = asyncio.run(call_once(place.access, reading, "shmio history"))
         known = {} if seen is None else {source.name: source for source in seen.sources}
         numbers = count(1)
         sources = [SourceEntries(source, layouts, known.get(source), numbers) for source in spool.sources]
@@ -155,28 +157,22 @@ def _span(entries: SourceEntries, spool: _Spool, begin_ns: int, end_ns: int) -> 
 
 
 async def _read(
-    place: Place, spool: _Spool, begin_ns: int, end_ns: int
+    client: Client, place: Place, spool: _Spool, begin_ns: int, end_ns: int
 ) -> tuple[dict[bytes, Layout], CellEntry | None]:
     """Fill the spool; return the layouts of its messages, and what the registry says of the cell."""
-    client = await connect(place.access, "shmio history", patient=False)
     heads: set[bytes] = set()
     malformed = 0
-    try:
-        async for message in _messages(client, place.cell, begin_ns, end_ns):
-            try:
-                header = decode_header(message.data)
-            except ValueError:
-                malformed += 1
-                continue
-            heads.add(header.layout)
-            spool.add(source_of(message.subject.split(".")[4]), header, message.data)
-        registry = await Registry.open(client)
-        layouts = {head: await registry.layout_like(head) for head in heads}
-        seen = await registry.find(place.cell)
-    except (TimeoutError, library("nats.errors", INSTALL).Error) as error:
-        raise RemoteError(f"{place.access}: {refusal(place.access, client.refused) or reason(error)}") from None
-    finally:
-        await client.close()
+    async for message in _messages(client, place.cell, begin_ns, end_ns):
+        try:
+            header = decode_header(message.data)
+        except ValueError:
+            malformed += 1
+            continue
+        heads.add(header.layout)
+        spool.add(source_of(message.subject.split(".")[4]), header, message.data)
+    registry = await Registry.open(client)
+    layouts = {head: await registry.layout_like(head) for head in heads}
+    seen = await registry.find(place.cell)
     if malformed:
         log.warning("%s: %d messages of the history are malformed and left out", place.cell, malformed)
     return layouts, None if seen is None else seen.entry

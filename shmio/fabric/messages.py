@@ -2,8 +2,8 @@
 
 A message has a fixed header and entries, in the order in which the source published them. An entry
 has the encoding of a recording (docs/reference/dump-format.md). The list of the source's injections
-is a message of its own. The uplink numbers the messages of
-each source without gaps, so a mirror knows which ones it has not received.
+is a message of its own. The uplink numbers the messages of each source without gaps, so a mirror
+knows which ones it has not received.
 docs/reference/fabric.md describes the bytes.
 """
 
@@ -228,6 +228,13 @@ def decode_state(data: bytes) -> SourceState | None:
 def _is_sound(one: InjectionEntry) -> bool:
     """Return whether the fields of an injection are in their ranges. JSON itself limits no number."""
     running = one.running
+    if running is not None and not (
+        running.state in _STATE_NAMES
+        and min(running.seed, running.runs, running.cycle) >= 0
+        and 0 <= running.time_ns < 1 << 63
+        and all(bit < 1 << 32 for bit in running.declaration.bits or ())
+    ):
+        return False
     return (
         0 <= one.writer < 1 << 32
         and 0 <= one.pid < 1 << 31
@@ -235,9 +242,6 @@ def _is_sound(one: InjectionEntry) -> bool:
         and 0 <= one.number < 1 << 64
         and one.direction in ("in", "out")
         and _fits(msgspec.to_builtins(one))
-        and (running is None or (running.state in _STATE_NAMES and min(running.seed, running.runs, running.cycle) >= 0))
-        and (running is None or 0 <= running.time_ns < 1 << 63)
-        and (running is None or all(bit < 1 << 32 for bit in running.declaration.bits or ()))
     )
 
 

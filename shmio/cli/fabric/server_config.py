@@ -123,7 +123,7 @@ def _check_listen(text: str, settings: ServerSettings) -> None:
         raise ConfigError(f"--listen: {error}") from None
     if not 0 < address.port <= 65535 - ROUTE_PORTS:
         raise ConfigError(f"--listen: {text}: choose a port from 1 to {65535 - ROUTE_PORTS}, such as 4222")
-    if len(settings.listen) > 1 and address.host in ("0.0.0.0", "::"):  # noqa: S104  a comparison
+    if len(settings.listen) > 1 and address.wildcard:
         raise ConfigError(f"--listen: {text}: the other servers of the cluster need this server's name or address")
     if not (address.loopback or settings.tls or settings.insecure):
         raise ConfigError(f"--listen: {plain_text(text, 'give --certificate and --key, or --insecure')}")
@@ -190,10 +190,9 @@ def _report(
     scheme = "nats" if settings.tls is None else "tls"
     replicas = f" --replicas {min(3, len(settings.listen))}" if len(settings.listen) > 1 else ""
     address = Address.parse(settings.listen[0])
-    if address.host in ("0.0.0.0", "::"):  # noqa: S104  a comparison
-        here = f"127.0.0.1:{address.port}" if settings.tls is None else f"NAME-IN-THE-CERTIFICATE:{address.port}"
-    else:
-        here = str(address)
+    here = str(address.here)
+    if address.wildcard and settings.tls is not None:
+        here = f"NAME-IN-THE-CERTIFICATE:{address.port}"
     prepare = f"shmio fabric prepare --server {scheme}://{here} {_tls_options(settings.tls)}"
     prepare += f"--credentials {folder / ADMIN}.seed{replicas}"
     farm = any(user.kind == "farm-user" for user in users)

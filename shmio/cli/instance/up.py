@@ -141,7 +141,7 @@ def _processes(prepared: Prepared) -> Iterator[str]:
 def _hints(prepared: Prepared) -> Iterator[str]:
     """Yield what the user can do now that the instance runs."""
     for job in prepared.plan.jobs:
-        if job.name == "web" and Address.parse(job.config["listen"]).host not in ("0.0.0.0", "::"):  # noqa: S104
+        if job.name == "web" and not Address.parse(job.config["listen"]).wildcard:
             yield f"open {_describe(job, prepared)} in a browser to see the cell"
 
 

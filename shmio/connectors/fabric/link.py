@@ -26,6 +26,7 @@ from shmio.fabric.messages import (
 )
 from shmio.fabric.names import CellName
 from shmio.fabric.registry import CellEntry
+from shmio.fabric.tasks import end
 from shmio.libraries import library
 from shmio.model.values import OutcomeKind
 
@@ -129,20 +130,18 @@ class Link:
         try:
             loop.run_forever()
         finally:
-            opening.cancel()
             loop.run_until_complete(self._end(opening))
             loop.run_until_complete(loop.shutdown_asyncgens())
             loop.close()
 
     async def _end(self, opening: asyncio.Task[None]) -> None:
         self._closing = True
-        await asyncio.gather(opening, return_exceptions=True)
+        await end(opening)
         if self._client is not None:
             await self._client.abandon()  # close() waits until a dead link has taken what waits
         others = asyncio.all_tasks() - {asyncio.current_task()}
-        for task in others:
-            task.cancel()
-        await asyncio.gather(*others, return_exceptions=True)
+        await asyncio.gather(*map(end, others))
+        await asyncio.gather(opening, *others, return_exceptions=True)  # takes their errors, which nobody needs now
 
     async def _open(self) -> None:
         try:

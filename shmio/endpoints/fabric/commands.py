@@ -13,7 +13,7 @@ import msgspec
 from shmio.audit.trail import MAX_NAMED, Actor, Attempt, acting
 from shmio.config.fabric import matches_cell
 from shmio.config.model import FabricAllow
-from shmio.endpoints.commands_in_flight import MAX_OPEN, CommandCost, Done, InFlightTable
+from shmio.endpoints.commands_in_flight import MAX_OPEN, CommandCost, InFlightTable
 from shmio.endpoints.fabric.feed import Feed
 from shmio.endpoints.fabric.injections import (
     LEASE_S,
@@ -36,7 +36,7 @@ from shmio.fabric.messages import (
 )
 from shmio.fabric.names import CellName
 from shmio.layout.values.write import Write, paths_of
-from shmio.local.writer import REPLACED, RETIRED, PendingCommand, SourceWriter
+from shmio.local.writer import REPLACED, RETIRED, SourceWriter
 from shmio.model.values import OutcomeKind
 from shmio.segment import Block, CommandKind, EventKind
 from shmio.segment.commands import Direction, End, apply, decode_writes
@@ -157,10 +157,9 @@ class CommandClient:
 
     def _lift(self, number: int, lease: Lease, attempt: Attempt) -> None:
         self._prepare(cost := CommandCost.of(()))
-        ticket: PendingCommand = self._source_writer.ask_to_lift(number)
+        ticket = self._source_writer.ask_to_lift(number)
         lease.open = True
-        done: Done = partial(self._lifted, lease)
-        self._in_flight.add(ticket, cost, done, attempt=attempt)
+        self._in_flight.add(ticket, cost, partial(self._lifted, lease), attempt=attempt)
 
     def _lifted(self, lease: Lease, _ends: Sequence[End]) -> None:
         lease.open = False  # if the injection still exists, it is lifted again

@@ -124,10 +124,10 @@ class NatsServer:
 
     def await_start(self, beat: Callable[[], object]) -> None:
         """Wait until the server accepts connections; see :meth:`ServerProcess.await_start`."""
-        here = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self._listen.host, self._listen.host)  # noqa: S104  a key
+        here = self._listen.here
 
         def accepts() -> bool:
-            with socket.create_connection((here, self._listen.port), 1.0) as probe:
+            with socket.create_connection((here.host, here.port), 1.0) as probe:
                 return probe.recv(4) == b"INFO"
 
         self._process.await_start(accepts, beat)
