@@ -132,7 +132,7 @@ def memory_mb(pid: int) -> float:
 
 
 class Run(NamedTuple):
-    """What sending some frames has shown."""
+    """The figures of one round: some frames, sent and received."""
 
     delays_ms: list[float]
     rate_hz: float

@@ -181,7 +181,7 @@ def decode_entry(data: bytes, at: int) -> tuple[Entry | None, int]:
 
 
 class SourceState(msgspec.Struct, frozen=True):
-    """What a source has besides its frames and events. It is the content of a message of its own.
+    """The injections and the clock of a source. A message of its own has them.
 
     Attributes:
         injections: The injections, the innermost first. ``cell`` is the cell whose program has created
@@ -302,14 +302,14 @@ class WriteItem(msgspec.Struct, frozen=True, array_like=True):
 
 
 InjectionKind = Literal["inject", "shadow", "lift", "declare", "renew"]
-"""What a command does with injections; the first four are as in :class:`shmio.segment.commands.CommandKind`."""
+"""The kinds of commands about injections; the first four are as in :class:`shmio.segment.commands.CommandKind`."""
 
 
 class InjectionRequest(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What a command does with injections of a source.
+    """The part of a command that is about injections of a source.
 
     Attributes:
-        kind: What it does. ``renew``: the programs that have created injections still run.
+        kind: What to do. ``renew``: the programs that have created injections still run.
         number: Number that the sender gave the command. The owner's events about the command have it,
             and so has an injection that the command creates. 0 with ``renew``.
         injection: With ``lift`` and ``shadow``: number of the injection.

@@ -32,9 +32,9 @@ Kind = Literal["admin", "cell", "viewer", "history-reader", "farm-user"]
 
 
 FARM_LIMITS: Final = {"max_file": 2 << 30, "max_mem": 64 << 20, "max_streams": 2, "max_consumers": 1000}
-"""What a farm may keep at a server, in bytes: its workers run programs of others, and the cells need the disk, too.
+"""Limits of what a farm may keep at a server; sizes are in bytes.
 
-The streams are the queue and the bundles.
+Its workers run other people's programs, and the cells need the disk, too. The streams are the queue and the bundles.
 """
 ACCOUNTS: Final[dict[str, tuple[Kind, ...]]] = {
     "shmio-cells": ("admin", "cell", "viewer", "history-reader"),

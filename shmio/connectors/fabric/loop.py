@@ -490,9 +490,10 @@ class MirrorLoop:
 class _Transit:
     """Finds how much longer than usual a message was on its way, without equal clocks on both hosts.
 
-    The usual time is the shortest of the last ``WINDOW_NS`` to twice that. If the owner's clock is set
-    back, messages seem to be late for that long. One message that is much faster than usual does not
-    count, because it may be false; if the next one is as fast, the owner's clock was set forward.
+    The usual time is the shortest of the last ``WINDOW_NS`` to twice that. After somebody sets the
+    owner's clock back, messages seem to be late for that long. A message that is much faster than usual
+    does not count, because it may be false. But if the next one is as fast, that one counts: somebody
+    has set the owner's clock forward.
     """
 
     WINDOW_NS: Final = 30_000_000_000

@@ -17,7 +17,10 @@ MAX_HELD_BYTES: Final = 32 << 20
 FRESH_NS: Final = 10_000_000_000
 """Age in ns up to which a number of the registry bounds those of messages."""
 MAX_AHEAD: Final = 1 << 20
-"""How far the number of a message can be beyond the registry's: no source is that fast."""
+"""Maximum difference between the number of a message and the newest number in the registry.
+
+No source publishes that many messages between two entries of the registry.
+"""
 _OLD_STREAMS: Final = 16
 
 
@@ -125,9 +128,9 @@ class MessageOrder:
     def announce(self, announced: Announced) -> None:
         """Take what the registry says about the owner's messages.
 
-        An entry may be older than the last messages. But if, later than ``PATIENCE_NS`` afterwards, the
-        owner still has not made a message that was delivered or given up, its number was false: continue
-        after those that the owner has made.
+        An entry may be older than the last messages. But if the numbers in the entries have not reached
+        that of the last message within ``PATIENCE_NS``, that number was false. Then the order continues
+        after the number in the entry.
         """
         self._announced = announced
         if announced.number is None:

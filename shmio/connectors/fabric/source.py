@@ -28,7 +28,7 @@ CACHE: Final = "{}.mirrored.json"
 
 
 class Settings(msgspec.Struct, frozen=True):
-    """What a mirror's process needs from the configuration.
+    """The part of the configuration that a mirror's process needs.
 
     Attributes:
         access: The servers.

@@ -182,7 +182,7 @@ class Participant:
         self._changes: Any = None
         """The readers and writers whose publishers or subscribers have changed since they were counted."""
         self._counted = False
-        """Whether all readers and writers that exist now were counted; their deletion is no change that DDS reports."""
+        """Whether all present readers and writers were counted. DDS does not report that one was deleted."""
         self._without_publisher: frozenset[str] = frozenset()
         self.discovery = Discovery()
         try:
