@@ -55,6 +55,7 @@ ONE_AFTER_THE_OTHER = (
     ("tests/conformance/test_opcua.py",),
     ("tests/native/test_reader.py",),
     ("tests/system/test_bits.py",),
+    ("tests/system/test_fabric_inject.py",),
     ("tests/system/test_inject.py",),
     ("tests/system/test_inject_grpc.py",),
     ("tests/system/test_one_name.py",),

@@ -60,8 +60,6 @@ class GrpcClient(threading.Thread):
         super().__init__(daemon=True)
         self._address, self._source = address, source
         self._ends = threading.Event()
-        self.first = threading.Event()
-        """Set when the first frame has come."""
         self.updates: list[Any] = []
         self.start()
 
@@ -73,7 +71,6 @@ class GrpcClient(threading.Thread):
         ):
             for update in updates:
                 self.updates.append((update.cycle, update.missed, update.source_ns, update.image))
-                self.first.set()
                 if self._ends.is_set():
                     return
 

@@ -182,10 +182,13 @@ def calm(near: Segment, far: Segment, folder: Path, seconds: float) -> dict[str,
     for frame in got:
         own = sent[frame.cycle]
         assert (frame.raw, frame.source_ns, frame.quality) == (own.raw, own.source_ns, own.quality)
+    compared = check_client(received, source)
+    assert compared > 25 * seconds, "the client has received less than half of the frames"
+    assert all(number > 1 for number, _ in seen), "a model has seen no change"
     delays = [(frame.publish_ns - sent[frame.cycle].publish_ns) / 1e6 for frame in got]
     return {
         "frames": len(got), "delay_ms": statistics.median(delays), "delay_max_ms": max(delays),
-        "frames of the gRPC client": check_client(received, source),
+        "frames of the gRPC client": compared,
         "values of the near and far model, passed over": seen,
     }  # fmt: skip
 
@@ -203,10 +206,12 @@ def stepped(near: Segment, far: Segment, count: int) -> dict[str, Any]:
             skipped += view.missed
             if number == count:
                 break
-        time.sleep(0.2)
+        last = far.blocks["follower"].ring.head()
+        until(lambda: any(one.number >= last for one in follower.frames), "the last step was seen", PATIENCE_S)
         cell.release()
     followed, source = follower.stop(), there.stop()
     seen = check_model(values(follower.block, "seen", followed), values(there.block, AXIS, source))
+    assert seen[0] > 1, "the model has seen no change"
     return {"steps": count, "frames missed": skipped, "values, passed over": seen}
 
 

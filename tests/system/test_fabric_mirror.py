@@ -124,11 +124,13 @@ def test_faults_in_the_configuration_of_a_mirror_are_named(cells: tuple[Cell, Ce
     _, far = cells
     file = far.folder / "supervisor.toml"
     text = file.read_text()
-    file.write_text(text.replace('source = "belt"', 'source = "bolt"'))
-    done = far.supervisor("check")
-    assert done.returncode == 1
-    assert "source[0].source" in done.stderr
-    assert "did you mean 'belt'" in done.stderr
-    file.write_text(text.replace('cell = "plant1.line3.near"', 'cell = "plant1.line3.neer"'))
-    assert "did you mean 'plant1.line3.near'" in far.supervisor("check").stderr
-    file.write_text(text)
+    try:
+        file.write_text(text.replace('source = "belt"', 'source = "bolt"'))
+        done = far.supervisor("check")
+        assert done.returncode == 1
+        assert "source[0].source" in done.stderr
+        assert "did you mean 'belt'" in done.stderr
+        file.write_text(text.replace('cell = "plant1.line3.near"', 'cell = "plant1.line3.neer"'))
+        assert "did you mean 'plant1.line3.near'" in far.supervisor("check").stderr
+    finally:
+        file.write_text(text)

@@ -326,7 +326,7 @@ def test_seeds_of_cells_and_farms_are_told_apart(
         (["--credentials", str(stranger)], "does not know the credentials"),
         (["--credentials", cell], "use the seed of a farm user"),
     ):
-        assert campaign(["worker", "--farm", url, *given]) == 2
+        assert campaign(["worker", "--farm", url, *given]) == 2, words
         assert words in one_line(capsys)
 
     async def look() -> None:

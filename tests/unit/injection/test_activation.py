@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -84,6 +86,11 @@ def test_invariants(start: int, end: int | None, for_ns: int | None, most: int |
             assert activation.state is State.OVER
         assert most is None or activation.runs <= most
         before = activation.state
+
+
+def test_an_activation_is_steady_until_its_window_begins_or_ends() -> None:
+    steady_until = Activation(Window(100, 200, None, None)).steady_until
+    assert [steady_until(time_ns) for time_ns in (0, 100, 200)] == [100, 200, math.inf]
 
 
 @given(

@@ -73,6 +73,16 @@ def test_packed_entries_are_those_that_take_returns(actions: list[str], limit: i
             segment.unlink()
 
 
+def test_good_frames_are_packed() -> None:
+    block = BlockSpec("cell", LAYOUT, 20_000_000, 500_000_000, 1 << 16, Attributes("s7", ()))
+    with Segment.private("followed", [block], []) as segment:
+        writer, other = segment.writer("cell"), follower(segment)
+        other.take(1)  # the event that the source has started
+        for cycle in range(5):
+            publish(writer, "good", cycle)
+        assert [len(list(decode_entries(bytes(other.pack(3)), 0))) for _ in range(3)] == [3, 2, 0]
+
+
 def test_a_gap_after_packed_frames_is_one_after_taken_frames() -> None:
     block = BlockSpec("cell", LAYOUT, 20_000_000, 500_000_000, 1 << 16, Attributes("s7", ()))
     with Segment.create(f"followed{os.getpid()}", [block], []) as segment:

@@ -67,6 +67,7 @@ class FakeLink:
         self.requests: list[Missing] = []
         self.asked = threading.Event()
         self.commands: list[CommandRequest] = []
+        self.all: list[CommandRequest] = []
         self.reply = CommandReply([], [])
         self.sent = threading.Semaphore(0)
         self.silent = False
@@ -94,6 +95,7 @@ class FakeLink:
     def command(self, request: CommandRequest, timeout_s: float) -> Future[CommandReply]:
         assert timeout_s > 0
         self.commands.append(request)
+        self.all.append(request)
         self.sent.release()
         future: Future[CommandReply] = Future()
         if not self.silent:

@@ -161,13 +161,16 @@ def test_an_injection_toward_the_device_needs_armed_here_too(mirroring: Mirrorin
     assert mirroring.link.commands == []
 
 
-def test_injections_are_renewed_until_their_program_ends(mirroring: Mirroring) -> None:
+def test_injections_are_renewed_until_their_program_ends(mirroring: Mirroring, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(injections, "RENEW_NS", 0)
     writer = writer_of(mirroring)
     number = injected(mirroring, writer).number
     assert sent(mirroring, "renew").renewed == [number]
     mirroring.gone.add(WRITER)
     assert sent(mirroring, "lift").injection == number
-    assert all(one.injection is None or one.injection.kind != "renew" for one in mirroring.link.commands)
+    other = injected(mirroring, SourceWriter(mirroring.block, 1)).number
+    for _ in range(2):
+        assert sent(mirroring, "renew").renewed == [other]
 
 
 def test_refused_renewals_are_reported_once(
@@ -182,12 +185,17 @@ def test_refused_renewals_are_reported_once(
     assert ["the role is missing" in one for one in caplog.messages].count(True) == 1
 
 
-def test_an_injection_that_stays_is_not_renewed(mirroring: Mirroring) -> None:
-    writer = writer_of(mirroring)
-    injected(mirroring, writer, keep=True)
+def test_an_injection_that_stays_is_neither_renewed_nor_lifted(
+    mirroring: Mirroring, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(injections, "RENEW_NS", 0)
+    kept = injected(mirroring, writer_of(mirroring), keep=True).number
     mirroring.gone.add(WRITER)
     number = injected(mirroring, SourceWriter(mirroring.block, 1)).number
-    assert sent(mirroring, "renew").renewed == [number]
+    for _ in range(2):
+        assert sent(mirroring, "renew").renewed == [number]
+    requests = [one.injection for one in mirroring.link.all if one.injection is not None]
+    assert all(kept not in (one.injection, *one.renewed) for one in requests)
 
 
 def test_an_injection_that_the_owner_no_longer_has_is_over(
@@ -235,9 +243,19 @@ def test_a_number_is_sent_once(mirroring: Mirroring) -> None:
     assert (found.command, "another number" in found.text) == (ticket.number, True)
 
 
-def test_the_state_is_asked_for_until_it_comes(mirroring: Mirroring) -> None:
+def test_the_state_is_asked_for_until_it_comes(mirroring: Mirroring, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shmio.connectors.fabric.loop.STATE_NS", 0)
     writer_of(mirroring)
-    assert mirroring.link.states >= 1
+    for number in range(8, 10):
+        mirroring.link.states_asked.clear()
+        mirroring.send(frame(number, 1))
+        assert mirroring.link.states_asked.wait(PATIENCE_S)
+    mirroring.link.send(mirroring.link.state(state()))
+    mirroring.send(frame(10, 1), skip=1)
+    assert mirroring.link.asked.wait(PATIENCE_S)
+    mirroring.link.states_asked.clear()
+    mirroring.link.answered(mirroring.link.requests[0])
+    assert mirroring.link.states_asked.wait(PATIENCE_S), "a change of the state may be among the lost messages"
 
 
 def declared(**more: Any) -> Declaration:
@@ -247,8 +265,8 @@ def declared(**more: Any) -> Declaration:
 
 def declare(mirroring: Mirroring, **more: Any) -> SourceWriter:
     writer = writer_of(mirroring)
-    declared = {"name": "one", "target": "other", "operation": "set", "value": 5} | more
-    writer.ask_to_declare(msgspec.convert(declared, Declaration))
+    values = {"name": "one", "target": "other", "operation": "set", "value": 5} | more
+    writer.ask_to_declare(msgspec.convert(values, Declaration))
     return writer
 
 
@@ -301,7 +319,7 @@ def test_a_faulty_declaration_is_rejected_here(mirroring: Mirroring, faulty: dic
         {"running": msgspec.structs.replace(RUNNING, declaration=declared(bits=[1 << 32]))},
         {"clock_ns": 10**400},
     ],
-    ids=lambda faulty: next(iter(faulty)),
+    ids=["number", "writer", "pid", "priority", "direction", "state", "runs", "time_ns", "times", "bits", "clock_ns"],
 )
 def test_a_state_with_a_number_that_is_too_large_changes_nothing(mirroring: Mirroring, faulty: dict[str, Any]) -> None:
     more: dict[str, Any] = {"number": 5, "running": RUNNING, "clock_ns": S} | faulty

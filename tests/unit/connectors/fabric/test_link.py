@@ -12,6 +12,7 @@ from shmio.connectors.fabric.link import Link
 from shmio.fabric.connection import Access
 from shmio.fabric.messages import CommandRequest, WriteItem
 from shmio.fabric.names import CellName
+from shmio.testing.cell import until
 from tests.nats_server import Link as Proxy
 from tests.nats_server import nats_server
 
@@ -24,8 +25,7 @@ def test_a_dead_link_does_not_keep_the_process_from_stopping(tmp_path: Path) -> 
         owner, sender = CellName.parse("plant1.line3.a50"), CellName.parse("plant1.line3.twin")
         link = Link(Access((proxy.url,)), owner, "cell", "test", sender, lambda _: None, lambda _: None)
         link.start()
-        while link.problem:
-            threading.Event().wait(0.01)
+        until(lambda: not link.problem, "the link is connected", PATIENCE_S)
         proxy.cut()
         for _ in range(12):  # more than the buffers of the sockets hold
             link.command(CommandRequest(1, 7, bytes(8), [WriteItem(0, 0, bytes(900_000))]), 2.0)
@@ -41,7 +41,6 @@ def test_a_normal_stop_is_no_lost_connection(tmp_path: Path, caplog: pytest.LogC
         owner = CellName.parse("plant1.line3.a50")
         link = Link(Access((server.url,)), owner, "cell", "test", None, lambda _: None, lambda _: None)
         link.start()
-        while link.problem:
-            threading.Event().wait(0.01)
+        until(lambda: not link.problem, "the link is connected", PATIENCE_S)
         link.close()
     assert [record.getMessage() for record in caplog.records] == [f"connected to the fabric at {server.url}"]

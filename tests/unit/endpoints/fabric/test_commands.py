@@ -179,7 +179,7 @@ async def test_malformed_commands_are_counted(segment: Segment, server: NatsServ
         for data in hostile:
             with pytest.raises(NatsTimeoutError):
                 await client.send(data, timeout_s=0.05)
-        assert client.uplink.commands.refused == len(hostile)
+        await until(lambda: client.uplink.commands.refused == len(hostile))
         newer = msgspec.msgpack.encode({"injection": {"kind": "pause", "number": 1}})
         for data in (encode_command(request), newer):
             reply = decode_reply(await client.send(data), 1)

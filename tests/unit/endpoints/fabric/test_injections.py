@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -180,7 +181,7 @@ async def test_the_role_is_needed_and_the_audit_names_the_sender(
 async def test_an_injection_that_is_not_renewed_is_lifted(
     segment: Segment, server: NatsServer, plant: Plant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(injections, "LEASE_S", 0.6)
+    monkeypatch.setattr(injections, "LEASE_S", 2.0)
     async with injector(segment, server.url) as twin:
         await twin.declare(NUMBER)
         await twin.declare(NUMBER + 1, name="renewed")
@@ -270,10 +271,17 @@ async def test_malformed_commands_are_counted(segment: Segment, server: NatsServ
             {"kind": "renew", "renewed": list(range(1000))},
             {"kind": "other", "number": 1},
         ]
-        for one in hostile:
+
+        def refused(count: int) -> bool:
+            return twin.uplink.commands.refused == count
+
+        for number, one in enumerate(hostile, 1):
             request = CommandRequest(1 << 62, 1, b"12345678", injection=InjectionRequest(**one))
             await twin.client.publish(f"shmio.{CELL}.cell.command.{TWIN}", encode_command(request), reply="reply")
-        await until(lambda: twin.uplink.commands.refused == len(hostile))
+            try:
+                await until(partial(refused, number))
+            except TimeoutError:
+                pytest.fail(f"not refused: {one}")
         assert twin.present == []
 
 
@@ -282,7 +290,6 @@ async def test_a_number_is_used_once(
     segment: Segment, server: NatsServer, plant: Plant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A second command of the same number, also of another cell, leaves the injection and its lease as they are."""
-    monkeypatch.setattr(injections, "LEASE_S", 0.6)
     async with injector(segment, server.url, allow=[FabricAllow(sender="*.*.*", roles=["inject"])]) as twin:
         await twin.declare(NUMBER)
         reply = await twin.declare(NUMBER, sender="plant1.line9.other", name="two")
@@ -290,6 +297,7 @@ async def test_a_number_is_used_once(
         reply = await twin.send("inject", NUMBER, "plant1.line9.other", items=[OTHER])
         assert (reply.outcomes, "exists" in reply.reasons[0]) == (["rejected"], True)
         assert twin.leases.sender_of(NUMBER) == TWIN
+        monkeypatch.setattr(injections, "LEASE_S", 0.6)
         await until(lambda: twin.present == [])
 
 
@@ -318,7 +326,7 @@ async def test_a_restored_injection_is_lifted_unless_a_cell_renews_it(
     segment: Segment, server: NatsServer, plant: Plant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A snapshot brings back injections that the uplink knows nothing of any more."""
-    monkeypatch.setattr(injections, "LEASE_S", 0.6)
+    monkeypatch.setattr(injections, "LEASE_S", 2.0)
     async with injector(segment, server.url) as twin:
         await twin.send("inject", NUMBER, items=[OTHER])
         await twin.send("inject", NUMBER + 1, items=[OTHER])

@@ -316,6 +316,7 @@ async def test_a_reply_that_the_server_does_not_take_does_not_keep_the_uplink_fr
         await until(lambda: found.publisher.up)
         monkeypatch.setattr(Uplink, "_send_reply", never)
         found._reply("_INBOX.any", b"")
+        assert found._replies
     assert not found._replies
 
 
