@@ -60,13 +60,18 @@ class Programs:
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._own: set[int] = set()
+        self._uplink = 0  # the pid of the present or last process "fabric"
         self._others: dict[int, Actor] = {}
         self._ended: dict[int, bool] = {}
 
     def look(self) -> None:
         """Read the process table. Call this often, because a program may end before its events are read."""
         self._ended.clear()
-        self._own |= {slot.report.pid for slot in self._segment.processes}
+        for slot in self._segment.processes:
+            pid = slot.report.pid
+            self._own.add(pid)
+            if slot.writer == WRITERS["fabric"] and pid:
+                self._uplink = pid
         for slot in self._segment.processes.external:
             report = slot.report
             if report.pid and report.pid not in self._others:
@@ -74,6 +79,19 @@ class Programs:
                 self._others[report.pid] = uid_actor(uid, f"pid {report.pid} {report.note}".rstrip())
         if len(self._others) > MAX_OPEN:
             self._others.clear()
+
+    def sender(self, number: int, writer: int) -> int:
+        """Return the pid of the process that sent a command.
+
+        It is in the number of the command. But the process ``fabric`` also passes on commands of other cells,
+        whose numbers contain pids of other hosts.
+
+        Args:
+            number: The number of the command.
+            writer: The queue from which it came.
+        """
+        pid = pid_of(number)
+        return self._uplink if writer == WRITERS["fabric"] and pid not in self._own else pid
 
     def is_own(self, pid: int, writer: int | None = None) -> bool:
         """Return whether a process belongs to the instance, and therefore writes its entries itself.
@@ -115,9 +133,10 @@ def _uid_of(pid: int, told: int | None) -> int | None:
 
 
 class _OpenCommand:
-    """The events of a command that is not known to be over."""
+    """The events of a command that is not known to be over, and the pid of the process that sent it."""
 
-    def __init__(self) -> None:
+    def __init__(self, pid: int) -> None:
+        self.pid = pid
         self.events: list[Event] = []
         self._accepted: set[int] = set()
         self._ended: set[int] = set()
@@ -191,20 +210,19 @@ class BlockCommands:
                 oldest = next(iter(self._open))
                 self._ending.pop(oldest, None)
                 self._end([oldest], "too many commands are in flight")
-            known = self._open[key] = _OpenCommand()
+            known = self._open[key] = _OpenCommand(self._programs.sender(event.command, event.writer))
         if known.add(event):
             self._ending[key] = None
 
     def _end(self, keys: Iterable[tuple[int, int, int]], missing: str = "") -> None:
         """Write the entries of commands; ``missing`` says why some outcomes are unknown."""
         for key in keys:
-            events = self._open.pop(key).events
+            command = self._open.pop(key)
+            pid, events = command.pid, command.events
             if events[0].kind == EventKind.INJECTED and not self._is_whole(events):
-                self._open[key] = _OpenCommand()
-                self._open[key].events = events
+                self._open[key] = command
                 continue
             _, writer, number = key
-            pid = pid_of(number)
             if self._programs.is_own(pid, writer):  # it has written the entry, unless it was killed before
                 wanted = events[-1].number > self._present and self._programs.has_ended(pid)
             else:

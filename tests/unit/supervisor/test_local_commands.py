@@ -35,7 +35,7 @@ from shmio.supervisor.local_commands import RESTARTED, LocalCommands
 LAYOUT = Layout("DB1", 1, 4, False, (
     Register("a", "INT", (), 0, None, 2, 1), Register("b", "INT", (), 2, None, 2, 1)
 ))  # fmt: skip
-GUEST, GRPC = 0, 4
+GUEST, GRPC, FABRIC = 0, 4, 7
 
 
 class Case:
@@ -121,6 +121,34 @@ def test_a_command_of_an_endpoint_has_an_entry_only_if_the_endpoint_was_killed(
     else:
         (entry,) = found
         assert (entry["kind"], entry["who"], entry["what"]) == ("process", "grpc", {"cell/a": 7})
+
+
+@pytest.mark.parametrize("alive", [True, False])
+def test_a_command_of_another_cell_has_an_entry_only_if_the_uplink_was_killed(
+    instance: str, tmp_path: Path, *, alive: bool
+) -> None:
+    """Its number has a pid of another host, which is here that of a process that has ended."""
+    block = BlockSpec("cell", LAYOUT, 20_000_000, 10**9, 1 << 22)
+    processes = [ProcessSpec("cell", "source"), ProcessSpec("fabric", "fabric")]
+    with Segment.create(instance, [block], processes) as segment:
+        case = Case(segment, tmp_path / "audit.jsonl")
+        uplink = os.getpid() if alive else ended_pid()
+        slot = next(slot for slot in segment.processes if slot.name == "fabric")
+        slot.report = Report(uplink, Activity.RUNNING)
+        trail.open_trail(AuditSettings(str(case.path), 10**7, 2), instance, "supervisor")
+        local = LocalCommands(instance, {})
+        number = first_number(ended_pid())
+        case.writer.event(Record(EventKind.LIFTED, "lifted", FABRIC, number, injection=7))
+        local.close()
+        trail.close_trail()
+        segment.unlink()
+    found = [json.loads(line) for line in case.path.read_bytes().splitlines()] if case.path.exists() else []
+    if alive:
+        assert found == []
+    else:
+        (entry,) = found
+        assert (entry["kind"], entry["who"], entry["action"]) == ("process", "fabric", "lift")
+        assert f"pid {uplink}," in entry["from"]
 
 
 def test_the_next_supervisor_goes_on_where_the_last_one_ended(case: Case) -> None:
