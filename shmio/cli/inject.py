@@ -28,7 +28,7 @@ from shmio.layout.values.write import Write, paths_of
 from shmio.model.cell import Campaign, Cell
 from shmio.model.event import Event, EventKind
 from shmio.model.injection import InjectionEvent
-from shmio.segment import NO_WRITER
+from shmio.model.values import NO_WRITER
 from shmio.wording import printable, unknown
 
 TURN_S: Final = 0.2

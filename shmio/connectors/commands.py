@@ -25,7 +25,8 @@ from shmio.connectors.output import Output, pieces
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout
 from shmio.layout.values.write import Write, apply, cover, merge, path_at
-from shmio.segment import NO_WRITER, Command, CommandKind, EventKind, Record
+from shmio.model.values import NO_WRITER
+from shmio.segment import Command, CommandKind, EventKind, Record
 
 MAX_WAITING: Final = 256
 """The largest number of items that may wait for a cycle; further commands stay in their queues.

@@ -24,7 +24,8 @@ from shmio.injection.draw import SeededRandom
 from shmio.injection.operations import Delay, Drop, Operation, OperationContext
 from shmio.layout.values.write import Write, apply, merge
 from shmio.model.injection import Running
-from shmio.segment import NO_WRITER, Direction
+from shmio.model.values import NO_WRITER
+from shmio.segment import Direction
 
 MAX_INJECTIONS: Final = 64
 """The largest number of injections on one source at a time."""

@@ -41,7 +41,8 @@ from shmio.injection.program import NEVER, Condition, compile_condition
 from shmio.layout.model import Layout
 from shmio.layout.values.write import Write, apply
 from shmio.model.injection import Running
-from shmio.segment import NO_WRITER, Block, Command, CommandKind, Direction, EventKind, Frame, Quality, Record, Segment
+from shmio.model.values import NO_WRITER
+from shmio.segment import Block, Command, CommandKind, Direction, EventKind, Frame, Quality, Record, Segment
 from shmio.segment.block import Layouts
 from shmio.segment.events import EVENT_SLOTS
 from shmio.segment.injection_list import InjectionEntry

@@ -15,7 +15,8 @@ import numpy as np
 
 from shmio.connectors.injection_layers import DeclaredLayer, Layer, LayerStack
 from shmio.layout.values.write import Write
-from shmio.segment import NO_WRITER, BlockWriter, Command, Direction, EventKind, Provenance, Quality, Record, Stamp
+from shmio.model.values import NO_WRITER
+from shmio.segment import BlockWriter, Command, Direction, EventKind, Provenance, Quality, Record, Stamp
 from shmio.segment.events import EVENT_DATA_SIZE
 from shmio.segment.injection_list import InjectionEntry, encode, ranges_of
 

@@ -12,6 +12,10 @@ if TYPE_CHECKING:
     from shmio.layout.values.codec import Value
 
 
+NO_WRITER: Final = 0xFFFFFFFF
+"""Takes the place of the number of a command queue, if no program gave the command."""
+
+
 class Quality(IntEnum):
     """Quality of a value, as in OPC UA (OPC 10000-8, section 6.3). Zero is bad."""
 

@@ -17,7 +17,8 @@ from shmio.injection import Program, compile_program
 from shmio.layout.model import Layout
 from shmio.layout.values.write import cover
 from shmio.model.injection import Running
-from shmio.segment import NO_WRITER, Provenance
+from shmio.model.values import NO_WRITER
+from shmio.segment import Provenance
 from shmio.segment.injection_list import InjectionEntry, declared_document, encode, ranges_of
 
 

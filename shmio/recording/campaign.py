@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 import msgspec
 
 from shmio.config import Declaration
+from shmio.model.values import NO_WRITER
 from shmio.recording.dump import Dump
-from shmio.segment.events import NO_WRITER, Event, EventKind
+from shmio.segment.events import Event, EventKind
 from shmio.segment.explain import Explained, Explainer, Place
 
 NS = 1e9

@@ -17,7 +17,7 @@ from shmio.segment.block import (
     Stamp,
 )
 from shmio.segment.commands import Command, CommandKind, Direction
-from shmio.segment.events import DONE, ENDS, NO_WRITER, Event, EventKind, Record
+from shmio.segment.events import DONE, ENDS, Event, EventKind, Record
 from shmio.segment.header import State
 from shmio.segment.processes import Activity, Phase, ProcessSlot, ProcessSpec, Report, Supervised
 from shmio.segment.segment import PREFIX, BlockSpec, Origin, Segment, instances, running_instances, segment_size
@@ -25,7 +25,6 @@ from shmio.segment.segment import PREFIX, BlockSpec, Origin, Segment, instances,
 __all__ = [
     "DONE",
     "ENDS",
-    "NO_WRITER",
     "PREFIX",
     "Activity",
     "Attributes",

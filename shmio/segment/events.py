@@ -11,7 +11,7 @@ import struct
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from shmio.model.values import Quality
+from shmio.model.values import NO_WRITER, Quality
 
 if TYPE_CHECKING:
     from shmio.segment._atomics import FrameTuple
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 EVENT_DATA_SIZE: Final = 256
 """Maximum number of data bytes in an event; a longer write becomes several consecutive events."""
 EVENT_SLOTS: Final = 2048
-NO_WRITER: Final = 0xFFFFFFFF
 
 _RECORD: Final = struct.Struct("<HHIQIIBxHIQ")
 EVENT_SIZE: Final = _RECORD.size + EVENT_DATA_SIZE

@@ -18,7 +18,8 @@ from shmio.layout.values.text import json_value, to_text
 from shmio.layout.values.write import Write, bits_of, paths_of
 from shmio.layout.values.write import apply as write_to
 from shmio.model.injection import Injection
-from shmio.segment.events import EVENT_DATA_SIZE, NO_WRITER, Event, EventKind
+from shmio.model.values import NO_WRITER
+from shmio.segment.events import EVENT_DATA_SIZE, Event, EventKind
 from shmio.segment.processes import EXTERNAL_SLOTS, WRITERS
 
 MAX_REMEMBERED: Final = 4096

@@ -17,8 +17,8 @@ from shmio.config import Declaration
 from shmio.layout.model import Register
 from shmio.layout.values.write import bits_of
 from shmio.model.injection import Injection
+from shmio.model.values import NO_WRITER
 from shmio.segment import _atomics
-from shmio.segment.events import NO_WRITER
 
 LIST_SIZE: Final = 32_768
 CELL_SIZE: Final = 8 + LIST_SIZE

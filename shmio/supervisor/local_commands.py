@@ -23,7 +23,8 @@ import msgspec
 from shmio.audit import trail
 from shmio.audit.trail import MAX_NAMED, Acting, Actor, uid_actor
 from shmio.model.clock import Clock
-from shmio.segment import NO_WRITER, Block, Event, EventKind, Segment
+from shmio.model.values import NO_WRITER
+from shmio.segment import Block, Event, EventKind, Segment
 from shmio.segment.clock import StateAction
 from shmio.segment.commands import pid_of, worst
 from shmio.segment.events import ENDS, EVENT_DATA_SIZE

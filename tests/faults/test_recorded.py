@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 
 from shmio.layout.model import Layout, Register
+from shmio.model.values import NO_WRITER
 from shmio.recorder.file_output import Output, create
 from shmio.recorder.instance_follower import InstanceFollower
 from shmio.recorder.recorder import Recorder
 from shmio.recording.format.encoding import Gap, Reason
 from shmio.segment import BlockSpec, Event, EventKind, Frame, Quality, Record, Segment
-from shmio.segment.events import NO_WRITER
 from tests.faults import recorded
 from tests.faults.checks import Source
 from tests.faults.recorded import BlockCheck, Watch

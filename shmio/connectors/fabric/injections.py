@@ -29,8 +29,8 @@ from shmio.injection import compile_program
 from shmio.injection.renaming import renamed
 from shmio.layout.values.write import Write
 from shmio.model.injection import Running
-from shmio.model.values import OutcomeKind
-from shmio.segment import NO_WRITER, BlockWriter, Command, CommandKind, Direction, Event, EventKind, Record
+from shmio.model.values import NO_WRITER, OutcomeKind
+from shmio.segment import BlockWriter, Command, CommandKind, Direction, Event, EventKind, Record
 from shmio.segment.block import Layouts
 from shmio.segment.commands import CommandOutcomes, first_number
 from shmio.segment.events import EVENT_DATA_SIZE

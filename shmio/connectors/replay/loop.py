@@ -21,7 +21,8 @@ from shmio.connectors.replay.source import Replay, ReplayStart, as_others, stamp
 from shmio.errors import PathError, SegmentError, ValueRangeError
 from shmio.layout.topic import find
 from shmio.layout.values.write import Write, bits_of
-from shmio.segment import NO_WRITER, BlockWriter, Event, EventKind, Frame, Provenance, Quality, Record, Stamp
+from shmio.model.values import NO_WRITER
+from shmio.segment import BlockWriter, Event, EventKind, Frame, Provenance, Quality, Record, Stamp
 from shmio.segment.commands import MAX_WRITES
 from shmio.segment.playhead import (
     MAX_SPEED,

@@ -12,7 +12,8 @@ from shmio.connectors.base import Replayed
 from shmio.connectors.replay.recording import RecordedSource, Recording, Span
 from shmio.errors import ConfigError, RecordingError, SegmentError
 from shmio.layout.model import Layout
-from shmio.segment import NO_WRITER, Block, Stamp
+from shmio.model.values import NO_WRITER
+from shmio.segment import Block, Stamp
 from shmio.segment.playhead import MAX_SPEED, MIN_SPEED, Playhead, PlayState
 
 File = Annotated[str, msgspec.Meta(min_length=1)]

@@ -11,7 +11,8 @@ import pytest
 
 from shmio.cli.dump import main
 from shmio.config.campaign import read_campaign
-from shmio.segment import NO_WRITER, EventKind, Record
+from shmio.model.values import NO_WRITER
+from shmio.segment import EventKind, Record
 from tests.unit.recording.build import Build, build, image
 
 DRIFT: dict[str, Any] = {

@@ -16,8 +16,8 @@ from shmio.audit import trail
 from shmio.audit.file import AuditSettings
 from shmio.audit.reading import last_events
 from shmio.layout.model import Layout, Register
+from shmio.model.values import NO_WRITER
 from shmio.segment import (
-    NO_WRITER,
     Activity,
     BlockSpec,
     BlockWriter,

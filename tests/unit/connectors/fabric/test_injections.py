@@ -13,7 +13,8 @@ from shmio.fabric.messages import CommandReply, CommandRequest, InjectionRequest
 from shmio.local.writer import PendingCommand, SourceWriter
 from shmio.model.clock import ClockMode
 from shmio.model.injection import Running
-from shmio.segment import NO_WRITER, CommandKind, Event, EventKind, Write
+from shmio.model.values import NO_WRITER
+from shmio.segment import CommandKind, Event, EventKind, Write
 from shmio.segment.commands import Direction
 from shmio.segment.injection_list import LIST_SIZE, InjectionEntry
 from tests.unit.connectors.fabric.harness import PATIENCE_S, Mirroring, S, frame

@@ -10,9 +10,9 @@ from shmio.connectors.fabric.order import Announced, Missing
 from shmio.errors import CommandError
 from shmio.fabric.messages import CommandReply, SourceState, encode_command
 from shmio.local.writer import SourceWriter
+from shmio.model.values import NO_WRITER
 from shmio.recording.format.encoding import Gap, Reason
 from shmio.segment import (
-    NO_WRITER,
     Event,
     EventKind,
     Provenance,

@@ -12,7 +12,8 @@ from shmio.connectors.replay.loop import OVER, STOPPED
 from shmio.local.attach import attach
 from shmio.local.time_control import Coordinator
 from shmio.local.writer import SourceWriter
-from shmio.segment import NO_WRITER, EventKind, Origin, Provenance, Quality, Record
+from shmio.model.values import NO_WRITER
+from shmio.segment import EventKind, Origin, Provenance, Quality, Record
 from shmio.segment.playhead import MoveRequest
 from tests.unit.connectors.replay.harness import (
     BEGIN_NS,
