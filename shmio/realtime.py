@@ -1,9 +1,14 @@
-"""Real-time priority (sched(7)). A thread with it runs before all threads without it."""
+"""How the kernel gives processors to threads: real-time priority (sched(7)), and how long a process has waited.
+
+A thread with real-time priority runs before all threads without it.
+"""
 
 from __future__ import annotations
 
 import os
 import threading
+from contextlib import suppress
+from pathlib import Path
 
 from shmio.errors import ConfigError
 
@@ -39,3 +44,17 @@ def check(priority: int) -> None:
     thread.join()
     if refused:
         raise refused[0]
+
+
+def waited_ns(pid: int) -> int:
+    """Return how long the threads of a process have waited for a processor, in ns; 0 if unknown.
+
+    This is the sum for all threads: while a thread waits for another one's lock, only the other
+    counts as waiting.
+    """
+    waited = 0
+    with suppress(OSError):  # the process has ended
+        for thread in Path(f"/proc/{pid}/task").iterdir():
+            with suppress(OSError, IndexError, ValueError):  # the thread has ended; or proc(5): a kernel lacks the file
+                waited += int((thread / "schedstat").read_text().split()[1])
+    return waited

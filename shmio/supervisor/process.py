@@ -13,6 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import shmio
+from shmio.realtime import waited_ns
 
 NOTIFY_VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
 """Environment variables that the service manager sets: sd_notify(3), sd_watchdog_enabled(3)."""
@@ -99,7 +100,7 @@ class ChildProcess:
 
     def waited_ns(self) -> int:
         """Return how long the threads of the process have waited for a processor, in ns; 0 if unknown."""
-        return _waited_ns(self.pid)
+        return waited_ns(self.pid)
 
     def last_words(self) -> str:
         """Return the last line that the process left in its log file; empty if there is none."""
@@ -155,21 +156,11 @@ class AdoptedProcess:
 
     def waited_ns(self) -> int:
         """Return how long the threads of the process have waited for a processor, in ns; 0 if unknown."""
-        return _waited_ns(self.pid)
+        return waited_ns(self.pid)
 
     def last_words(self) -> str:
         """Return "", because it is unknown which lines of the log file are from this process."""
         return ""
-
-
-def _waited_ns(pid: int) -> int:
-    """Return the sum for all threads: while a thread waits for another one's lock, only the other counts as waiting."""
-    waited_ns = 0
-    with suppress(OSError):  # the process has ended
-        for thread in Path(f"/proc/{pid}/task").iterdir():
-            with suppress(OSError, IndexError, ValueError):  # the thread has ended; or proc(5): a kernel lacks the file
-                waited_ns += int((thread / "schedstat").read_text().split()[1])
-    return waited_ns
 
 
 def _write_description(pid: int, pidfd: int, description: bytes) -> None:

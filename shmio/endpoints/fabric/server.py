@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import socket
+import ssl
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -17,7 +18,7 @@ import msgspec
 
 from shmio.config import Address
 from shmio.config.model import MqttTls
-from shmio.endpoints.server_process import ServerProcess
+from shmio.endpoints.server_process import CONNECT_S, Probe, ServerProcess
 from shmio.errors import ConfigError, EndpointError
 from shmio.fabric.messages import MAX_MESSAGE_BYTES
 
@@ -29,6 +30,9 @@ MAX_UNSENT_BYTES: Final = 64 << 20
 """Maximum size of what waits for a slow client, in bytes. Beyond it, the server disconnects the client."""
 MAX_MEMORY_BYTES: Final = 256 << 20
 """Maximum size of the streams that the server keeps in memory, in bytes. The fabric keeps all streams on the disk."""
+PING: Final = b"PING\r\n"
+HELLO: Final = b'CONNECT {"verbose":false,"pedantic":false,"name":"shmio liveness"}\r\n' + PING
+MAX_GREETING_BYTES: Final = 1 << 16
 _STAMP: Final = re.compile(r"^\[\d+\] (?:\d{4}/\d\d/\d\d \d\d:\d\d:\d\d\.\d+ )?")
 _LEVEL: Final = re.compile(r"^\[(INF|WRN|ERR|FTL|DBG|TRC)\](?: |$)")
 
@@ -97,6 +101,15 @@ def _tls(tls: MqttTls) -> Mapping[str, Any]:
     return files if tls.ca is None else {**files, "ca_file": tls.ca, "verify": True}
 
 
+def _client_context(tls: MqttTls) -> ssl.SSLContext:
+    """Return a TLS context for a client that asks only whether the server answers, not who it is."""
+    context = ssl.create_default_context()
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    if tls.ca is not None and tls.certificate is not None:  # clients need a certificate
+        context.load_cert_chain(tls.certificate, tls.key)
+    return context
+
+
 class NatsServer:
     """The NATS server and its directory. Start it from the main thread: see :class:`ServerProcess`."""
 
@@ -110,6 +123,7 @@ class NatsServer:
         """
         check_installed()
         self._listen = Address.parse(settings.listen)
+        self._tls = settings.tls
         self._lock = _prepare(Path(settings.directory))
         file = Path(settings.directory) / CONFIGURATION
         try:
@@ -117,23 +131,42 @@ class NatsServer:
             with open(fd, "wb") as stream:  # noqa: PTH123  a descriptor
                 stream.write(configuration(settings, name))
             command = [str(find_server()), "-c", str(file)]
-            self._process = ServerProcess("the NATS server", command, STOP_S, _read)
+            self._process = ServerProcess("the NATS server", command, STOP_S, _read, Probe(self._connect, HELLO, PING))
         except OSError as error:
             os.close(self._lock)
             raise EndpointError(f"{file}: {error.strerror}") from None
 
     def await_start(self, beat: Callable[[], object]) -> None:
         """Wait until the server accepts connections; see :meth:`ServerProcess.await_start`."""
-        here = self._listen.here
 
         def accepts() -> bool:
-            with socket.create_connection((here.host, here.port), 1.0) as probe:
-                return probe.recv(4) == b"INFO"
+            self._connect().close()
+            return True
 
         self._process.await_start(accepts, beat)
 
+    def _connect(self) -> socket.socket:
+        """Connect as a client, with TLS if the server demands it."""
+        here = self._listen.here
+        connection = socket.create_connection((here.host, here.port), CONNECT_S)
+        try:
+            greeting = b""
+            while not greeting.endswith(b"\r\n") and len(greeting) < MAX_GREETING_BYTES:
+                if not (data := connection.recv(MAX_GREETING_BYTES)):
+                    raise ConnectionResetError
+                greeting += data
+            return connection if self._tls is None else _client_context(self._tls).wrap_socket(connection)
+        except BaseException:
+            connection.close()
+            raise
+
+    @property
+    def problem(self) -> str:
+        """What is wrong with the server, which is running; empty if nothing is."""
+        return self._process.problem
+
     def check(self) -> None:
-        """Check that the server is running; raise EndpointError if it has ended."""
+        """Check that the server is running and answers; raise EndpointError if it has ended or hangs."""
         self._process.check()
 
     def stop(self) -> None:

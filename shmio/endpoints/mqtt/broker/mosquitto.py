@@ -14,8 +14,8 @@ from typing import Final, NamedTuple
 
 from shmio.config import Address, Mqtt, MqttAccount
 from shmio.config.credentials import read_accounts
-from shmio.endpoints.mqtt.broker.directory import BRIDGE, ID, SOCKET, new_secret, write_private
-from shmio.endpoints.server_process import ServerProcess
+from shmio.endpoints.mqtt.broker.directory import BRIDGE, ID, SOCKET, new_secret, secret_id, secret_of, write_private
+from shmio.endpoints.server_process import Probe, ServerProcess
 
 STOP_S: Final = 3.0
 MAX_PACKET_BYTES: Final = 1 << 21
@@ -26,6 +26,7 @@ MAX_LEVELS: Final = 64
 """Maximum number of levels in the path of a register that clients can write by MQTT."""
 READERS: Final = MqttAccount(roles=["read"])
 """The account of clients that have no ``[[mqtt.account]]``."""
+PINGREQ: Final = b"\xc0\0"
 _STAMP: Final = re.compile(r"^\d+: ")
 
 log = logging.getLogger("shmio.mqtt")
@@ -146,7 +147,9 @@ class Mosquitto:
         write_private(place / "bridge-rights", f"user {BRIDGE}\ntopic readwrite #\n")
         write_private(place / "mosquitto.conf", configuration(settings, place, anonymous=None in given))
         self._socket = place / SOCKET
-        self._process = ServerProcess("mosquitto", [program, "-c", str(place / "mosquitto.conf")], STOP_S, _read)
+        command = [program, "-c", str(place / "mosquitto.conf")]
+        probe = Probe(self._connect, _connect_packet(secret_of(str(self._socket))), PINGREQ)
+        self._process = ServerProcess("mosquitto", command, STOP_S, _read, probe)
 
     def await_start(self, beat: Callable[[], object]) -> None:
         """Wait until mosquitto accepts connections; see :meth:`ServerProcess.await_start`."""
@@ -158,13 +161,31 @@ class Mosquitto:
 
         self._process.await_start(accepts, beat)
 
+    def _connect(self) -> socket.socket:
+        probe = socket.socket(socket.AF_UNIX)
+        probe.setblocking(False)
+        probe.connect(str(self._socket))
+        return probe
+
+    @property
+    def problem(self) -> str:
+        """What is wrong with mosquitto, which is running; empty if nothing is."""
+        return self._process.problem
+
     def check(self) -> None:
-        """Check that mosquitto is running; raise EndpointError if it has ended."""
+        """Check that mosquitto is running and answers; raise EndpointError if it has ended or hangs."""
         self._process.check()
 
     def stop(self) -> None:
         """Stop mosquitto."""
         self._process.stop()
+
+
+def _connect_packet(secret: str) -> bytes:
+    """Return a CONNECT packet with the bridge's account, and without keep-alive (MQTT 3.1.1, section 3.1)."""
+    fields = [part.encode() for part in (secret_id("watch", secret), BRIDGE, secret)]
+    body = b"\0\4MQTT\4\xc2\0\0" + b"".join(len(one).to_bytes(2, "big") + one for one in fields)
+    return bytes((0x10, len(body))) + body  # the secret is short enough for a length of one byte
 
 
 def _read(line: str) -> str:

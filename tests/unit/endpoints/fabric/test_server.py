@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,7 @@ from nats.errors import NoServersError
 
 from shmio.config import Address
 from shmio.config.model import Fabric, MqttTls
+from shmio.endpoints import server_process
 from shmio.endpoints.fabric.server import NatsServer, ServerSettings
 from shmio.errors import EndpointError
 from shmio.fabric.connection import Access, connect
@@ -107,6 +109,38 @@ def test_its_end_is_reported(address: Address, tmp_path: Path) -> None:
         until(lambda: server._process._process.poll() is not None, "the server's end")
         with pytest.raises(EndpointError, match="has ended"):
             server.check()
+
+
+@pytest.mark.parametrize("encrypted", [False, True])
+def test_a_server_that_does_not_answer_is_reported(
+    address: Address,
+    tmp_path: Path,
+    pem: dict[str, str],
+    encrypted: bool,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name, limit_s in {"ASK_S": 0.02, "LATE_S": 0.4, "HANG_S": 0.8}.items():
+        monkeypatch.setattr(server_process, name, limit_s)
+    with embedded(section(address, tmp_path, MqttTls(**pem) if encrypted else None)) as server:
+        child = server._process._process
+        until_s = time.monotonic() + 0.8
+        until(lambda: problem(server) != "" or time.monotonic() > until_s, "some answers")
+        assert problem(server) == ""
+        os.kill(child.pid, signal.SIGSTOP)
+        until(lambda: "the NATS server has not answered" in problem(server), "the problem")
+        os.kill(child.pid, signal.SIGCONT)
+        until(lambda: problem(server) == "", "an answer")
+        os.kill(child.pid, signal.SIGSTOP)
+        with pytest.raises(EndpointError, match="the NATS server hangs"):
+            until(lambda: problem(server) == "never", "the hang")
+    assert child.returncode == -signal.SIGKILL
+    assert [one.getMessage() for one in caplog.records if one.name == "shmio.fabric"] == [], "questions are not logged"
+
+
+def problem(server: NatsServer) -> str:
+    server.check()
+    return server.problem
 
 
 def test_a_port_in_use_is_reported(address: Address, tmp_path: Path) -> None:

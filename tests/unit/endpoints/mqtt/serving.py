@@ -43,6 +43,7 @@ class Process:
     def __init__(self, segment: Segment, **config: Any) -> None:
         self.stopping, self.ready = threading.Event(), threading.Event()
         self.failure: Exception | None = None
+        self.notes: list[str] = []
         self._stops: list[Callable[[], object]] = []
         self._worker: Any = SimpleNamespace(
             name="broker",
@@ -52,10 +53,14 @@ class Process:
             stopping=self.stopping,
             on_stop=self._stops.append,
             running=self.ready.set,
-            report=lambda: None,
+            report=self._report,
         )
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
+
+    def _report(self, note: str | None = None) -> None:
+        if note is not None:
+            self.notes.append(note)
 
     def _run(self) -> None:
         try:

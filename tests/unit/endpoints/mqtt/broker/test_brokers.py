@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import socket
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +18,13 @@ from paho.mqtt.client import Client, MQTTv5, MQTTv311
 from paho.mqtt.enums import CallbackAPIVersion
 
 from shmio.config import Address, Mqtt, MqttTls
+from shmio.endpoints import server_process
 from shmio.endpoints.mqtt.broker import mosquitto
 from shmio.endpoints.mqtt.broker.directory import folder
 from shmio.endpoints.mqtt.broker.program import choose_broker
 from shmio.errors import ConfigError, EndpointError
 from shmio.segment import Segment
+from shmio.testing.cell import until
 from shmio.testing.mosquitto import missing
 from tests.unit.endpoints.mqtt.harness import PREFIX, bridge, listening
 from tests.unit.endpoints.mqtt.serving import address as address  # noqa: PLC0414  the fixture
@@ -109,6 +114,30 @@ def test_amqtt_refuses_mqtt_5(segment: Segment, address: Address, monkeypatch: p
     with serving(segment, address):
         assert answer(address, MQTTv5) == "Unsupported protocol version"
         assert answer(address, MQTTv311) == "Success"
+
+
+@MOSQUITTO
+def test_a_broker_that_hangs_is_killed_with_the_reason(
+    segment: Segment, address: Address, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, limit_s in {"ASK_S": 0.02, "LATE_S": 0.4, "HANG_S": 0.8}.items():
+        monkeypatch.setattr(server_process, name, limit_s)
+    with serving(segment, address) as process:
+        until(lambda: len(process.notes) > 10, "some answers")
+        assert set(process.notes) == {""}
+        [pid] = [int(one.name) for one in Path("/proc").glob("[0-9]*") if f"{folder(segment)}/" in command_line(one)]
+        os.kill(pid, signal.SIGSTOP)
+        until(lambda: process.failure is not None, "the broker's end")
+        assert "mosquitto has not answered for" in process.notes[-1]
+        assert "mosquitto hangs" in str(process.failure)
+    assert not Path(f"/proc/{pid}").exists()
+    assert not folder(segment).exists()
+
+
+def command_line(process: Path) -> str:
+    with suppress(OSError):
+        return (process / "cmdline").read_text()
+    return ""
 
 
 @MOSQUITTO
