@@ -11,6 +11,8 @@ MAX_HINTED: Final = 100
 MAX_WORD: Final = 80
 MAX_NAMES: Final = 30
 """Maximum number of valid words that a message lists."""
+MAX_PATHS: Final = 3
+"""Maximum number of paths that a message about them lists."""
 
 
 def printable(text: str) -> str:
@@ -68,6 +70,13 @@ def unknown(what: str, word: object, names: Iterable[str], of: str = "") -> str:
 def already_named(name: str, first: str) -> str:
     """Return the message about a name that two sections have; ``first`` is the key of the first section."""
     return f"{name!r} is already the name of {first}; choose another name"
+
+
+def not_writable(paths: Sequence[str], where: str = "the configuration") -> str:
+    """Return the message about registers that commands may not write; ``where`` is what has their source."""
+    shown = f"{', '.join(paths[:MAX_PATHS])}{', …' if len(paths) > MAX_PATHS else ''}"
+    are, them = ("is", "it") if len(paths) == 1 else ("are", "them")
+    return f"{shown} {are} not writable; name {them} in the source's `writable` in {where}"
 
 
 EXISTS: Final = "this file exists already; choose another name, or remove the file"

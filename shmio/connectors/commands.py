@@ -24,9 +24,10 @@ from shmio.connectors.injections import Blocks, InjectionProcessor, OwnerOf
 from shmio.connectors.output import Output, pieces
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout
-from shmio.layout.values.write import Write, apply, cover, merge, path_at
+from shmio.layout.values.write import Write, apply, cover, merge, path_at, paths_outside
 from shmio.model.values import NO_WRITER
 from shmio.segment import Command, CommandKind, EventKind, Record
+from shmio.wording import MAX_PATHS, not_writable
 
 MAX_WAITING: Final = 256
 """The largest number of items that may wait for a cycle; further commands stay in their queues.
@@ -40,7 +41,6 @@ FAR_NS: Final = 1 << 62
 TELL_NS: Final = 1_000_000_000
 """Minimum time in ns between two reports of malformed commands from the same writer."""
 
-_UNARMED: Final = "an injection toward a device needs `armed = true` in the source's configuration"
 _SUPERSEDED: Final = "superseded by a later write of the same cycle"
 _EXPONENTS: Final = {"REAL": b"\x7f\x80\0\0", "LREAL": b"\x7f\xf0\0\0\0\0\0\0"}
 """For each type of number, a mask of its exponent bits, with the most significant byte first.
@@ -337,6 +337,10 @@ Its arguments are the bits that commands may write, as an image of the block, an
 """
 
 
+def _unarmed(source: str) -> str:
+    return f"an injection toward a device needs `armed = true` in the configuration of source {source!r}"
+
+
 class CommandProcessor:
     """Processes the commands of one block.
 
@@ -381,7 +385,7 @@ class CommandProcessor:
         self._writable = cover(layout, writable or ())
         self._finite = FiniteCheck(layout, allow_nonfinite)
         self._most_bytes = MAX_WAITING_BLOCKS * layout.size
-        refuse_in = self._cannot or ("" if armed else _UNARMED)
+        refuse_in = self._cannot or ("" if armed else _unarmed(self._writer.block.source))
         blocks = blocks or (lambda: {output.writer.block.source: output.writer.block})
         if injections is None:
             self._injections: Injections = InjectionProcessor(output, self._writable, refuse_in, owner_of, blocks)
@@ -659,7 +663,9 @@ class CommandProcessor:
                 return f"byte {stop - 1} lies outside the block"
             allowed = self._writable[write.offset : stop]
             if not (allowed[0] & write.mask if write.mask else allowed == b"\xff" * len(allowed)):
-                return f"bytes {write.offset} to {stop - 1} are not writable; name them in the source's `writable`"
+                block = self._writer.block
+                paths = paths_outside(block.layout, [write], self._writable, MAX_PATHS + 1)
+                return not_writable([f"{block.source}/{path}" for path in paths] or [f"byte {write.offset}"])
         return self._finite.refusal(command.writes)
 
     def _end(self, items: Sequence[Item], ends: Sequence[End]) -> None:

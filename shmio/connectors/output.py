@@ -14,11 +14,13 @@ import msgspec
 import numpy as np
 
 from shmio.connectors.injection_layers import DeclaredLayer, Layer, LayerStack
-from shmio.layout.values.write import Write
+from shmio.layout.model import Layout
+from shmio.layout.values.write import Write, paths_outside
 from shmio.model.values import NO_WRITER
 from shmio.segment import BlockWriter, Command, Direction, EventKind, Provenance, Quality, Record, Stamp
 from shmio.segment.events import EVENT_DATA_SIZE
 from shmio.segment.injection_list import InjectionEntry, encode, ranges_of
+from shmio.wording import MAX_PATHS, not_writable
 
 EXTRA_FRAMES: Final = 4
 """Maximum number of frames in a period besides the frame of the cycle.
@@ -28,7 +30,22 @@ At this rate, a ring has room for the frames of 8 s.
 GROWTH: Final = 64
 """Number of bytes reserved in the segment for each injection: its JSON grows with the numbers in it."""
 
-NOT_WRITABLE: Final = "the injection covers registers that are not writable; name them in the source's `writable`"
+
+def unwritable(source: str, layout: Layout, cover: np.ndarray[tuple[int], np.dtype[np.uint8]], writable: bytes) -> str:
+    """Return why an injection over ``/in`` may not cover some bits; empty if it may.
+
+    Args:
+        source: Name of the source.
+        layout: The layout of its block.
+        cover: The bits that the injection covers, as an image of the block.
+        writable: The bits that commands may write, as an image of the block.
+
+    """
+    if not (cover & ~np.frombuffer(writable, np.uint8)).any():
+        return ""
+    covered = [Write(offset, mask, bytes(size)) for offset, size, mask in ranges_of(cover.tobytes())]
+    paths = paths_outside(layout, covered, writable, MAX_PATHS + 1)
+    return f"the injection is over /in, but {not_writable([f'{source}/{path}' for path in paths])}"
 
 
 class Image(NamedTuple):
@@ -231,7 +248,7 @@ class LayerPublisher:
 
         """
         self.output = output
-        self._writable = np.frombuffer(writable, np.uint8)
+        self._writable = writable
         self._refuse_in = refuse_in
         self._shown: dict[int, tuple[object, bytes]] = {}  # by number: the state, and its JSON
         self._ranges: dict[int, tuple[tuple[int, int, int], ...]] = {}
@@ -250,8 +267,9 @@ class LayerPublisher:
         if layer.direction is Direction.IN:
             if self._refuse_in:
                 return self._refuse_in
-            if (layer.cover & ~self._writable).any():
-                return NOT_WRITABLE
+            block = self.output.writer.block
+            if reason := unwritable(block.source, block.layout, layer.cover, self._writable):
+                return reason
         if reason := self.injections.add(layer):
             return reason
         self._ranges[layer.id] = ranges_of(layer.cover.tobytes())

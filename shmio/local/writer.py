@@ -16,7 +16,7 @@ from shmio.config import Declaration
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.model import Register
 from shmio.layout.topic import find
-from shmio.layout.values.write import Write, apply, bits_of, cover, encode, merge, path_at
+from shmio.layout.values.write import Write, apply, bits_of, cover, encode, merge, path_at, paths_outside
 from shmio.model.values import WRITE_MIN_PERIODS, WRITE_TIMEOUT_S, Outcome, OutcomeKind
 from shmio.segment.commands import (
     EMPTY,
@@ -30,6 +30,7 @@ from shmio.segment.commands import (
     first_number,
 )
 from shmio.segment.events import Event, EventKind
+from shmio.wording import MAX_PATHS, not_writable
 
 if TYPE_CHECKING:
     from shmio.segment.block import Block, Cursor
@@ -421,10 +422,15 @@ class SourceWriter:
     def check(self, register: Register) -> None:
         """Raise CommandError if a register is not writable."""
         if not self.is_writable(register):
-            remedy = "name it in the source's `writable` in the configuration"
+            why = not_writable([f"{self.block.source}/{register.path}"])
             if self.block.attributes.connector in _MODELS:
-                remedy += ", unless its model computes it: then only shmio inject can show another value"
-            raise CommandError(f"{self.block.source}/{register.path} is not writable; {remedy}")
+                why += ", unless its model computes it: then only shmio inject can show another value"
+            raise CommandError(why)
+
+    def unwritable(self, writes: Iterable[Write]) -> list[str]:
+        """Return the paths of what writes set although commands may not write it; not more than a message lists."""
+        outside = paths_outside(self.block.layout, writes, self._writable, MAX_PATHS + 1)
+        return [f"{self.block.source}/{path}" for path in outside]
 
     def _next(self, ticket: PendingCommand) -> Event | None:
         """Return the next event about a command; None if no event comes in time."""

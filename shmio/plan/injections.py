@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 import msgspec
-import numpy as np
 
 from shmio.config import Config, Declaration, Source
 from shmio.connectors import registry
 from shmio.connectors.base import Connector
 from shmio.connectors.injection_layers import MAX_INJECTIONS
-from shmio.connectors.output import GROWTH
+from shmio.connectors.output import GROWTH, unwritable
 from shmio.errors import ConfigError
 from shmio.injection import Program, compile_program
 from shmio.layout.model import Layout
@@ -61,12 +60,8 @@ def _check_in(program: Program, source: Source, layout: Layout) -> None:
         raise ConfigError(f"target: {source.name}/…/in: the source's connector cannot write")
     if device and not source.armed:
         raise ConfigError(f"target: an injection toward a device needs `armed = true` in source {source.name!r}")
-    writable = np.frombuffer(cover(layout, source.writable), np.uint8)
-    if (program.cover & ~writable).any():
-        raise ConfigError(
-            "target: the injection covers registers that are not writable; "
-            f"name them in `writable` of source {source.name!r}"
-        )
+    if reason := unwritable(source.name, layout, program.cover, cover(layout, source.writable)):
+        raise ConfigError(f"target: {reason}")
 
 
 def _document(source: str, programs: list[Program]) -> bytes:

@@ -21,7 +21,7 @@ from shmio.config import Declaration
 from shmio.config.declaration import contradictions
 from shmio.connectors.injection_layers import DeclaredLayer, Layer, Owner, covering
 from shmio.connectors.injections import LOOK_NS, NO_OWNER, Blocks, OwnerOf
-from shmio.connectors.output import NOT_WRITABLE
+from shmio.connectors.output import unwritable
 from shmio.errors import ConfigError
 from shmio.fabric.messages import CommandReply, InjectionRequest, SourceState, WriteItem
 from shmio.fabric.names import CellName
@@ -170,7 +170,7 @@ class MirroredInjections:
 
         """
         self._cell, self._writer, self._block = cell, writer, writer.block
-        self._writable = np.frombuffer(writable, np.uint8)
+        self._writable = writable
         self._refuse_in, self._ask, self._names = refuse_in, ask, names
         own = {name: other for name, other in names.items() if name == writer.block.source}
         self._own_names = {other: name for name, other in [*names.items(), *own.items()]}
@@ -271,8 +271,8 @@ class MirroredInjections:
         if direction is Direction.IN:
             if self._refuse_in:
                 raise ValueError(self._refuse_in)
-            if (cover & ~self._writable).any():
-                raise ValueError(NOT_WRITABLE)
+            if reason := unwritable(self._block.source, self._block.layout, cover, self._writable):
+                raise ValueError(reason)
 
     def _translated(self, data: bytes) -> Declaration:
         """Return a declaration with the owner's names and times.

@@ -90,6 +90,8 @@ class Link:
         self._thread = threading.Thread(target=self._run, name="fabric", daemon=True)
         self.problem = "the fabric is not connected yet"
         """Why there is no connection; empty if there is one."""
+        self.host = ""
+        """Name of the owner's host; empty until an entry of the owner has come."""
 
     @property
     def connected(self) -> bool:
@@ -187,6 +189,7 @@ class Link:
             entry = msgspec.json.decode(message.data, type=CellEntry)
             source = entry.source(self._source)
             if source is not None and entry.cell == str(self._cell):
+                self.host = entry.host
                 self._told(Announced(source.stream, source.number, time.monotonic_ns()))
 
     async def _request(self, missing: Missing) -> None:

@@ -34,7 +34,7 @@ from shmio.fabric.messages import (
     decode_state,
 )
 from shmio.layout.values.write import Write
-from shmio.model.values import OutcomeKind
+from shmio.model.values import NO_WRITER, OutcomeKind
 from shmio.recording.format.encoding import Gap
 from shmio.segment import BlockWriter, Event, EventKind, Frame, Provenance, Quality, Record
 from shmio.segment.commands import MAX_WRITES
@@ -381,8 +381,12 @@ class MirrorLoop:
         if event.kind in _LEFT_OUT or (writer := self._injections.writer_of(event)) is None:
             return
         self._writer.cycle = event.cycle
+        text = event.text
+        if event.kind == EventKind.REJECTED and writer != NO_WRITER:
+            host = f" on host {self._link.host}" if self._link.host else ""
+            text = f"cell {self._mirror.cell}{host}: {text}"
         record = Record(
-            cast(EventKind, event.kind), event.text, writer, event.command, event.item,
+            cast(EventKind, event.kind), text, writer, event.command, event.item,
             min(event.items, MAX_WRITES), event.offset, event.mask, event.size, event.data, event.injection,
         )  # fmt: skip
         self._writer.event(record, quality=event.quality)

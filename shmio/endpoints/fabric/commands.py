@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import socket
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Final
@@ -40,6 +41,7 @@ from shmio.local.writer import REPLACED, RETIRED, SourceWriter
 from shmio.model.values import OutcomeKind
 from shmio.segment import Block, CommandKind, EventKind
 from shmio.segment.commands import Direction, End, apply, decode_writes
+from shmio.wording import not_writable
 
 EXPIRED: Final = "the command came after its deadline; the source did not begin it"
 RESTARTED: Final = "the uplink was restarted after the command was sent; the source did not begin it"
@@ -77,6 +79,10 @@ class CommandClient:
         self._source_writer = SourceWriter(feed.block, writer)
         self._in_flight = InFlightTable(writer)
         self._events = feed.block.events.cursor()
+
+    def unwritable(self, writes: Sequence[Write]) -> list[str]:
+        """Return the paths of what writes set although commands may not write it."""
+        return self._source_writer.unwritable(writes)
 
     def write(self, writes: Sequence[Write], timeout_s: float, answer: Answer, attempt: Attempt) -> None:
         """Send writes as one command.
@@ -235,6 +241,8 @@ class CommandReceiver:
         self.refused = 0
         """Number of commands that were not sent to a source."""
         self._cell, self._allow, self._writer, self._now_ns = cell, allow, writer, now_ns
+        self._host = socket.gethostname()
+        self._there = f"the supervisor.toml of {cell}, and reload that instance"
         self._reply, self._server, self._feeds = reply, server, feeds
         self._clients: dict[int, CommandClient] = {}
         self._checks: set[asyncio.Task[None]] = set()
@@ -292,8 +300,8 @@ class CommandReceiver:
         role = "write" if request.injection is None else "inject"
         if not self._may(sender, role):
             why = (
-                f"no [[fabric.allow]] of cell {self._cell} gives {sender} the role {role}; to allow it, add {role!r} "
-                f"to its roles in the supervisor.toml of {self._cell}, and reload that instance"
+                f"no [[fabric.allow]] of cell {self._cell} gives {sender} the role {role}; to allow it, "
+                f"{self._permission(sender, role)} in the supervisor.toml of {self._cell}, and reload that instance"
             )
             return OutcomeKind.REJECTED, why, DENIED
         if feed is None:
@@ -307,12 +315,17 @@ class CommandReceiver:
                 return _rejected(why)
         elif not feed.publishes(_writes(request.writes)):
             return _rejected("a write is outside the registers that this cell publishes of the source")
+        elif why := self._unwritable(feed, request.writes):
+            return _rejected(why)
         return (OutcomeKind.EXPIRED, EXPIRED, "expired") if self._rest_s(request) <= 0 else None
 
     def _injection_refusal(self, request: InjectionRequest, feed: Feed) -> str:
         """Return why a command about an injection is rejected; empty if it is not."""
         if request.kind == "inject" and not feed.publishes(_writes(request.items)):
             return "the injection covers registers that this cell does not publish of the source"
+        toward_device = request.kind == "inject" and request.direction == Direction.IN
+        if toward_device and (why := self._unwritable(feed, request.items)):
+            return why
         if request.kind in ("lift", "shadow") and feed.partial:
             found = [one for one in feed.block.injections.read() if one.number == request.injection]
             if not all(feed.covers(one.ranges) for one in found):
@@ -367,8 +380,24 @@ class CommandReceiver:
         attempt.end(outcome, why, refused=True)
         answer(CommandReply([str(kind)] * request.outcomes, [why] * request.outcomes))
 
+    def _unwritable(self, feed: Feed, items: Sequence[WriteItem]) -> str:
+        """Return which registers the source does not let commands write; empty if it does."""
+        paths = self.client(feed).unwritable(_writes(items))
+        return not_writable(paths, self._there) if paths else ""
+
+    def _permission(self, sender: str, role: str) -> str:
+        """Return what to add to the configuration, so that a cell has a role."""
+        if any(matches_cell(pattern, sender) for one in self._allow for pattern in one.patterns):
+            return f"add {role!r} to its roles"
+        return f'add the lines [[fabric.allow]], sender = "{sender}" and roles = ["{role}"]'
+
     def _answer(self, subject: str, reply: CommandReply) -> None:
-        self._reply(subject, encode_command(reply))
+        """Send an answer. A reason why this instance rejects a command names the cell and the host."""
+        reasons = [
+            f"cell {self._cell} on host {self._host}: {why}" if why and kind == OutcomeKind.REJECTED else why
+            for kind, why in zip(reply.outcomes, reply.reasons, strict=True)
+        ]
+        self._reply(subject, encode_command(CommandReply(reply.outcomes, reasons)))
 
     def _may(self, sender: str, role: str) -> bool:
         return any(

@@ -200,6 +200,25 @@ def paths_of(layout: Layout, writes: Iterable[Write], most: int | None = None) -
     return list(islice(paths, most))
 
 
+def paths_outside(layout: Layout, writes: Iterable[Write], allowed: bytes, most: int | None = None) -> list[str]:
+    """Return the paths of what writes set outside some bits, as :func:`paths_of` does.
+
+    Args:
+        layout: The layout of the block.
+        writes: The writes; they may set several bits of each byte.
+        allowed: The bits, as an image of the block.
+        most: Maximum number of paths; None: no limit.
+
+    """
+    outside = (
+        Write(at, bits, b"\0")
+        for offset, mask, data in writes
+        for at in range(offset, min(offset + len(data), len(allowed)))
+        if (bits := (mask or 0xFF) & ~allowed[at])
+    )
+    return paths_of(layout, outside, most)
+
+
 def path_at(layout: Layout, offset: int) -> str:
     """Return the path of the register or array element to which a byte belongs; "" if there is none."""
     for index in _overlapping(layout, offset, offset + 1):

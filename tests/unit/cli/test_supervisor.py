@@ -1081,7 +1081,7 @@ def test_injection_toward_the_device_needs_armed_and_writable(
     example("Outputs/100", "Inputs/100")
     assert main(["check"]) == 1
     assert (
-        "target: the injection covers registers that are not writable; name them in `writable` of source 'cell'"
+        "target: the injection is over /in, but cell/Inputs/100 is not writable; name it in the source's `writable`"
         in capsys.readouterr().err
     )
 

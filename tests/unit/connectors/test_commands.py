@@ -160,9 +160,9 @@ def test_neighbouring_bits_of_two_writers_both_arrive(bench: Bench, writer: Bloc
 @pytest.mark.parametrize(
     ("write", "reason"),
     [
-        (Write(4, 0, b"\0\0"), "bytes 4 to 5 are not writable; name them in the source's `writable`"),
-        (Write(2, 4, b"\4"), "bytes 2 to 2 are not writable"),
-        (Write(2, 0, b"\3"), "bytes 2 to 2 are not writable"),
+        (Write(4, 0, b"\0\0"), "cell/secret is not writable; name it in the source's `writable`"),
+        (Write(2, 4, b"\4"), "byte 2 is not writable"),
+        (Write(2, 0, b"\3"), "byte 2 is not writable"),
         (Write(399, 0, b"\0\0"), "byte 400 lies outside the block"),
         (Write(2**32 - 1, 0, b"\0\0"), "lies outside the block"),
     ],

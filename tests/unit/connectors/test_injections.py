@@ -266,7 +266,7 @@ def test_values_below_other_injections_outlive_the_sources_process(rig: Rig) -> 
 def test_invalid_requests_are_refused(rig: Rig) -> None:
     with pytest.raises(PathError, match="no register matches"):
         rig.client.inject(["speeds"])
-    with pytest.raises(CommandError, match="covers registers that are not writable"):
+    with pytest.raises(CommandError, match="cell/locked is not writable"):
         rig.client.inject(["locked"], direction=Direction.IN)
     number = rig.client.inject(["speed"], name="test")
     (outcome,) = rig.client.shadow(number, {"axis/1": 1})

@@ -64,6 +64,7 @@ class FakeLink:
     def __init__(self, received: Callable[[bytes], None], answered: Callable[[Missing | Announced], None]) -> None:
         self.send, self.answered = received, answered
         self.problem = ""
+        self.host = "near.example"
         self.requests: list[Missing] = []
         self.asked = threading.Event()
         self.commands: list[CommandRequest] = []

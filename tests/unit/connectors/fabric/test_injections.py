@@ -139,6 +139,12 @@ def test_a_failure_is_reported_once(mirroring: Mirroring, outcome: str) -> None:
     assert next_one.text == "after"
 
 
+def test_a_rejection_by_the_owner_names_its_cell_and_host(mirroring: Mirroring) -> None:
+    ticket = writer_of(mirroring).ask_to_inject(OTHER)
+    mirroring.send(event(EventKind.REJECTED, ticket.number, "because"))
+    assert mirroring.event(EventKind.REJECTED).text == "cell plant1.line3.a50 on host near.example: because"
+
+
 def test_an_outcome_whose_event_was_lost_is_reported_nevertheless(
     mirroring: Mirroring, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
@@ -101,6 +102,9 @@ async def test_the_source_checks_each_command(segment: Segment, server: NatsServ
             reply = await client.write(*writes)
             assert reply.outcomes == ["rejected"] * len(writes), writes
             assert all(reply.reasons)
+        reply = await client.write((4, 0, b"\1\2\3\4"))
+        for word in (CELL, socket.gethostname(), "cell/other is not writable", "`writable`", "supervisor.toml"):
+            assert word in reply.reasons[0]
         assert plant.memory == bytes(8)
 
 

@@ -165,6 +165,9 @@ async def test_the_role_is_needed_and_the_audit_names_the_sender(
             assert reply.outcomes == ["rejected"]
             for word in ("[[fabric.allow]]", "plant1.line1.writer", "'inject'", "supervisor.toml", CELL):
                 assert word in reply.reasons[0]
+            reply = await twin.declare(sender="plant7.line1.unnamed")
+            for word in ("lines [[fabric.allow]]", 'sender = "plant7.line1.unnamed"', 'roles = ["inject"]'):
+                assert word in reply.reasons[0]
             await twin.declare()
             await twin.send("lift", 7, injection=NUMBER)
     finally:
@@ -172,6 +175,7 @@ async def test_the_role_is_needed_and_the_audit_names_the_sender(
     entries = [json.loads(line) for line in file.read_text().splitlines()]
     assert [(one["who"], one["action"], one["outcome"]) for one in entries] == [
         ("plant1.line1.writer", "declare", "denied"),
+        ("plant7.line1.unnamed", "declare", "denied"),
         (TWIN, "declare", "injected"),
         (TWIN, "lift", "lifted"),
     ]

@@ -227,7 +227,7 @@ def test_injections_on_one_register_form_a_chain(segment: Segment) -> None:
             "cell/secret/in",
             "s",
             Status.FAILED_PRECONDITION,
-            "cell/secret/in: rejected: the injection covers registers that are not writable",
+            "cell/secret/in: rejected: the injection is over /in, but cell/secret is not writable",
         ),
     ],
 )
