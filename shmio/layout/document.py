@@ -28,7 +28,7 @@ from shmio.layout.model import (
     status_bytes,
 )
 from shmio.layout.overlay import overlay_register
-from shmio.layout.topic import check_canonical
+from shmio.layout.topic import check_canonical, find, holders
 
 MAX_JSON_BYTES = 128 << 20
 
@@ -64,19 +64,71 @@ def load_layout(data: bytes, digest: bytes | None = None) -> Layout:
         document = _DECODER.decode(data)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise LayoutError(f"layout: {error}") from None
-    for register in document.registers:
-        if not register.dims:
-            msgspec.structs.force_setattr(register, "dims", ())
-    layout = Layout(
-        document.name, document.number, document.size, document.optimized, document.registers,
-        document.byte_order, document.status_offset,
-    )  # fmt: skip
+    layout = _layout_of(document)
     _check(document)
     _check_paths(layout)
     _check_overlay(layout)
     if digest is not None:
         vars(layout)["hash"] = digest
     return layout
+
+
+def load_part(data: bytes, path: str) -> Layout | None:
+    """Read only the register that a path names, or that contains what the path names.
+
+    The JSON of a large block takes long to read, and most programs that start need few registers.
+
+    Args:
+        data: The JSON, as for :func:`load_layout`; it may be hostile.
+        path: Canonical path of a register, or of an element, slice or part of one.
+
+    Returns:
+        A layout with this one register, in which :func:`shmio.layout.topic.find` finds the path.
+        None if that takes the whole layout: the path names a structure or nothing, the register
+        lies over the block, the registers have statuses, or the JSON is malformed.
+
+    """
+    # Inside a string of JSON, quotation marks are escaped. So these bytes begin a register, or nothing.
+    key = _key(path)
+    if data.find(key + b"/") >= 0:
+        return None
+    for place in holders(path):
+        if (at := data.find(_key(place) + b'",')) >= 0:
+            break
+    else:
+        return None
+    first, last = data.find(_REGISTERS) + len(_REGISTERS), data.rfind(_REGISTERS_END)
+    end = data.find(b',{"path":"', at, last)
+    try:
+        head = _DECODER.decode(data[:first] + data[at : last if end < 0 else end] + data[last:])
+        layout = _layout_of(head)
+        (register,) = layout.registers
+        if head.status_offset is not None or register.over or register.path != place:
+            return None
+        _check(head)
+        find(layout, path)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, ValueError, LayoutError, PathError):
+        return None
+    return layout
+
+
+_REGISTERS = b'"registers":['
+_REGISTERS_END = b'],"'
+
+
+def _key(path: str) -> bytes:
+    """Return the bytes with which the JSON of a register with this path, or with a path that begins so, begins."""
+    return b'{"path":' + msgspec.json.encode(path)[:-1]
+
+
+def _layout_of(document: _Layout) -> Layout:
+    for register in document.registers:
+        if not register.dims:
+            msgspec.structs.force_setattr(register, "dims", ())
+    return Layout(
+        document.name, document.number, document.size, document.optimized, document.registers,
+        document.byte_order, document.status_offset,
+    )  # fmt: skip
 
 
 def _check(document: _Layout) -> None:

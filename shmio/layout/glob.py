@@ -9,7 +9,7 @@ patterns come from clients, the time to match is linear in the path's length, wh
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from shmio.errors import PathError
 from shmio.layout.model import Layout, Register
@@ -148,12 +148,16 @@ def named(layout: Layout, topic: Topic) -> list[Register]:
     return look_up_each(layout, topic)
 
 
-def choose(patterns: Iterable[str], layouts: Mapping[str, Layout]) -> list[tuple[str, Register]]:
+def choose(
+    patterns: Iterable[str], layouts: Mapping[str, Layout], narrow: Callable[[Topic], Layout] | None = None
+) -> list[tuple[str, Register]]:
     """Return the registers that patterns name, as (source, register), in the patterns' order without duplicates.
 
     Args:
         patterns: Paths, array elements, slices, structures, globs, or names of sources.
         layouts: Layouts by source; the patterns may omit the source if there is only one.
+        narrow: Returns a layout with at least the register that a topic names, if it names one; None: use
+            ``layouts``.
 
     Raises:
         PathError: A pattern names nothing, or ends in ``/in``.
@@ -169,7 +173,10 @@ def choose(patterns: Iterable[str], layouts: Mapping[str, Layout]) -> list[tuple
             raise PathError(f"{pattern}: an input of a source cannot be read; leave out /in")
         if topic.source not in layouts:
             raise PathError(f"{pattern}: {unknown('source', topic.source, layouts)}")
-        registers = named(layouts[topic.source], topic)
+        if narrow is None or not topic.path or "*" in topic.path:
+            registers = named(layouts[topic.source], topic)
+        else:
+            registers = named(narrow(topic), topic)
         if not registers:
             raise PathError(f"{pattern}: source {topic.source!r} has no such register")
         chosen += [(topic.source, register) for register in registers]

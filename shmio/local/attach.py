@@ -174,7 +174,7 @@ class Attachment:
         if topic.direction == "in":
             raise PathError(f"{path}: an input of a source cannot be read; follow it by written(), or leave out /in")
         block = blocks[topic.source]
-        return block, look_up(block.layout, topic)
+        return block, look_up(block.layout_with(topic.path), topic)
 
     def get(self, *patterns: str) -> list[Reading]:
         """Read the registers that match the patterns, whatever their quality: see :class:`shmio.Cell`.
@@ -185,7 +185,7 @@ class Attachment:
         """
         self._segment.require_running()
         blocks = self._blocks()
-        chosen = choose(patterns, Layouts(blocks))
+        chosen = choose(patterns, Layouts(blocks), lambda topic: blocks[topic.source].layout_with(topic.path))
         frames = {source: blocks[source].latest() for source in {source for source, _ in chosen}}
         return [reading(blocks[source], register, frames[source]) for source, register in chosen]
 

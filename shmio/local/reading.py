@@ -136,7 +136,7 @@ def reading(block: Block, register: Register, frame: Frame | None, *, aged: bool
     quality, reason = frame.assess(block.stale_ns, now_ns) if aged else (frame.quality, frame.reason)
     source_ns = frame.source_ns
     is_injected = injected(block, (register,), frame)
-    value = codec(register, block.layout.byte_order).decode(frame.image) if source_ns else None
+    value = codec(register, block.byte_order).decode(frame.image) if source_ns else None
     if source_ns and (status := status_of(block, register, frame)) is not None:
         quality, reason = worse(quality, reason, status)
         source_ns = status.source_ns or source_ns

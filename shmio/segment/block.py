@@ -27,7 +27,7 @@ from shmio.segment.header import cut
 from shmio.segment.reader_lag import ReportedPosition
 
 if TYPE_CHECKING:
-    from shmio.layout.model import Layout
+    from shmio.layout.model import ByteOrder, Layout
     from shmio.segment._atomics import FrameTuple
     from shmio.segment.clock import ClockPage
     from shmio.segment.commands import CommandQueues
@@ -262,6 +262,10 @@ class EventRing:
         return Cursor(self.ring, decode_event, self.head() if after is None else after, self._retired)
 
 
+_MAX_PARTS: Final = 8
+"""Number of paths that are looked up one by one, before the whole layout is read."""
+
+
 class Block:
     """A block of a source, for readers. Readers never delay the writer.
 
@@ -272,6 +276,7 @@ class Block:
         self,
         source: str,
         load_layout: Callable[[], Layout],
+        load_part: Callable[[str], Layout | None],
         ring: Ring,
         events: Ring,
         commands: CommandQueues,
@@ -288,7 +293,8 @@ class Block:
         self.source = source
         self.section = section
         """Index of the section with the block's layout, unique within this run of the instance."""
-        self._load_layout = load_layout
+        self._load_layout, self._load_part = load_layout, load_part
+        self._parts: dict[str, Layout] = {}
         self.ring = ring
         self.events = EventRing(events, retired)
         self.commands = commands
@@ -314,10 +320,39 @@ class Block:
         """
         return self._load_layout()
 
+    def layout_with(self, path: str) -> Layout:
+        """Return the block's layout, or one with only the register that a path names or lies in.
+
+        To read single registers of a large layout is much faster than to read all of it. A program
+        that names more than a few paths reads all.
+
+        Args:
+            path: Canonical path of a register, element, slice or part.
+
+        Raises:
+            FormatError: The layout is inconsistent.
+        """
+        if "layout" in vars(self):
+            return self.layout
+        part = self._parts.get(path)
+        if part is None and len(self._parts) < _MAX_PARTS and (part := self._load_part(path)) is not None:
+            self._parts[path] = part
+        return self.layout if part is None else part
+
+    @property
+    def _known_layout(self) -> Layout:
+        """The layout with at least one register: what has been read of it, else all of it."""
+        return next(iter(self._parts.values())) if self._parts and "layout" not in vars(self) else self.layout
+
+    @property
+    def byte_order(self) -> ByteOrder:
+        """Byte order of the block's images."""
+        return self._known_layout.byte_order
+
     @property
     def statuses(self) -> StatusArea | None:
         """The status area of the block's images; None if the source gives its registers no statuses."""
-        return status_area(self.layout)
+        return status_area(self._known_layout)
 
     @property
     def retired(self) -> bool:

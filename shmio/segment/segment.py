@@ -22,7 +22,7 @@ from shmio.errors import (
     UnfinishedError,
     WrongInstanceError,
 )
-from shmio.layout.document import load_layout
+from shmio.layout.document import load_layout, load_part
 from shmio.layout.model import Layout
 from shmio.segment import _atomics, commands, header, model_channel, shm
 from shmio.segment.block import Attributes, Block, BlockWriter, Stamp
@@ -204,10 +204,16 @@ def read_block(
     if frames.frame_size != linked_size or events.frame_size != EVENT_SIZE:
         raise FormatError(f"{name}: block {described.name}: its rings have wrong frame sizes{_DAMAGED}")
 
+    def document() -> bytes:
+        return bytes(memory[described.offset : described.offset + described.size])
+
+    def part_with(path: str) -> Layout | None:
+        found = load_part(document(), path)
+        return None if found is None or found.size != frames.frame_size else found
+
     def layout() -> Layout:
         try:
-            data = bytes(memory[described.offset : described.offset + described.size])
-            found = load_layout(data, described.digest)
+            found = load_layout(document(), described.digest)
         except LayoutError as error:
             raise FormatError(f"{name}: block {described.name}: {error}") from None
         if found.size != frames.frame_size:
@@ -218,7 +224,7 @@ def read_block(
         return found
 
     return Block(
-        described.name, layout, frames, events, queues, injections, declared, readers, attributes,
+        described.name, layout, part_with, frames, events, queues, injections, declared, readers, attributes,
         lambda: header.retired(memory, head, layout_at), layout_at, clock, channel, playhead,
     )  # fmt: skip
 

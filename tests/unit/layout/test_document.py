@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 
 from shmio.errors import LayoutError
 from shmio.layout.compiler import Source, compile_sources
-from shmio.layout.document import load_layout
+from shmio.layout.document import load_layout, load_part
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
+from shmio.layout.topic import find
 
 TEXT = """DATA_BLOCK DB5 STRUCT a : Bool; b : Bool; "c/d" : Array[-1..1] of Byte := [1, 2]; // of c
     s : Array[1..2] of Struct t : String[3] := 'ä'; END_STRUCT; r : Real := 1.5; m : DT; n : Int := "MAX"; p : DTL;
@@ -216,3 +217,47 @@ def test_a_status_area_that_is_not_aligned_is_refused(layout: Layout) -> None:
     document["size"] += 4
     with pytest.raises(LayoutError, match="not aligned"):
         load_layout(json.dumps(document).encode())
+
+
+@pytest.mark.parametrize(
+    "path", ["a", "b", "c%2Fd", "c%2Fd/-1", "c%2Fd/0..1", "c%2Fd/1.%X3", "s/1/t", "n.%X15", "o/1", "p"]
+)
+def test_a_part_has_the_same_register(layout: Layout, path: str) -> None:
+    part = load_part(layout.to_json(), path)
+    assert part is not None
+    assert find(part, path) == find(layout, path)
+    assert [find(part, one.path) for one in part.registers] == [find(layout, one.path) for one in part.registers]
+    assert len(part.registers) == 1
+    assert (part.name, part.number, part.size, part.byte_order) == ("DB5", 5, layout.size, "big")
+
+
+@pytest.mark.parametrize("path", ["s", "s/1", "c%2Fd/2", "c%2Fd/7..8", "r.%X0", "A", "x", "s/1/t/1", "", "aa"])
+def test_a_part_of_what_is_no_register_takes_the_whole_layout(layout: Layout, path: str) -> None:
+    assert load_part(layout.to_json(), path) is None
+
+
+def test_a_part_of_a_layout_with_statuses_takes_the_whole_layout(layout: Layout) -> None:
+    assert load_part(layout.with_statuses().to_json(), "a") is None
+
+
+def test_a_comment_cannot_look_like_a_register() -> None:
+    text = """DATA_BLOCK DB5 STRUCT a : Int; // {"path":"b","type":"BYTE"}, {"path":"b",
+        b : Real; END_STRUCT; BEGIN END_DATA_BLOCK"""
+    (layout,) = compile_sources([Source("x.db", text.encode())]).layouts
+    assert '"b"' in layout.registers[0].comment
+    part = load_part(layout.to_json(), "b")
+    assert part is not None
+    assert part.registers == layout.registers[1:]
+
+
+@given(st.data())
+def test_a_part_of_damaged_json_is_none_or_possible(data: st.DataObject) -> None:
+    (layout,) = compile_sources([Source("x.db", TEXT.encode())]).layouts
+    damaged = bytearray(layout.to_json())
+    for _ in range(data.draw(st.integers(1, 3))):
+        damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
+    part = load_part(bytes(damaged), "c%2Fd/0")
+    if part is not None:
+        (register,) = part.registers
+        assert register.offset + register.size <= part.size
+        assert load_layout(part.to_json()) == part

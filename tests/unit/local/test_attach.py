@@ -10,7 +10,9 @@ import pytest
 
 import shmio
 from shmio.errors import NotRunningError, PathError, QualityError, SegmentError
+from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.document import load_layout
+from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout, Register
 from shmio.local.attach import Attachment
 from shmio.segment import BlockSpec, BlockWriter, ProcessSpec, Quality, Segment
@@ -96,13 +98,29 @@ def test_a_program_reads_only_the_layouts_that_it_needs(instance: str, monkeypat
         read.clear()
         with shmio.attach(instance) as cell:
             assert (cell.sources, read) == (["one", "two", "three"], [])
-            assert len(cell.get("two/on", "two/counts")) == 2
+            assert len(cell.get("two/on", "two/counts", "two/counts/2")) == 3
+            assert (cell["two/axis/position"], cell.read("two/counts/1").value, read) == (1.5, 0, [])
             with cell.subscribe("two/axis") as updates:
                 assert next(updates).source == "two"
             assert len(read) == 1
             assert [*cell.layouts("one", "two")] == ["one", "two"]
             three = cell.layouts()["three"]
             assert (three, three.hash, len(read)) == (LAYOUT, LAYOUT.hash, 2)
+        segment.unlink()
+
+
+def test_a_program_that_reads_many_registers_reads_their_layout_once(instance: str) -> None:
+    members = " ".join(f"m{number} : Int := {number};" for number in range(20))
+    text = f"DATA_BLOCK DB1 STRUCT {members} END_STRUCT; BEGIN END_DATA_BLOCK"
+    (layout,) = compile_sources([Source("x.db", text.encode())]).layouts
+    with Segment.create(instance, [BlockSpec("one", layout, 20_000_000, 60_000_000_000, 1 << 20)], []) as segment:
+        segment.writer("one").publish(initial_frame(layout)[0], cycle=1)
+        with shmio.attach(instance) as cell:
+            for _ in range(2):
+                assert [cell[f"m{number}"] for number in range(20)] == [*range(20)]
+            assert cell.block().layout == layout
+            with pytest.raises(PathError, match="m20"):
+                cell["m20"]
         segment.unlink()
 
 
