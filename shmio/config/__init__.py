@@ -2,35 +2,36 @@
 
 from __future__ import annotations
 
-from shmio.config.address import Address, UnixAddress, parse_address
-from shmio.config.model import (
-    RESERVED_SOURCES,
-    Alert,
-    Config,
-    Declaration,
-    Emulator,
-    Expectation,
-    Grpc,
-    Instance,
-    Metrics,
-    Mqtt,
-    MqttAccount,
-    MqttTls,
-    MqttTopic,
-    OpcUa,
-    Recorder,
-    Source,
-    Sparkplug,
-    Tls,
-    Token,
-    Trigger,
-)
+import importlib
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
+    from shmio.config.address import Address, UnixAddress, parse_address
+    from shmio.config.model import (
+        Alert,
+        Config,
+        Declaration,
+        Emulator,
+        Expectation,
+        Grpc,
+        Instance,
+        Metrics,
+        Mqtt,
+        MqttAccount,
+        MqttTls,
+        MqttTopic,
+        OpcUa,
+        Recorder,
+        Source,
+        Sparkplug,
+        Tls,
+        Token,
+        Trigger,
+    )
     from shmio.config.read import load
+    from shmio.config.reserved import RESERVED_SOURCES
 
 __all__ = [
     "RESERVED_SOURCES",
@@ -60,10 +61,14 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    """Import ``load`` at its first use: most processes of an instance read no configuration file."""
-    if name == "load":
-        from shmio.config.read import load  # noqa: PLC0415
+_MODULES = {"load": "read", "RESERVED_SOURCES": "reserved"} | dict.fromkeys(
+    ("Address", "UnixAddress", "parse_address"), "address"
+)
+"""The module that defines each name; all others are in ``model``."""
 
-        return load
-    raise AttributeError(f"module 'shmio.config' has no attribute {name!r}")
+
+def __getattr__(name: str) -> Any:
+    """Import a name at its first use: programs that attach need no types of the configuration."""
+    if name not in __all__:
+        raise AttributeError(f"module 'shmio.config' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"shmio.config.{_MODULES.get(name, 'model')}"), name)

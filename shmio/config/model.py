@@ -7,8 +7,6 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct, field
 
-RESERVED_SOURCES = frozenset({"simlog", "model", "shmio"})
-
 Text = Annotated[str, Meta(min_length=1)]
 Texts = Annotated[list[Text], Meta(min_length=1)]
 

@@ -17,7 +17,6 @@ from shmio.config.fabric import check_fabric, resolve_fabric
 from shmio.config.faults import MAX_KEY, MAX_PARTS, Faults, decode, explain, explain_toml, too_long
 from shmio.config.listening import check_listening, resolve
 from shmio.config.model import (
-    RESERVED_SOURCES,
     Alert,
     Client,
     Config,
@@ -48,6 +47,7 @@ from shmio.config.model import (
 )
 from shmio.config.mqtt import check_mqtt, resolve_mqtt
 from shmio.config.opcua import check_opcua, resolve_opcua
+from shmio.config.reserved import RESERVED_SOURCES
 from shmio.config.web import check_web, resolve_web
 from shmio.errors import ConfigError
 from shmio.wording import already_named, did_you_mean, larger_than, listed, near, unknown

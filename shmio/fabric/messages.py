@@ -28,7 +28,8 @@ from shmio.recording.format.encoding import (
 from shmio.segment.block import Frame
 from shmio.segment.commands import MAX_NAME_BYTES
 from shmio.segment.events import Event
-from shmio.segment.injection_list import LIST_SIZE, InjectionEntry
+from shmio.segment.header import LIST_SIZE
+from shmio.segment.injection_list import InjectionEntry
 
 VERSION: Final = 1
 MAX_MESSAGE_BYTES: Final = 1 << 20

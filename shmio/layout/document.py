@@ -27,7 +27,6 @@ from shmio.layout.model import (
     shape_of,
     status_bytes,
 )
-from shmio.layout.overlay import overlay_register
 from shmio.layout.topic import check_canonical, find, holders
 
 MAX_JSON_BYTES = 128 << 20
@@ -179,6 +178,10 @@ def _check_overlay(layout: Layout) -> None:
     Set ``partial`` of each of these registers, which the JSON does not contain.
     """
     own = len(layout.own)
+    if own == len(layout.registers):
+        return
+    from shmio.layout.overlay import overlay_register  # noqa: PLC0415  most layouts have no such registers
+
     for register in layout.registers[own:]:
         try:
             found = overlay_register(layout.base, register.path, register.over, (register.element, register.dims))

@@ -21,7 +21,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal, TypeVar, cast
 
-from shmio.config import RESERVED_SOURCES
+from shmio.config.reserved import RESERVED_SOURCES
 from shmio.errors import PathError
 from shmio.layout.model import INTEGERS, MAX_DEPTH, MAX_DIMENSIONS, MAX_PATH, Layout, Register, array_size
 from shmio.wording import did_you_mean, unknown

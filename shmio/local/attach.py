@@ -21,39 +21,40 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from functools import partial
-from pathlib import Path
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from shmio.config import Declaration
 from shmio.errors import CommandError, NotRunningError, PathError, QualityError, SegmentError, ValueRangeError
 from shmio.layout.glob import choose
 from shmio.layout.model import Layout, Register
-from shmio.layout.overlay import names_in
 from shmio.layout.topic import Topic, look_up, parse_topic
 from shmio.layout.values.codec import Value
-from shmio.local.events import Events
-from shmio.local.injection import Campaign, ObservedWrite, Shadow, as_given, by_path, lift_all, written
 from shmio.local.reading import View, reading
-from shmio.local.replays import Replays
-from shmio.local.subscription import Following, Subscription
-from shmio.local.writer import SourceWriter
 from shmio.model.clock import Clock, check_step
-from shmio.model.injection import Injection, Lifted, Running
-from shmio.model.values import Outcome, Quality, Reading
+from shmio.model.values import Quality, Reading
 from shmio.segment.block import Block, Cursor, Entry, Frame, Layouts
 from shmio.segment.commands import Direction
-from shmio.segment.injection_list import InjectionEntry
 from shmio.segment.processes import Activity, Report
 from shmio.segment.segment import Segment, running_instances
 from shmio.wording import name_one, unknown
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    from shmio.config import Declaration
+    from shmio.local.events import Events
+    from shmio.local.injection import Campaign, ObservedWrite, Shadow
+    from shmio.local.replays import Replays
     from shmio.local.snapshots import Snapshots, States
+    from shmio.local.subscription import Following, Subscription
     from shmio.local.time_control import Coordinator, Timekeeper
+    from shmio.local.writer import SourceWriter
+    from shmio.model.injection import Injection, Lifted
     from shmio.model.snapshot import SnapshotInfo
+    from shmio.model.values import Outcome
+    from shmio.segment.injection_list import InjectionEntry
 
 _TURN_S: Final = 1.0
 """Interval in s at which a waiting reader checks whether the instance still runs."""
@@ -75,18 +76,23 @@ class Attachment:
         self._segment = segment
         self._coordinator, self._states, self._snapshot_folder = coordinator, states, snapshot_folder
         self._timekeeper: Timekeeper | None = None
-        self.replay = Replays(segment)
-        """The instance's replays. Call it as ``replay`` of :class:`shmio.Cell`, or use its methods.
-
-        The attachment must be ``writable`` to change them.
-        """
         self._lock = threading.Lock()
         self._slot: int | None = None
         self._source_writers: dict[str, SourceWriter] = {}
         self._open: weakref.WeakSet[Following[Any]] = weakref.WeakSet()
         self._detached = False
 
-    # Most programs neither move time nor use snapshots, and the modules for both take long to import.
+    # Most programs only read values. So a method imports what reading does not need.
+
+    @cached_property
+    def replay(self) -> Replays:
+        """The instance's replays. Call it as ``replay`` of :class:`shmio.Cell`, or use its methods.
+
+        The attachment must be ``writable`` to change them.
+        """
+        from shmio.local.replays import Replays  # noqa: PLC0415
+
+        return Replays(self._segment)
 
     @property
     def _time(self) -> Timekeeper:
@@ -194,6 +200,8 @@ class Attachment:
 
         See :class:`shmio.Cell`. The iterator ends when you close it or the attachment.
         """
+        from shmio.local.subscription import Subscription  # noqa: PLC0415
+
         subscription = Subscription(
             self._segment, self._blocks, patterns, every_frame=every_frame, max_rate_hz=max_rate_hz
         )
@@ -209,6 +217,8 @@ class Attachment:
             PathError: There is no such source.
             NotRunningError: The instance has stopped.
         """
+        from shmio.local.events import Events  # noqa: PLC0415
+
         self._segment.require_running()
         followed = [self.block(source) for source in dict.fromkeys(sources) or self._blocks()]
         events = Events(self._segment, self._blocks, followed)
@@ -345,6 +355,8 @@ class Attachment:
             PathError, ValueRangeError, CommandError: As for :meth:`write`; nothing has been sent.
             NotRunningError: The instance has stopped.
         """
+        from shmio.local.injection import as_given  # noqa: PLC0415
+
         self._segment.require_running()
         return as_given(values, self.write(values, timeout_s))
 
@@ -367,6 +379,8 @@ class Attachment:
             CommandError: A register is not writable, or the source's queue has no room.
                 After any of these errors, nothing has been sent.
         """
+        from shmio.local.injection import by_path  # noqa: PLC0415
+
         block, topics = _of_one_source("write", values, self._blocks(), written=True)
         return self._source_writer(block).write(by_path(topics, values), timeout_s)
 
@@ -393,6 +407,9 @@ class Attachment:
             CommandError: The source refuses, or does not answer.
             NotRunningError: The instance has stopped.
         """
+        from shmio.layout.overlay import names_in  # noqa: PLC0415
+        from shmio.local.injection import Shadow  # noqa: PLC0415
+
         self._segment.require_running()
         block, topics = _of_one_source("injection", paths, self._blocks())
         directions = {topic.direction or "out" for topic in topics}
@@ -423,6 +440,8 @@ class Attachment:
             PathError: A path names no register, or the paths belong to several sources.
             NotRunningError: The instance has stopped.
         """
+        from shmio.local.injection import written  # noqa: PLC0415
+
         block, topics = _of_one_source("call", paths, self._blocks(), written=True)
         patterns = [topic.path or "**" for topic in topics]
         return written(block, patterns, block.events.cursor(), partial(self._next, block), timeout_s)
@@ -446,6 +465,8 @@ class Attachment:
             CommandError: A source refuses, or does not answer.
             NotRunningError: The instance has stopped.
         """
+        from shmio.local.injection import Campaign  # noqa: PLC0415
+
         self._segment.require_running()
         campaign = Campaign(self._segment, declarations, self._blocks(), self._source_writer, keep=keep)
         self._end_with_this(campaign)
@@ -497,6 +518,9 @@ class Attachment:
             CommandError: Some injections could not be lifted; the message gives the reasons.
             NotRunningError: The instance has stopped.
         """
+        from shmio.local.injection import lift_all  # noqa: PLC0415
+        from shmio.model.injection import Lifted  # noqa: PLC0415
+
         self._segment.require_running()
         blocks = [self.block(source) for source in dict.fromkeys(sources) or self._blocks()]
         present = [(block, one) for block in blocks for one in block.injections.read() if not one.lifted]
@@ -634,6 +658,8 @@ class Attachment:
 
         The first call takes an external slot for this attachment, until it is closed.
         """
+        from shmio.local.writer import SourceWriter  # noqa: PLC0415
+
         if not self._segment.shared.writable:
             raise CommandError("this attachment only reads; attach with writable=True")
         with self._lock:
@@ -715,7 +741,7 @@ def _take_external_slot(segment: Segment) -> int:
     places = segment.processes.external
     for slot in places:
         if slot.writer is not None and slot.take():
-            program = Path(sys.argv[0]).name if sys.argv else ""  # not the arguments, which may be secret
+            program = sys.argv[0].rpartition("/")[2] if sys.argv else ""  # not the arguments, which may be secret
             slot.report = Report(os.getpid(), Activity.RUNNING, time.monotonic_ns(), (os.getuid(),), program)
             return slot.writer
     pids = ", ".join(str(slot.report.pid) for slot in places)
@@ -761,6 +787,8 @@ def _of_one_source(
 
 def _with_source(source: str, one: InjectionEntry) -> Injection[Mapping[str, Any]]:
     """Convert an injection of the segment to the form for programs, which names the source."""
+    from shmio.model.injection import Injection, Running  # noqa: PLC0415
+
     now, running = one.running, None
     if now is not None:
         declaration = msgspec.to_builtins(now.declaration)

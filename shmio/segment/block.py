@@ -280,8 +280,7 @@ class Block:
         ring: Ring,
         events: Ring,
         commands: CommandQueues,
-        injections: InjectionListCell,
-        declared: DeclaredCell,
+        lists: tuple[memoryview, int, int],
         readers: ReaderTable,
         attributes: Attributes,
         retired: Callable[[], bool],
@@ -298,10 +297,7 @@ class Block:
         self.ring = ring
         self.events = EventRing(events, retired)
         self.commands = commands
-        self.injections = injections
-        """The existing injections of the source."""
-        self.declared = declared
-        """The injections that the configuration declares for the source."""
+        self._lists = lists
         self._readers = readers
         self.attributes = attributes
         self.clock = clock
@@ -353,6 +349,22 @@ class Block:
     def statuses(self) -> StatusArea | None:
         """The status area of the block's images; None if the source gives its registers no statuses."""
         return status_area(self._known_layout)
+
+    # Most programs read no lists of injections, and the modules for them take long to import.
+
+    @cached_property
+    def injections(self) -> InjectionListCell:
+        """The existing injections of the source."""
+        from shmio.segment.injection_list import injection_list_cell  # noqa: PLC0415
+
+        return injection_list_cell(self._lists[0], self._lists[1])
+
+    @cached_property
+    def declared(self) -> DeclaredCell:
+        """The injections that the configuration declares for the source."""
+        from shmio.segment.injection_list import declared_cell  # noqa: PLC0415
+
+        return declared_cell(self._lists[0], self._lists[2])
 
     @property
     def retired(self) -> bool:

@@ -6,8 +6,7 @@ import os
 import struct
 from collections.abc import Sequence
 from enum import IntEnum
-from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
@@ -15,11 +14,16 @@ from shmio.errors import FormatError, UnfinishedError
 from shmio.segment import _atomics
 from shmio.version import __version__
 
+if TYPE_CHECKING:
+    from pathlib import Path
+
 MAGIC: Final = int.from_bytes(b"SHMIOSEG", "little")
 ABI_VERSION: Final = 2
 HEADER_SIZE: Final = 4096
 SECTION_SIZE: Final = 128
 SLOT_SIZE: Final = 1088
+LIST_SIZE: Final = 32_768
+LIST_CELL_SIZE: Final = 8 + LIST_SIZE
 MAX_SECTIONS: Final = 4096
 MAX_PROCESSES: Final = 256
 
@@ -233,6 +237,8 @@ def write_config(memory: memoryview, file: Path) -> None:
 def read_config(memory: memoryview) -> Path | None:
     """Read the path of the configuration file that the instance was started from; None: unknown."""
     path = bytes(memory[CONFIG_OFFSET : CONFIG_OFFSET + CONFIG_SIZE]).split(b"\0", 1)[0]
+    from pathlib import Path  # noqa: PLC0415  programs that attach need no path
+
     return Path(os.fsdecode(path)) if path else None
 
 

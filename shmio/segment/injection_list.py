@@ -9,7 +9,7 @@ configured injections.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Final, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import msgspec
 
@@ -19,9 +19,7 @@ from shmio.layout.values.write import bits_of
 from shmio.model.injection import Injection
 from shmio.model.values import NO_WRITER
 from shmio.segment import _atomics
-
-LIST_SIZE: Final = 32_768
-CELL_SIZE: Final = 8 + LIST_SIZE
+from shmio.segment.header import LIST_SIZE
 
 
 class InjectionEntry(Injection[Declaration], frozen=True, omit_defaults=True):
@@ -100,10 +98,7 @@ def encode(items: Iterable[bytes], growth: int = 0) -> bytes:
 class ListCell(Generic[_Item]):
     """A section of a block that holds a list of items. Only one process writes it."""
 
-    def __init__(self, memory: memoryview, offset: int, size: int, decoder: msgspec.json.Decoder[tuple[_Item, ...]]):
-        """Open the section; raise ValueError if it is too short."""
-        if size < CELL_SIZE:
-            raise ValueError("the section of the source's injections is too short")
+    def __init__(self, memory: memoryview, offset: int, decoder: msgspec.json.Decoder[tuple[_Item, ...]]) -> None:
         self._memory = memory
         self._offset = offset
         self._decoder = decoder
@@ -137,22 +132,14 @@ InjectionListCell = ListCell[InjectionEntry]
 DeclaredCell = ListCell[Declaration]
 
 
-def injection_list_cell(memory: memoryview, offset: int, size: int) -> InjectionListCell:
-    """Open the section of existing injections, which the source writes, by its offset and size in bytes.
-
-    Raises:
-        ValueError: The section is too short.
-    """
-    return ListCell(memory, offset, size, _ENTRIES)
+def injection_list_cell(memory: memoryview, offset: int) -> InjectionListCell:
+    """Open the section of existing injections, which the source writes."""
+    return ListCell(memory, offset, _ENTRIES)
 
 
-def declared_cell(memory: memoryview, offset: int, size: int) -> DeclaredCell:
-    """Open the section of configured injections, which the supervisor writes, by its offset and size in bytes.
-
-    Raises:
-        ValueError: The section is too short.
-    """
-    return ListCell(memory, offset, size, _DECLARED)
+def declared_cell(memory: memoryview, offset: int) -> DeclaredCell:
+    """Open the section of configured injections, which the supervisor writes."""
+    return ListCell(memory, offset, _DECLARED)
 
 
 def declared_document(declarations: Iterable[Declaration]) -> bytes:

@@ -9,7 +9,7 @@ import time
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
 from functools import partial
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -29,14 +29,25 @@ from shmio.segment.block import Attributes, Block, BlockWriter, Stamp
 from shmio.segment.clock import ClockPage, page_size, time_lock
 from shmio.segment.commands import CommandQueues
 from shmio.segment.events import EVENT_SIZE, EVENT_SLOTS
-from shmio.segment.header import HEADER_SIZE, SECTION_SIZE, SLOT_SIZE, Header, SectionEntry, SectionKind, State
-from shmio.segment.injection_list import CELL_SIZE, declared_cell, injection_list_cell
+from shmio.segment.header import (
+    HEADER_SIZE,
+    LIST_CELL_SIZE,
+    SECTION_SIZE,
+    SLOT_SIZE,
+    Header,
+    SectionEntry,
+    SectionKind,
+    State,
+)
 from shmio.segment.model_channel import ModelChannel
 from shmio.segment.playhead import PLAYHEAD_SIZE, Playhead
 from shmio.segment.processes import EXTERNAL_SLOTS, SUPERVISOR_LOCK, ProcessSpec, ProcessTable, supervisor_beat
 from shmio.segment.reader_lag import TABLE_SIZE, ReaderTable
 from shmio.segment.shm import SharedObject
 from shmio.version import __version__
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 PREFIX = "shmio-"
 """Prefix of the name of each segment; the name of the instance follows."""
@@ -135,8 +146,8 @@ class BlockSpec(msgspec.Struct, frozen=True):
             (SectionKind.EVENTS, _atomics.RING_HEADER_SIZE + EVENT_SLOTS * _EVENT_STRIDE, events),
             (SectionKind.COMMANDS, commands.section_size(self.layout.size), queues),
             (SectionKind.SOURCE, len(attributes), attributes),
-            (SectionKind.INJECTIONS, CELL_SIZE, b""),
-            (SectionKind.DECLARED, CELL_SIZE, bytes(8) + self.declared),
+            (SectionKind.INJECTIONS, LIST_CELL_SIZE, b""),
+            (SectionKind.DECLARED, LIST_CELL_SIZE, bytes(8) + self.declared),
             (SectionKind.READERS, TABLE_SIZE, b""),
             *([(SectionKind.LINK, *model_channel.section(linked, self.slot_bytes))] if self.attributes.remote else []),
             *([(SectionKind.PLAYHEAD, PLAYHEAD_SIZE, b"")] if self.attributes.replay else []),
@@ -190,8 +201,10 @@ def read_block(
         frames = _atomics.Ring(memory, *part(SectionKind.FRAMES))
         events = _atomics.Ring(memory, *part(SectionKind.EVENTS))
         queues = CommandQueues(memory, *part(SectionKind.COMMANDS))
-        injections = injection_list_cell(memory, *part(SectionKind.INJECTIONS))
-        declared = declared_cell(memory, *part(SectionKind.DECLARED))
+        injections, size = part(SectionKind.INJECTIONS)
+        declared, declared_size = part(SectionKind.DECLARED)
+        if min(size, declared_size) < LIST_CELL_SIZE:
+            raise ValueError("the section of the source's injections is too short")
         readers = ReaderTable(memory, *part(SectionKind.READERS))
         lock_byte = head.process_capacity + _FIRST_LINK + layout_at
         channel = ModelChannel(shared, memory, *part(SectionKind.LINK), lock_byte) if attributes.remote else None
@@ -224,7 +237,7 @@ def read_block(
         return found
 
     return Block(
-        described.name, layout, part_with, frames, events, queues, injections, declared, readers, attributes,
+        described.name, layout, part_with, frames, events, queues, (memory, injections, declared), readers, attributes,
         lambda: header.retired(memory, head, layout_at), layout_at, clock, channel, playhead,
     )  # fmt: skip
 

@@ -13,13 +13,12 @@ import mmap
 import os
 import struct
 from contextlib import suppress
-from pathlib import Path
 
 import posix_ipc
 
 from shmio.errors import SegmentError
 
-DIRECTORY = Path("/dev/shm")  # noqa: S108  where Linux keeps POSIX shared memory, shm_overview(7)
+DIRECTORY = "/dev/shm"  # noqa: S108  where Linux keeps POSIX shared memory, shm_overview(7)
 _FLOCK = "@hhqqi4x"  # struct flock of 64-bit Linux: type, whence, start, length, pid
 
 
@@ -33,7 +32,7 @@ class SharedObject:
 
     def __init__(self, name: str, fd: int, *, writable: bool, private: bool = False) -> None:
         self.name = name
-        self._path = DIRECTORY / name
+        self._path = f"{DIRECTORY}/{name}"
         self.writable = writable
         self._private = private
         self.inode = os.fstat(fd).st_ino
@@ -166,7 +165,7 @@ class SharedObject:
         if self._private:
             return True
         try:
-            return self._path.stat().st_ino == self.inode
+            return os.stat(self._path).st_ino == self.inode  # noqa: PTH116  programs that attach do not load pathlib
         except FileNotFoundError:
             return False
 
@@ -203,4 +202,5 @@ def unlink(name: str) -> None:
 
 def names(prefix: str) -> list[str]:
     """Return the names of the shared-memory objects that start with ``prefix``."""
-    return sorted(entry.name for entry in DIRECTORY.iterdir() if entry.name.startswith(prefix))
+    with os.scandir(DIRECTORY) as entries:
+        return sorted(entry.name for entry in entries if entry.name.startswith(prefix))

@@ -238,7 +238,7 @@ def _maps(pid: int, inode: int, right: str = "") -> bool:
 
     If ``right`` is given, a letter such as ``w``, the mapping must have this permission.
     """
-    device = shm.DIRECTORY.stat().st_dev
+    device = Path(shm.DIRECTORY).stat().st_dev
     wanted = f"{os.major(device):02x}:{os.minor(device):02x}", str(inode)
     with suppress(OSError):
         for line in Path(f"/proc/{pid}/maps").read_text(errors="replace").splitlines():

@@ -7,6 +7,7 @@ import os
 import stat
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final
 
 from shmio.control import remove_socket
@@ -84,7 +85,7 @@ def _usable_segment(shared: SharedObject, plan: Plan) -> tuple[Segment | None, l
         return None, [f"{plan.instance} was started with instance.clock {began}, not {wanted}; {_START_AGAIN}"]
     if plan.origin and segment.header.started_utc_ns != plan.origin.started_utc_ns:
         return None, [f"{plan.instance} played another recording; {_START_AGAIN}"]
-    status = (shm.DIRECTORY / shared.name).stat()
+    status = Path(shm.DIRECTORY, shared.name).stat()
     if status.st_uid != os.geteuid():
         return None, [f"segment {shared.name} belongs to another user; {_START_AGAIN}"]
     if stat.S_IMODE(status.st_mode) & 0o040 != (0o040 if plan.group else 0) or (

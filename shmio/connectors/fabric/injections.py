@@ -34,7 +34,8 @@ from shmio.segment import BlockWriter, Command, CommandKind, Direction, Event, E
 from shmio.segment.block import Layouts
 from shmio.segment.commands import CommandOutcomes, first_number
 from shmio.segment.events import EVENT_DATA_SIZE
-from shmio.segment.injection_list import LIST_SIZE, InjectionEntry, encode
+from shmio.segment.header import LIST_SIZE
+from shmio.segment.injection_list import InjectionEntry, encode
 from shmio.wording import counted
 
 BEGIN_NS: Final = 1_000_000_000

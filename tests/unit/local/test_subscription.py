@@ -160,6 +160,6 @@ def test_subscription_during_a_close_by_another_thread_is_over(
         cell.close()
         return subscription
 
-    monkeypatch.setattr("shmio.local.attach.Subscription", overtaken)
+    monkeypatch.setattr("shmio.local.subscription.Subscription", overtaken)
     assert list(cell.subscribe("cell")) == []
     assert not [thread for thread in threading.enumerate() if thread.name == "following-cell"]

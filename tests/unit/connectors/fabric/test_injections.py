@@ -16,7 +16,8 @@ from shmio.model.injection import Running
 from shmio.model.values import NO_WRITER
 from shmio.segment import CommandKind, Event, EventKind, Write
 from shmio.segment.commands import Direction
-from shmio.segment.injection_list import LIST_SIZE, InjectionEntry
+from shmio.segment.header import LIST_SIZE
+from shmio.segment.injection_list import InjectionEntry
 from tests.unit.connectors.fabric.harness import PATIENCE_S, Mirroring, S, frame
 
 WRITER: Final = 0
