@@ -6,31 +6,19 @@ import fcntl
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import (
-    AttachmentIndex,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    McapRecord,
-    MessageIndex,
-    MetadataIndex,
-    Statistics,
-    SummaryOffset,
-)
+from mcap.records import AttachmentIndex, ChunkIndex, MetadataIndex
 
 from shmio.errors import RecordingError
+from shmio.recording.format.mcap_writer import IndexedChunk, Summary, message_index
 from shmio.recording.format.records import (
     BROKEN,
     CHUNK,
-    FOOTER,
     HEAD,
     INDEX,
     LOOK_BYTES,
@@ -97,15 +85,6 @@ def _write(fd: int, ending: _RecordingEnd) -> None:
         raise
 
 
-@dataclass(slots=True)
-class _Chunk:
-    """A chunk of a recording, with the number of its messages by channel."""
-
-    record: Record
-    index: ChunkIndex
-    counts: dict[int, int] = field(default_factory=dict)
-
-
 class _RecordingEnd:
     """Builds the index and the footer that close a recording after its last complete record."""
 
@@ -117,11 +96,8 @@ class _RecordingEnd:
         """
         self._reader = reader
         self._records = reader.records
-        self._schemas: dict[int, bytes] = {}
-        self._channels: dict[int, bytes] = {}
-        self._chunks: list[_Chunk] = []
-        self._attachments: list[AttachmentIndex] = []
-        self._metadata: list[MetadataIndex] = []
+        self._summary = Summary()
+        self._chunks: list[tuple[Record, IndexedChunk]] = []
         self.cut = len(MAGIC)
         """Offset in the file at which the last complete record ends."""
         self._anew = b""
@@ -154,7 +130,7 @@ class _RecordingEnd:
         if not over:
             self._tail()
         if last in (Opcode.CHUNK, Opcode.MESSAGE_INDEX) and self._chunks:
-            self._index_anew()
+            self._index_anew(*self._chunks[-1])
 
     def _tail(self) -> None:
         """Check that only zeros or the start of one record follow the last complete record."""
@@ -195,17 +171,17 @@ class _RecordingEnd:
             message_start_time=begin_ns,
             uncompressed_size=size,
         )
-        self._chunks.append(_Chunk(record, index))
+        self._chunks.append((record, IndexedChunk(index)))
 
     def _index(self, record: Record) -> None:
         """Add a message index to the last chunk.
 
         If its channel is new, read the channel's description.
         """
-        chunk = self._chunks[-1]
+        of, chunk = self._chunks[-1]
         number, size = INDEX.unpack(self._records.read(record.at, INDEX.size))
-        if number not in self._channels:
-            self._describe(chunk.record)
+        if number not in self._summary.channels:
+            self._describe(of)
         chunk.index.message_index_offsets[number] = record.start
         chunk.index.message_index_length += record.size + HEAD.size
         chunk.counts[number] = size // _ENTRY_BYTES
@@ -214,30 +190,27 @@ class _RecordingEnd:
         for opcode, content in self._records.chunk(chunk):
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 (number,) = struct.unpack_from("<H", content)
-                known = self._schemas if opcode == Opcode.SCHEMA else self._channels
+                known = self._summary.schemas if opcode == Opcode.SCHEMA else self._summary.channels
                 known[number] = HEAD.pack(opcode, len(content)) + bytes(content)
 
-    def _index_anew(self) -> None:
+    def _index_anew(self, record: Record, chunk: IndexedChunk) -> None:
         """Create the message indexes of the last chunk again, because some may be missing."""
-        chunk = self._chunks[-1]
-        self.cut = chunk.record.at + chunk.record.size
-        found: dict[int, MessageIndex] = {}
+        self.cut = record.at + record.size
+        found: dict[int, list[int]] = {}
         at = 0
         with suppress(RecordingError, struct.error):  # _check() reports the damage
-            self._describe(chunk.record)
-            for opcode, content in self._records.chunk(chunk.record):
+            self._describe(record)
+            for opcode, content in self._records.chunk(record):
                 if opcode == Opcode.MESSAGE:
                     number, _, log_ns = _MESSAGE.unpack_from(content)
-                    found.setdefault(number, MessageIndex(number, [])).records.append((log_ns, at))
+                    found.setdefault(number, []).extend((log_ns, at))
                 at += HEAD.size + len(content)
         chunk.index.message_index_offsets = {}
-        builder = RecordBuilder()
         for number, entries in found.items():
-            chunk.index.message_index_offsets[number] = self.cut + builder.count
-            entries.write(builder)
-        chunk.index.message_index_length = builder.count
-        chunk.counts = {number: len(entries.records) for number, entries in found.items()}
-        self._anew = builder.end()
+            chunk.index.message_index_offsets[number] = self.cut + len(self._anew)
+            self._anew += message_index(number, entries)
+        chunk.index.message_index_length = len(self._anew)
+        chunk.counts = {number: len(entries) // 2 for number, entries in found.items()}
 
     def _attachment(self, record: Record) -> None:
         self._reader.note(record)
@@ -246,73 +219,24 @@ class _RecordingEnd:
         name, media_type = data.read_prefixed_string(), data.read_prefixed_string()
         length = record.size + HEAD.size
         index = AttachmentIndex(record.start, length, log_ns, changed_ns, data.read8(), name, media_type)
-        self._attachments.append(index)
+        self._summary.attachments.append(index)
 
     def _metadatum(self, record: Record) -> None:
         self._reader.note(record)
         name = stream(self._records.read(record.at, record.size)).read_prefixed_string()
-        self._metadata.append(MetadataIndex(record.start, record.size + HEAD.size, name))
+        self._summary.metadata.append(MetadataIndex(record.start, record.size + HEAD.size, name))
 
     def _check(self) -> None:
         """Leave damaged chunks near the end of the file out of the index."""
         whole = self._chunks[:-CHECKED]
         for chunk in self._chunks[-CHECKED:]:
             with suppress(RecordingError):
-                self._records.check_crc(chunk.record)
+                self._records.check_crc(chunk[0])
                 whole.append(chunk)
         self._chunks = whole
 
-    # ---- the index and footer to write -------------------------------------------------------------------------------
-
     def data(self) -> bytes:
-        """Return the bytes to write at offset :attr:`cut`."""
-        builder = RecordBuilder()
-        builder.write(self._anew)
-        DataEnd(zlib.crc32(self._anew, self._records.crc(0, self.cut))).write(builder)
-        data = builder.end()
-        start = self.cut + len(data)
-        groups: list[tuple[Opcode, int]] = []
-        for opcode, content in self._groups():
-            groups.append((opcode, len(content)))
-            builder.write(content)
-        at, offsets_at = start, start + builder.count
-        for opcode, size in groups:
-            SummaryOffset(opcode, at, size).write(builder)
-            at += size
-        summary = builder.end()
-        covered = summary + HEAD.pack(Opcode.FOOTER, FOOTER.size) + FOOTER.pack(start, offsets_at, 0)[: -U32.size]
-        Footer(start, offsets_at, zlib.crc32(covered)).write(builder)
-        return b"".join((data, summary, builder.end(), MAGIC))
-
-    def _groups(self) -> Iterator[tuple[Opcode, bytes]]:
-        """Yield the records of the summary, grouped by kind."""
-        yield Opcode.SCHEMA, b"".join(self._schemas.values())
-        yield Opcode.CHANNEL, b"".join(self._channels.values())
-        yield Opcode.STATISTICS, _written(self._statistics())
-        yield Opcode.CHUNK_INDEX, _written(*(chunk.index for chunk in self._chunks))
-        yield Opcode.ATTACHMENT_INDEX, _written(*self._attachments)
-        yield Opcode.METADATA_INDEX, _written(*self._metadata)
-
-    def _statistics(self) -> Statistics:
-        counts: dict[int, int] = {}
-        for chunk in self._chunks:
-            for number, count in chunk.counts.items():
-                counts[number] = counts.get(number, 0) + count
-        return Statistics(
-            attachment_count=len(self._attachments),
-            channel_count=len(self._channels),
-            channel_message_counts=counts,
-            chunk_count=len(self._chunks),
-            message_count=sum(counts.values()),
-            message_end_time=max((chunk.index.message_end_time for chunk in self._chunks), default=0),
-            message_start_time=min((chunk.index.message_start_time for chunk in self._chunks), default=0),
-            metadata_count=len(self._metadata),
-            schema_count=len(self._schemas),
-        )
-
-
-def _written(*records: McapRecord) -> bytes:
-    builder = RecordBuilder()
-    for record in records:
-        record.write(builder)
-    return bytes(builder.end())
+        """Return the bytes to write at offset :attr:`cut`: the index and the footer."""
+        self._summary.chunks = [chunk for _, chunk in self._chunks]
+        crc = zlib.crc32(self._anew, self._records.crc(0, self.cut))
+        return self._anew + self._summary.end(self.cut + len(self._anew), crc)

@@ -15,12 +15,12 @@ from typing import IO, Any, Final, NamedTuple, Protocol
 import msgspec
 import numpy as np
 import numpy.typing as npt
-from mcap.writer import Writer
 
 from shmio.layout.model import Register
 from shmio.libraries import ANALYSIS, library
 from shmio.recording.columns import Collector, Columns, flat, heading
 from shmio.recording.dump import Chosen, Dump
+from shmio.recording.format.mcap_writer import McapWriter
 from shmio.recording.reading.part import MAX_NS, DumpBlock
 from shmio.recording.rewriting import new_file
 from shmio.recording.times import iso
@@ -381,14 +381,13 @@ def export_mcap(
     Returns:
         The number of messages.
     """
-    writer = Writer(stream)
-    writer.start("", f"shmio {__version__}")
+    writer = McapWriter(stream, "", f"shmio {__version__}")
     sources = list(dict.fromkeys(block.source for block in chosen))
     streams = [_frames(dump, source, chosen, writer, from_ns, to_ns, raw=raw) for source in sources]
     streams += [_events(dump, source, writer, from_ns, to_ns) for source in sources]
     count = 0
     for row in heapq.merge(*streams, key=lambda row: row.log_ns):
-        writer.add_message(row.channel, row.log_ns, row.data, row.publish_ns)
+        writer.add_messages(row.channel, [(row.log_ns, row.publish_ns, 0, row.data)])
         progress(row.log_ns - dump.begin_ns)
         count += 1
     writer.finish()
@@ -396,7 +395,7 @@ def export_mcap(
 
 
 def _frames(
-    dump: Dump, source: str, chosen: Chosen, writer: Writer, from_ns: int, to_ns: int, *, raw: bool
+    dump: Dump, source: str, chosen: Chosen, writer: McapWriter, from_ns: int, to_ns: int, *, raw: bool
 ) -> Iterator[_Row]:
     channels: dict[DumpBlock, int] = {}
     for block, columns in pieces(dump, source, chosen, from_ns, to_ns, raw=raw):
@@ -417,7 +416,7 @@ def _frames(
             yield _Row(log_ns, channels[block], source_ns if source_ns > 0 else log_ns, msgspec.json.encode(message))
 
 
-def _events(dump: Dump, source: str, writer: Writer, from_ns: int, to_ns: int) -> Iterator[_Row]:
+def _events(dump: Dump, source: str, writer: McapWriter, from_ns: int, to_ns: int) -> Iterator[_Row]:
     channel = 0
     explainers: dict[DumpBlock, Explainer] = {}
     for log_ns, block, event in dump.events(source, from_ns, to_ns):
@@ -437,7 +436,7 @@ def _property(kind: str) -> dict[str, Any]:
     return {"type": kind, "items": {"type": "string"}} if kind == "array" else {"type": kind}
 
 
-def _channel(writer: Writer, topic: str, name: str, properties: dict[str, Any]) -> int:
+def _channel(writer: McapWriter, topic: str, name: str, properties: dict[str, Any]) -> int:
     text = msgspec.json.encode({"title": name, "type": "object", "properties": properties})
     return writer.register_channel(topic, "json", writer.register_schema(name, "jsonschema", text))
 

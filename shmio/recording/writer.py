@@ -8,9 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import IO, Final, Protocol, cast
-
-import mcap.writer
+from typing import Final
 
 from shmio.layout.model import Layout
 from shmio.recording.format.encoding import (
@@ -37,11 +35,10 @@ from shmio.recording.format.encoding import (
     encode_json,
     encode_position,
 )
+from shmio.recording.format.mcap_writer import McapWriter, Message, Output
 from shmio.recording.reading.part import DumpBlock
 from shmio.segment import Block, Event, Frame
 from shmio.version import __version__
-
-CHUNK_BYTES: Final = 1 << 20
 
 JSON: Final = "application/json"
 TOML: Final = "application/toml"
@@ -59,19 +56,6 @@ def layout_files(layout: Layout) -> Iterator[tuple[str, bytes]]:
         yield f"layouts/{one.hex()}.json", data
 
 
-class Output(Protocol):
-    """An object to which a recording is written, such as a binary file."""
-
-    def write(self, data: bytes, /) -> object:
-        """Append data."""
-
-    def tell(self) -> int:
-        """Return the number of bytes written so far."""
-
-    def flush(self) -> None:
-        """Pass all buffered data on to the file."""
-
-
 @dataclass(frozen=True, slots=True)
 class Channels:
     """The numbers of a block's channels."""
@@ -86,9 +70,8 @@ class Writer:
     def __init__(self, output: Output, about: Mapping[str, str]) -> None:
         """Begin the recording. ``about`` is the metadata about the instance."""
         self._output = output
-        self._mcap = mcap.writer.Writer(cast("IO[bytes]", output), chunk_size=CHUNK_BYTES, enable_data_crcs=True)
-        self._mcap.start(PROFILE, f"shmio {__version__}")
-        self._mcap.add_metadata(ABOUT, dict(about))
+        self._mcap = McapWriter(output, PROFILE, f"shmio {__version__}")
+        self._mcap.add_metadata(ABOUT, about)
         self._schemas: dict[str, int] = {}
         self._own: dict[str, int] = {}
         self.flush()
@@ -167,30 +150,28 @@ class Writer:
 
     def frames(self, channels: Channels, frames: Iterable[tuple[int, Frame]]) -> None:
         """Add frames, each with its log time."""
-        channel, add = channels.frames, self._mcap.add_message
-        for log_ns, frame in frames:
-            publish_ns = frame.source_ns if frame.source_ns > 0 else log_ns
-            sequence = frame.number & 0xFFFFFFFF
-            add(channel, log_ns, encode_frame_v2(frame, sequence, log_ns, publish_ns), publish_ns, sequence)
+        self._mcap.add_messages(channels.frames, map(_frame_message, frames))
 
     def event(self, channels: Channels, event: Event, log_ns: int) -> None:
         """Add an event with the log time ``log_ns``."""
         publish_ns = event.utc_ns if event.utc_ns > 0 else log_ns
-        self._mcap.add_message(channels.events, log_ns, encode_event(event), publish_ns, event.number & 0xFFFFFFFF)
+        message = log_ns, publish_ns, event.number & 0xFFFFFFFF, encode_event(event)
+        self._mcap.add_messages(channels.events, [message])
 
     def gap(self, gap: Gap, log_ns: int) -> None:
         """Add a gap. Call this before you add the entry that follows the gap."""
-        self._mcap.add_message(self._channel(GAPS_TOPIC, "shmio.gap.v1", GAP_SCHEMA), log_ns, encode_json(gap), log_ns)
+        channel = self._channel(GAPS_TOPIC, "shmio.gap.v1", GAP_SCHEMA)
+        self._mcap.add_messages(channel, [(log_ns, log_ns, 0, encode_json(gap))])
 
     def step(self, mark: StepMark, log_ns: int) -> None:
         """Add the end of a step. Call this after you have added all frames of the step."""
         channel = self._channel(STEPS_TOPIC, "shmio.step.v1", STEP_SCHEMA)
-        self._mcap.add_message(channel, log_ns, encode_json(mark), log_ns, mark.step & 0xFFFFFFFF)
+        self._mcap.add_messages(channel, [(log_ns, log_ns, mark.step & 0xFFFFFFFF, encode_json(mark))])
 
     def process(self, change: ProcessChange, log_ns: int) -> None:
         """Add a process change."""
         channel = self._channel(PROCESSES_TOPIC, "shmio.process.v1", PROCESS_SCHEMA)
-        self._mcap.add_message(channel, log_ns, encode_json(change), log_ns)
+        self._mcap.add_messages(channel, [(log_ns, log_ns, 0, encode_json(change))])
 
     def _channel(self, topic: str, schema: str, text: bytes) -> int:
         """Return the number of a channel that belongs to no block. Create it if necessary."""
@@ -208,3 +189,10 @@ class Writer:
         """Close the recording: write its index and footer."""
         self._mcap.finish()
         self._output.flush()
+
+
+def _frame_message(entry: tuple[int, Frame]) -> Message:
+    log_ns, frame = entry
+    publish_ns = frame.source_ns if frame.source_ns > 0 else log_ns
+    sequence = frame.number & 0xFFFFFFFF
+    return log_ns, publish_ns, sequence, encode_frame_v2(frame, sequence, log_ns, publish_ns)

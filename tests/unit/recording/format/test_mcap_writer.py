@@ -1,0 +1,94 @@
+"""The writer of MCAP files, compared with the mcap library's own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from io import BytesIO
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from shmio.recording.format import mcap_writer
+from shmio.recording.format.mcap_writer import McapWriter, Message
+
+u64, u32, names = st.integers(0, 2**64 - 1), st.integers(0, 2**32 - 1), st.text(max_size=8)
+message = st.tuples(u64, u64, u32, st.binary(max_size=60))
+calls = st.lists(
+    st.one_of(
+        st.tuples(st.just("schema"), names, st.binary(max_size=20)),
+        st.tuples(st.just("channel"), names, names, st.dictionaries(names, names, max_size=2)),
+        st.tuples(st.just("messages"), st.integers(0, 3), st.lists(message, max_size=8)),
+        st.tuples(st.just("attachment"), u64, u64, names, st.binary(max_size=20)),
+        st.tuples(st.just("metadata"), names, st.dictionaries(names, names, max_size=2)),
+        st.tuples(st.just("flush")),
+    ),
+    max_size=15,
+)
+CHUNK_BYTES = 300
+
+
+class LibraryWriter(Writer):
+    """The library's writer, with the method that ours has for messages."""
+
+    def add_messages(self, channel: int, messages: Iterable[Message]) -> None:
+        for log_ns, publish_ns, sequence, data in messages:
+            self.add_message(channel, log_ns, data, publish_ns, sequence)
+
+
+def ours(made: list[Any]) -> bytes:
+    stream = BytesIO()
+    play(McapWriter(stream, "profile", "library"), made)
+    return stream.getvalue()
+
+
+def theirs(made: list[Any]) -> bytes:
+    stream = BytesIO()
+    writer = LibraryWriter(stream, chunk_size=CHUNK_BYTES, enable_data_crcs=True)
+    writer.start("profile", "library")
+    play(writer, made)
+    return stream.getvalue()
+
+
+def play(writer: McapWriter | LibraryWriter, made: list[Any]) -> None:
+    channels = [writer.register_channel("first", "", writer.register_schema("s", "e", b""), {})]
+    for what, *args in made:
+        match what, args:
+            case "schema", (name, data):
+                writer.register_schema(name, "text/plain", data)
+            case "channel", (topic, encoding, metadata):
+                channels.append(writer.register_channel(topic, encoding, 1, metadata))
+            case "messages", (channel, messages):
+                writer.add_messages(channels[channel % len(channels)], messages)
+            case "attachment", (create_ns, log_ns, name, data):
+                writer.add_attachment(create_ns, log_ns, name, "text/plain", data)
+            case "metadata", (name, metadata):
+                writer.add_metadata(name, metadata)
+            case _:
+                writer.flush()
+    writer.finish()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_chunks() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mcap_writer, "CHUNK_BYTES", CHUNK_BYTES)
+        yield
+
+
+@given(calls)
+def test_the_same_bytes_as_those_of_the_library(made: list[Any]) -> None:
+    assert ours(made) == theirs(made)
+
+
+def test_the_library_reads_every_message() -> None:
+    messages = [(number, 2 * number, number, bytes(number)) for number in range(100)]
+    stream = BytesIO(ours([("messages", 0, messages)]))
+    read = [
+        (one.log_time, one.publish_time, one.sequence, one.data)
+        for _, _, one in make_reader(stream, validate_crcs=True).iter_messages()
+    ]
+    assert read == messages
