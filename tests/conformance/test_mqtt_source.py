@@ -63,7 +63,10 @@ class MqttRig:
         return MqttRig(self.proxy, self._version, changed=True)
 
     def connector(self) -> Connector:
-        options = MqttOptions(url=f"mqtt://{self.proxy.address}", timeout=200, max_age_ms=0, version=self._version)
+        options = MqttOptions(
+            url=f"mqtt://{self.proxy.address}", timeout=200, max_age_ms=0, version=self._version,
+            retain=True,  # for the next connection, as a device would keep its values
+        )  # fmt: skip
         return MqttConnector(options, self.layout)
 
     def generation(self, raw: bytes) -> int:

@@ -6,7 +6,7 @@ import secrets
 import ssl
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Final
 
@@ -15,7 +15,7 @@ from paho.mqtt.client import MQTTv5, MQTTv311
 from shmio.config.credentials import read_password
 from shmio.config.model import MqttTls
 from shmio.config.tls import client_context
-from shmio.connectors.base import Connector, Lost, WriteLostError
+from shmio.connectors.base import Connector, Lost, UnconfirmedError, WriteLostError
 from shmio.connectors.browsing import Browsed, Wanted
 from shmio.connectors.mqtt.browse import Listener
 from shmio.connectors.mqtt.commands import Command, plan
@@ -33,7 +33,10 @@ TIMEOUTS: Final = 4
 FIRST_S: Final = 0.1
 """Maximum time in s for which a new connection waits for retained messages."""
 ECHO_S: Final = 0.2
-"""Maximum time in s for which an acknowledged write waits until the broker has sent the message back."""
+"""Maximum time in s for which an acknowledged write waits for the first message of its topic.
+
+A broker may let a client publish on a topic and subscribe to it, but send it no messages of that topic.
+"""
 
 
 @dataclass
@@ -48,8 +51,8 @@ class _Sending:
     sent: list[Command] = field(default_factory=list)
     ping: int = 0
     """Number of the PINGREQ that was sent after the messages with QoS 0; 0 if none was sent."""
-    echo_until_s: float = 0.0
-    """When to stop waiting for the messages to come back, s of CLOCK_MONOTONIC; 0 before all are acknowledged."""
+    acknowledged_s: float = 0.0
+    """When the last acknowledgement came, s of CLOCK_MONOTONIC; 0 before that."""
 
 
 class MqttConnector(Connector):
@@ -227,7 +230,11 @@ class MqttConnector(Connector):
     def confirm(self, until_ns: int) -> list[str] | None:
         """Wait until the broker has acknowledged all messages, and has sent back those that this source reads.
 
+        So no image that is requested later shows an older value.
+
         Raises:
+            UnconfirmedError: The broker did not send all of them back in time, and images show older
+                values.
             WriteLostError: The connection is lost, or the broker did not acknowledge all messages
                 in time.
 
@@ -236,7 +243,7 @@ class MqttConnector(Connector):
         if link is None:
             raise self._lost(ConnectorError(f"not connected to {self._options.address}"))
         until_s = until_ns / 1e9
-        if not sending.echo_until_s:
+        if not sending.acknowledged_s:
             try:
                 while sending.left and link.await_room(min(until_s, sending.until_s)):
                     self._publish(link, sending)
@@ -249,12 +256,31 @@ class MqttConnector(Connector):
             except ConnectorError as error:
                 raise self._lost(error) from None
             self._take_outcomes(link, sending)
-            accepted = all(one.outcome == "" for one in sending.sent)  # a refused message does not come back
-            sending.echo_until_s = time.monotonic() + min(ECHO_S, self._options.timeout / 1000) * accepted
-        if not self._store.await_expected(min(until_s, sending.echo_until_s)):
-            if time.monotonic() < sending.echo_until_s:
+            self._store.expect_only(one.publication.topic for one in sending.sent if one.outcome == "")
+            sending.acknowledged_s = time.monotonic()
+        return self._confirm_echoes(link, sending, until_s)
+
+    def _confirm_echoes(self, link: Link, sending: _Sending, until_s: float) -> list[str] | None:
+        """Wait until the broker has sent the acknowledged messages back."""
+        timeout_s = self._options.timeout / 1000
+        if not self._store.await_expected(min(until_s, sending.acknowledged_s + timeout_s)):
+            try:
+                link.check()
+            except ConnectorError as error:
+                raise self._lost(error) from None
+            outdated = self._store.outdated()
+            wait_s = timeout_s if outdated else min(ECHO_S, timeout_s)
+            if time.monotonic() < sending.acknowledged_s + wait_s:
                 return None
             self._store.expect_nothing()
+            if outdated:
+                _doubt(sending.sent, outdated)
+                _mark(sending.outcomes, sending.commands, sending.sent)
+                raise UnconfirmedError(
+                    f"{self._options.address} has acknowledged the message on {min(outdated)}, but has not sent it "
+                    f"back within {self._options.timeout} ms",
+                    sending.outcomes,
+                )
         _mark(sending.outcomes, sending.commands, sending.sent)
         return [str(outcome) for outcome in sending.outcomes]
 
@@ -290,11 +316,14 @@ class MqttConnector(Connector):
                 one.outcome = link.outcome(one.number, one.publication.topic, retain=one.publication.retain)
 
     def _lost(self, error: ConnectorError) -> WriteLostError:
-        """Return the error about writes whose messages were not all acknowledged."""
+        """Return the error about writes whose messages were not all acknowledged and sent back.
+
+        A message that was not retained, and was not sent back, is not seen on the next connection.
+        """
         sending = self._sending
         if self._link is not None:
             self._take_outcomes(self._link, sending)
-        self._store.expect_nothing()
+        _doubt((one for one in sending.sent if not one.publication.retain), self._store.expect_nothing())
         _mark(sending.outcomes, sending.commands, sending.sent)
         return WriteLostError(str(error), sending.outcomes)
 
@@ -310,6 +339,13 @@ def _secrets(options: MqttOptions) -> tuple[str | None, ssl.SSLContext | None]:
     if not options.tls:
         return password, None
     return password, client_context(MqttTls(ca=options.ca, certificate=options.certificate, key=options.key), "")
+
+
+def _doubt(commands: Iterable[Command], topics: Collection[str]) -> None:
+    """Forget that the broker has accepted the messages on these topics."""
+    for one in commands:
+        if one.outcome == "" and one.publication.topic in topics:
+            one.outcome = None
 
 
 def _mark(outcomes: list[str | Lost], commands: Sequence[Command], sent: Sequence[Command]) -> None:

@@ -360,10 +360,26 @@ class Store:
         """
         return self.wait(lambda: not self._expected, until_s)
 
-    def expect_nothing(self) -> None:
-        """Forget the expected payloads that have not come back."""
+    def outdated(self) -> set[str]:
+        """Return the topics whose newest message is another one than the expected one."""
         with self._changed:
+            messages = {topic: self._topics[topic].message for topic in self._expected}
+            return {
+                topic for topic, message in messages.items() if message and message.payload != self._expected[topic]
+            }
+
+    def expect_only(self, topics: Iterable[str]) -> None:
+        """Forget the expected payloads of all other topics, because the broker has refused them."""
+        wanted = set(topics)
+        with self._changed:
+            self._expected = {topic: payload for topic, payload in self._expected.items() if topic in wanted}
+
+    def expect_nothing(self) -> set[str]:
+        """Forget the expected payloads that have not come back; return their topics."""
+        with self._changed:
+            topics = {*self._expected}
             self._expected.clear()
+            return topics
 
     @property
     def complete(self) -> bool:

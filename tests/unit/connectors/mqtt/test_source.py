@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
 
-from shmio.connectors.base import Lost, WriteLostError
+from shmio.connectors.base import Lost, UnconfirmedError, WriteLostError
 from shmio.errors import ConnectorError
 from shmio.layout.values.write import encode
 from shmio.model import statuses
 from shmio.testing.ports import reserved_port
-from shmio.testing.write_conformance import write
+from shmio.testing.proxy import FaultProxy
+from shmio.testing.write_conformance import confirm, write
 from tests.unit.connectors.mqtt.conftest import Plant
-from tests.unit.connectors.mqtt.peer import Peer, connected
+from tests.unit.connectors.mqtt.peer import Peer, connected, framing
+from tests.unit.connectors.source import Source
 
 TAGS = {
     "pos": ("LREAL", "plant/pos"),
@@ -255,6 +259,83 @@ def test_many_writes_and_qos_0(plant: Plant) -> None:
             assert source.write(**{f"r{at}": at + qos for at in range(100)}) == [""] * 100
             source.read()
             assert [source.value(f"r{at}") for at in range(100)] == [at + qos for at in range(100)]
+
+
+class Echoes:
+    """Keeps back what the broker sends on the topic of a write, until a message comes on another topic."""
+
+    def __init__(self) -> None:
+        self._kept = b""
+
+    def __call__(self, packet: bytes) -> bytes:
+        if packet[0] >> 4 == 3 and b"w/speed" in packet:
+            self._kept += packet
+            return b""
+        if b"w/read" in packet:
+            packet, self._kept = self._kept + packet, b""
+        return packet
+
+
+@contextmanager
+def kept_back(plant: Plant, *, value: float | None = 1.0, **options: Any) -> Iterator[tuple[Source, FaultProxy]]:
+    """Provide a source that has received a value, and will receive no echoes of its writes."""
+    with (
+        FaultProxy(plant.address, framing=framing) as proxy,
+        connected(plant.address, WRITABLE, url=f"mqtt://{proxy.address}", **options) as source,
+    ):
+        if value is not None:
+            plant.device.publish("w/speed", str(value))
+            source.until(lambda: source.value("speed") == value)
+        proxy.edit(Echoes())
+        yield source, proxy
+    plant.device.clear("w/speed")
+
+
+def test_a_write_is_confirmed_when_frames_show_it(plant: Plant) -> None:
+    """Not earlier, although the broker has acknowledged it long ago."""
+    with kept_back(plant) as (source, _):
+        register = source.layout.registers[source.layout.by_path["speed"]]
+        source.connector.send(encode(register, 2.5, source.layout.byte_order))
+        assert source.connector.confirm(time.monotonic_ns() + 500_000_000) is None
+        source.read()
+        assert source.value("speed") == 1.0
+        plant.device.publish("w/read", "1")
+        assert confirm(source.connector) == [""]
+        source.read()
+        assert (source.value("speed"), source.code("speed")) == (2.5, 0)
+
+
+def test_the_outcome_of_a_write_that_frames_do_not_show_is_unknown(plant: Plant) -> None:
+    with kept_back(plant, timeout=500) as (source, _):
+        with pytest.raises(UnconfirmedError, match="not sent it back within 500 ms") as raised:
+            source.write(speed=2.5, lamp=True)
+        assert raised.value.outcomes[0] is Lost.UNKNOWN
+        assert raised.value.outcomes[1] is not Lost.UNKNOWN
+        plant.device.publish("w/read", "1")  # the connection still works
+        source.until(lambda: source.value("speed") == 2.5)
+        assert source.write(speed=2.5) == [""]  # frames show it already
+    with kept_back(plant, value=None) as (source, _):
+        assert source.write(speed=2.5) == [""]  # frames show no older value
+        source.read()
+        assert source.code("speed") == statuses.BAD_WAITING_FOR_INITIAL_DATA
+
+
+@pytest.mark.parametrize("retain", [True, False])
+def test_a_write_whose_echo_is_lost_with_the_connection(plant: Plant, retain: bool) -> None:
+    """On the next connection, the source sees a retained message, and no other one."""
+    with kept_back(plant, retain=retain) as (source, proxy):
+        register = source.layout.registers[source.layout.by_path["speed"]]
+        source.connector.send(encode(register, 2.5, source.layout.byte_order))
+        assert source.connector.confirm(time.monotonic_ns() + 500_000_000) is None
+        proxy.cut()
+        with pytest.raises(WriteLostError) as raised:
+            confirm(source.connector)
+        assert raised.value.outcomes == (("",) if retain else (Lost.UNKNOWN,))
+        proxy.pass_all()
+        source.connector.connect()
+        source.read()
+        assert source.code("speed") == (0 if retain else statuses.BAD_WAITING_FOR_INITIAL_DATA)
+        assert source.value("speed") == (2.5 if retain else 1.0)
 
 
 def test_without_a_connection_nothing_is_written(plant: Plant) -> None:
