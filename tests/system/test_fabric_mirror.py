@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 
 import shmio
 from shmio.model.values import OutcomeKind, Quality
+from shmio.segment import instances
 from shmio.testing.cell import Cell, until
 from shmio.testing.ports import reserved_port
 
@@ -92,6 +94,19 @@ def test_a_mirror_shows_what_the_owner_has_and_passes_writes_on(cells: tuple[Cel
         assert outcome.kind is OutcomeKind.WRITTEN, "the owner's table makes it writable at the owner"
         with pytest.raises(shmio.errors.CommandError, match=r"count is not writable.*`writable`"):
             mirror.set({"mirrored/count": 4})
+
+
+def test_the_start_of_a_second_cell_of_the_same_name_fails(cells: tuple[Cell, Cell], tmp_path: Path) -> None:
+    near, _ = cells
+    text = NEAR.replace('server = "embedded"\nlisten = "{nats}"', 'server = "nats://{nats}"')
+    (tmp_path / "supervisor.toml").write_text(text.format(instance=near.instance, nats=near.grpc))
+    (tmp_path / "tags.toml").write_text(TAGS)
+    second = Cell(tmp_path, f"{near.instance}n", near.grpc)
+    done = second.supervisor("up", "--detach")
+    assert done.returncode == 1, done.stdout
+    assert f"fabric already has a cell plant1.line3.near: instance {near.instance} on host" in done.stderr
+    assert second.instance not in instances()
+    assert near.status()["state"] == "running"
 
 
 def test_a_mirror_is_bad_while_the_owner_is_away(cells: tuple[Cell, Cell]) -> None:

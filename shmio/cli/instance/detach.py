@@ -20,7 +20,7 @@ import msgspec
 from shmio.cli.common import say
 from shmio.cli.target import config_file, option_for
 from shmio.errors import ConfigError, ControlError
-from shmio.local.status import InstanceStatus, SourceStatus, read_status
+from shmio.local.status import InstanceStatus, SourceStatus, problems, read_status
 from shmio.segment import PREFIX
 from shmio.supervisor.process import child_environment
 
@@ -192,6 +192,8 @@ def _lines(fd: int) -> Iterator[bytes]:
 
 
 def _tell_how(status: InstanceStatus, option: str) -> None:
+    for problem in problems(status):
+        say(f"warning: {problem}", sys.stderr)
     for process in status.processes:
         if isinstance(process, SourceStatus) and process.quality == "bad":
             say(f"warning: source {process.name} is bad: {process.reason}", sys.stderr)

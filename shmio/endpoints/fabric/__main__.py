@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from contextlib import suppress
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
@@ -16,8 +17,13 @@ from shmio.fabric.tasks import end
 from shmio.logs import LogRateLimit
 from shmio.worker import BEAT_S, Worker
 
+if TYPE_CHECKING:
+    from shmio.endpoints.fabric.uplink import Uplink
+
 SERVER: Final = "nats"
 """Name of the process of the embedded server."""
+ATTEMPT_S: Final = 3.0
+"""Longest time in s for which the process waits for a server before it reports that it runs."""
 LOGGERS: Final = ("shmio.fabric", "nats", "asyncio")
 """Loggers that others can flood. The rate of their lines is limited."""
 
@@ -56,9 +62,10 @@ async def _publish(worker: Worker) -> None:
         await asyncio.wait((starting,), timeout=BEAT_S)
         worker.report()
     starting.result()
-    worker.running()
     running = loop.create_task(uplink.run())
     try:
+        await _first_attempt(worker, uplink, running, stopping)
+        worker.running()
         while not stopping.is_set():
             uplink.follow_reloads()
             worker.report(uplink.counters, note=uplink.problem)
@@ -72,6 +79,27 @@ async def _publish(worker: Worker) -> None:
         await uplink.close()
     worker.report(uplink.counters, note="")
     log.info("the uplink has stopped; it sent %d messages", uplink.publisher.sent)
+
+
+async def _first_attempt(worker: Worker, uplink: Uplink, running: asyncio.Task[None], stopping: asyncio.Event) -> None:
+    """Wait until the uplink publishes, or knows why it does not, so that a start that is refused fails.
+
+    Raises:
+        ConfigError: The uplink can never publish as configured.
+
+    """
+    begun_s = time.monotonic()
+    trying = asyncio.create_task(uplink.tried.wait())
+    try:
+        while not (stopping.is_set() or time.monotonic() - begun_s > ATTEMPT_S):
+            done, _ = await asyncio.wait((trying, running), timeout=BEAT_S, return_when=asyncio.FIRST_COMPLETED)
+            worker.report(uplink.counters, note=uplink.problem)
+            if running in done:
+                running.result()
+            if done:
+                return
+    finally:
+        await end(trying)
 
 
 if __name__ == "__main__":

@@ -90,6 +90,8 @@ class Uplink:
         self.publisher = Publisher(self.backlog, self._history)
         self.problem = ""
         """The present problem; empty if there is none."""
+        self.tried = asyncio.Event()
+        """Set once the uplink publishes, or ``problem`` says why it does not."""
         self.connects = 0
         self._segment, self._settings = segment, settings
         if slot.writer is None:
@@ -286,6 +288,7 @@ class Uplink:
 
     def _on_failed(self, why: str) -> None:
         self.problem = f"{why}; the backlog keeps new messages"
+        self.tried.set()
 
     async def _establish(self, client: FabricClient) -> bool:
         """Claim the cell, then publish. Return False if the registry does not answer."""
@@ -296,10 +299,12 @@ class Uplink:
             raise ConfigError(str(error)) from None
         except (RemoteError, self._errors.Error, TimeoutError) as error:
             self._complain(error)
+            self.tried.set()
             if not self._claimed:
                 return False
         else:
             self.problem = ""
+            self.tried.set()
         if self._history is not None:
             with suppress(self._errors.Error):  # the connection is lost again
                 await self._history.begin(client)
