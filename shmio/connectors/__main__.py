@@ -21,7 +21,7 @@ from shmio.connectors.models.stepped import PageClock, SteppedLoop, connected_in
 from shmio.connectors.poll_loop import Schedule, SourceLoop, WallClock
 from shmio.errors import ConfigError, ConnectorError, ShmioError
 from shmio.local.state_requests import StateRequests
-from shmio.segment import Segment
+from shmio.segment import Segment, State
 from shmio.worker import BEAT_S, Reload, Worker
 
 if TYPE_CHECKING:
@@ -257,6 +257,7 @@ def _mirror_loop(worker: Worker, options: Any) -> _LoopHandle:
         names={**settings.names, worker.name: mirror.source},
         own_layout=worker.config["layout"] is not None,
         changed=partial(_ask_to_reload, segment.instance),
+        ending=lambda: segment.supervisor[1] is State.STOPPING,
     )
     return _LoopHandle(loop, clock.stop, ANSWER_S)
 

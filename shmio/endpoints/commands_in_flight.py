@@ -21,6 +21,8 @@ The limit is a quarter of the event ring, so that no event is overwritten before
 
 SUCCESS: Final = DONE | {EventKind.ACCEPTED, EventKind.INJECTED, EventKind.LIFTED, EventKind.NOTED}
 """The outcomes that are a success, for commands of any kind."""
+WITHOUT_REASON: Final = frozenset({EventKind.INJECTED, EventKind.LIFTED, EventKind.SHADOWED})
+"""Successes whose text is not a reason, but a name or the word of the outcome."""
 
 Done = Callable[[Sequence[End]], None]
 """Function that is called once for each command, with the outcome of each of its values."""
@@ -104,7 +106,7 @@ class InFlightCommand:
             kind, reason = worst(ends)
             if len(ends) > 1 and kind not in SUCCESS:
                 reason = f"{self.paths[ends.index((kind, reason))]}: {reason}"
-            self.attempt.end(str(kind), reason, refused=kind not in SUCCESS)
+            self.attempt.end(str(kind), "" if kind in WITHOUT_REASON else reason, refused=kind not in SUCCESS)
         self.done(ends)
 
 

@@ -181,6 +181,7 @@ class Supervisor:
     def _stop(self) -> None:
         if not self._stopping:
             self._notifier.stopping()
+            self._segment.set_state(os.getpid(), InstanceState.STOPPING)  # before a process receives SIGTERM
         self._stopping = True
         self._reloader.drop()
 

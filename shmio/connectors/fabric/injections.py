@@ -8,10 +8,10 @@ import threading
 import time
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import accumulate
+from itertools import accumulate, count
 from typing import Final
 
 import msgspec
@@ -50,6 +50,8 @@ GONE_NS: Final = 2_000_000_000
 """Time in ns for which the event about the end of an injection may come after the end itself."""
 UNSEEN_NS: Final = 30_000_000_000
 """Time in ns for which an injection may be missing in the owner's list after its creation."""
+LEAVE_S: Final = 1.0
+"""Longest wait in s for the owner when the instance ends."""
 MAX_TIME_NS: Final = (1 << 63) - 1
 """Latest time that a command or an injection can have; a faulty owner may send later ones."""
 REPORT_NS: Final = 60_000_000_000
@@ -187,7 +189,7 @@ class MirroredInjections:
         self._clock: _OwnersClock | None = None
         self._shown: bytes | None = None
         self._reported_ns = self._refused_ns = -REPORT_NS
-        self._next = first_number(os.getpid())
+        self._numbers = count(first_number(os.getpid()) + 1)
         self._look_ns = self._renew_ns = 0
 
     # ---- in the command thread -----------------------------------------------------------------------------------
@@ -354,8 +356,7 @@ class MirroredInjections:
         for number, held in ended:
             if now_ns >= held.lift_ns:
                 held.lift_ns = now_ns + REPEAT_NS
-                self._next += 1
-                self._ask(InjectionRequest("lift", self._next, number), BEGIN_NS)
+                self._lift(number)
         gone = {number for number, _ in ended}
         alive = [number for number, _ in some if number not in gone]
         if alive and now_ns >= self._renew_ns:
@@ -363,6 +364,15 @@ class MirroredInjections:
             reply = self._ask(InjectionRequest("renew", renewed=alive), BEGIN_NS)
             if reply is not None:
                 reply.add_done_callback(self._on_renewed)
+
+    def _lift(self, number: int) -> Future[CommandReply] | None:
+        return self._ask(InjectionRequest("lift", next(self._numbers), number), BEGIN_NS)
+
+    def leave(self) -> None:
+        """Ask the owner to lift the injections of this instance, which ends, except those with ``keep``."""
+        with self._lock:
+            numbers = [number for number, held in self._held.items() if not held.keep]
+        wait([reply for number in numbers if (reply := self._lift(number)) is not None], LEAVE_S)
 
     def _on_renewed(self, reply: Future[CommandReply]) -> None:
         """Tell why the owner will end injections of this instance. The link's thread calls this."""

@@ -96,6 +96,7 @@ class MirrorLoop:
         names: Mapping[str, str] | None = None,
         own_layout: bool = False,
         changed: Callable[[], None] = lambda: None,
+        ending: Callable[[], bool] = lambda: False,
     ) -> None:
         """Create the loop.
 
@@ -115,12 +116,13 @@ class MirrorLoop:
                 None: only this one.
             own_layout: True if files of this instance have the layout, so that a reload changes nothing.
             changed: Called when the owner's layout is another one, at most each ``RELOAD_NS``.
+            ending: Returns whether the whole instance is stopping, and not only this source.
 
         """
         self._mirror = mirror
         self._writer = writer
         self._clock = clock
-        self._changed = changed
+        self._changed, self._ending = changed, ending
         self._own_layout = own_layout
         self._reload_ns = -RELOAD_NS
         self._layout = writer.block.layout.hash[:8]
@@ -201,6 +203,8 @@ class MirrorLoop:
         finally:
             self.commands.stop()
             self._confirm()
+            if self._ending() and self._link.connected:
+                self._injections.leave()
             self._link.close()
             self._fail("the source was stopped")
             self._writer.event(Record(EventKind.STOPPED))

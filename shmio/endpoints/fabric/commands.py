@@ -14,7 +14,7 @@ import msgspec
 from shmio.audit.trail import MAX_NAMED, Actor, Attempt, acting
 from shmio.config.fabric import matches_cell
 from shmio.config.model import FabricAllow
-from shmio.endpoints.commands_in_flight import MAX_OPEN, CommandCost, InFlightTable
+from shmio.endpoints.commands_in_flight import MAX_OPEN, WITHOUT_REASON, CommandCost, InFlightTable
 from shmio.endpoints.fabric.feed import Feed
 from shmio.endpoints.fabric.injections import (
     LEASE_S,
@@ -57,9 +57,6 @@ _KINDS: Final = {
     "lift": CommandKind.LIFT,
     "declare": CommandKind.DECLARE,
 }
-
-_DONE: Final = frozenset({EventKind.INJECTED, EventKind.LIFTED, EventKind.SHADOWED})
-"""Successes whose text is no reason."""
 
 Answer = Callable[[CommandReply], None]
 """Function that is called once for each command, with its outcomes."""
@@ -145,7 +142,7 @@ class CommandClient:
             lease.open = False
             if ends[0][0] not in (EventKind.INJECTED, EventKind.UNKNOWN):
                 self.leases.remove(number)
-        _report(answer, values, [(kind, "" if kind in _DONE else reason) for kind, reason in ends])
+        _report(answer, values, [(kind, "" if kind in WITHOUT_REASON else reason) for kind, reason in ends])
 
     def lift_expired(self) -> None:
         """Lift the injections that their cells no longer renew."""

@@ -136,6 +136,7 @@ class Mirroring:
             self.link = FakeLink(received, answered)
             return cast("Link", self.link)
 
+        self.ending = False
         self.loop = MirrorLoop(
             Mirror(Mirror.Options(cell="plant1.line3.a50"), "cell"),
             segment.writer("cell"),
@@ -145,6 +146,7 @@ class Mirroring:
             owner_of=lambda writer: None if writer in self.gone else Owner(writer, os.getpid()),
             own_layout=own_layout,
             changed=self._changed,
+            ending=lambda: self.ending,
         )
         self._threads = [threading.Thread(target=run) for run in (self.loop.run, self.loop.commands.run)]
         for thread in self._threads:

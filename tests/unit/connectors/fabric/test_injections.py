@@ -142,6 +142,7 @@ def test_a_failure_is_reported_once(mirroring: Mirroring, outcome: str) -> None:
 
 def test_a_rejection_by_the_owner_names_its_cell_and_host(mirroring: Mirroring) -> None:
     ticket = writer_of(mirroring).ask_to_inject(OTHER)
+    sent(mirroring, "inject")
     mirroring.send(event(EventKind.REJECTED, ticket.number, "because"))
     assert mirroring.event(EventKind.REJECTED).text == "cell plant1.line3.a50 on host near.example: because"
 
@@ -204,6 +205,27 @@ def test_an_injection_that_stays_is_neither_renewed_nor_lifted(
         assert sent(mirroring, "renew").renewed == [number]
     requests = [one.injection for one in mirroring.link.all if one.injection is not None]
     assert all(kept not in (one.injection, *one.renewed) for one in requests)
+
+
+@pytest.mark.parametrize("ending", [False, True])
+def test_the_end_of_the_instance_lifts_its_injections_at_once(mirroring: Mirroring, *, ending: bool) -> None:
+    """A restart of the source alone does not: the programs that hold them still run."""
+    injected(mirroring, writer_of(mirroring), keep=True)
+    number = injected(mirroring, SourceWriter(mirroring.block, 1)).number
+    mirroring.ending = ending
+    mirroring.stop()
+    requests = [one.injection for one in mirroring.link.all if one.injection is not None]
+    assert [one.injection for one in requests if one.kind == "lift"] == ([number] if ending else [])
+
+
+def test_the_end_of_the_instance_does_not_wait_long_for_an_owner_that_is_gone(
+    mirroring: Mirroring, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(injections, "LEAVE_S", 0.01)
+    injected(mirroring, writer_of(mirroring))
+    mirroring.ending = mirroring.link.silent = True
+    mirroring.stop()
+    assert sent(mirroring, "lift")
 
 
 def test_an_injection_that_the_owner_no_longer_has_is_over(

@@ -173,6 +173,7 @@ async def test_the_role_is_needed_and_the_audit_names_the_sender(
     finally:
         trail.close_trail()
     entries = [json.loads(line) for line in file.read_text().splitlines()]
+    assert entries[-1]["reason"] == ""
     assert [(one["who"], one["action"], one["outcome"]) for one in entries] == [
         ("plant1.line1.writer", "declare", "denied"),
         ("plant7.line1.unnamed", "declare", "denied"),
