@@ -253,29 +253,41 @@ class _LabCoordinator(Coordinator):
             ValueRangeError: The length is not between 1 us and 1 h.
 
         """
+        return self.steps(dt_ns, 1)
+
+    def steps(self, dt_ns: int | None, count: int) -> Step:
+        """Compute ``count`` steps, up to the first one that fails; return the last one.
+
+        Raises:
+            TimeError: A source failed, or another program owns time.
+            ValueRangeError: The length is not between 1 us and 1 h.
+
+        """
         lab, page = self._lab, self._lab.page
-        with lab.moving:
+        moving, loops, write = lab.moving, tuple(lab.loops.items()), page.write
+        with self._lock:
             if not self.owns:
                 self.take_over(steps=True)
             mode, step, time_ns, _, done, size_ns, playing, rate, _, owner, _, *wall = page.last_written()
             dt_ns = size_ns if dt_ns is None else dt_ns
             check_step(dt_ns)
-            step, time_ns = step + 1, time_ns + dt_ns
-            asked = Clock(mode, step, time_ns, dt_ns, done, size_ns, playing, rate, True, owner, "", *wall)
-            problems = ["it was cancelled"]
-            lab.stepping = True
+            problem, end = "", step + count
             try:
-                page.write(asked, ring=False)
-                problems = [f"{name}: {why}" for name, loop in lab.loops.items() if (why := loop.step(asked))]
+                while step < end and not problem:
+                    step, time_ns, problem = step + 1, time_ns + dt_ns, "it was cancelled"
+                    asked = Clock(mode, step, time_ns, dt_ns, done, size_ns, playing, rate, True, owner, "", *wall)
+                    with moving:  # between two steps, other threads carry out commands
+                        lab.stepping = True
+                        try:
+                            write(asked, ring=False)
+                            problem = "; ".join([f"{name}: {why}" for name, loop in loops if (why := loop.step(asked))])
+                        finally:
+                            lab.stepping = False
+                    done = done if problem else step
             finally:
-                lab.stepping = False
-                problem = "; ".join(problems)
                 note = f"step {step} failed: {problem}" if problem else ""
-                done = done if problem else step
-                page.write(
-                    Clock(mode, step, time_ns, dt_ns, done, size_ns, playing, rate, False, owner, note, *wall),
-                    ring=False,
-                )
+                ended = Clock(mode, step, time_ns, dt_ns, done, size_ns, playing, rate, False, owner, note, *wall)
+                write(ended, ring=False)
             if problem:
                 raise TimeError(f"step {step}: {problem}")
             return Step(step, time_ns, dt_ns)

@@ -234,6 +234,14 @@ class Coordinator:
                 else:
                     block.ring.wait(seen, rest_ns)
 
+    def steps(self, dt_ns: int | None, count: int) -> Step:
+        """Do ``count`` steps, each as :meth:`step` does; return the last one."""
+        step = self.step(dt_ns)
+        for _ in range(count - 1):
+            self._segment.require_running()
+            step = self.step(dt_ns)
+        return step
+
     def stepping(self, dt_ns: int | None = None) -> Generator[StepWait, None, Step]:
         """Do a step as :meth:`step` does, but yield what to wait for instead of waiting.
 
@@ -464,11 +472,7 @@ class Timekeeper:
         if self._player is not None:
             raise TimeError("time is playing; pause it before you step it")
         self._take_over()
-        step = self._coordinator.step(dt_ns)
-        for _ in range(count - 1):
-            self._segment.require_running()
-            step = self._coordinator.step(dt_ns)
-        return step
+        return self._coordinator.steps(dt_ns, count)
 
     @contextmanager
     def still(self) -> Iterator[Coordinator]:

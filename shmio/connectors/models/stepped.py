@@ -212,6 +212,8 @@ class SteppedLoop:
         self._writer = writer
         self._page = writer.block.clock
         writer.utc_ns = self._page.utc_ns
+        self._began_ns = self._page.monotonic_ns(0)
+        self._began_utc_ns = self._page.utc_ns(self._began_ns)
         self._from_start = self._schedule = schedule
         self._basis = Clock().basis  # the clock's basis for which the schedule is valid
         self._clock = clock
@@ -350,8 +352,8 @@ class SteppedLoop:
 
     def _stand(self, time_ns: int) -> None:
         """Give all frames and events the time ``time_ns`` of virtual time, until the next call."""
-        at_ns = self._writer.at_ns = self._page.monotonic_ns(time_ns)
-        self._at = Stamp(at_ns, time_ns, self._page.utc_ns(at_ns))
+        at_ns = self._writer.at_ns = self._began_ns + time_ns
+        self._at = Stamp(at_ns, time_ns, self._began_utc_ns + time_ns)
 
     def write_now(self) -> None:
         """Carry out the waiting commands. Call this between two steps."""
