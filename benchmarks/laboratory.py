@@ -22,7 +22,8 @@ from common import DB201, HERE, begin, db201, interleave, keep, median_ratio, ta
 
 from shmio.campaigns.live import MAX_STEPS, Plan, frames_of
 from shmio.config import Declaration, Expectation
-from shmio.injection.draw import SeededRandom
+from shmio.injection._numbers import uniform
+from shmio.injection.draw import Purpose, SeededRandom
 from shmio.judging.judge import Judge
 from shmio.lab import Laboratory, prepare_laboratory
 from shmio.layout.model import Layout
@@ -189,7 +190,7 @@ def _injected(cell: Cell, runner: ModelRunner, block: Block) -> Callable[[int], 
         raw = runner.step(time_ns, dt_ns)
         image = bytearray(raw)
         (seen,) = value.unpack_from(raw, target.offset)
-        seen += (2 * random.one_uniform(1, number) - 1) * 0.1
+        seen += (2 * uniform(random.key, 1, number, Purpose.VALUE) - 1) * 0.1
         if sensed.unpack_from(raw, sensor.offset)[0] > cell.limit:
             seen += 1
         value.pack_into(image, target.offset, seen)

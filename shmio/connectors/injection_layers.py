@@ -12,12 +12,13 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
 from shmio.config import Declaration
 from shmio.injection import Program
+from shmio.injection._numbers import change_all
 from shmio.injection.activation import Activation, State
 from shmio.injection.condition import Memory
 from shmio.injection.draw import SeededRandom
@@ -27,6 +28,9 @@ from shmio.model.injection import Running
 from shmio.model.values import NO_WRITER
 from shmio.segment import Direction
 
+if TYPE_CHECKING:
+    from shmio.injection._numbers import Change
+
 MAX_INJECTIONS: Final = 64
 """The largest number of injections on one source at a time."""
 MAX_HELD: Final = 256
@@ -34,7 +38,6 @@ MAX_HELD: Final = 256
 
 Bits = np.ndarray[Any, np.dtype[np.uint8]]
 
-_OUT: Final = Direction.OUT  # each image needs these, and looking up a member of an enum is slow
 _ACTIVE: Final = State.ACTIVE
 
 
@@ -84,6 +87,11 @@ class Layer:
         """True if the layer changes the covered bits at present."""
         return True
 
+    @property
+    def change(self) -> Change | None:
+        """A change that does the same as :meth:`show` while the layer's activation lasts; None: there is none."""
+        return None
+
     def show(self, image: Bits, now: CycleImage) -> None:  # noqa: ARG002  the values do not depend on time
         """Replace the covered bits of an image of ``/out`` by the layer's values, in place."""
         image ^= (image ^ self.values) & self.cover
@@ -123,6 +131,8 @@ class LayerStack:
     def __post_init__(self) -> None:
         self._effective = bytearray(self.size)
         self._image = np.frombuffer(self._effective, np.uint8)
+        self._shown: tuple[list[Layer], tuple[Change, ...] | None] | None = None
+        """The result of :meth:`_find_shown`; None: it must be found anew."""
 
     def add(self, injection: Layer) -> str:
         """Add a layer; return the reason why it cannot be added, or "" if it was added."""
@@ -132,6 +142,7 @@ class LayerStack:
             return f"{MAX_INJECTIONS} injections cover this source already, which is the maximum; lift one first"
         place = sum(layer.priority <= injection.priority for layer in self.layers)
         self.layers.insert(place, injection)
+        self.settle()
         return ""
 
     def find(self, number: int) -> Layer | None:
@@ -142,6 +153,7 @@ class LayerStack:
         """Remove and return the layers that ``which`` selects."""
         lifted = [layer for layer in self.layers if which(layer)]
         self.layers = [layer for layer in self.layers if not which(layer)]
+        self.settle()
         return lifted
 
     def effective(self, raw: bytes) -> bytes | bytearray | None:
@@ -149,14 +161,30 @@ class LayerStack:
 
         The next call overwrites the image.
         """
-        image = None
-        for layer in self.layers:
-            if layer.direction is _OUT and layer.active:
-                if image is None:
-                    self._effective[:] = raw
-                    image = self._image
-                layer.show(image, self.now)
-        return None if image is None else self._effective
+        shown = self._shown
+        if shown is None:
+            shown = self._shown = self._find_shown()
+        layers, changes = shown
+        if not layers:
+            return None
+        self._effective[:] = raw
+        if changes is not None:
+            change_all(self._effective, changes, self.now.cycle)
+        else:
+            for layer in layers:
+                layer.show(self._image, self.now)
+        return self._effective
+
+    def settle(self) -> None:
+        """Take a change into account: of the layers, or of what the activations of declared ones have become."""
+        self._shown = None
+
+    def _find_shown(self) -> tuple[list[Layer], tuple[Change, ...] | None]:
+        """Return the active layers over ``/out``, and the changes that do the same; None: not all are changes."""
+        layers = [layer for layer in self.layers if layer.direction is Direction.OUT and layer.active]
+        changes = [layer.change for layer in layers]
+        known = tuple(change for change in changes if change is not None)
+        return layers, known if len(known) == len(layers) else None
 
     def seen(self, raw: bytes, inner: Iterable[Layer]) -> Bits:
         """Return a copy of the image ``raw`` after applying the layers ``inner``, which cover ``/out``."""
@@ -323,7 +351,14 @@ class DeclaredLayer(Layer):
     @property
     def active(self) -> bool:
         """True if the injection is active at present."""
-        return self.activation.state is _ACTIVE  # LayerStack.effective() has the same, without this call
+        return self.activation.state is _ACTIVE
+
+    @property
+    def change(self) -> Change | None:
+        """A change that does the same as :meth:`show` while the activation lasts; None: there is none."""
+        if self._probability is not None:
+            return None
+        return self.operation.change(self.activation.runs, self.activation.cycle)
 
     @property
     def configured(self) -> bool:
@@ -365,9 +400,6 @@ class DeclaredLayer(Layer):
     def show(self, image: Bits, now: CycleImage) -> None:
         """Apply the operation to the covered bits of an image, in place."""
         activation, operation = self.activation, self.operation
-        if operation.single is not None and self._probability is None:
-            operation.single(image, activation.runs, now.cycle - activation.cycle)
-            return
         at = OperationContext(activation.runs, now.cycle - activation.cycle, now.cycle, now.time_ns)
         if self._probability is not None and not self._happens(at):
             operation.passed(image, at)

@@ -366,12 +366,13 @@ class LayerPublisher:
         return in_parts(end, msgspec.json.encode(how))
 
     def publish(self, growth: int = 0) -> None:
-        """Write the list of injections into the segment. The caller holds the output's ``lock``.
+        """Write the list of injections into the segment, after each change. The caller holds the output's ``lock``.
 
         Raises:
             ValueError: The list, with ``growth`` more bytes, would be too long for the segment.
 
         """
+        self.injections.settle()
         items = (self._item(layer) for layer in self.injections.layers)
         self.output.writer.block.injections.write(encode(items, growth))
 

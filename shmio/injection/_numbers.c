@@ -17,7 +17,7 @@ typedef struct {
     char code;       /* as in Python's struct; ?: one bit */
     uint8_t mask;    /* the bit, for ? */
     bool big;        /* the byte order in the image */
-    double minimum, maximum; /* the range for add() and multiply() */
+    double minimum, maximum; /* the range for changes */
 } Number;
 
 #define REAL_MAX 3.4028234663852886e38
@@ -168,51 +168,9 @@ static void store_clamped(const Number *self, uint8_t *at, double value)
     store(self, at, word);
 }
 
-static PyObject *change(Number *self, PyObject *const *args, Py_ssize_t count, bool multiply)
-{
-    Py_buffer image;
-    if (count != 2) {
-        PyErr_SetString(PyExc_TypeError, "an image and a number are needed");
-        return NULL;
-    }
-    double by = PyFloat_AsDouble(args[1]);
-    if (by == -1.0 && PyErr_Occurred()) return NULL;
-    if (!self->size || self->code == '?' || self->code == 'q' || self->code == 'Q') {
-        PyErr_SetString(PyExc_TypeError, "a double cannot represent each value of this type");
-        return NULL;
-    }
-    if (PyObject_GetBuffer(args[0], &image, PyBUF_WRITABLE) < 0) return NULL;
-    uint8_t *at = number_at(self, &image);
-    if (at) {
-        double value = as_double(self, at);
-        value = multiply ? value * by : value + by;
-        if (isnan(value) && self->code != 'f' && self->code != 'd') {
-            PyErr_SetString(PyExc_ValueError, "an integer cannot be NaN");
-            at = NULL;
-        } else {
-            store_clamped(self, at, value);
-        }
-    }
-    PyBuffer_Release(&image);
-    if (!at) return NULL;
-    Py_RETURN_NONE;
-}
-
-static PyObject *Number_add(Number *self, PyObject *const *args, Py_ssize_t count)
-{
-    return change(self, args, count, false);
-}
-
-static PyObject *Number_multiply(Number *self, PyObject *const *args, Py_ssize_t count)
-{
-    return change(self, args, count, true);
-}
-
 #define METHOD(type, name, flags, doc) {#name, (PyCFunction)(void (*)(void))type##_##name, flags, doc}
 static PyMethodDef Number_methods[] = {
     METHOD(Number, decode, METH_O, "Return the number in an image."),
-    METHOD(Number, add, METH_FASTCALL, "Add to the number in an image; clamp and round the result to its type."),
-    METHOD(Number, multiply, METH_FASTCALL, "Multiply the number in an image; clamp and round the result to its type."),
     {0},
 };
 
@@ -225,6 +183,111 @@ static PyType_Slot Number_slots[] = {
 };
 static PyType_Spec Number_spec = {"shmio.injection._numbers.Number", sizeof(Number), 0, Py_TPFLAGS_DEFAULT,
                                   Number_slots};
+
+/* ---- random numbers, as draw.py computes them for many values ------------------------------------------------------ */
+
+#define TAU 6.283185307179586
+
+enum { CHANCE, VALUE, ANGLE }; /* as draw.Purpose */
+
+static uint64_t mix(uint64_t word)
+{
+    word += UINT64_C(0x9E3779B97F4A7C15);
+    word = (word ^ word >> 30) * UINT64_C(0xBF58476D1CE4E5B9);
+    word = (word ^ word >> 27) * UINT64_C(0x94D049BB133111EB);
+    return word ^ word >> 31;
+}
+
+static double uniform(uint64_t key, uint64_t run, uint64_t place, uint64_t purpose)
+{
+    return (double)(mix(mix(mix(mix(key + run) + place) + purpose)) >> 11) * 0x1p-53;
+}
+
+static double gaussian(uint64_t key, uint64_t run, uint64_t place)
+{
+    return sqrt(-2 * log(1 - uniform(key, run, place, VALUE))) * cos(TAU * uniform(key, run, place, ANGLE));
+}
+
+/* Reads `count` integers modulo 2^64; returns false with an exception. */
+static bool words(PyObject *const *objects, uint64_t *to, int count)
+{
+    for (int i = 0; i < count; i++) {
+        to[i] = PyLong_AsUnsignedLongLongMask(objects[i]);
+        if (to[i] == UINT64_MAX && PyErr_Occurred()) return false;
+    }
+    return true;
+}
+
+static PyObject *numbers_uniform(PyObject *module, PyObject *const *args, Py_ssize_t given)
+{
+    uint64_t word[4]; /* key, run, place, purpose */
+    (void)module;
+    if (given == 4) return words(args, word, 4) ? PyFloat_FromDouble(uniform(word[0], word[1], word[2], word[3])) : NULL;
+    PyErr_SetString(PyExc_TypeError, "a key, a run, a place and a purpose are needed");
+    return NULL;
+}
+
+/* ---- changes ------------------------------------------------------------------------------------------------------- */
+
+enum { ADD_AMOUNT, MULTIPLY_BY, ADD_UNIFORM, ADD_GAUSSIAN }; /* as in operations.py */
+enum { CHANGE_SIZE = 6 };
+
+/* Changes one number of an image: (Number, kind, amount, key, run, first cycle of the run). Returns false with an
+ * exception. */
+static bool change(PyTypeObject *own, PyObject *what, const Py_buffer *image, uint64_t cycle)
+{
+    PyObject *fields[CHANGE_SIZE];
+    uint64_t word[3]; /* key, run, cycle */
+    if (!PyTuple_Check(what) || PyTuple_Size(what) != CHANGE_SIZE || Py_TYPE(PyTuple_GetItem(what, 0)) != own) {
+        PyErr_SetString(PyExc_TypeError, "a change is a tuple of a Number, a kind, an amount, a key, a run and a cycle");
+        return false;
+    }
+    for (int i = 0; i < CHANGE_SIZE; i++) fields[i] = PyTuple_GetItem(what, i);
+    const Number *number = (const Number *)fields[0];
+    long kind = PyLong_AsLong(fields[1]);
+    if (kind == -1 && PyErr_Occurred()) return false;
+    double amount = PyFloat_AsDouble(fields[2]);
+    if (amount == -1.0 && PyErr_Occurred()) return false;
+    if (!words(fields + 3, word, 3)) return false;
+    if (!number->size || number->code == '?' || number->code == 'q' || number->code == 'Q') {
+        PyErr_SetString(PyExc_TypeError, "a double cannot represent each value of this type");
+        return false;
+    }
+    uint8_t *at = number_at(number, image);
+    if (!at) return false;
+    double value = as_double(number, at);
+    switch (kind) {
+    case ADD_AMOUNT: value += amount; break;
+    case MULTIPLY_BY: value *= amount; break;
+    case ADD_UNIFORM: value += (2 * uniform(word[0], word[1], cycle - word[2], VALUE) - 1) * amount; break;
+    case ADD_GAUSSIAN: value += gaussian(word[0], word[1], cycle - word[2]) * amount; break;
+    default: PyErr_Format(PyExc_ValueError, "there is no kind of change %ld", kind); return false;
+    }
+    if (isnan(value) && number->code != 'f' && number->code != 'd') {
+        PyErr_SetString(PyExc_ValueError, "an integer cannot be NaN");
+        return false;
+    }
+    store_clamped(number, at, value);
+    return true;
+}
+
+static PyObject *numbers_change_all(PyObject *module, PyObject *const *args, Py_ssize_t given)
+{
+    PyTypeObject *own = *(PyTypeObject **)PyModule_GetState(module);
+    Py_buffer image;
+    uint64_t cycle;
+    if (given != 3 || !PyTuple_Check(args[1])) {
+        PyErr_SetString(PyExc_TypeError, "an image, a tuple of changes and a cycle are needed");
+        return NULL;
+    }
+    if (!words(args + 2, &cycle, 1) || PyObject_GetBuffer(args[0], &image, PyBUF_WRITABLE) < 0) return NULL;
+    bool done = true;
+    for (Py_ssize_t i = 0; done && i < PyTuple_Size(args[1]); i++)
+        done = change(own, PyTuple_GetItem(args[1], i), &image, cycle);
+    PyBuffer_Release(&image);
+    if (!done) return NULL;
+    Py_RETURN_NONE;
+}
 
 /* ---- conditions ---------------------------------------------------------------------------------------------------- */
 
@@ -415,6 +478,8 @@ static PyObject *numbers_evaluate_all(PyObject *module, PyObject *const *args, P
 /* ---- module -------------------------------------------------------------------------------------------------------- */
 
 static PyMethodDef functions[] = {
+    METHOD(numbers, uniform, METH_FASTCALL, "Return the random number of a key, a run, a place and a purpose."),
+    METHOD(numbers, change_all, METH_FASTCALL, "Change numbers of an image in place, one after another."),
     METHOD(numbers, evaluate, METH_FASTCALL, "Return whether a condition is true; None if that is unknown."),
     METHOD(numbers, evaluate_all, METH_FASTCALL, "Return for each condition whether it is true for images of sources."),
     {0},

@@ -16,6 +16,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from shmio.injection._numbers import uniform
+
 Words = npt.NDArray[np.uint64]
 Floats = npt.NDArray[np.float64]
 
@@ -25,15 +27,9 @@ FEW: Final = 16
 Both compute the same numbers, except for the last bit of a Gaussian number.
 """
 
-BATCH: Final = 64
-"""How many single numbers are computed at once."""
-
 _MASK: Final = (1 << 64) - 1
 _GOLDEN: Final = 0x9E3779B97F4A7C15
 _FIRST, _SECOND = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
-
-
-_NO_BATCH: Final[tuple[int, int, list[float]]] = (-1, 0, [])
 
 
 class Purpose(IntEnum):
@@ -53,9 +49,8 @@ class SeededRandom:
 
     def __init__(self, seed: int, name: str) -> None:
         """Create the generator. For the same seed, different names give different numbers."""
-        self._key = int.from_bytes(hashlib.sha256(f"{seed}/{name}".encode()).digest()[:8], "little")
-        self._batches: dict[Purpose, tuple[int, int, list[float]]] = {}
-        """For each purpose, the first numbers of BATCH places: the run, the first place, and the numbers."""
+        self.key = int.from_bytes(hashlib.sha256(f"{seed}/{name}".encode()).digest()[:8], "little")
+        """What determines all numbers."""
 
     def words(self, run: int, place: int, purpose: Purpose, count: int) -> Words:
         """Return ``count`` random 64-bit integers: an array of shape (count,) and type uint64."""
@@ -86,29 +81,8 @@ class SeededRandom:
         normal: Floats = radius * np.cos(math.tau * angle)
         return normal
 
-    def one_uniform(self, run: int, place: int, purpose: Purpose = Purpose.VALUE) -> float:
-        """Return the only number that :meth:`uniform` would return for a count of 1.
-
-        Cycles follow one another, so this computes the numbers of the next cycles, too, by numpy.
-        """
-        known, first, numbers = self._batches.get(purpose, _NO_BATCH)
-        if known == run and 0 <= place - first < BATCH:
-            return numbers[place - first]
-        base = _mix(self._key + run & _MASK) + place + _GOLDEN & _MASK
-        words = _mix_all(np.arange(BATCH, dtype=np.uint64) + np.uint64(base))
-        for part in (purpose, 0):
-            words = _mix_all(words + np.uint64(part + _GOLDEN))
-        numbers = ((words >> np.uint64(11)).astype(np.float64) * 2.0**-53).tolist()
-        self._batches[purpose] = run, place, numbers
-        return float(numbers[0])
-
-    def one_gaussian(self, run: int, place: int) -> float:
-        """Return the only number that :meth:`gaussian` would return for a count of 1."""
-        radius = 1 - self.one_uniform(run, place)
-        return math.sqrt(-2 * math.log(radius)) * math.cos(math.tau * self.one_uniform(run, place, Purpose.ANGLE))
-
     def _base(self, run: int, place: int, purpose: Purpose) -> int:
-        return _mix(_mix(_mix(self._key + run & _MASK) + place & _MASK) + purpose & _MASK)
+        return _mix(_mix(_mix(self.key + run & _MASK) + place & _MASK) + purpose & _MASK)
 
     def _few(self, run: int, place: int, purpose: Purpose, count: int) -> list[int]:
         base = self._base(run, place, purpose)
@@ -121,7 +95,7 @@ class SeededRandom:
 
     def happens(self, probability: float, run: int, place: int) -> bool:
         """Return True with the probability ``probability``, from 0 to 1, else False."""
-        return probability >= 1 or self.one_uniform(run, place, Purpose.CHANCE) < probability
+        return probability >= 1 or uniform(self.key, run, place, Purpose.CHANCE) < probability
 
 
 def _mix(word: int) -> int:

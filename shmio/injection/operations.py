@@ -12,15 +12,18 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from shmio.injection._numbers import Number
-from shmio.injection.draw import BATCH, SeededRandom
+from shmio.injection._numbers import Number, change_all
+from shmio.injection.draw import SeededRandom
 from shmio.layout.model import ByteOrder, ElementType, Register, bit_positions
 from shmio.layout.values.codec import REAL_MAX, scalar_codec
+
+if TYPE_CHECKING:
+    from shmio.injection._numbers import Change
 
 Bytes = npt.NDArray[np.uint8]
 Values = npt.NDArray[Any]
@@ -132,7 +135,10 @@ class ValueGroup:
         return np.where(set_bits, bits, np.uint8(0)), np.where(set_bits, np.uint8(0), bits)
 
 
-_Change = Callable[[ValueGroup, Values], Values]
+ADD, MULTIPLY, UNIFORM, GAUSSIAN = range(4)
+"""The kinds of :data:`Change`, as in ``_numbers.c``: by an amount, or by a random number times an amount."""
+
+_Compute = Callable[[ValueGroup, Values], Values]
 """A function of a group and its present values, which returns the new values."""
 
 
@@ -206,18 +212,24 @@ class Operation(ABC):
     exact: ClassVar[bool] = False
     """True if :meth:`apply` changes no bits but those that the injection covers."""
 
-    single: Callable[[Bytes, int, int], None] | None = None
-    """Does the same as :meth:`apply`, but faster, with an image, the run and the place; None: there is no such way.
-
-    Only operations on a single number have it.
-    """
-
     def begin(self) -> None:  # noqa: B027  most operations have no state
         """Reset the operation's state at the start of an activation."""
 
     @abstractmethod
     def apply(self, image: Bytes, at: OperationContext) -> None:
         """Change the image in place. The caller uses only the bits that the injection covers."""
+
+    def change(self, run: int, cycle: int) -> Change | None:  # noqa: ARG002  most operations have none
+        """Return a change that does the same as :meth:`apply`, but faster; None: there is no such change.
+
+        Only operations on a single number have it.
+
+        Args:
+            run: The number of the activation.
+            cycle: The number of its first cycle.
+
+        """
+        return None
 
     def passed(self, image: Bytes, at: OperationContext) -> None:  # noqa: B027  most operations have no state
         """Take an image into account that the operation does not change.
@@ -257,28 +269,32 @@ class Arithmetic(Operation):
     exact = True
 
     def __init__(
-        self, places: Sequence[ValueGroup], change: _Change, single: Callable[[Number, Bytes], None] | None = None
+        self, places: Sequence[ValueGroup], compute: _Compute, single: tuple[int, float] | None = None
     ) -> None:
         """Create the operation.
 
         Args:
             places: The values.
-            change: Computes new numbers of a group.
-            single: Does the same with a single number in an image, but faster; if None, ``change`` does it.
+            compute: Computes new numbers of a group.
+            single: The kind and the amount of a change that does the same with a single number; None if
+                there is none.
 
         """
         self._places = places
-        self._change = change
-        if len(places) == 1 and single is not None and (number := places[0].single) is not None:
-            self.single = lambda image, _run, _place: single(number, image)
+        self._compute = compute
+        number = places[0].single if len(places) == 1 and single is not None else None
+        self._change = None if number is None or single is None else (number, *single, 0, 0, 0)
+
+    def change(self, run: int, cycle: int) -> Change | None:  # noqa: ARG002, D102
+        return self._change
 
     def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: D102
-        if self.single is not None:
-            self.single(image, at.run, at.place)
+        if self._change is not None:
+            change_all(image, (self._change,), at.cycle)
             return
         with np.errstate(all="ignore"):
             for group in self._places:
-                group.put_numbers(image, self._change(group, group.numbers(image)))
+                group.put_numbers(image, self._compute(group, group.numbers(image)))
 
 
 class Noise(Operation):
@@ -292,15 +308,17 @@ class Noise(Operation):
         self._draw = draw
         self._amplitude = amplitude
         self._gaussian = gaussian
-        self._addends: tuple[int, int, list[float]] = 0, 0, []
-        """The numbers to add at BATCH places: the run, the first place, the numbers."""
-        if self._count == 1 and (number := places[0].single) is not None:
-            self._number = number
-            self.single = self._add
+        self._number = places[0].single if self._count == 1 else None
+
+    def change(self, run: int, cycle: int) -> Change | None:  # noqa: D102
+        if self._number is None:
+            return None
+        return self._number, GAUSSIAN if self._gaussian else UNIFORM, self._amplitude, self._draw.key, run, cycle
 
     def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: D102
-        if self.single is not None:
-            self.single(image, at.run, at.place)
+        change = self.change(at.run, at.cycle - at.place)
+        if change is not None:
+            change_all(image, (change,), at.cycle)
             return
         count = self._count
         if self._gaussian:
@@ -311,19 +329,6 @@ class Noise(Operation):
             for group in self._places:
                 own = noise[group.first : group.first + len(group)]
                 group.put_numbers(image, group.numbers(image) + own)
-
-    def _add(self, image: Bytes, run: int, place: int) -> None:
-        known, first, addends = self._addends
-        if known != run or not 0 <= place - first < len(addends):
-            first = place
-            addends = [self._addend(run, one) for one in range(place, place + BATCH)]
-            self._addends = run, place, addends
-        self._number.add(image, addends[place - first])
-
-    def _addend(self, run: int, place: int) -> float:
-        if self._gaussian:
-            return self._draw.one_gaussian(run, place) * self._amplitude
-        return (2 * self._draw.one_uniform(run, place) - 1) * self._amplitude
 
 
 class RandomRange(Operation):

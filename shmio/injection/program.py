@@ -17,8 +17,10 @@ from shmio.injection.activation import Window
 from shmio.injection.condition import Expression, parse
 from shmio.injection.draw import SeededRandom
 from shmio.injection.operations import (
+    ADD,
     MAX_DELAY_BYTES,
     MAX_DELAY_CYCLES,
+    MULTIPLY,
     Arithmetic,
     Bytes,
     Delay,
@@ -298,16 +300,12 @@ def _encode(value: Any, key: str, register: Register, layout: Layout, image: byt
 
 def _offset(declaration: Declaration, target: Target, layout: Layout, _period_ns: int) -> _Operate:
     groups, by = _numbers(declaration, target, layout), _number(declaration.value, "value")
-    return lambda _draw: Arithmetic(
-        groups, lambda _places, values: values + by, lambda number, image: number.add(image, by)
-    )
+    return lambda _draw: Arithmetic(groups, lambda _places, values: values + by, (ADD, by))
 
 
 def _scale(declaration: Declaration, target: Target, layout: Layout, _period_ns: int) -> _Operate:
     groups, by = _numbers(declaration, target, layout), _number(declaration.value, "value")
-    return lambda _draw: Arithmetic(
-        groups, lambda _places, values: values * by, lambda number, image: number.multiply(image, by)
-    )
+    return lambda _draw: Arithmetic(groups, lambda _places, values: values * by, (MULTIPLY, by))
 
 
 def _clamp(declaration: Declaration, target: Target, layout: Layout, _period_ns: int) -> _Operate:

@@ -12,8 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmio.injection._numbers import Number, evaluate, evaluate_all
+from shmio.injection._numbers import Number, change_all, evaluate, evaluate_all, uniform
 from shmio.injection.condition import parse
+from shmio.injection.draw import Purpose
+from shmio.injection.operations import ADD, GAUSSIAN, MULTIPLY, UNIFORM
 
 CODES = "bBhHiIqQfd"
 formats = st.builds("{}{}".format, st.sampled_from("<>"), st.sampled_from(CODES))
@@ -35,14 +37,14 @@ def test_decodes_bits(image: bytes, offset: int, bit: int) -> None:
 @given(st.sampled_from("<>"), st.integers(-(2**31), 2**31 - 1), st.floats(-(2.0**34), 2.0**34))
 def test_rounds_as_python_and_clamps(order: str, value: int, by: float) -> None:
     image = bytearray(struct.pack(f"{order}xi", value))
-    Number(f"{order}i", 1).add(image, by)
+    change_all(image, ((Number(f"{order}i", 1), ADD, by, 0, 0, 0),), 0)
     assert struct.unpack(f"{order}xi", image) == (min(max(round(value + by), -(2**31)), 2**31 - 1),)
 
 
 @given(st.sampled_from("<>"), st.floats(width=32), st.floats())
 def test_a_real_is_clamped_but_stays_nan(order: str, value: float, by: float) -> None:
     image = bytearray(struct.pack(f"{order}f", value))
-    Number(f"{order}f", 0).multiply(image, by)
+    change_all(image, ((Number(f"{order}f", 0), MULTIPLY, by, 0, 0, 0),), 0)
     (found,) = struct.unpack(f"{order}f", image)
     if math.isnan(value * by):
         assert math.isnan(found)
@@ -55,7 +57,33 @@ REAL_MAX = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
 
 def test_an_integer_cannot_become_nan() -> None:
     with pytest.raises(ValueError, match="NaN"):
-        Number("<h", 0).multiply(bytearray(2), math.inf)
+        change_all(bytearray(2), ((Number("<h", 0), MULTIPLY, math.inf, 0, 0, 0),), 0)
+
+
+@given(st.integers(0, 2**64 - 1), st.integers(1, 1000), st.integers(0, 1000), st.floats(-1e6, 1e6))
+def test_changes_follow_one_another(key: int, run: int, cycle: int, amount: float) -> None:
+    image, number = bytearray(8), Number("<d", 0)
+    changes = [(ADD, 3.0), (MULTIPLY, amount), (UNIFORM, amount), (GAUSSIAN, amount)]
+    change_all(image, tuple((number, kind, by, key, run, cycle) for kind, by in changes), cycle + 7)
+    value, angle = uniform(key, run, 7, Purpose.VALUE), uniform(key, run, 7, Purpose.ANGLE)
+    noise = math.sqrt(-2 * math.log(1 - value)) * math.cos(math.tau * angle)
+    assert struct.unpack("<d", image) == (3.0 * amount + (2 * value - 1) * amount + noise * amount,)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        (), None, (None, 0, 1, 0, 0, 0), (Number("<d", 0), 0, 1, 0, 0), (Number("<d", 0), 0, "1", 0, 0, 0),
+        (Number("<d", 0), 9, 1, 0, 0, 0), (Number("<d", 0), "0", 1, 0, 0, 0), (Number("<d", 0), 2, 1, 0, None, 0),
+        (Number("<d", 1), 0, 1, 0, 0, 0), (Number("<q", 0), 0, 1, 0, 0, 0), (Number("<?", 0), 0, 1, 0, 0, 0),
+        (cast("Any", Number).__new__(Number), 0, 1, 0, 0, 0), (Number("<d", 0), 0, 10**400, 0, 0, 0),
+    ],
+)  # fmt: skip
+def test_refuses_what_is_no_change(wrong: Any) -> None:
+    image = bytearray(8)
+    with pytest.raises((TypeError, ValueError, OverflowError)):
+        change_all(image, (wrong,), 0)
+    assert not any(image)
 
 
 @pytest.mark.parametrize(
@@ -72,11 +100,9 @@ def test_touches_no_byte_outside_the_image() -> None:
         with pytest.raises(ValueError, match="outside"):
             number.decode(bytes(4))
         with pytest.raises(ValueError, match="outside"):
-            number.add(bytearray(4), 1)
+            change_all(bytearray(4), ((number, ADD, 1, 0, 0, 0),), 0)
     with pytest.raises(BufferError):
-        Number("<i", 0).add(bytes(4), 1)
-    with pytest.raises(TypeError, match="double"):
-        Number("<q", 0).add(bytearray(8), 1)
+        change_all(bytes(4), (), 0)
     with pytest.raises(ValueError, match="outside"):
         cast("Any", Number).__new__(Number).decode(bytes(4))
 

@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmio.injection.draw import Purpose, SeededRandom
-from shmio.injection.operations import Arithmetic, Noise, OperationContext, ValueGroup, places
+from shmio.injection.draw import SeededRandom
+from shmio.injection.operations import ADD, MULTIPLY, Arithmetic, Noise, OperationContext, ValueGroup, places
 from shmio.layout.model import ByteOrder, Register
 
 TYPES = {"REAL": 4, "LREAL": 8, "INT": 2, "UINT": 2, "DINT": 4, "UDINT": 4, "SINT": 1, "BYTE": 1, "LINT": 8}
@@ -29,8 +29,8 @@ def groups(type_: str, order: ByteOrder, group: type[ValueGroup]) -> list[ValueG
 def test_arithmetic(type_: str, order: ByteOrder, data: bytes, by: float) -> None:
     at = OperationContext(1, 2, 3, 4)
     for array, single in (
-        (lambda _, values: values + by, lambda number, image: number.add(image, by)),
-        (lambda _, values: values * by, lambda number, image: number.multiply(image, by)),
+        (lambda _, values: values + by, (ADD, by)),
+        (lambda _, values: values * by, (MULTIPLY, by)),
     ):
         found = []
         for kind in (ValueGroup, NeverSingle):
@@ -55,10 +55,3 @@ def test_noise(type_: str, data: bytes, amplitude: float, gaussian: bool, seed: 
         Noise(groups(type_, "big", kind), draw, amplitude, gaussian=gaussian).apply(image, OperationContext(1, 2, 3, 4))
         found.append(image.tobytes())
     assert found[0] == found[1]
-
-
-@given(st.integers(0), st.integers(0, 1000), st.integers(0, 10**6))
-def test_one_random_number(seed: int, run: int, place: int) -> None:
-    draw = SeededRandom(seed, "x")
-    assert draw.one_uniform(run, place, Purpose.CHANCE) == draw.uniform(run, place, 1, Purpose.CHANCE)[0]
-    assert draw.one_gaussian(run, place) == draw.gaussian(run, place, 1)[0]
