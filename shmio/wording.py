@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 from collections.abc import Iterable, Sequence
 from typing import Final
 
@@ -20,6 +21,14 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def brief(value: object) -> str:
+    """Return a value as a short text for a message; for a huge integer, the number of its bytes."""
+    if isinstance(value, int) and not -(1 << 128) < value < 1 << 128:
+        return f"an integer of {math.ceil(value.bit_length() / 8)} bytes"
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:59]}…"
 
 
 def counted(count: int, noun: str) -> str:

@@ -19,7 +19,7 @@ from msgspec.structs import fields
 from shmio.config.model import NAME_PATTERN, NAME_RULE
 from shmio.config.toml_tokens import TOKEN
 from shmio.errors import ConfigError, LayoutError
-from shmio.wording import unknown
+from shmio.wording import brief, unknown
 
 MAX_KEY: Final = 1_000
 """Maximum number of characters of a key, with all its dotted parts."""
@@ -166,13 +166,36 @@ def _bare(token: str) -> str:
     return token
 
 
-def explain(error: ValidationError, key: str, kind: Any) -> str:
-    """Return an error of msgspec as a message ``key: what is wrong``.
+def but_found(key: str, value: Any) -> str:
+    """Return ``, found VALUE`` for the end of a message about a value; empty if the value may be a secret."""
+    from shmio.config.masking import is_secret, mask_value  # noqa: PLC0415  compiles many patterns, for messages only
+
+    names = re.findall(r"[A-Za-z0-9_-]+", re.sub(r"\[[^\]]*\]|^grpc\.token\b", "", key))
+    if any(map(is_secret, names)):
+        return ""
+    return f", found {str(value).lower() if isinstance(value, bool) else brief(mask_value('', value))}"
+
+
+def _inner(value: Any, path: str) -> Any:
+    """Return the value at a path of msgspec within another, such as ``.name[2]``; None if the path is not exact."""
+    for name, index in re.findall(r"\.([^.\[]+)|\[([^\]]*)\]", path):
+        if name and isinstance(value, dict):
+            value = value.get(name)
+        elif index.isdigit() and isinstance(value, list | tuple) and int(index) < len(value):
+            value = value[int(index)]
+        else:
+            return None
+    return value
+
+
+def explain(error: ValidationError, key: str, kind: Any, value: Any) -> str:
+    """Return an error of msgspec as a message ``key: what is wrong``, with the wrong value.
 
     Args:
         error: The error.
         key: The key of the value that msgspec could not convert; empty for a whole file or table.
         kind: The type to which the value should have been converted.
+        value: That value.
 
     """
     text, _, at = str(error).partition(" - at `$")
@@ -191,6 +214,9 @@ def explain(error: ValidationError, key: str, kind: Any) -> str:
         text = "must not be empty"
     text = re.sub(r"`([a-z]+(?: \| [a-z]+)*)`", _types, text)
     text = text[:1].lower() + text[1:]
+    wrong = _inner(value, at.rstrip("`")) if text.startswith("expected ") else None
+    if wrong is not None and (shown := but_found(path, wrong)):
+        text = text.partition(", got ")[0] + shown
     return f"{path}: {text}" if path else text
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from shmio.errors import ConfigError
-from shmio.wording import did_you_mean, near, unknown
+from shmio.wording import brief, did_you_mean, near, unknown
 
 MAX_DIMENSIONS: Final = 64
 """Maximum number of ranges in one campaign."""
@@ -229,7 +229,7 @@ def _dimension(table: Mapping[str, Any], name: str, place: tuple[str | int, ...]
         raise ConfigError(f".to: {high:g} is not above from, {low:g}; write a single value without a range")
     log = table.get("log", False)
     if not isinstance(log, bool):
-        raise ConfigError(".log: expected true or false")
+        raise ConfigError(f".log: expected true or false, found {brief(log)}")
     whole_key = place[2] in _WHOLE and place[0] == "injection"
     step = _number(table, "step") if "step" in table else 1 if whole_key and not log else None
     if step is not None and log:
@@ -240,7 +240,8 @@ def _dimension(table: Mapping[str, Any], name: str, place: tuple[str | int, ...]
         raise ConfigError(f".step: {step:g} is not above 0 and at most {high - low:g}, the length of the range")
     whole = whole_key or (step is not None and all(isinstance(one, int) for one in (low, high, step)))
     if whole and not all(float(one).is_integer() for one in (low, high, step or 1)):
-        raise ConfigError(f".from: {place[2]} takes only whole numbers")
+        wrong = next(one for one in (low, high, step or 1) if not float(one).is_integer())
+        raise ConfigError(f".from: {place[2]} takes only whole numbers, but the range has {wrong:g}")
     if step is not None and (high - low) / step > 1e9:
         raise ConfigError(".step: the range has more than 1e9 values; leave out step")
     return Range(name, place, low, high, step, log, whole)
@@ -251,7 +252,7 @@ def _choice(table: Mapping[str, Any], name: str, place: tuple[str | int, ...]) -
     if len(table) > 1:
         raise ConfigError(f".{next(key for key in table if key != 'choice')}: choice takes no other key")
     if not isinstance(options, list) or not 2 <= len(options) <= MAX_OPTIONS:
-        raise ConfigError(f".choice: expected a list of 2 to {MAX_OPTIONS} values")
+        raise ConfigError(f".choice: expected a list of 2 to {MAX_OPTIONS} values, found {brief(options)}")
     for index, one in enumerate(options):
         if isinstance(one, dict):
             raise ConfigError(f".choice[{index}]: a choice cannot contain a range; write a value")
@@ -265,6 +266,6 @@ def _number(table: Mapping[str, Any], key: str) -> float:
         raise ConfigError(f".{key}: this key is needed; {SYNTAX}")
     value = table[key]
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or abs(value) > 1e300:
-        raise ConfigError(f".{key}: expected a number")
+        raise ConfigError(f".{key}: expected a number, found {brief(value)}")
     number: float = value
     return number

@@ -14,7 +14,7 @@ import msgspec
 from shmio.config.alert import alert_faults, resolve_alert
 from shmio.config.declaration import declaration_faults
 from shmio.config.fabric import check_fabric, resolve_fabric
-from shmio.config.faults import MAX_KEY, MAX_PARTS, Faults, decode, explain, explain_toml, too_long
+from shmio.config.faults import MAX_KEY, MAX_PARTS, Faults, but_found, decode, explain, explain_toml, too_long
 from shmio.config.listening import check_listening, resolve
 from shmio.config.model import (
     Alert,
@@ -366,7 +366,7 @@ class Structure:
         if isinstance(value, dict):
             self._faults.add(f"{key}: write [[{key}]] with double brackets, because there can be several")
         else:
-            self._faults.add(f"{key}: expected tables, each with the header [[{key}]]")
+            self._faults.add(f"{key}: expected tables, each with the header [[{key}]]{but_found(key, value)}")
 
     def table(self, value: Any, key: str, name: str) -> tuple[bool, dict[str, Any]]:
         """Return whether a table has no faults, and its keys without faults, with their values.
@@ -377,7 +377,7 @@ class Structure:
             name: The dotted name of the table without indices.
         """
         if not isinstance(value, dict):
-            self._faults.add(f"{key}: expected a table with the header [{name}]")
+            self._faults.add(f"{key}: expected a table with the header [{name}]{but_found(key, value)}")
             return False, {}
         kind = self._kinds[name]
         before = self._faults.count
@@ -415,7 +415,7 @@ class Structure:
         try:
             msgspec.convert(value, kind)
         except msgspec.ValidationError as error:
-            self._faults.add(explain(error, key, kind))
+            self._faults.add(explain(error, key, kind, value))
             return False
         return True
 
@@ -500,7 +500,7 @@ def convert(tables: dict[str, Any], kind: type[_Table]) -> _Table:
         path = at.rstrip("`").lstrip(".")
         unknown = re.search(r"unknown field `([^`]*)`", text)
         if unknown is None:
-            raise ConfigError(explain(error, "", kind)) from None
+            raise ConfigError(explain(error, "", kind, tables)) from None
         table = re.sub(r"\[[^]]*\]", "", path)
         known = kind if not table else _TABLES.get(table)
         raise ConfigError(
@@ -542,7 +542,7 @@ def text_faults(value: Any, key: str) -> Iterator[str]:
     """Yield a fault for each text with control characters in the value of ``key``, however deeply it is nested."""
     if isinstance(value, str) and any(char < " " or char == "\x7f" for char in value):
         path = "; write a path with backslashes in single quotes" if _SLIPPED.search(value) else ""
-        yield f"{key}: must not contain control characters{path}"
+        yield f"{key}: must not contain control characters{but_found(key, value)}{path}"
     if isinstance(value, dict):
         for name, item in value.items():
             yield from text_faults(item, f"{key}.{name}".lstrip("."))

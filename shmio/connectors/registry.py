@@ -149,10 +149,11 @@ def convert_options(name: str, options: dict[str, Any], texts: Mapping[str, str]
     for fault in option_faults(name, options, texts or {}):
         raise ConfigError(fault)
     kind = options_type(name)
+    given = _read(kind, texts or {}) | options
     try:
-        return msgspec.convert(_read(kind, texts or {}) | options, kind)
+        return msgspec.convert(given, kind)
     except msgspec.ValidationError as error:
-        raise ConfigError(explain(error, "", kind)) from None
+        raise ConfigError(explain(error, "", kind, given)) from None
 
 
 def option_faults(name: str, options: Mapping[str, Any], texts: Mapping[str, str]) -> Iterator[str]:
@@ -169,7 +170,7 @@ def option_faults(name: str, options: Mapping[str, Any], texts: Mapping[str, str
             elif field.required:
                 yield f"{key}: this key is needed"
         except msgspec.ValidationError as error:
-            yield explain(error, key, field.type)
+            yield explain(error, key, field.type, options.get(key))
         except ConfigError as error:
             yield str(error)
 
@@ -183,4 +184,4 @@ def _convert_text(key: str, text: str, kind: Any) -> Any:
     try:
         return msgspec.convert(text, kind, strict=False)
     except msgspec.ValidationError as error:
-        raise ConfigError(explain(error, key, kind)) from None
+        raise ConfigError(explain(error, key, kind, text)) from None

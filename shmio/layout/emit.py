@@ -19,8 +19,8 @@ from shmio.layout.report import Report
 from shmio.layout.source.constants import Constants
 from shmio.layout.source.syntax import Assignment, Position
 from shmio.layout.values import calendar
-from shmio.layout.values.codec import brief
 from shmio.layout.values.literal import REPEAT, default_text, split_array, split_items
+from shmio.wording import brief
 
 _NAMED = re.compile(r'\s*(?:"([^"]*)"|(\w+))\s*:=(.*)', re.DOTALL)
 _BRACKETS = {"(": ")", "[": "]"}

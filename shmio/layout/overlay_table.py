@@ -169,7 +169,7 @@ def _entry(given: object) -> _Entry:
     try:
         return msgspec.convert(given, _Entry)
     except msgspec.ValidationError as error:
-        raise ValueError(explain(error, "", _Entry)) from None
+        raise ValueError(explain(error, "", _Entry, given)) from None
 
 
 def _refuse_conversions(entry: _Entry, layout: Layout) -> None:

@@ -32,7 +32,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
 from pathlib import PurePath
-from typing import Annotated, Final, Literal, TypeVar
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 import msgspec
 from msgspec.structs import replace
@@ -172,10 +172,12 @@ def _read(file: str, data: bytes, report: Report, kind: type[_Read]) -> _Read | 
         what = f"a key has more than {MAX_PARTS} parts; write a path with dots in quotes"
         report.add(Diagnostic(file, line, 1, what))
         return None
+    tables: dict[str, Any] = {}
     try:
-        return msgspec.convert(tomllib.loads(text), kind)
+        tables = tomllib.loads(text)
+        return msgspec.convert(tables, kind)
     except msgspec.ValidationError as error:
-        report.add(Diagnostic(file, 1, 1, f"the file is not a tag table: {explain(error, '', kind)}"))
+        report.add(Diagnostic(file, 1, 1, f"the file is not a tag table: {explain(error, '', kind, tables)}"))
     except (ValueError, RecursionError) as error:
         report.add(_syntax_error(file, text, error))
     return None
@@ -365,7 +367,7 @@ def _tag(key: str, given: object) -> _Tag:
             raise ValueError(
                 "initial: expected one flat list, in which the last index varies fastest, found nested lists"
             ) from None
-        raise ValueError(explain(error, "", _Tag)) from None
+        raise ValueError(explain(error, "", _Tag, given)) from None
 
 
 def _is_nested(initial: object) -> bool:

@@ -14,8 +14,9 @@ import numpy.typing as npt
 from shmio.errors import LayoutError, ValueRangeError
 from shmio.layout.image import initial_frame
 from shmio.layout.model import NUMBERS, ByteOrder, Layout, Register
-from shmio.layout.values.codec import brief, codec, scalar_codec
+from shmio.layout.values.codec import codec, scalar_codec
 from shmio.layout.values.write import Write, apply, covering
+from shmio.wording import brief
 
 _NUMBERS: Final = frozenset({int, float, np.float64})
 _PYTHON: Final = frozenset({bool, int, float, str, list, tuple})

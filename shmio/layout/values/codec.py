@@ -27,7 +27,6 @@ Formats: Siemens, "STEP 7 Professional", chapter "Data types".
 
 from __future__ import annotations
 
-import math
 import operator
 import struct
 import sys
@@ -39,6 +38,7 @@ from typing import Any, Protocol
 from shmio.errors import ValueRangeError
 from shmio.layout.model import ByteOrder, ElementType, Register, bit_positions
 from shmio.layout.values import calendar
+from shmio.wording import brief
 
 Buffer = bytes | bytearray | memoryview
 Scalar = bool | int | float | str | None
@@ -583,11 +583,3 @@ def _encode_text(value: object, encoding: str, name: str) -> bytes:
 def out_of_range(value: object, name: str, least: object, most: object) -> ValueRangeError:
     """Create the error for a value outside the range of its type."""
     return ValueRangeError(f"{name}: {brief(value)} is out of range {least}..{most}")
-
-
-def brief(value: object) -> str:
-    """Return a value as a short text for a message; for a huge integer, the number of its bytes."""
-    if isinstance(value, int) and not -(1 << 128) < value < 1 << 128:
-        return f"an integer of {math.ceil(value.bit_length() / 8)} bytes"
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:59]}…"

@@ -15,8 +15,9 @@ from fractions import Fraction
 from shmio.errors import ValueRangeError
 from shmio.layout.model import INTEGERS, ByteOrder, ElementType, Register
 from shmio.layout.values import calendar
-from shmio.layout.values.codec import Scalar, Value, brief, nest, scalar_codec
+from shmio.layout.values.codec import Scalar, Value, nest, scalar_codec
 from shmio.layout.values.text import to_text
+from shmio.wording import brief
 
 MAX_LITERAL = 100  # characters, except for text
 

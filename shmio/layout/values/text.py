@@ -18,7 +18,8 @@ import msgspec
 
 from shmio.errors import ValueRangeError
 from shmio.layout.model import ElementType, Register
-from shmio.layout.values.codec import Scalar, Value, bounds, brief, flatten, out_of_range, scalar_codec, to_bool
+from shmio.layout.values.codec import Scalar, Value, bounds, flatten, out_of_range, scalar_codec, to_bool
+from shmio.wording import brief
 
 WireType = Literal["double", "int", "bool", "string"]
 

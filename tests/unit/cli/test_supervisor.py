@@ -571,8 +571,8 @@ TAKEN = "has the same port as emulator[0].listen (127.0.0.1:1102); choose anothe
     ("old", "new", "error"),
     [
         ("port = 1102", "prot = 1102", "source[0].prot: unknown key; did you mean 'port'?"),
-        ("port = 1102", 'port = "eleven"', "source[0].port: expected a whole number, got text"),
-        ("port = 1102", 'port = "1102"', "source[0].port: expected a whole number, got text"),
+        ("port = 1102", 'port = "eleven"', "source[0].port: expected a whole number, found 'eleven'"),
+        ("port = 1102", 'port = "1102"', "source[0].port: expected a whole number, found '1102'"),
         ('host = "127.0.0.1"', 'host = "127.0.0.1:1102"', "source[0].host: '127.0.0.1:1102' is not a host name"),
         ('host = "127.0.0.1"  ', "# ", 'source[0].host: this key is needed (source "cell")\n'),
         ("port = 1102", 'model = "S7_2000"', "source[0].model: unknown model 'S7_2000'; did you mean 'S7_1200'?"),

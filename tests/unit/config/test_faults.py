@@ -69,8 +69,8 @@ def test_all_faults_are_reported_together_with_their_lines(tmp_path: Path) -> No
         "F:3: instance.clock: unknown clock 'Wall'; did you mean 'wall'?",
         "F:4: instance.ring: unknown key; did you mean 'ring_mb'?",
         'F:6: source[0].connector: this key is needed (source "cell")',
-        'F:8: source[0].layout: expected text or a list in [ ], got a whole number (source "cell")',
-        'F:9: source[0].period_ms: expected a number, got text (source "cell")',
+        'F:8: source[0].layout: expected text or a list in [ ], found 5 (source "cell")',
+        "F:9: source[0].period_ms: expected a number, found 'x' (source \"cell\")",
         "F:12: source[1].name: 'Model' is reserved; choose another name",
         (
             "F:14: source[1].stale_ms: 1 is less than two periods of 20 ms: one late frame would make the source "
@@ -102,8 +102,8 @@ def test_fault_in_a_properties_file_has_its_line(tmp_path: Path) -> None:
     place = tmp_path / "plc.ini"
     assert str(caught.value).split("\n") == [
         f"{place}:2: hosst: unknown key; did you mean 'host'? (source \"c\")",
-        f'{place}:3: port: expected a whole number, got text (source "c")',
-        f'{file}:8: source[0].period_ms: expected a number >= 0.1 (source "c")',
+        f"{place}:3: port: expected a whole number, found 'eleven' (source \"c\")",
+        f'{file}:8: source[0].period_ms: expected a number >= 0.1, found -1 (source "c")',
     ]
 
 
