@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -12,7 +15,7 @@ from shmio.fabric.messages import Entry, decode_entries
 from shmio.layout.model import Layout, Register
 from shmio.recording.block_follower import BlockFollower
 from shmio.recording.format.encoding import BlockPosition, Gap, Reason
-from shmio.segment import Attributes, BlockSpec, BlockWriter, EventKind, Quality, Record, Segment
+from shmio.segment import Attributes, BlockSpec, BlockWriter, Event, EventKind, Frame, Quality, Record, Segment
 
 LAYOUT = Layout("DB1", 1, 4, False, (Register("count", "INT", (), 0, None, 2, 1),))
 
@@ -98,3 +101,40 @@ def test_a_gap_after_packed_frames_is_one_after_taken_frames() -> None:
             assert (after_packed.log_ns, after_packed.item) == (taken.log_ns, taken.item)
         finally:
             segment.unlink()
+
+
+@pytest.fixture
+def interleaved() -> Iterator[None]:
+    """Let threads take turns after a few instructions."""
+    usual_s = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    yield
+    sys.setswitchinterval(usual_s)
+
+
+@pytest.mark.usefixtures("interleaved")
+@pytest.mark.parametrize("read", [lambda of: in_runs(of, 4), lambda of: [item for _, _, item in of.take(8)]])
+def test_events_of_other_threads_have_one_place_among_the_frames(
+    read: Callable[[BlockFollower], Iterable[Entry]],
+) -> None:
+    """Each reader sees an event after the frames that were published before it, and before all others."""
+    block = BlockSpec("cell", LAYOUT, 20_000_000, 500_000_000, 1 << 16, Attributes("s7", ()))
+    with Segment.private("followed", [block], []) as segment:
+        writer, of = segment.writer("cell"), follower(segment)
+        last = {Frame: 0, Event: 0}
+
+        def work(action: str) -> None:
+            for _ in range(50):
+                publish(writer, action, 1)
+
+        for _ in range(20):
+            threads = [threading.Thread(target=work, args=(action,)) for action in ("good", "event", "event")]
+            for thread in threads:
+                thread.start()
+            while any(thread.is_alive() for thread in threads) or of.behind:
+                for item in read(of):
+                    assert isinstance(item, Frame | Event)
+                    last[type(item)] += 1
+                    frames, events = (item.number, item.event) if isinstance(item, Frame) else (item.frame, item.number)
+                    assert (frames, events) == (last[Frame], last[Event])
+        assert last == {Frame: 1000, Event: 2001}
