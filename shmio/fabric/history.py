@@ -10,7 +10,8 @@ import heapq
 import logging
 import os
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import suppress
 from functools import partial
 from itertools import chain, count
 from pathlib import Path
@@ -19,13 +20,14 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from shmio.errors import RecordingError, RemoteError
 from shmio.fabric.connection import INSTALL, call_once
-from shmio.fabric.entries import SourceEntries
-from shmio.fabric.messages import Header, decode_header
+from shmio.fabric.entries import SourceEntries, log_time
+from shmio.fabric.messages import Header, decode_entries, decode_header
 from shmio.fabric.names import CellName, source_of
 from shmio.fabric.place import Place
 from shmio.fabric.registry import CellEntry, Registry
 from shmio.layout.model import Layout
 from shmio.libraries import library
+from shmio.recording.format.encoding import Gap
 from shmio.recording.reading.part import MAX_NS, Entry
 from shmio.recording.reading.reader import Item
 from shmio.recording.rewriting import Rewriter, new_file
@@ -40,7 +42,7 @@ _IDLE_S: Final = 5.0
 _BATCH: Final = 64
 """Number of messages that are asked for at once. They may have 1 MB each."""
 _MARGIN_NS: Final = 5_000_000_000
-"""A live message is made at most this long after its entries, and stored at most this long after others, in ns."""
+"""A live message is stored at most this long after others, in ns."""
 
 log = logging.getLogger("shmio.fabric")
 
@@ -182,7 +184,8 @@ async def _messages(client: Client, cell: CellName, begin_ns: int, end_ns: int) 
     """Yield the messages of a span: first the live ones, then the late ones.
 
     The server's clock and the owner's may differ. The owner's times of live messages increase, so
-    the span is found by them. Late messages are stored at any time after the time of their entries.
+    the span is found by them. An uplink that could not run for a while makes messages long after
+    their entries. Late messages are stored at any time after the time of their entries.
     """
     errors = library("nats.js.errors", INSTALL)
     nats_errors = library("nats.errors", INSTALL)
@@ -199,36 +202,52 @@ async def _messages(client: Client, cell: CellName, begin_ns: int, end_ns: int) 
         return
     first, last = max(1, state.first_seq), state.last_seq
     if begin_ns > _MARGIN_NS:
-        first = await _find(stream, cell, begin_ns - _MARGIN_NS, first, last + 1)
-    after = (
-        last + 1 if end_ns >= MAX_NS - _MARGIN_NS else await _find(stream, cell, end_ns + _MARGIN_NS, first, last + 1)
-    )
+        first = await _find(stream, cell, lambda data: max(_times(data)) >= begin_ns - _MARGIN_NS, first, last + 1)
+    after = last + 1
+    if end_ns < MAX_NS - _MARGIN_NS:
+        after = await _find(stream, cell, lambda data: min(_times(data)) > end_ns + _MARGIN_NS, first, after)
     for subject, end in ((cell.live("*"), after), (cell.late("*"), last + 1)):
         async for message in _range(stream, cell, subject, first, end):
             yield message
 
 
-async def _find(stream: Any, cell: CellName, moment_ns: int, first: int, end: int) -> int:
-    """Return the number of the first live message that was made at or after a time; ``end`` if there is none."""
+def _times(data: bytes) -> list[int]:
+    """Return when a message was made, and the times of its frames and events.
+
+    Raises:
+        ValueError: The message is malformed, or has neither frames nor events.
+
+    """
+    header = decode_header(data)
+    times_ns = [log_time(header, entry) for entry in decode_entries(data) if not isinstance(entry, Gap)]
+    if not times_ns:
+        raise ValueError("the message has neither frames nor events")
+    return [header.made_ns, *times_ns]
+
+
+async def _find(stream: Any, cell: CellName, matches: Callable[[bytes], bool], first: int, end: int) -> int:
+    """Return the number of the first live message that matches; ``end`` if there is none.
+
+    All messages after one that matches must match, too. Messages for which ``matches`` raises a
+    ValueError do not count.
+    """
     errors = library("nats.js.errors", INSTALL)
     low, high = first, end
     while low < high:
         middle = at = (low + high) // 2
-        made_ns = None
-        while made_ns is None and at < high:
+        found: bool | None = None
+        while found is None and at < high:
             try:
-                found = await stream.get_msg(cell.history, seq=at, subject=cell.live("*"), next=True)
+                message = await stream.get_msg(cell.history, seq=at, subject=cell.live("*"), next=True)
             except errors.NotFoundError:
                 break
-            at = found.seq + 1
-            try:
-                made_ns = decode_header(found.data or b"").made_ns
-            except ValueError:
-                continue  # damaged: the next one says the time
-        if made_ns is None or made_ns >= moment_ns:
-            high = middle
-        else:
+            at = message.seq + 1
+            with suppress(ValueError):  # if it does not count, the next one decides
+                found = matches(message.data or b"")
+        if found is False:
             low = at
+        else:
+            high = middle
     return low
 
 

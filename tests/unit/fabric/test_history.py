@@ -157,8 +157,14 @@ def test_restarts_of_uplink_and_instance_and_a_reload(
         assert [block.layout.size for block in dump.blocks] == [2, 6]
 
 
-def test_a_span_of_time_is_found_by_the_owners_clock(segment: Segment, history: History, tmp_path: Path) -> None:
-    """The server's clock differs from the owner's by a day, and late messages come at the end."""
+@pytest.mark.parametrize("stalled", [False, True])
+def test_a_span_of_time_is_found_by_the_owners_clock(
+    segment: Segment, history: History, tmp_path: Path, stalled: bool
+) -> None:
+    """The server's clock differs from the owner's by a day, and late messages come at the end.
+
+    If the uplink is stalled, it makes the messages of 30 s only after this time.
+    """
     history.create()
     uplink = Uplink(segment)
     day_ns = 86_400 * 10**9
@@ -171,6 +177,8 @@ def test_a_span_of_time_is_found_by_the_owners_clock(segment: Segment, history: 
                 "zero_ns": one.header.zero_ns + day_ns + turn * 10**9,
             }
             messages.append(_with(one, **times))
+    if stalled:
+        messages[20:80] = [_with(one, made_ns=messages[80].header.made_ns) for one in messages[20:80]]
     history.publish(*messages[:20], *messages[30:], *map(late, messages[20:30]))
     with open_dump([fetched(history, tmp_path)]) as dump:
         times_ns = [entry.time_ns for entry in dump.frames("cell")]
