@@ -213,9 +213,11 @@ class _Watch:
         """Take note that one of the injections has ended, and say so at once if others remain."""
         if (created := self._left.pop((source, number), None)) is None:
             return
-        text = f"{created} was lifted{f' by {event.by}' if event is not None and event.by else ''}"
-        if event is not None and event.text not in ("", "lifted"):
-            text += f": {printable(event.text)}"
+        said = "" if event is None else printable(event.text)
+        where = said if said.startswith("lifted") else "lifted"
+        text = f"{created} was {where}{f' by {event.sender}' if event is not None and event.by else ''}"
+        if said and where != said:
+            text += f": {said}"
         if self._left:
             print(text, file=sys.stderr, flush=True)
         self._lifted.append(text)

@@ -32,7 +32,7 @@ from shmio.connectors.injection_layers import (
     shadow,
 )
 from shmio.connectors.injection_state import LayerState, check_configured, make_layer, save_layer
-from shmio.connectors.output import Image, LayerPublisher, Output, in_parts, layer_event, lost, pieces
+from shmio.connectors.output import LIFTED, Image, LayerPublisher, Output, in_parts, layer_event, lost, pieces
 from shmio.errors import ConfigError, SegmentError, SnapshotError
 from shmio.injection import Program, compile_program
 from shmio.injection._numbers import evaluate_all
@@ -235,7 +235,7 @@ class DeclaredInjections:
             layer.activation.state = State.LIFTED
             self._publisher.publish()
             records = [*lost(layer, "the injection was lifted"), *self._publisher.computed(self._output.base)]
-            self._output.show([*records, layer_event(EventKind.LIFTED, layer, "lifted", command)])
+            self._output.show([*records, layer_event(EventKind.LIFTED, layer, LIFTED, command)])
         return ""
 
     def follow(self) -> None:
@@ -555,7 +555,7 @@ class InjectionProcessor:
             return self._shadow(layer, command)
         if isinstance(layer, DeclaredLayer) and layer.configured:
             return self.declared.lift(layer, command)
-        self._publisher.lift(lambda other: other is layer, "lifted", command)
+        self._publisher.lift(lambda other: other is layer, LIFTED, command)
         self.declared.settle()
         return ""
 

@@ -27,6 +27,8 @@ EXTRA_FRAMES: Final = 4
 
 At this rate, a ring has room for the frames of 8 s.
 """
+LIFTED: Final = "lifted"
+"""Text of the event if a program has lifted an injection."""
 GROWTH: Final = 64
 """Number of bytes reserved in the segment for each injection: its JSON grows with the numbers in it."""
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec
 
-from shmio.model.values import Quality
+from shmio.model.values import Quality, pid_of
 
 
 class EventKind(StrEnum):
@@ -110,3 +110,11 @@ class Event(msgspec.Struct, frozen=True):
     paths: tuple[str, ...] = ()
     values: Mapping[str, Any] = msgspec.field(default_factory=dict)
     missed: int = 0
+
+    @property
+    def sender(self) -> str:
+        """Who caused the event, for messages: for a program of the instance's host, its pid."""
+        if self.by == "fabric":
+            return "a program of another cell, which shmio-supervisor audit names"
+        pid = pid_of(self.command) if self.by.startswith("program ") else 0
+        return f"pid {pid}" if pid else self.by

@@ -16,6 +16,15 @@ NO_WRITER: Final = 0xFFFFFFFF
 """Takes the place of the number of a command queue, if no program gave the command."""
 
 
+PID_SHIFT: Final = 40
+"""Number of bits of a command's number below the pid of its sender, which has at most 22 bits: proc(5)."""
+
+
+def pid_of(number: int) -> int:
+    """Return the pid of the process that sent a command, from the command's number."""
+    return number >> PID_SHIFT
+
+
 class Quality(IntEnum):
     """Quality of a value, as in OPC UA (OPC 10000-8, section 6.3). Zero is bad."""
 

@@ -20,6 +20,7 @@ from shmio.layout.topic import find_each
 from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.write import Write, bits_of, merge, paths_of
 from shmio.layout.values.write import apply as write_to
+from shmio.model.values import PID_SHIFT
 from shmio.segment import _atomics
 from shmio.segment.events import DONE, ENDS, Event, EventKind
 
@@ -39,9 +40,6 @@ _WRITE: Final = struct.Struct("<IIB7x")
 _KEEP: Final = 2  # flag in the byte of the direction
 
 
-_PID_SHIFT: Final = 40  # pids have at most 22 bits: proc(5)
-
-
 def first_number(pid: int) -> int:
     """Return the number of the first command of a writer in a process.
 
@@ -51,12 +49,7 @@ def first_number(pid: int) -> int:
     """
     import secrets  # noqa: PLC0415  programs that only read need no random numbers, and it loads OpenSSL
 
-    return pid << _PID_SHIFT | secrets.randbits(_PID_SHIFT - 1) | 1
-
-
-def pid_of(number: int) -> int:
-    """Return the pid of the process that sent a command, from the command's number."""
-    return number >> _PID_SHIFT
+    return pid << PID_SHIFT | secrets.randbits(PID_SHIFT - 1) | 1
 
 
 class CommandKind(IntEnum):

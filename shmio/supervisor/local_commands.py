@@ -23,10 +23,10 @@ import msgspec
 from shmio.audit import trail
 from shmio.audit.trail import MAX_NAMED, Acting, Actor, uid_actor
 from shmio.model.clock import Clock
-from shmio.model.values import NO_WRITER
+from shmio.model.values import NO_WRITER, pid_of
 from shmio.segment import Block, Event, EventKind, Segment
 from shmio.segment.clock import StateAction
-from shmio.segment.commands import pid_of, worst
+from shmio.segment.commands import worst
 from shmio.segment.events import ENDS, EVENT_DATA_SIZE
 from shmio.segment.processes import WRITERS
 

@@ -17,7 +17,7 @@ from shmio.connectors.fabric.order import Announced, Lost, MessageOrder, Missing
 from shmio.connectors.fabric.source import Mirror
 from shmio.connectors.injections import Blocks, OwnerOf
 from shmio.connectors.models.stepped import StepClock
-from shmio.connectors.output import Image, Output
+from shmio.connectors.output import LIFTED, Image, Output
 from shmio.connectors.poll_loop import Counters, QualityLog
 from shmio.fabric.messages import (
     ENTRIES_AT,
@@ -385,10 +385,11 @@ class MirrorLoop:
         if event.kind in _LEFT_OUT or (writer := self._injections.writer_of(event)) is None:
             return
         self._writer.cycle = event.cycle
-        text = event.text
+        text, owner = event.text, f"cell {self._mirror.cell}{f' on host {self._link.host}' if self._link.host else ''}"
         if event.kind == EventKind.REJECTED and writer != NO_WRITER:
-            host = f" on host {self._link.host}" if self._link.host else ""
-            text = f"cell {self._mirror.cell}{host}: {text}"
+            text = f"{owner}: {text}"
+        elif event.kind == EventKind.LIFTED and writer == NO_WRITER and text == LIFTED:
+            text = f"lifted in {owner}"
         record = Record(
             cast(EventKind, event.kind), text, writer, event.command, event.item,
             min(event.items, MAX_WRITES), event.offset, event.mask, event.size, event.data, event.injection,

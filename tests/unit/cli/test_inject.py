@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import re
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
@@ -59,11 +60,11 @@ def test_it_ends_when_others_have_lifted_its_injections(segment: Segment, *, rem
             await asyncio.to_thread(cell.lift, "cell", first)
             assert process.stderr is not None
             said = (await asyncio.wait_for(process.stderr.readline(), PATIENCE_S)).decode()
-            assert re.search(rf"^{first}: cell/step/out was lifted by program", said)
+            assert re.search(rf"^{first}: cell/step/out was lifted by pid {os.getpid()}\n", said)
             await asyncio.to_thread(cell.lift, "cell", second)
             status, error = await end(process)
             assert (status, error.count("\n")) == (1, 1)
-            assert re.search(rf"^{second}: cell/running/in was lifted by program", error)
+            assert re.search(rf"^{second}: cell/running/in was lifted by pid {os.getpid()}\n", error)
             await asyncio.to_thread(cell.note, "the end")
             kinds = []
             for event in events:

@@ -140,6 +140,12 @@ def test_a_failure_is_reported_once(mirroring: Mirroring, outcome: str) -> None:
     assert next_one.text == "after"
 
 
+def test_a_lift_by_others_names_the_owner(mirroring: Mirroring) -> None:
+    number = injected(mirroring, writer_of(mirroring)).number
+    mirroring.send(event(EventKind.LIFTED, number + (1 << 41), "lifted", number))
+    assert mirroring.event(EventKind.LIFTED).text == "lifted in cell plant1.line3.a50 on host near.example"
+
+
 def test_a_rejection_by_the_owner_names_its_cell_and_host(mirroring: Mirroring) -> None:
     ticket = writer_of(mirroring).ask_to_inject(OTHER)
     sent(mirroring, "inject")
