@@ -22,6 +22,7 @@ from shmio.cli.common import (
     run,
     seconds,
     seed_number,
+    verb_first,
 )
 from shmio.errors import ConfigError, LayoutError, PathError, ValueRangeError
 from shmio.version import __version__
@@ -34,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run ``shmio-campaign`` and return its exit status."""
     parser = _parser()
     complete(parser)
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse_args(verb_first(sys.argv[1:] if argv is None else argv))
     execute = load(f"shmio.cli.campaigns.{arguments.verb}:{arguments.verb}")
     with exit_on_signals():
         return run(PROGRAM, lambda: execute(arguments), arguments, _status_of)

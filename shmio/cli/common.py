@@ -24,6 +24,8 @@ from shmio.errors import CommandError, ConfigError, ControlError, LayoutError, S
 from shmio.wording import printable
 
 MAX_SECONDS = 86_400
+_TARGETS: Final = ("-c", "--instance", "--host")
+"""Options that name the instance; each takes a value."""
 _MOST: Final = 9_999_999
 SHOWN_CHARACTERS = 60
 """Maximum number of characters of a value that a terminal shows."""
@@ -115,6 +117,17 @@ def add_verbs(
 ) -> argparse._SubParsersAction[argparse.ArgumentParser]:
     """Return the object with which to add verbs to a command."""
     return parser.add_subparsers(dest=dest, required=True, metavar="VERB", parser_class=_VerbParser)
+
+
+def verb_first(words: Sequence[str]) -> list[str]:
+    """Return the words of a command line, with options that name the instance moved from before the verb to after it.
+
+    Users of other commands write ``shmio-supervisor -c FILE status``.
+    """
+    at = 0
+    while at < len(words) and words[at].startswith(_TARGETS):
+        at += 2 if words[at] in _TARGETS else 1
+    return [*words[at : at + 1], *words[:at], *words[at + 1 :]]
 
 
 def complete(parser: argparse.ArgumentParser) -> None:

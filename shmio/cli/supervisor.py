@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from shmio.cli.common import add_json, add_verbs, at_least, complete, load, milliseconds, moment, run
+from shmio.cli.common import add_json, add_verbs, at_least, complete, load, milliseconds, moment, run, verb_first
 from shmio.control import ANSWERS
 from shmio.version import __version__
 
@@ -23,7 +23,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run ``shmio-supervisor`` and return its exit status."""
     parser = _parser()
     complete(parser)
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse_args(verb_first(sys.argv[1:] if argv is None else argv))
 
     detach = arguments.verb == "up" and arguments.detach
     execute = load(f"shmio.cli.instance.{'detach:detach' if detach else arguments.command}")

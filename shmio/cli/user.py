@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from shmio.cli import completion, inject, read, replay, snapshot, step
 from shmio.cli import set as set_verb
-from shmio.cli.common import add_json, add_verbs, complete, ended_by_interrupt, load, run
+from shmio.cli.common import add_json, add_verbs, complete, ended_by_interrupt, load, run, verb_first
 from shmio.config.address import UNIX, Address
 from shmio.errors import ConfigError, UnknownClientError
 from shmio.layout.spelling import may_be_tia_spelling, topic_path
@@ -66,7 +66,7 @@ VERBS = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``shmio`` and return its exit status."""
-    words = list(sys.argv[1:] if argv is None else argv)
+    words = verb_first(sys.argv[1:] if argv is None else argv)
     parser = _parser()
     complete(parser)
     arguments = parser.parse_args(set_verb.shield(words) if words[:1] in (["set"], ["inject"]) else words)

@@ -822,6 +822,19 @@ def test_verbs_report_that_no_instance_is_running(
     assert error.count("\n") == 1
 
 
+def test_the_options_for_the_instance_may_come_before_the_verb(
+    instance: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for words in (["--instance", instance, "status", "--json"], [f"--instance={instance}", "status", "--json"]):
+        assert main(words) == 1
+        assert json.loads(capsys.readouterr().out)["instance"] == instance
+    assert main(["-c", f"{instance}.toml", "check"]) == 1
+    assert f"{instance}.toml: No such file" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["-c", "list"])
+    assert "VERB" in capsys.readouterr().err
+
+
 def test_down_without_an_instance_does_not_suggest_up(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["down", "--instance", instance]) == 1
     assert capsys.readouterr().err == f"no instance {instance!r} is running: nothing to stop\n"
