@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from shmio import garbage
-from shmio.cli.common import add_full, at_least, draw, dumps, ended_by_interrupt, room, seconds
+from shmio.cli.common import add_full, at_least, draw, dumps, room, seconds
 from shmio.errors import NotRunningError, PathError
 from shmio.layout.glob import choose
 from shmio.layout.model import Register
@@ -77,7 +77,6 @@ def get_arguments(parser: argparse.ArgumentParser) -> None:
 def get(cell: Cell, options: argparse.Namespace) -> int:
     """Print the present values. All values of a source are from the same frame."""
     found = cell.get(*options.patterns)
-    load_numpy(found)
     if options.json:
         print(dumps({one.path: object_of(one) for one in found}))
         return 0
@@ -115,8 +114,6 @@ def watch(cell: Cell, options: argparse.Namespace) -> int:
         batches = _rounds(cell, options.patterns, options.every_s)
     width = printed = 0
     for batch in batches:
-        if not printed:
-            load_numpy(batch)
         width = max(width, _width(batch))
         for one in batch:
             if options.json:
@@ -135,8 +132,6 @@ def _table(cell: Cell, options: argparse.Namespace) -> int:
     drawn = 0
     for read in _rounds(cell, options.patterns, options.every_s or TABLE_EVERY_S):
         columns = shutil.get_terminal_size().columns
-        if not drawn:
-            load_numpy(read)
         width, limit = _width(read), room(options)
         if limit is not None:
             limit = min(limit, columns - CLOCK_CHARACTERS - width - 4)
@@ -187,16 +182,6 @@ def _rounds(cell: Cell, patterns: Sequence[str], every_s: float) -> Iterator[Seq
             readings = cell.get(*patterns)
         except PathError as error:
             raise NotRunningError(f"{error}: a reload removed it") from None
-
-
-def load_numpy(readings: Sequence[Reading]) -> None:
-    """Import numpy, which formats REAL values.
-
-    During the import, Ctrl-C ends the process at once.
-    """
-    if any(one.register.element.base == "REAL" for one in readings):
-        with ended_by_interrupt():
-            import numpy as np  # noqa: F401, PLC0415  other values are printed without it
 
 
 def _width(readings: Sequence[Reading]) -> int:

@@ -22,7 +22,7 @@ _LEAST: Final = dict.fromkeys(_LETTERS, 1024) | {Area.TIMER: 512, Area.COUNTER: 
 
 def is_table(layout: Layout) -> bool:
     """Return whether a layout is a tag table with addresses, rather than a data block."""
-    return any(register.address for register in layout.registers)
+    return layout.addressed
 
 
 def place_name(place: Place) -> str:

@@ -247,6 +247,11 @@ class Layout:
         return self if len(self.own) == len(self.registers) else replace(self, registers=self.own)
 
     @cached_property
+    def addressed(self) -> bool:
+        """Whether registers have addresses in a device, as in a tag table."""
+        return any(register.address for register in self.registers)
+
+    @cached_property
     def hash(self) -> bytes:
         """SHA-256 of the canonical JSON: equal for equal layouts."""
         import hashlib  # noqa: PLC0415  programs that only read need no digests, and it loads OpenSSL

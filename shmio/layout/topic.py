@@ -46,8 +46,6 @@ _WIDTHS: Final = {"B": ("BYTE", 1), "W": ("WORD", 2), "D": ("DWORD", 4)}
 _ESCAPE = re.compile(r"%([0-9A-Fa-f]{2})?")
 _RESERVED = re.compile(r"[/%+#]")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
-_NOT_PLAIN = re.compile(r"[%+#\x00-\x1f\x7f]")
-"""Finds the characters that a canonical path has only percent-encoded, or not at all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +135,8 @@ def check_canonical(paths: Sequence[str]) -> None:
 
     """
     text = f"/{'/'.join(paths)}/"
-    plain = _NOT_PLAIN.search(text) is None and not any(segment in text for segment in ("//", "/in/", "/out/"))
+    # Finding a text is faster than a regular expression. No printable text has control characters.
+    plain = text.isprintable() and not any(part in text for part in ("%", "+", "#", "//", "/in/", "/out/"))
     # A path has fewer segments than characters, and most paths are short.
     if plain and (
         max(map(len, paths), default=0) < _MAX_SEGMENTS or all(path.count("/") < _MAX_SEGMENTS for path in paths)

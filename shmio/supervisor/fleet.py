@@ -393,8 +393,9 @@ class Fleet:
     def _spawn(self, managed: ManagedProcess) -> None:
         job = managed.job
         place = self._segment.instance, self._segment.header.epoch
-        description = job.describe(*place)
-        managed.slot.digest = digest(job.identify(*place))
+        identity = job.identify(*place)
+        description = job.describe(*place) if job.rules else identity  # with a layout, it is large
+        managed.slot.digest = digest(identity)
         try:
             child = ChildProcess.spawn(self._modules[job.kind], description, job.log_file)
         except OSError as error:

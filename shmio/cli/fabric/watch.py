@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from shmio.cli.common import dumps, room, say
 from shmio.cli.fabric.access import with_client
-from shmio.cli.read import clock, line_of, load_numpy, object_of
+from shmio.cli.read import clock, line_of, object_of
 from shmio.errors import RemoteError
 from shmio.fabric.connection import is_stored
 from shmio.fabric.live import LiveReadings, Watched
@@ -81,8 +81,6 @@ class _Printer:
 
     def show(self, readings: Sequence[Reading]) -> None:
         """Print a line for each reading."""
-        if not self._printed:
-            load_numpy(readings)
         self._width = max([self._width, *(len(one.path) for one in readings)])
         for one in readings:
             if self.done:

@@ -84,7 +84,7 @@ class S7Connector(S7Client, Connector):
     @classmethod
     def for_layout(cls, layout: Layout) -> type[Connector]:
         """Return this class, or the class of connectors for tag tables if registers have addresses."""
-        if not any(register.address for register in layout.registers):
+        if not layout.addressed:
             return cls
         from shmio.connectors.s7.table import S7TableConnector  # noqa: PLC0415  data blocks do not need it
 

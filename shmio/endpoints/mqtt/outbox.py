@@ -236,11 +236,11 @@ class Outbox:
         self._pass(self._connection, self._due)
 
     def _pass(self, connection: Sender, due: Callable[[], Iterator[tuple[Message, Properties | None]]]) -> None:
-        rest = TURN_MESSAGES
+        rest, messages = TURN_MESSAGES, due()
         while (room := min(connection.room, rest)) > 0:
             rest -= room
             before = self.sent
-            for message, properties in islice(due(), room):
+            for message, properties in islice(messages, room):
                 self.sent += 1
                 connection.send(message, properties)
             if self.sent == before:

@@ -9,10 +9,11 @@ from __future__ import annotations
 import json
 import math
 import re
+import struct
 from collections.abc import Callable
-from decimal import Decimal
+from decimal import ROUND_UP, Context, Decimal
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import msgspec
 
@@ -76,9 +77,40 @@ def shortest(value: float, element: ElementType) -> float:
 
 
 def _shortest_real(value: float) -> float:
-    import numpy as np  # noqa: PLC0415  the command line prints and reads other values without it
+    """Do what ``float(str(numpy.float32(value)))`` does: a command prints a value before it has imported numpy."""
+    if abs(value) <= _EXACT and value.is_integer():
+        return value
+    digits = 7  # most values need 7 or 8
+    while not _is_real(near := float(f"{value:.{digits}g}"), value):
+        # The next REAL toward 0 is nearer to a power of two than the next one away from it.
+        if math.frexp(value)[0] in (0.5, -0.5) and _is_real(near := _away(value, digits), value):
+            return near
+        digits += 1
+    if digits == 7 and _is_real(shorter := float(f"{value:.6g}"), value):
+        near, digits = shorter, 6
+    if abs(value) < _LEAST_NORMAL:
+        while digits > 1 and _is_real(shorter := float(f"{value:.{digits - 1}g}"), value):
+            near, digits = shorter, digits - 1
+    return near  # numbers of up to 6 digits are different REALs from _LEAST_NORMAL on
 
-    return float(str(np.float32(value)))
+
+_EXACT: Final = 1 << 24
+"""Up to this number, all integers are different REALs."""
+_LEAST_NORMAL: Final = 2.0**-126
+_REAL: Final = struct.Struct("<f")
+
+
+def _is_real(near: float, value: float) -> bool:
+    """Return whether a float becomes the REAL ``value``."""
+    try:
+        return _REAL.unpack(_REAL.pack(near))[0] == value  # type: ignore[no-any-return]
+    except OverflowError:
+        return False
+
+
+def _away(value: float, digits: int) -> float:
+    """Return the next number of so many digits whose absolute value is not less than that of ``value``."""
+    return float(Context(digits, ROUND_UP).create_decimal(value))
 
 
 def from_text(text: str, register: Register) -> Value:

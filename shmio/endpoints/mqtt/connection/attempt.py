@@ -22,6 +22,7 @@ from paho.mqtt.reasoncodes import ReasonCode
 from shmio.config.credentials import read_password
 from shmio.config.tls import client_context
 from shmio.endpoints.mqtt.broker.directory import BRIDGE, secret_id, secret_of
+from shmio.endpoints.mqtt.connection.broker_client import BrokerClient
 from shmio.endpoints.mqtt.connection.reconnect import ReconnectPolicy, Target
 from shmio.endpoints.mqtt.topics import Message
 from shmio.errors import ConfigError
@@ -36,22 +37,6 @@ MAX_PACKET_BYTES: Final = 1 << 21
 _WHO: Final = frozenset({0x86, 0x87})
 _BUSY: Final = frozenset({0x88, 0x89, 0x97, 0x9F})
 _TAKEN_OVER: Final = 0x8E
-
-
-class BrokerClient(Client):
-    """A paho client that remembers the TLS error that ended its connection."""
-
-    tls_error: ssl.SSLError | None = None
-    """The TLS error that ended the established connection; None if there was none."""
-
-
-class _TlsClient(BrokerClient):
-    def _sock_recv(self, bufsize: int) -> bytes:
-        try:
-            return super()._sock_recv(bufsize)
-        except ssl.SSLError as error:  # with TLS 1.3 a broker rejects our certificate only after the handshake
-            self.tls_error = error
-            raise
 
 
 class ConnectAttempt:
@@ -135,7 +120,7 @@ class ConnectAttempt:
         own = secret_of(target.host) if target.transport == "unix" else None
         client_id = self._policy.client_id
         # Each attempt has a new client, so that no state is left from the attempt before.
-        client = self.client = (BrokerClient if settings.tls is None else _TlsClient)(
+        client = self.client = BrokerClient(
             CallbackAPIVersion.VERSION2,
             client_id if own is None else secret_id(client_id, own),
             clean_session=None if new else not settings.session_expiry_s,

@@ -24,11 +24,11 @@ from shmio.config import Mqtt
 from shmio.endpoints.mqtt.connection.attempt import (
     CONNECT_S,
     SLOW,
-    BrokerClient,
     ConnectAttempt,
     ended,
     refusal,
 )
+from shmio.endpoints.mqtt.connection.broker_client import BrokerClient
 from shmio.endpoints.mqtt.connection.reconnect import ReconnectPolicy, Target
 from shmio.endpoints.mqtt.connection.socket_io import BATCH, SocketIo
 from shmio.endpoints.mqtt.topics import Message
@@ -54,6 +54,8 @@ OFTEN_S: Final = 60.0
 """If ``OFTEN`` connections are lost within this time in s, the reported problem names a likely cause."""
 REFUSED_S: Final = 10.0
 """Time in s for which a refused message stays the current problem if the broker accepts later messages."""
+FAILURE: Final = 0x80
+"""The least reason code that means a failure (MQTT 5.0, section 2.4)."""
 WITH_WILL: Final = "Disconnect with will message"
 _WATCHED: Final = 1
 """Identifier of the subscription to the bridge's own topics."""
@@ -107,6 +109,14 @@ def _subscription(*, retained: bool) -> SubscribeOptions:
     """
     before = SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE if retained else SubscribeOptions.RETAIN_DO_NOT_SEND
     return SubscribeOptions(1, noLocal=True, retainAsPublished=True, retainHandling=before)
+
+
+def _name(code: int) -> str:
+    """Return the name of the reason code of a PUBACK."""
+    try:
+        return str(ReasonCode(PacketTypes.PUBACK, identifier=code))
+    except (AssertionError, KeyError):  # the code is not in the standard
+        return f"reason code {code:#x}"
 
 
 class ConnectionProblems:
@@ -239,8 +249,15 @@ class BrokerConnection:
     @property
     def room(self) -> int:
         """Number of messages that can be sent now without being queued in memory."""
-        blocked = not self.up or self._socket_io is None or self._socket_io.writing
-        return 0 if blocked else min(BATCH, self._limits.in_flight - len(self._in_flight))
+        if not self.up or self._socket_io is None or self._socket_io.writing:
+            return 0
+        most = self._limits.in_flight
+        room = min(BATCH, most - len(self._in_flight))
+        if self._target is not None and self._target.transport == "unix":
+            # Else a message would follow each acknowledgement, and the batches would be small. With TCP, the broker
+            # may hold acknowledgements back until it has received something.
+            return room if room >= min(BATCH, most // 4) else 0
+        return room
 
     @property
     def in_flight(self) -> int:
@@ -291,7 +308,7 @@ class BrokerConnection:
         client.on_disconnect = self._disconnected
         client.on_subscribe = self._subscribed
         self._client, self._socket_io = client, SocketIo(client, made, self._selector, self.drop)
-        client.on_publish = self._socket_io.counting(self._acknowledged)
+        client.on_acknowledged = self._acknowledged
         client.on_message = self._socket_io.counting(self._received)
 
     # ---- callbacks of the client -------------------------------------------------------------------------------------
@@ -323,12 +340,10 @@ class BrokerConnection:
         why = ended(self._client.tls_error, up=self.at is not None, tls=tls)
         self.drop(refusal(code, self._policy) if by_broker else why)
 
-    def _acknowledged(
-        self, client: Client, _data: Any, mid: int, code: ReasonCode, _properties: Properties | None
-    ) -> None:
-        message = self._in_flight.pop(mid, None) if client is self._client else None
-        if message is not None and code.is_failure:
-            self.problems.message_refused(f"broker {self._target} refuses messages: {code}: {message.topic}")
+    def _acknowledged(self, identifier: int, code: int) -> None:
+        message = self._in_flight.pop(identifier, None)
+        if message is not None and code >= FAILURE:
+            self.problems.message_refused(f"broker {self._target} refuses messages: {_name(code)}: {message.topic}")
         else:
             self.problems.message_accepted()
 
@@ -413,10 +428,12 @@ class BrokerConnection:
             )
             return
         qos, retain = message.qos and limits.qos, message.retain and limits.retain
-        info = client.publish(message.topic, message.payload, qos, retain, properties if self.mqtt5 else None)
+        identifier = client.queue_message(
+            message.topic, message.payload, qos, properties, retain=retain, unacknowledged=self._in_flight
+        )
         self.sent_bytes += len(message.topic.encode()) + len(message.payload)
         if qos:
-            self._in_flight[info.mid] = message
+            self._in_flight[identifier] = message
         else:
             self.problems.message_accepted()
 

@@ -5,6 +5,7 @@ It reads a few packets at a time, and writes in batches.
 
 from __future__ import annotations
 
+import os
 import selectors
 import socket
 import ssl
@@ -12,10 +13,10 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Final
 
-from paho.mqtt.client import Client
 from paho.mqtt.enums import MQTTErrorCode
 
 from shmio.endpoints.mqtt.connection.attempt import close_socket
+from shmio.endpoints.mqtt.connection.broker_client import BrokerClient
 
 BATCH: Final = 32
 """Maximum number of messages in a batch.
@@ -26,8 +27,7 @@ made.
 PACKETS: Final = 4
 """Number of packets after which reading stops, so that the bridge can do other work.
 
-More packets may be read: one call of paho may read a packet for each unacknowledged message. That
-takes hardly any time.
+Acknowledgements do not count, because they take hardly any time.
 """
 
 
@@ -40,7 +40,7 @@ class SocketIo:
 
     def __init__(
         self,
-        client: Client,
+        client: BrokerClient,
         made: socket.socket,
         selector: selectors.BaseSelector,
         on_failure: Callable[[str], object],
@@ -62,7 +62,13 @@ class SocketIo:
         """Number of received packets for which one of the client's callbacks was called."""
         client.on_socket_register_write = lambda *_: None  # from now on this object writes, not paho
         _set(made, socket.TCP_NODELAY, 1)  # a batch does not wait for TCP's acknowledgement of the previous batch
+        self._unseen = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        """Wakes the selector for data that the client or TLS has buffered, which it does not see."""
+        self._more = False
+        """True while such data wait for the next turn of the selector."""
         selector.register(made, selectors.EVENT_READ, self._serve)
+        selector.register(self._unseen, selectors.EVENT_READ, self._serve_unseen)
+        self._note_unseen()
 
     def counting(self, callback: Callable[..., None]) -> Callable[..., None]:
         """Return a callback that calls ``callback``, and counts its calls."""
@@ -74,11 +80,9 @@ class SocketIo:
         return counted
 
     def run_once(self) -> float:
-        """Read data that the selector cannot see. Return the time in s after which to call this method again."""
-        if self._unseen():
-            self._serve(selectors.EVENT_READ)
+        """Write queued messages. Return the time in s after which to call this method again."""
         self.push()
-        return 0.0 if self._unseen() else 1.0
+        return 1.0
 
     def push(self) -> None:
         """Write the messages that the client has queued to the socket."""
@@ -88,14 +92,17 @@ class SocketIo:
     def close(self) -> None:
         """Close the socket."""
         if self._socket is not None:
-            with suppress(KeyError, ValueError):
-                self._selector.unregister(self._socket)
+            for file in (self._socket, self._unseen):
+                with suppress(KeyError, ValueError):
+                    self._selector.unregister(file)
+            os.close(self._unseen)
             self._socket = None
         close_socket(self._client)
 
     def _serve(self, events: int) -> None:
         """Read and write the socket, as far as this does not block."""
-        code = self._read() if events & selectors.EVENT_READ else MQTTErrorCode.MQTT_ERR_SUCCESS
+        reads = events & selectors.EVENT_READ and not self._more  # else it would read twice in one turn
+        code = self._read() if reads else MQTTErrorCode.MQTT_ERR_SUCCESS
         if not code and self._socket is not None and (events & selectors.EVENT_WRITE or not self.writing):
             code = self._write(self._socket)
         if code and self._socket is not None:
@@ -104,12 +111,11 @@ class SocketIo:
             self.writing = not self.writing  # to be woken when the socket has room for the rest
             events = selectors.EVENT_READ | (selectors.EVENT_WRITE if self.writing else 0)
             self._selector.modify(self._socket, events, self._serve)
+        if self._socket is not None:
+            self._note_unseen()
 
     def _read(self) -> MQTTErrorCode:
-        """Read a few packets.
-
-        One call of paho may read several, so this may read more than ``PACKETS``.
-        """
+        """Read a few packets."""
         before, most = -1, self._packets + PACKETS
         code = MQTTErrorCode.MQTT_ERR_SUCCESS
         while not code and before < self._packets < most and self._socket is not None:
@@ -123,18 +129,22 @@ class SocketIo:
         Do not use this for a DISCONNECT. Paho closes the socket after it, and corked data may be
         lost.
         """
-        client = self._client
-        # Otherwise paho would call on_publish for each message of QoS 0, which is slow.
-        acknowledged, client.on_publish = client.on_publish, None
         _set(made, socket.TCP_CORK, 1)
-        code = client.loop_write()
+        code = self._client.loop_write()
         _set(made, socket.TCP_CORK, 0)
-        client.on_publish = acknowledged
         return code
 
-    def _unseen(self) -> bool:
-        """Return whether TLS has buffered data, which the selector does not see."""
-        return isinstance(self._socket, ssl.SSLSocket) and self._socket.pending() > 0
+    def _serve_unseen(self, events: int) -> None:
+        if self._socket is not None:  # else it was closed in this turn of the selector
+            os.eventfd_read(self._unseen)
+            self._more = False
+            self._serve(events)
+
+    def _note_unseen(self) -> None:
+        unseen = self._client.unread or (isinstance(self._socket, ssl.SSLSocket) and self._socket.pending())
+        if unseen and not self._more:
+            self._more = True
+            os.eventfd_write(self._unseen, 1)
 
 
 def _set(made: socket.socket, option: int, value: int) -> None:

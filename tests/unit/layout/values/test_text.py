@@ -67,6 +67,14 @@ def test_real_is_the_shortest_text(value: float) -> None:
         assert digits <= 1 or np.float32(float(fewer)) != np.float32(value)
 
 
+def test_real_has_the_same_digits_as_in_numpy() -> None:
+    """At powers of two, the REALs below are nearer than those above; the least REALs have fewer digits."""
+    patterns = [exponent << 23 | least for exponent in range(255) for least in (0, 1, 2, (1 << 23) - 1)]
+    numbers = np.array([*patterns, *range(1000), 0x3DCCCCCD, 0x7F7FFFFF], np.uint32).view(np.float32)
+    for number in [*numbers, *-numbers]:
+        assert to_text(float(number), register("REAL")) == repr(float(str(number)))
+
+
 @given(st.floats(allow_nan=False))
 def test_lreal_survives_a_round_trip(value: float) -> None:
     assert from_text(to_text(value, register("LREAL")), register("LREAL")) == value

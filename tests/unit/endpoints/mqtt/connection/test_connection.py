@@ -84,6 +84,13 @@ class Broker:
             while length:
                 length -= len(self._socket.recv(length))
 
+    def expect(self, data: bytes) -> None:
+        """Assert that exactly these bytes arrive next."""
+        got = b""
+        while len(got) < len(data):
+            got += self._socket.recv(len(data) - len(got))
+        assert got == data
+
     def put(self, packet: str) -> None:
         self._socket.sendall(bytes.fromhex(packet))
 
@@ -178,6 +185,74 @@ def test_messages_are_sent_on_push_and_returned_when_the_connection_is_lost() ->
                 connection.send(message)
             broker.say("e0 00", lambda: not connection.up)  # the connection ends before they are sent
             assert lost == messages[1:]
+        finally:
+            broker.close()
+
+
+@pytest.mark.parametrize("size", [1, 7, 1000])
+def test_acknowledgements_come_in_any_form_and_in_pieces(size: int) -> None:
+    """Another packet follows them in the same piece, or begins in it."""
+    text = bytes([0x1F, 0x00, 0xC8]) + b"x" * 200  # the property that has the reason as text
+    packets = [
+        bytes.fromhex("40 02 00 01"),
+        bytes.fromhex("40 03 00 02 10"),
+        bytes.fromhex("40 04 00 03 00 00"),
+        bytes.fromhex("40 d0 01 00 04 00 cb 01") + text,
+        bytes.fromhex("40 03 00 05 ee"),
+        bytes.fromhex("30 06 00 01 61 00 68 69"),
+        bytes.fromhex("40 02 00 06"),
+        bytes.fromhex("30 06 00 01 62 00 68 6f"),
+    ]
+    received: list[tuple[str, bytes]] = []
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        broker = Broker(server)
+        connection = broker.connection
+        connection.on_message = lambda message: received.append((message.topic, bytes(message.payload)))
+        try:
+            for number in range(6):
+                connection.send(Message(f"t{number}", b"1", 1, retain=True))
+            connection.push()
+            broker.hear(0x30, 6)
+            data = b"".join(packets)
+            for at in range(0, len(data), size):
+                broker.put(data[at : at + size].hex())
+                connection.run_once()
+            broker.turn_until(lambda: len(received) == 2)
+            assert (connection.in_flight, received) == (0, [("a", b"hi"), ("b", b"ho")])
+            assert connection.problem.endswith("refuses messages: reason code 0xee: t4")
+        finally:
+            broker.close()
+
+
+def test_a_malformed_acknowledgement_ends_the_connection() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        broker = Broker(server)
+        try:
+            broker.say("40 01 00", lambda: not broker.connection.up)
+        finally:
+            broker.close()
+
+
+def test_joined_messages_arrive_as_they_were_sent() -> None:
+    """With QoS 0 and 1, and with other packets between them."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        broker = Broker(server)
+        connection = broker.connection
+        try:
+            connection.send(Message("a", b"1", 0, retain=False))
+            connection.send(Message("b/ä", b"22", 1, retain=True))
+            connection.subscribe(["c"])
+            connection.send(Message("d", bytes(200), 1, retain=False))
+            with pytest.raises(ValueError, match="wildcards"):
+                connection.send(Message("e/+", b"", 1, retain=False))
+            connection.push()
+            expected = (
+                "30 05 00 01 61 00 31",
+                "33 0b 00 04 62 2f c3 a4 00 01 00 32 32",
+                "82 07 00 02 00 00 01 63 2d",
+                f"32 ce 01 00 01 64 00 03 00 {'00' * 200}",
+            )
+            broker.expect(bytes.fromhex("".join(expected)))
         finally:
             broker.close()
 
