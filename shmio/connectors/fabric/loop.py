@@ -409,11 +409,13 @@ class MirrorLoop:
         self._open = self._good = False
         self.commands.close(reason)
         self._bad = True
-        if self._quality_log.update(Quality.BAD, reason, self._writer.cycle):
-            last = self._output.last
+        last = self._output.last
+        # Not the cycle of the last event: the owner's frame with that cycle may still come.
+        cycle = self._writer.cycle if last is None else last.cycle
+        if self._quality_log.update(Quality.BAD, reason, cycle):
             provenance = Provenance.LIVE if last is None else last.provenance
             image = Image(
-                self._output.raw, self._writer.cycle, self._output.source_ns, Quality.BAD, provenance, reason,
+                self._output.raw, cycle, self._output.source_ns, Quality.BAD, provenance, reason,
                 shown=None if last is None else last.shown,
             )  # fmt: skip
             self._output.publish(image)

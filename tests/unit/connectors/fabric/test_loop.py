@@ -254,6 +254,21 @@ def test_a_lost_connection_is_the_reason_for_bad_quality(mirroring: Mirroring) -
     assert "plant1.line3.a50 sends nothing" in mirroring.next().reason, "the server has no JetStream, for example"
 
 
+def test_a_bad_frame_of_the_mirror_takes_no_cycle_of_a_frame_that_comes_late(mirroring: Mirroring) -> None:
+    """The owner publishes events of a cycle before its frame, and before a late frame of the cycle before."""
+    accepted = Event(4, EventKind.ACCEPTED, 7, 1009, 0, 0, 9, 3, Quality.GOOD, 5, 99, 0, 1, 0, 0, 2, b"\0\5", "")
+    mirroring.send(frame(7, 1), accepted)
+    mirroring.next()
+    mirroring.event(EventKind.ACCEPTED)
+    mirroring.link.problem = "the connection is lost"
+    assert mirroring.next().quality is Quality.BAD
+    mirroring.link.problem = ""
+    mirroring.send(frame(8, 2), frame(9, 3))
+    assert [found.cycle for found in (mirroring.next(), mirroring.next())] == [1008, 1009]
+    cycles = [found.cycle for number in range(1, 5) if (found := mirroring.block.read(number)) is not None]
+    assert cycles == [1007, 1007, 1008, 1009]
+
+
 def test_events_of_the_owner_have_no_writer(mirroring: Mirroring) -> None:
     written = Event(
         4, EventKind.WRITTEN, 7, 1007, 0, 0, 9, 3, Quality.GOOD, 5, 99, 1, 2, 0, 0, 2, b"\0\5", "by the owner"
