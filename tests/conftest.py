@@ -296,6 +296,14 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
+    """Exclude what the tests of a module imported, too, as soon as its fixtures have ended."""
+    if nextitem is None or nextitem.path != item.path:
+        gc.collect()
+        gc.freeze()
+
+
 def segments() -> set[str]:
     """Return this run's segments; other instances on this host do not count."""
     return {entry.name for entry in SHM.iterdir() if entry.name.startswith(f"shmio-{PREFIX}")}
