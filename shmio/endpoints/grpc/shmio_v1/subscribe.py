@@ -26,8 +26,8 @@ from shmio.endpoints.grpc.shmio_v1.tables import (
     stale_fields,
 )
 from shmio.endpoints.grpc.streams.feed import VirtualTime
-from shmio.endpoints.grpc.streams.outbox import OpenStreams, SendQueue
-from shmio.endpoints.grpc.time.timeline import PATIENCE_S, Timeline
+from shmio.endpoints.grpc.streams.outbox import OpenStreams, SendQueue, StepStream
+from shmio.endpoints.grpc.time.timeline import Timeline
 from shmio.endpoints.grpc.wakeups import Callback, WakeUps
 from shmio.errors import EndpointError, PathError, SegmentError, ShmioError, ValueRangeError
 from shmio.local.time_control import Step
@@ -244,7 +244,8 @@ class SubscribeCall:
         """True if a step has waited too long for the client; see :meth:`give_up`."""
         self._virtual_time = virtual_time
         self._opened = False
-        self._step_marks: deque[tuple[Step, asyncio.Future[None]]] = deque()
+        self.on_taken: Callable[[StepStream], object] | None = None
+        self._step: Step | None = None  # the step whose marker waits
         self._selections = selections
         self._wake_ups = wake_ups
         self._request = request
@@ -284,12 +285,12 @@ class SubscribeCall:
 
     def close(self) -> None:
         """Stop following the blocks."""
-        while self._step_marks:
-            _set(self._step_marks.popleft()[1])
+        self._step = None
         for place in self._wanted:
             self._leave(place)
+        self._report_taken()
 
-    def give_up(self) -> None:
+    def give_up(self, _: str) -> None:
         """End the call, because its client is too slow for the steps.
 
         The call stops following its blocks at once. The stream ends when the client reads again.
@@ -307,21 +308,25 @@ class SubscribeCall:
         self._moved |= dict.fromkeys(place for place in self._wanted if place.source in sources)
         self._wake.set()
 
-    def mark(self, step: Step) -> asyncio.Future[None]:
+    def mark(self, step: Step) -> bool:
         """Queue the marker of a step. The marker is sent after the changes of the step.
 
         Returns:
-            A future that is done when the marker has been sent or the call has ended. If the call
-            is not open yet, the future is done at once, because :meth:`open` can take seconds.
+            Whether the client has to take them. If the call is not open yet, it has not, because
+            :meth:`open` can take seconds.
 
         """
-        sent = asyncio.get_running_loop().create_future()
         if self.late or not self._opened:
-            sent.set_result(None)
-        else:
-            self._step_marks.append((step, sent))
-            self._wake.set()
-        return sent
+            return False
+        self._step = step
+        self._wake.set()
+        return True
+
+    def _report_taken(self) -> None:
+        """Report that the client has taken a step's marker, or that the call has ended."""
+        if self.on_taken is not None:
+            taken, self.on_taken = self.on_taken, None
+            taken(self)
 
     async def messages(self) -> AsyncIterator[bytes]:
         """Yield serialised SubscribeResponses, without end.
@@ -336,12 +341,10 @@ class SubscribeCall:
                     raise EndpointError(inward.failure)
             self._wake.clear()  # before the checks, so that no wake-up is lost
             batch, whole = self._batch()
-            if self._step_marks and whole and not self._moved:
-                step, sent = self._step_marks.popleft()
-                try:
-                    yield batch + field(STEP, wire.Step(number=step.number, time_ns=step.time_ns).SerializeToString())
-                finally:
-                    _set(sent)
+            if (step := self._step) and whole and not self._moved:
+                self._step = None
+                yield batch + field(STEP, wire.Step(number=step.number, time_ns=step.time_ns).SerializeToString())
+                self._report_taken()
             elif batch:
                 yield batch
             elif self._moved:
@@ -386,7 +389,7 @@ class SubscribeCall:
         ended.
         """
         suspended = self._virtual_time.on and updates.view.block.attributes.stepped
-        return not suspended or bool(self._step_marks) or updates.follower.frame is None
+        return not suspended or self._step is not None or updates.follower.frame is None
 
     def _ring(self, updates: BlockUpdates) -> None:
         """Wake the stream, because a block has a new frame or event."""
@@ -439,11 +442,6 @@ class SubscribeCall:
             inward.leave()
         if updates := self._blocks.pop(place, None):
             self._wake_ups.leave(updates.view.block, self._rings.pop(place))
-
-
-def _set(sent: asyncio.Future[None]) -> None:
-    if not sent.done():
-        sent.set_result(None)
 
 
 class SubscribeCalls:
@@ -518,17 +516,9 @@ class SubscribeCalls:
             self._ended_updates += subscription.updates
             subscription.close()
 
-    async def deliver(self, step: Step) -> None:
-        """Send the changes and the marker of a step on all streams, and wait until they are sent."""
-        marks = {subscription.mark(step): subscription for subscription in self._open}
-        try:
-            async with asyncio.timeout(PATIENCE_S):
-                for mark in marks:
-                    await mark
-        except TimeoutError:
-            for mark, subscription in marks.items():
-                if mark.cancelled() or not mark.done():  # the time-out cancels the one that it has waited for
-                    subscription.give_up()
+    def deliver(self, step: Step) -> list[SubscribeCall]:
+        """Send the changes and the marker of a step on all streams. Return the streams that have to take them."""
+        return [subscription for subscription in self._open if subscription.mark(step)]
 
     def release(self) -> None:
         """Wake all streams: time is real again, so values no longer wait for steps."""

@@ -12,7 +12,7 @@ from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator, Sized
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from shmio.endpoints.grpc.encoding import Subject
 from shmio.endpoints.grpc.streams.back_pressure import LATE_S, Backlog, LossMonitor, TotalBacklog
@@ -33,6 +33,16 @@ STEP_BOUND_BYTES: Final = 64 << 20
 Finish = Callable[[Any], bytes]
 
 
+class StepStream(Protocol):
+    """A stream that has to take its part of a step."""
+
+    on_taken: Callable[[StepStream], object] | None
+    """Called once, when the client has taken the stream's part of a step, or when the stream has ended."""
+
+    def give_up(self, reason: str) -> None:
+        """End the stream, because its client takes too long."""
+
+
 class Outbox:
     """The waiting messages of a stream, in the order in which they came. Each topic has a lane of its own.
 
@@ -51,9 +61,9 @@ class Outbox:
         self._next = 0
         self._waiter: asyncio.Future[None] | None = None
         self._ended = False
-        self._required = 0  # delivered() waits for the messages before this number
+        self._required = 0  # the client has to take the messages before this number
         self._taken = 0  # messages before this number were sent or dropped
-        self._delivery: asyncio.Future[None] | None = None
+        self.on_taken: Callable[[StepStream], object] | None = None
         self._asked = False  # whether the reader waits
         self.losses = LossMonitor()
         self.refills: dict[Callable[[], object], None] = {}
@@ -129,27 +139,23 @@ class Outbox:
             asyncio.get_running_loop().call_soon(self.on_failure)  # later, as the caller may iterate over listeners
 
     def require_delivery(self) -> None:
-        """Make :meth:`delivered` wait for all messages that have been added so far."""
+        """Require that the client take all messages that have been added so far, before a step ends."""
         self._required = self._next
 
     @property
     def delivery_pending(self) -> bool:
-        """True if the client has not yet taken all messages that :meth:`delivered` waits for."""
+        """True if the client has not yet taken all messages that :meth:`require_delivery` marked."""
         return self._taken < self._required and not self.failure
 
-    async def delivered(self) -> None:
-        """Wait until the client has taken all messages marked by :meth:`require_delivery`, or until the stream ends."""
-        while self.delivery_pending:
-            self._delivery = asyncio.get_running_loop().create_future()
-            try:
-                await self._delivery
-            finally:
-                self._delivery = None
+    def give_up(self, reason: str) -> None:
+        """End the stream, because its client takes too long."""
+        self.fail(reason)
 
     def _report_delivery(self) -> None:
-        """Wake :meth:`delivered` if the client has taken all messages that it waits for."""
-        if self._delivery is not None and not self._delivery.done() and not self.delivery_pending:
-            self._delivery.set_result(None)
+        """Call :attr:`on_taken` if the client has taken all messages that it has to take."""
+        if self.on_taken is not None and not self.delivery_pending:
+            taken, self.on_taken = self.on_taken, None
+            taken(self)
 
     async def pop(self) -> bytes | None:
         """Wait for the oldest message, and return it. After :meth:`end`, return None.
@@ -159,7 +165,7 @@ class Outbox:
         """
         waiting = self._waiting
         self._taken = next(iter(waiting)) if waiting else self._next
-        if self._delivery is not None:
+        if self.on_taken is not None:
             self._report_delivery()
         self._asked = True
         while not waiting:
@@ -372,22 +378,9 @@ class Outboxes:
             self._dropped += outbox.dropped
             outbox.close()
 
-    async def delivered(self, patience_s: float) -> None:
-        """Wait until all clients have taken the messages marked by :meth:`Outbox.require_delivery`.
-
-        If a client has not done so within ``patience_s``, its stream fails.
-        """
-        late = [outbox for outbox in self._open if outbox.delivery_pending]
-        if not late:
-            return
-        try:
-            async with asyncio.timeout(patience_s):
-                for outbox in late:
-                    await outbox.delivered()
-        except TimeoutError:
-            for outbox in late:
-                if outbox.delivery_pending:
-                    outbox.fail(f"the client has not taken the values of a step within {patience_s:g} s")
+    def undelivered(self) -> list[Outbox]:
+        """Return the outboxes whose clients have not yet taken all messages of a step."""
+        return [outbox for outbox in self._open if outbox.delivery_pending]
 
 
 MAX_WAITING: Final = 4096

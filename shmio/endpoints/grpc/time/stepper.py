@@ -36,44 +36,54 @@ class StepDriver:
         self._clock = clock
         self._wake_ups = wake_ups
         self._delivered: WakeUp | None = None  # made when needed: usually no other process delivers steps
+        self._woken: asyncio.Future[None] | None = None
+        self._stopped = False
 
     async def step(self, dt_ns: int | None) -> Step:
-        """Make one step. If the task is cancelled, the step is aborted.
+        """Make one step. If the task is cancelled meanwhile, raise CancelledError when the step has ended.
 
         ``dt_ns`` is the length of the step, in ns; None for the step size. This raises the errors
         of :meth:`Coordinator.step`.
         """
         until_ns = time.monotonic_ns() + BRIEF_NS
+        cancelled = False
         with closing(self._coordinator.stepping(dt_ns)) as stepping:
-            while True:
+            while not self._stopped:
                 try:
                     wait = next(stepping)
                 except StopIteration as over:
                     step: Step = over.value
+                    if cancelled:
+                        break
                     return step
                 if not _brief(wait, until_ns - time.monotonic_ns()):
-                    await self._wait(wait)
+                    try:
+                        await self._wait(wait)
+                    except asyncio.CancelledError:
+                        cancelled = True
+        raise asyncio.CancelledError
 
     def stop(self) -> None:
-        """Stop waiting for other processes to deliver steps."""
+        """Abort the present step, and make no others. Stop waiting for other processes to deliver steps."""
+        self._stopped = True
+        self._ring()
         if self._delivered is not None:
             self._delivered.stop()
             self._delivered.join()
 
     async def _wait(self, wait: StepWait) -> None:
         """Wait until the step may continue, or until it is time to check again."""
-        woken = asyncio.get_running_loop().create_future()
-
-        def ring() -> None:
-            if not woken.done():
-                woken.set_result(None)
-
-        leave = self._listen(wait, ring)
+        self._woken = asyncio.get_running_loop().create_future()
+        leave = self._listen(wait, self._ring)
         try:
             if wait.seen == (wait.block.ring.doorbell() if wait.block else self._clock.delivered_bell.value()):
-                await woken
+                await self._woken
         finally:
             leave()
+
+    def _ring(self) -> None:
+        if self._woken is not None and not self._woken.done():
+            self._woken.set_result(None)
 
     def _listen(self, wait: StepWait, ring: Callable[[], None]) -> Callable[[], object]:
         block = wait.block
@@ -214,7 +224,6 @@ class Stepper:
         self._lock = asyncio.Lock()  # only one task moves time
         self._owns = False
         self._changing = asyncio.Lock()  # only one task starts or stops playing
-        self._moving: asyncio.Task[Any] | None = None
         self._rest: asyncio.TimerHandle | None = None
         self._rest_s = 0.0  # when control of time is released
         self._player = Player(self._make, lambda: segment.clock.read().step_size_ns)
@@ -274,14 +283,13 @@ class Stepper:
             ValueRangeError: ``dt_ns`` is out of range.
 
         """
-        done: asyncio.Future[Step] = self._loop.create_future()
         with _attempt("step", dt_ns) as attempt:
-            task = self._spawn(_complete(self._step(dt_ns, peer), done))
-            try:
-                step = await done
-            finally:
-                if task is not self._moving:  # do not abort a step in progress
-                    task.cancel()
+            _check(dt_ns)
+            if peer:
+                await self._settle(peer)
+            if self._player.on:
+                raise TimeError("time is playing; pause it before you step it")
+            step = await self._make(dt_ns)
             attempt.what = {"step": step.number, "dt_s": step.dt_ns / 1e9, "time_s": step.time_ns / 1e9}
             attempt.end("done")
         return step
@@ -343,14 +351,15 @@ class Stepper:
         """Stop moving time. If this process was playing, the next process of this endpoint resumes playing."""
         if self._rest is not None:
             self._rest.cancel()
+        self._driver.stop()
+        self.timeline.stop()
         tasks = list(self._tasks)
         for task in tasks:
             task.cancel()
         await asyncio.gather(self._player.break_off(), *tasks, return_exceptions=True)
-        if not self._player.on:
-            self._coordinator.close()
-        self._driver.stop()
-        await self.timeline.stop()
+        async with self._lock:  # the steps in progress have ended
+            if not self._player.on:
+                self._coordinator.close()
 
     # ---- moving time ---------------------------------------------------------------------------------------------
 
@@ -362,14 +371,6 @@ class Stepper:
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return task
-
-    async def _step(self, dt_ns: int | None, peer: str) -> Step:
-        _check(dt_ns)
-        if peer:
-            await self._settle(peer)
-        if self._player.on:
-            raise TimeError("time is playing; pause it before you step it")
-        return await self._make(dt_ns)
 
     async def _make(self, dt_ns: int | None) -> Step:
         """Make a step and deliver it."""
@@ -388,7 +389,8 @@ class Stepper:
     async def _moved(self) -> AsyncIterator[None]:
         """Take control of time. Until the block ends, no other client of this endpoint can move time."""
         async with self._lock:
-            self._moving, self.timeline.steered = asyncio.current_task(), True
+            await self.timeline.delivered()
+            self.timeline.steered = True
             try:
                 if self._segment.outdated:
                     await asyncio.to_thread(self._segment.refresh)
@@ -398,7 +400,7 @@ class Stepper:
                     self.timeline.update()
                 yield
             finally:
-                self._moving, self.timeline.steered = None, False
+                self.timeline.steered = False
                 self.timeline.update()
                 self._set_rest()
 
@@ -456,21 +458,6 @@ class Stepper:
             await self._player.end()
             await self._change(partial(self._coordinator.set_playing, False), end=end)
         return self.timeline.status
-
-
-async def _complete(work: Coroutine[Any, Any, _Result], done: asyncio.Future[_Result]) -> None:
-    """Await ``work``, and pass its result or error to ``done``, unless ``done`` is cancelled."""
-    try:
-        result = await work
-    except Exception as error:  # noqa: BLE001  passed on to the waiting task
-        if not done.done():
-            done.set_exception(error)
-    except asyncio.CancelledError:
-        done.cancel()
-        raise
-    else:
-        if not done.done():
-            done.set_result(result)
 
 
 def _attempt(action: str, dt_ns: int | None, **more: float) -> Attempt:

@@ -6,23 +6,17 @@ import asyncio
 import logging
 from collections.abc import Callable, Mapping, Sized
 from functools import partial
-from typing import Any, Final, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 from shmio.endpoints.grpc.streams.feed import Feed, Moment, VirtualTime
 from shmio.endpoints.grpc.streams.outbox import OpenStreams, Outboxes
+from shmio.endpoints.grpc.time.delivery import Delivery, StepReceiver
 from shmio.endpoints.grpc.topics import TimeTopic
 from shmio.endpoints.grpc.wakeups import WakeUp
 from shmio.errors import SegmentError
 from shmio.local.time_control import Step
 from shmio.model.clock import Clock
 from shmio.segment import ProcessSlot, Segment
-
-PATIENCE_S: Final = 3.0
-"""Maximum time in s for clients to take the values of a step, and again to take the step's marker.
-
-Clients of shmio.v1 get a step after the other clients. The total is less than the time-out of a
-step. If only one stream is open, it has this time once, for values and marker together.
-"""
 
 log = logging.getLogger("shmio.grpc")
 
@@ -138,102 +132,6 @@ class TimeTopics:
             self._timer = None
 
 
-class StepReceiver(Protocol):
-    """A service that delivers steps to its own streams."""
-
-    @property
-    def streams(self) -> int:
-        """Number of the service's open streams."""
-
-    async def deliver(self, step: Step) -> None:
-        """Send the changes of a step, and then its marker. Wait until all streams have taken both."""
-
-    def release(self) -> None:
-        """Send values without waiting for steps, because time is real again."""
-
-
-class _Delivery:
-    """Delivers steps in order to all streams, whichever program makes the steps.
-
-    First come the writes before the step. Then come the changed values of all blocks on the
-    instance's clock, in the segment's order. When all streams have taken these values, they get the
-    step's marker. The delivery ends when all streams have taken the marker. If only one stream is
-    open, its marker need not wait for the values. Use it only in the event loop's thread.
-    """
-
-    def __init__(self, virtual_time: VirtualTime, feeds: Mapping[str, Feed], outboxes: Outboxes) -> None:
-        self._virtual_time = virtual_time
-        self._feeds = feeds
-        self._outboxes = outboxes
-        self._lock = asyncio.Lock()
-        self.receivers: list[StepReceiver] = []
-
-    def begin(self, moment: Moment) -> None:
-        """Switch to virtual time. The step ``moment`` counts as delivered."""
-        self._virtual_time.on = True
-        self._virtual_time.moment = moment
-        for feed in self._feeds.values():
-            feed.suspend()
-
-    def end(self) -> None:
-        """Switch back to real time. Call this only while not :attr:`busy`."""
-        self._virtual_time.on = False
-        for feed in list(self._feeds.values()):
-            try:
-                feed.resume()
-            except SegmentError as error:
-                log.warning("the server did not send some values when the cell returned to real time: %s", str(error))
-        for receiver in self.receivers:
-            receiver.release()
-
-    async def deliver(self, step: Step, mark: Callable[[], None]) -> bool:
-        """Deliver a step. Return False if it had already been delivered.
-
-        If a client does not read for ``PATIENCE_S``, its stream fails.
-
-        Args:
-            step: The step.
-            mark: Queues the step's marker.
-
-        """
-        async with self._lock:
-            if step.number <= self._virtual_time.moment.number:
-                return False
-            self._show(step)
-            if len(self._outboxes) + sum(receiver.streams for receiver in self.receivers) > 1:
-                await self._outboxes.delivered(PATIENCE_S)
-            for receiver in self.receivers:
-                await receiver.deliver(step)
-            mark()
-            await self._outboxes.delivered(PATIENCE_S)
-            return True
-
-    @property
-    def busy(self) -> bool:
-        """True while a step is being delivered."""
-        return self._lock.locked()
-
-    def pass_over(self, step: Step, mark: Callable[[], None]) -> None:
-        """Deliver a step without waiting, because no stream is open.
-
-        Call this only while not :attr:`busy`.
-        """
-        if step.number > self._virtual_time.moment.number:
-            self._show(step)
-            mark()
-
-    def _show(self, step: Step) -> None:
-        for feed in list(self._feeds.values()):
-            if feed.block.attributes.stepped:
-                feed.commands.catch_up()
-        self._virtual_time.moment = Moment(step.number, step.time_ns)
-        for feed in list(self._feeds.values()):
-            try:
-                feed.step()
-            except SegmentError as error:
-                log.warning("step %d: %s", step.number, str(error))
-
-
 class Timeline:
     """The instance's time, as all services of the endpoint see it.
 
@@ -277,13 +175,13 @@ class Timeline:
         self._open_streams = open_streams
         self._play_dt_ns = play_dt_ns
         self._loop = asyncio.get_running_loop()
-        self._delivery = _Delivery(virtual_time, feeds, outboxes)
+        self._feeds = feeds
+        self._delivery = Delivery(virtual_time, feeds, outboxes, self._end_delivery)
         self._watchers: list[Callable[[TimeStatus], None]] = []
-        self._delivering: set[asyncio.Task[Any]] = set()
         self._page: WakeUp | None = None  # calls update() when the clock page is written
         state = self._clock.read()
         if state.virtual:
-            self._delivery.begin(Moment(state.done, state.present_ns))
+            self._begin(Moment(state.done, state.present_ns))
         self._reported = self._status(state)[1:]
         self._delivered = state.done
         self._awaited = False  # whether steps wait for this process's delivery
@@ -296,17 +194,14 @@ class Timeline:
         self._page = WakeUp(self._clock.bell, "clock")
         self._page.listeners[self.update] = None
 
-    async def stop(self) -> None:
-        """Stop following time, and cancel the deliveries that have not ended."""
+    def stop(self) -> None:
+        """Stop following time, and abandon a delivery that has not ended."""
         self.time_topics.stop()
+        self._delivery.stop()
         page, self._page = self._page, None  # own() may still be called
         if page is not None:
             page.stop()
             page.join()
-        tasks = list(self._delivering)
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
 
     @property
     def alive(self) -> bool:
@@ -334,12 +229,18 @@ class Timeline:
         """The present state of time."""
         return self._status(self.update())
 
+    async def delivered(self) -> None:
+        """Wait until no step is being delivered."""
+        await self._delivery.over()
+
     async def deliver(self, step: Step) -> None:
-        """Deliver the values and the marker of a step to all streams, unless that has been done already."""
-        if await self._delivery.deliver(step, partial(self._mark, step)):
-            self._delivered = step.number
-            if self._awaited:
-                self._clock.deliver(self._slot.index, step.number)
+        """Deliver the values and the marker of a step to all streams. Return when all clients have taken them.
+
+        If the task is cancelled, the delivery continues. Call this only while no other step is being
+        delivered.
+        """
+        self._delivery.begin(step, partial(self._mark, step))
+        await self._delivery.over()
 
     def update(self) -> Clock:
         """Read the clock page, and react to its changes.
@@ -348,29 +249,45 @@ class Timeline:
         """
         state = self._clock.read()
         if state.virtual and not self.virtual_time.on:
-            self._delivery.begin(_before(state))
+            self._begin(_before(state))
         elif self.virtual_time.on and not state.virtual and not self._delivery.busy:  # if busy, at the next call
             self._end(state)
         if state.virtual and state.done < self.virtual_time.moment.number and not self.steered:
             self.virtual_time.moment = Moment(state.done - 1, state.present_ns)  # a snapshot has set time back
         if state.virtual and state.done > self.virtual_time.moment.number and not self.steered:
-            step = Step(state.done, state.present_ns, state.dt_ns)
-            if self._awaited or self._delivery.busy:
-                task = self._loop.create_task(self.deliver(step))
-                self._delivering.add(task)
-                task.add_done_callback(self._delivering.discard)
-            else:
-                self._delivered = step.number
-                self._delivery.pass_over(step, partial(self._mark, step))
+            if not self._delivery.busy:  # if it is, at its end
+                step = Step(state.done, state.present_ns, state.dt_ns)
+                self._delivery.begin(step, partial(self._mark, step))
         elif (status := self._status(state))[1:] != self._reported:
             self._report(status, state)
         return state
 
+    def _begin(self, moment: Moment) -> None:
+        """Switch to virtual time. The step ``moment`` counts as delivered."""
+        self.virtual_time.on = True
+        self.virtual_time.moment = moment
+        for feed in self._feeds.values():
+            feed.suspend()
+
     def _end(self, state: Clock) -> None:
-        """Handle the return to real time."""
-        self._delivery.end()
+        """Return to real time."""
+        self.virtual_time.on = False
+        for feed in list(self._feeds.values()):
+            try:
+                feed.resume()
+            except SegmentError as error:
+                log.warning("the server did not send some values when the cell returned to real time: %s", str(error))
+        for receiver in self._delivery.receivers:
+            receiver.release()
         self.time_topics.resume()
         self._report(self._status(state), state)
+
+    def _end_delivery(self) -> None:
+        self._delivered = self.virtual_time.moment.number
+        if self._awaited:
+            self._clock.deliver(self._slot.index, self._delivered)
+        if not self.steered:
+            self.update()  # another program may have made a step meanwhile
 
     def _attend(self) -> None:
         """Make steps wait for this process while it has open streams, and only then."""

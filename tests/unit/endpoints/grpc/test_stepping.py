@@ -10,8 +10,7 @@ import grpc
 import pytest
 from google.protobuf.empty_pb2 import Empty
 
-from shmio.endpoints.grpc.shmio_v1 import subscribe
-from shmio.endpoints.grpc.time import timeline
+from shmio.endpoints.grpc.time import delivery
 from shmio.local.time_control import Coordinator
 from shmio.segment import Segment
 from shmio.wire import shmio_v1_pb2 as ours
@@ -339,7 +338,7 @@ def test_a_first_step_that_ends_before_the_endpoint_looks_is_delivered(instance:
 
 
 def test_a_stream_that_is_not_read_ends_and_others_continue(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(timeline, "PATIENCE_S", 2.0)
+    monkeypatch.setattr(delivery, "PATIENCE_S", 2.0)
 
     async def test(served: Endpoint, models: Models) -> None:
         options = [
@@ -380,8 +379,7 @@ def test_a_client_that_takes_nothing_delays_one_step_only(
     instance: str, monkeypatch: pytest.MonkeyPatch, wire: str
 ) -> None:
     def patience(for_s: float) -> None:
-        for module in (timeline, subscribe):
-            monkeypatch.setattr(module, "PATIENCE_S", for_s)
+        monkeypatch.setattr(delivery, "PATIENCE_S", for_s)
 
     async def test(served: Endpoint, models: Models) -> None:
         patience(0.5)

@@ -182,7 +182,7 @@ def test_a_stream_that_is_slow_to_open_delays_no_step(instance: str, monkeypatch
 
 
 def test_a_stream_that_is_not_read_is_ended_and_steps_continue(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shmio.endpoints.grpc.shmio_v1.subscribe.PATIENCE_S", 0.2)
+    monkeypatch.setattr("shmio.endpoints.grpc.time.delivery.PATIENCE_S", 0.2)
 
     async def test(served: Endpoint, models: Models) -> None:
         async with grpc.aio.insecure_channel(

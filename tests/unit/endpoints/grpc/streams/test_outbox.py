@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import ExitStack
 from types import SimpleNamespace
 
 import pytest
@@ -269,36 +268,14 @@ def test_a_message_counts_as_taken_when_the_reader_asks_for_the_next() -> None:
         lane.deliver(b"before")
         lane.keep(b"a")
         lane.deliver(b"after")
-        taken = asyncio.ensure_future(outbox.delivered())
+        taken: list[object] = []
+        outbox.on_taken = taken.append
         for expected in (b"before", b"a"):
             assert await outbox.pop() == expected
-            await asyncio.sleep(0)
             assert outbox.delivery_pending
-            assert not taken.done()
+            assert not taken
         assert await outbox.pop() == b"after"
-        await taken
+        assert taken == [outbox]
         assert not outbox.delivery_pending
-
-    asyncio.run(test())
-
-
-def test_streams_that_take_nothing_end_and_others_continue() -> None:
-    async def test() -> None:
-        outboxes = Outboxes()
-        with ExitStack() as stack:
-            idle, reader, gone, none = (stack.enter_context(outboxes.opened()) for _ in range(4))
-            for outbox in (idle, reader, gone):
-                StateLane(outbox).keep(b"x")
-            StateLane(none).deliver(b"of a device")
-            waiting = asyncio.ensure_future(outboxes.delivered(0.05))
-            await asyncio.sleep(0)
-            assert await reader.pop() == b"x"
-            popping = asyncio.ensure_future(reader.pop())
-            gone.close()
-            await waiting
-            assert idle.failure == "the client has not taken the values of a step within 0.05 s"
-            assert (reader.failure, gone.failure, none.failure) == ("", "", "")
-            await outboxes.delivered(60)  # no delivery is pending
-            popping.cancel()
 
     asyncio.run(test())
