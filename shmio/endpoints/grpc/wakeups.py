@@ -40,6 +40,7 @@ class WakeUp:
         self._loop = asyncio.get_running_loop()
         self._relay = Relay(word, name, turn_ns)
         self._pausing: asyncio.TimerHandle | None = None
+        self._muted = True
         self.unmute()
 
     @property
@@ -49,15 +50,18 @@ class WakeUp:
 
     def mute(self) -> None:
         """Stop calling the listeners. After :meth:`unmute`, one call makes up for the calls that they missed."""
+        self.resume()
+        self._muted = True
         self._loop.remove_reader(self._relay.descriptor)
 
     def unmute(self) -> None:
         """Call the listeners again."""
+        self._muted = False
         self._loop.add_reader(self._relay.descriptor, self._ring)
 
     def pause(self) -> None:
         """If all listeners are patient, stop calling them for ``PAUSE_S``."""
-        if self._pausing is None and self.patient >= self.listeners.keys():
+        if not self._muted and self.patient >= self.listeners.keys():
             self.mute()
             self._pausing = self._loop.call_later(PAUSE_S, self._pause_over)
 
@@ -76,7 +80,6 @@ class WakeUp:
 
     def stop(self) -> None:
         """Stop calling the listeners, and make the thread end."""
-        self.resume()
         self.mute()
         self._relay.stop()
 
@@ -124,6 +127,11 @@ class WakeUps:
         if wake_up := self._wake_ups.get(block.section):
             wake_up.patient.add(ring)
             wake_up.pause()
+
+    def end_pause(self, block: Block) -> None:
+        """End a pause of the block's wake-ups. The listeners stay as patient as they were."""
+        if wake_up := self._wake_ups.get(block.section):
+            wake_up.resume()
 
     def resume(self, block: Block, ring: Callback) -> None:
         """Mark ``ring`` as no longer patient."""
@@ -204,7 +212,7 @@ class BatchReader:
         if not self.alive:
             return  # stopped during the wake-up
         if self._passes is not None and self._passes():
-            self._wake_ups.pause(self._block, self.read_batch)
+            self.pause()
         else:
             self.read()
 
@@ -219,6 +227,14 @@ class BatchReader:
         if more and not self._again:
             self._again = True
             self._loop.call_soon(self._look_again)
+
+    def pause(self) -> None:
+        """Make the reader patient until :meth:`resume`, and pause the wake-ups if all listeners are patient."""
+        self._wake_ups.pause(self._block, self.read_batch)
+
+    def end_pause(self) -> None:
+        """End a pause of the wake-ups, because news will come that cannot wait."""
+        self._wake_ups.end_pause(self._block)
 
     def resume(self) -> None:
         """Make the reader read at each wake-up again, because it is no longer patient."""

@@ -92,6 +92,11 @@ class CommandClient:
             or self.followers.busy
         )
 
+    @property
+    def idle(self) -> bool:
+        """True if nobody waits for an event: there are no commands in flight, subscribers or followers."""
+        return not self._in_flight and not self.write_subscriptions.busy and self.followers.idle
+
     def start(self) -> None:
         """Start following the block's events."""
         self._reader.start()
@@ -340,6 +345,7 @@ class CommandClient:
     # ---- time-outs -----------------------------------------------------------------------------------------
 
     def _start_timer(self) -> None:
+        self._reader.end_pause()  # the outcome of a command cannot wait
         if self._timer is None:
             self._set_timer()
 

@@ -101,6 +101,11 @@ class InjectionFollowers:
         self._listeners.pop(listener, None)
 
     @property
+    def idle(self) -> bool:
+        """True if there are no followers and no listeners."""
+        return not (self._followers or self._listeners)
+
+    @property
     def busy(self) -> bool:
         """True if somebody listens to writes."""
         return bool(self._listeners)

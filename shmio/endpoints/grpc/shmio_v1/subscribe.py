@@ -300,7 +300,9 @@ class SubscribeCall:
         self._wake.set()
 
     def wake(self) -> None:
-        """Wake the stream, so that it looks for updates."""
+        """Wake the stream, so that it looks for updates, which no longer wait for steps."""
+        for place, ring in self._rings.items():
+            self._wake_ups.resume(self._blocks[place].view.block, ring)
         self._wake.set()
 
     def on_sources_replaced(self, sources: Collection[str]) -> None:
@@ -391,10 +393,12 @@ class SubscribeCall:
         suspended = self._virtual_time.on and updates.view.block.attributes.stepped
         return not suspended or self._step is not None or updates.follower.frame is None
 
-    def _ring(self, updates: BlockUpdates) -> None:
+    def _ring(self, place: SourceDirection, updates: BlockUpdates) -> None:
         """Wake the stream, because a block has a new frame or event."""
         if self._may_send(updates):
             self._wake.set()
+        else:
+            self._wake_ups.join(updates.view.block, self._rings[place], patient=True)
 
     async def _wait(self) -> None:
         due_s = min((updates.due_s for updates in self._blocks.values()), default=math.inf)
@@ -433,7 +437,7 @@ class SubscribeCall:
         else:
             updates = LatestFrame(view, 1 / request.max_rate_hz if request.max_rate_hz else 0.0, request.deadband)
         self._blocks[place] = updates
-        ring = self._rings[place] = partial(self._ring, updates)
+        ring = self._rings[place] = partial(self._ring, place, updates)
         self._wake_ups.join(view.block, ring)
         return field(TABLES, view.table)
 

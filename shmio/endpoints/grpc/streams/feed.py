@@ -236,6 +236,7 @@ class Feed:
             return
         self._suspended = self._stepped = False
         self._follower.restart()
+        self._reader.resume()
         self._reader.read_batch()
         self._settle()
 
@@ -336,8 +337,17 @@ class Feed:
                 self._turn_bad(follower.last + 1)
             if follower.ended:
                 self._reader.stop()
+            elif self._suspended:
+                self._rest(count)
             return False
         return True
+
+    def _rest(self, frames: int) -> None:
+        """Pause the wake-ups after these frames of a suspended feed, unless somebody waits for an event."""
+        if not self.commands.idle:
+            self._reader.resume()
+        elif frames:  # without a new frame, there is nothing to rest from
+            self._reader.pause()
 
     def _take(self, frame: Frame) -> None:
         """Deliver a frame if its quality is good.

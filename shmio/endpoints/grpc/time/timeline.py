@@ -193,6 +193,7 @@ class Timeline:
         """Start following time."""
         self._page = WakeUp(self._clock.bell, "clock")
         self._page.listeners[self.update] = None
+        self._page.patient.add(self.update)
 
     def stop(self) -> None:
         """Stop following time, and abandon a delivery that has not ended."""
@@ -258,6 +259,8 @@ class Timeline:
             if not self._delivery.busy:  # if it is, at its end
                 step = Step(state.done, state.present_ns, state.dt_ns)
                 self._delivery.begin(step, partial(self._mark, step))
+            if self._page is not None and not self._awaited:
+                self._page.pause()  # no stream is open
         elif (status := self._status(state))[1:] != self._reported:
             self._report(status, state)
         return state
@@ -294,6 +297,8 @@ class Timeline:
         if self._open_streams:
             self.update()  # delivers the steps so far; the next step will wait for this process
             self._awaited = True
+            if self._page is not None:
+                self._page.resume()
             self._clock.deliver(self._slot.index, self._delivered)
         else:
             self._awaited = False
