@@ -208,7 +208,7 @@ def record(
     if trail is None:
         return
     who = who or _present.get() or Acting(Actor("process", trail.process), trail.process)
-    trail.add(_Waiting(time.time(), who, action, _brief(what), outcome, reason, command, event, count))
+    trail.add(_Waiting(time.time(), who, action, what, outcome, reason, command, event, count))
 
 
 class Attempt:
@@ -327,7 +327,7 @@ class Trail:
                     known.last = entry
                     return
         if self._waiting.qsize() < MAX_WAITING:
-            self._waiting.put(entry)
+            self._waiting.put(entry._replace(what=_brief(entry.what)))
         else:
             with self._counting:
                 self._lost += 1
@@ -425,11 +425,10 @@ class Trail:
     def _line(self, waiting: _Waiting) -> bytes:
         who = waiting.acting
         what = waiting.what
-        if callable(what):
-            try:
-                what = _brief(what())
-            except Exception as error:  # noqa: BLE001  whatever the client has sent, there is an entry
-                what = {"error": f"this value cannot be shown: {type(error).__name__}"}
+        try:
+            what = _brief(what() if callable(what) else what)
+        except Exception as error:  # noqa: BLE001  whatever the client has sent, there is an entry
+            what = {"error": f"this value cannot be shown: {type(error).__name__}"}
         entry = Entry(
             stamp(waiting.time_s), self._instance, self.process, os.getpid(), who.endpoint, who.actor.kind,
             _cut(who.actor.name), _cut(who.actor.origin), waiting.action, waiting.outcome,

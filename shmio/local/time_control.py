@@ -6,7 +6,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from typing import Final, NamedTuple
 
@@ -17,6 +17,7 @@ from shmio.model.clock import MAX_RATE, Clock, ClockMode, check_step
 from shmio.model.values import Quality
 from shmio.segment.block import Block
 from shmio.segment.clock import time_lock
+from shmio.segment.doorbell import Doorbell
 from shmio.segment.processes import ProcessSlot
 from shmio.segment.segment import Segment
 
@@ -105,6 +106,7 @@ class Coordinator:
         self._lock = threading.RLock()
         self._lock_byte = time_lock(segment.header)
         self._owns = False
+        self._roles: _Roles | None = None
 
     @property
     def owns(self) -> bool:
@@ -253,14 +255,16 @@ class Coordinator:
         dt_ns = before.step_size_ns if dt_ns is None else dt_ns
         check_step(dt_ns)
         step = Step(before.step + 1, before.time_ns + dt_ns, dt_ns)
-        participants = self._participants()
-        unmoved = _unmoved_note(self._segment, participants)
+        roles = self._current_roles()
+        unmoved = _unmoved_note(self._segment, roles.participants)
         asked = before._replace(step=step.number, time_ns=step.time_ns, dt_ns=dt_ns, stepping=True, note="")
         problem = "it was cancelled"
         try:
+            heads = {block: block.ring.head() for block in roles.participants}
             self._segment.clock.write(asked, ring=False)  # processes need not deliver a step before it is done
-            self._ring([block.source for block in participants])
-            problem = yield from self._await_frames(step.number, participants, asked)
+            for bell in roles.bells:
+                bell.ring()
+            problem = yield from self._await_frames(step.number, heads, asked)
         finally:
             note = f"step {step.number} failed: {problem}" if problem else unmoved
             done = before.done if problem else step.number
@@ -347,8 +351,13 @@ class Coordinator:
         return state._replace(mode=ClockMode.VIRTUAL, step=step, done=step, time_ns=now_ns, resumed_ns=0, offset_ns=0)
 
     def _participants(self) -> list[Block]:
+        return self._current_roles().participants
+
+    def _current_roles(self) -> _Roles:
         self._segment.refresh()
-        return [block for block in self._segment.blocks.values() if block.attributes.stepped]
+        if self._roles is None or self._roles.blocks is not self._segment.blocks:
+            self._roles = _Roles.of(self._segment, self._own)
+        return self._roles
 
     @staticmethod
     def _cycle(block: Block, state: Clock, now_ns: int) -> int:
@@ -365,37 +374,32 @@ class Coordinator:
         for slot in self._segment.processes:
             self._segment.clock.slot_bell(slot.index).ring()
 
-    def _ring(self, sources: Sequence[str]) -> None:
-        for slot in self._segment.processes:
-            if slot.name in sources:
-                self._segment.clock.slot_bell(slot.index).ring()
-
-    def _await_frames(self, number: int, participants: Sequence[Block], asked: Clock) -> Generator[StepWait, None, str]:
+    def _await_frames(self, number: int, heads: Mapping[Block, int], asked: Clock) -> Generator[StepWait, None, str]:
         """Wait until each source has done a step.
 
-        Return a text about the sources that failed; empty: none failed.
+        ``heads`` has the number of each source's newest frame before the step. Return a text about
+        the sources that failed; empty: none failed.
         """
         begun_ns = time.monotonic_ns()
-        # Sources with remote models first: their answers come through a process that may itself wait here.
-        waiting = sorted(participants, key=lambda block: block.model_channel is None)
+        waiting = list(heads)
         problems: list[str] = []
         warned = False
         while waiting:
             block = waiting[0]
             seen = block.ring.doorbell()  # before reading
-            found = _step_answer(block, number)
+            found = _step_answer(block, number, heads[block])
             if found is not None:
                 waiting.remove(block)
                 problems += [f"{block.source}: {found}"] if found else []
                 continue
             passed_ns = time.monotonic_ns() - begun_ns
             if passed_ns >= self._hard_ns:
-                silent = [block for block in waiting if _step_answer(block, number) is None]
+                silent = [block for block in waiting if _step_answer(block, number, heads[block]) is None]
                 problems += [_describe_silence(self._segment, block, self._hard_ns) for block in silent]
                 return "; ".join(problems)
             if passed_ns >= self._soft_ns and not warned:
                 warned = True
-                names = [block.source for block in waiting if _step_answer(block, number) is None]
+                names = [block.source for block in waiting if _step_answer(block, number, heads[block]) is None]
                 note = f"step {number} waits for {', '.join(names)}"
                 log.warning(note)
                 self._write(asked._replace(note=note))
@@ -409,13 +413,15 @@ class Coordinator:
         Return a text about the processes that have not delivered it; empty: all have.
         """
         clock, begun_ns = self._segment.clock, time.monotonic_ns()
+        dispatchers = self._current_roles().dispatchers
         rung = warned = False
         while True:
             seen = clock.delivered_bell.value()
-            waiting = [slot for slot in self._segment.processes if self._owes(slot, number, jumped=jumped)]
+            waiting = [slot for slot in dispatchers if self._owes(slot, number, jumped=jumped)]
             if not rung:
                 rung = True
-                self._ring([slot.name for slot in waiting])
+                for slot in waiting:
+                    clock.slot_bell(slot.index).ring()
             passed_ns = time.monotonic_ns() - begun_ns
             if not waiting:
                 return ""
@@ -429,17 +435,45 @@ class Coordinator:
             yield StepWait(None, seen, min(self._soft_ns, self._hard_ns - passed_ns))
 
     def _owes(self, slot: ProcessSlot, number: int, *, jumped: bool) -> bool:
-        """Return whether another living process still has to deliver this step."""
-        if slot.kind not in _DISPATCHERS:
-            return False
+        """Return whether a living process still has to deliver this step."""
         last = self._segment.clock.delivered(slot.index)
         owes = last is not None and (last != number if jumped else last < number)
-        return owes and slot is not self._own and slot.alive()  # alive() is False for this process's own slot
+        return owes and slot.alive()
 
     def _owner(self, pid: int) -> str:
         """Return name and pid of the owner of time, for a message."""
         names = [slot.name for slot in self._segment.processes if pid and slot.report.pid == pid and slot.alive()]
         return f"{names[0]} (pid {pid})" if names else f"another program (pid {pid})"
+
+
+class _Roles(NamedTuple):
+    """What the blocks and processes of a segment do in each step, until a reload changes them.
+
+    Attributes:
+        blocks: The segment's blocks when the roles were determined.
+        participants: The blocks that do each step; those with remote models first, because their
+            answers come through a process that may itself wait.
+        bells: The doorbells of their sources.
+        dispatchers: The other processes that deliver steps.
+    """
+
+    blocks: Mapping[str, Block]
+    participants: list[Block]
+    bells: list[Doorbell]
+    dispatchers: list[ProcessSlot]
+
+    @classmethod
+    def of(cls, segment: Segment, own: ProcessSlot | None) -> _Roles:
+        """Determine the roles; ``own`` is the slot of this process, if it has one."""
+        stepped = [block for block in segment.blocks.values() if block.attributes.stepped]
+        sources = {block.source for block in stepped}
+        slots = [slot for slot in segment.processes if own is None or slot.index != own.index]
+        return cls(
+            segment.blocks,
+            sorted(stepped, key=lambda block: block.model_channel is None),
+            [segment.clock.slot_bell(slot.index) for slot in slots if slot.name in sources],
+            [slot for slot in slots if slot.kind in _DISPATCHERS],
+        )
 
 
 class Timekeeper:
@@ -571,14 +605,19 @@ def check_virtual(clock: Clock) -> None:
         raise TimeError("time is real, but snapshots need virtual time; stop time with shmio step --pause")
 
 
-def _step_answer(block: Block, number: int) -> str | None:
-    """Return a source's answer to a step: "" if it is done, the reason if it failed, None if none came yet."""
+def _step_answer(block: Block, number: int, head: int) -> str | None:
+    """Return a source's answer to a step: "" if it is done, the reason if it failed, None if none came yet.
+
+    ``head`` is the number of its newest frame before the step.
+    """
     if block.retired:
         return ""  # a reload has retired the block
     try:
         if block.playhead is not None:
             play = block.playhead.read()
             return None if play is None or play.step < number else ""
+        if block.ring.head() == head:
+            return None
         frame = block.latest()
     except SegmentError as error:
         return str(error)

@@ -306,6 +306,7 @@ class Block:
         self.playhead = playhead
         """The playhead of the replayed recording; None if the block replays none."""
         self._retired = retired
+        self._newest: Frame | None = None  # the last result of latest()
 
     @cached_property
     def layout(self) -> Layout:
@@ -420,10 +421,14 @@ class Block:
         Raises:
             SegmentError: The writer overtook the reader at every attempt to copy.
         """
+        newest, head = self._newest, self.ring.head()
+        if newest is not None and newest.number == head:
+            return newest  # a frame never changes
         fields = self.ring.latest()
         if fields is not None:
-            return decode_frame(fields)
-        if self.ring.head() == 0:
+            self._newest = newest = decode_frame(fields)
+            return newest
+        if head == 0:
             return None
         raise SegmentError(
             f"source {self.source}: its ring is overwritten faster than a frame can be read; raise instance.ring_mb"
