@@ -271,7 +271,7 @@ class Coordinator:
             self._write(asked._replace(done=done, stepping=False, note=note))
         if not problem:
             self._deliver(step)
-            problem = yield from self._await_delivery(step.number)
+            problem = yield from self._await_delivery(step.number, roles.dispatchers)
         if problem:
             raise TimeError(f"step {step.number}: {problem}")
         return step
@@ -296,7 +296,7 @@ class Coordinator:
         with self._lock:
             number = self.read().done
             self._segment.clock.bell.ring()
-            waiting = self._await_delivery(number, jumped=True)
+            waiting = self._await_delivery(number, self._current_roles().dispatchers, jumped=True)
             while True:
                 try:
                     _, seen, rest_ns = next(waiting)
@@ -406,14 +406,15 @@ class Coordinator:
             yield StepWait(block, seen, (self._hard_ns if warned else min(self._soft_ns, self._hard_ns)) - passed_ns)
         return "; ".join(problems)
 
-    def _await_delivery(self, number: int, *, jumped: bool = False) -> Generator[StepWait, None, str]:
-        """Wait until other processes have delivered a step.
+    def _await_delivery(
+        self, number: int, dispatchers: Sequence[ProcessSlot], *, jumped: bool = False
+    ) -> Generator[StepWait, None, str]:
+        """Wait until these processes have delivered a step.
 
         With ``jumped``, time may have gone back, so that a later step may have been delivered.
         Return a text about the processes that have not delivered it; empty: all have.
         """
         clock, begun_ns = self._segment.clock, time.monotonic_ns()
-        dispatchers = self._current_roles().dispatchers
         rung = warned = False
         while True:
             seen = clock.delivered_bell.value()
