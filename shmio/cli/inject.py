@@ -259,14 +259,18 @@ def _list(cell: Cell, *, as_json: bool) -> None:
     if as_json:
         print(dumps(found))
         return
-    for one_found in found:
+    for one, one_found in zip(present, found, strict=True):
         paths = _targets(one_found)
         more = f" and {len(paths) - 3} more" if paths[3:] else ""
         keep = ", kept" if one_found["keep"] else ""
-        other = "supervisor.toml" if one_found["writer"] == NO_WRITER else "a program"
-        by = f"pid {one_found['pid']}" if one_found["pid"] else other
-        if "cell" in one_found:
-            by += f" of {one_found['cell']}"
+        other = "supervisor.toml" if one.writer == NO_WRITER else "a program"
+        by = f"pid {one.pid}" if one.pid else other
+        if one.endpoint == "fabric" and one.pid:
+            by = "a program of another cell"
+        elif one.cell:
+            by += f" of {one.cell}"
+        elif one.endpoint:
+            by = one.endpoint
         print(
             f"{one_found['id']}  {', '.join(map(printable, paths[:3]))}{more} /{one_found['direction']}, "
             f"priority {one_found['priority']}, {by}{keep}{_running(one_found.get('running'))}  "

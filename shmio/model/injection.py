@@ -6,6 +6,8 @@ from typing import Generic, TypeVar
 
 import msgspec
 
+from shmio.model.values import ROLES
+
 DeclarationT = TypeVar("DeclarationT")
 
 
@@ -61,6 +63,11 @@ class Injection(msgspec.Struct, Generic[DeclarationT], frozen=True, omit_default
     running: Running[DeclarationT] | None = None
     source: str = ""
     cell: str = ""
+
+    @property
+    def endpoint(self) -> str:
+        """The process of the instance that the injection came through, such as ``grpc``; empty: there is none."""
+        return ROLES.get(self.writer, "")
 
 
 class Declared(msgspec.Struct, frozen=True):

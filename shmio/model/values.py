@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import IntEnum, StrEnum
 from typing import TYPE_CHECKING, Final
 
@@ -16,6 +17,12 @@ NO_WRITER: Final = 0xFFFFFFFF
 """Takes the place of the number of a command queue, if no program gave the command."""
 
 
+WRITERS: Final[Mapping[str, int]] = {"grpc": 4, "mqtt": 5, "opcua": 6, "fabric": 7}
+"""For each process of the instance that sends commands: the number of its command queue.
+
+The keys are the names of the processes, which are also their kinds.
+"""
+ROLES: Final[Mapping[int, str]] = {writer: name for name, writer in WRITERS.items()}
 PID_SHIFT: Final = 40
 """Number of bits of a command's number below the pid of its sender, which has at most 22 bits: proc(5)."""
 

@@ -18,9 +18,9 @@ from shmio.layout.values.text import json_value, to_text
 from shmio.layout.values.write import Write, bits_of, paths_of
 from shmio.layout.values.write import apply as write_to
 from shmio.model.injection import Injection
-from shmio.model.values import NO_WRITER
+from shmio.model.values import NO_WRITER, ROLES
 from shmio.segment.events import EVENT_DATA_SIZE, Event, EventKind
-from shmio.segment.processes import EXTERNAL_SLOTS, WRITERS
+from shmio.segment.processes import EXTERNAL_SLOTS
 
 MAX_REMEMBERED: Final = 4096
 """An explainer remembers at most this many unfinished commands and this many injections."""
@@ -43,7 +43,6 @@ _OF_WRITES: Final = frozenset({*_INWARD, EventKind.DIVERTED, EventKind.SHADOWED}
 _OF_INJECTIONS: Final = frozenset(
     {EventKind.INJECTED, EventKind.LIFTED, EventKind.ACTIVATED, EventKind.DEACTIVATED, EventKind.DIVERTED}
 )
-_ROLES: Final = {writer: name for name, writer in WRITERS.items()}
 
 
 class Place(NamedTuple):
@@ -272,7 +271,7 @@ def by(writer: int) -> str:
     """Return the name of the endpoint or program that owns a command queue; empty if there is none."""
     if writer == NO_WRITER:
         return ""
-    return _ROLES.get(writer, f"program {writer + 1}" if writer < EXTERNAL_SLOTS else f"writer {writer}")
+    return ROLES.get(writer, f"program {writer + 1}" if writer < EXTERNAL_SLOTS else f"writer {writer}")
 
 
 ABOUT: Final = ("path", "value", "direction", "by")

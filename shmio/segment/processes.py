@@ -17,6 +17,7 @@ from typing import Final
 import msgspec
 
 from shmio.errors import SegmentError
+from shmio.model.values import WRITERS
 from shmio.segment import _atomics
 from shmio.segment.header import HEARTBEAT_OFFSET, SLOT_SIZE, Header, cut, text
 from shmio.segment.shm import SharedObject
@@ -53,12 +54,6 @@ EXTERNAL_SLOTS: Final = 4
 """Number of external slots: slots for programs that write but do not belong to the instance.
 
 They are the last slots of the table. Their programs have the first command queues.
-"""
-
-WRITERS: Final[Mapping[str, int]] = {"grpc": 4, "mqtt": 5, "opcua": 6, "fabric": 7}
-"""For each process of the instance that sends commands: the number of its command queue.
-
-The keys are the names of the processes, which are also their kinds.
 """
 
 

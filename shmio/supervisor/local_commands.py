@@ -23,12 +23,11 @@ import msgspec
 from shmio.audit import trail
 from shmio.audit.trail import MAX_NAMED, Acting, Actor, uid_actor
 from shmio.model.clock import Clock
-from shmio.model.values import NO_WRITER, pid_of
+from shmio.model.values import NO_WRITER, ROLES, WRITERS, pid_of
 from shmio.segment import Block, Event, EventKind, Segment
 from shmio.segment.clock import StateAction
 from shmio.segment.commands import worst
 from shmio.segment.events import ENDS, EVENT_DATA_SIZE
-from shmio.segment.processes import WRITERS
 
 if TYPE_CHECKING:
     from shmio.segment.explain import Explained, Explainer
@@ -47,7 +46,6 @@ CLOSE_S: Final = 2.0
 """Longest time in s to wait for the end of the thread."""
 RESTARTED: Final = "the source was restarted before it reported the outcome"
 
-_KINDS: Final = {writer: kind for kind, writer in WRITERS.items()}
 _WRITES: Final = frozenset(
     {EventKind.WRITTEN, EventKind.REFUSED, EventKind.EXPIRED, EventKind.UNKNOWN, EventKind.TAKEN}
 )
@@ -101,7 +99,7 @@ class Programs:
             pid: The process.
             writer: The queue from which its command came; None if it is unknown.
         """
-        return pid in self._own or writer in _KINDS
+        return pid in self._own or writer in ROLES
 
     def has_ended(self, pid: int) -> bool:
         """Return whether a process has ended."""
@@ -115,7 +113,7 @@ class Programs:
         ``writer`` is the queue from which its command came; None if it is unknown.
         """
         if self.is_own(pid, writer):
-            kind = "web" if writer is None else _KINDS.get(writer, "web")
+            kind = "web" if writer is None else ROLES.get(writer, "web")
             return Acting(Actor("process", kind, f"pid {pid}, which ended before shmio could find its user"), kind)
         found = self._others.get(pid)
         if found is None:

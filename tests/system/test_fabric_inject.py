@@ -115,7 +115,9 @@ def only(cell: Attachment) -> Injection[Any]:
     return found
 
 
-def test_a_shadow_changes_what_both_hosts_see(attached: tuple[Attachment, Attachment]) -> None:
+def test_a_shadow_changes_what_both_hosts_see(
+    cells: tuple[Cell, Cell], attached: tuple[Attachment, Attachment]
+) -> None:
     owner, mirror = attached
     owner.set({"belt/speed": 1.5})
     with mirror.inject("mirrored/speed", name="test") as shadow:
@@ -125,6 +127,7 @@ def test_a_shadow_changes_what_both_hosts_see(attached: tuple[Attachment, Attach
         assert only(owner).number == only(mirror).number == shadow.number
         assert only(mirror).name == "test"
         assert only(mirror).pid != only(owner).pid, "each host names its own process"
+        assert "a program of another cell" in cells[0].output("shmio", "inject", "--list")
     until(lambda: seen(mirror, "mirrored/speed") == seen(owner, "belt/speed"), "over")
     assert not owner.injections()
 

@@ -187,7 +187,7 @@ def _creator(one: InjectionEntry, names: Mapping[int, str]) -> str:
     if one.cell:
         who = f"process {one.pid}" if one.pid else "a program"
         return f"{one.cell} (configuration)" if one.configured else f"{who} of {one.cell}"
-    return "configuration" if one.configured else names.get(one.pid) or f"process {one.pid}"
+    return "configuration" if one.configured else one.endpoint or names.get(one.pid) or f"process {one.pid}"
 
 
 def _present(block: Block, codec: Decoder) -> Number | None:

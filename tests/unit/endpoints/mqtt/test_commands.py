@@ -15,8 +15,8 @@ from shmio.connectors.injection_layers import Owner
 from shmio.endpoints.mqtt.bridge import Bridge
 from shmio.endpoints.mqtt.connection.connection import FEW_IN_FLIGHT
 from shmio.endpoints.mqtt.connection.socket_io import PACKETS
+from shmio.model.values import WRITERS
 from shmio.segment import Segment
-from shmio.segment.processes import WRITERS
 from shmio.testing.mosquitto import Mosquitto
 from shmio.testing.ports import reserved_port
 from shmio.testing.proxy import FaultProxy

@@ -14,8 +14,8 @@ from paho.mqtt.enums import CallbackAPIVersion
 from shmio.backoff import Backoff
 from shmio.config import Address
 from shmio.connectors.injection_layers import Owner
+from shmio.model.values import WRITERS
 from shmio.segment import Segment
-from shmio.segment.processes import WRITERS
 from shmio.testing.mosquitto import Mosquitto
 from tests.unit.endpoints.harness import image
 from tests.unit.endpoints.mqtt.harness import PREFIX, TIMEOUT_S, bridge, listening

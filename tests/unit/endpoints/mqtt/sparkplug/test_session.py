@@ -13,8 +13,8 @@ from shmio.backoff import Backoff
 from shmio.config import Address, Mqtt, MqttTopic, Sparkplug
 from shmio.connectors.injection_layers import Owner
 from shmio.endpoints.mqtt.bridge import Bridge
+from shmio.model.values import WRITERS
 from shmio.segment import Quality, Segment
-from shmio.segment.processes import WRITERS
 from shmio.testing.mosquitto import Mosquitto
 from shmio.testing.proxy import FaultProxy
 from shmio.wire import sparkplug_b_pb2 as wire
