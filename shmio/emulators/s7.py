@@ -374,6 +374,7 @@ class S7Server(Server):
     """
 
     def __init__(self, address: Address, *, max_clients: int = 16, options: ServerOptions | None = None) -> None:
+        logging.getLogger("snap7.server").setLevel(logging.WARNING)  # the library logs each area
         super().__init__(log=False, max_clients=max_clients)
         self._options = options or ServerOptions()
         self.host, self.port = address.host, address.port

@@ -270,9 +270,7 @@ def _mirrored(key: str, source: Source, config: Config, files: LayoutFiles) -> L
     except ConfigError as error:
         if own is None:
             raise ConfigError(f"{key}.{error}") from None
-        files.warnings.append(
-            f"{key}.{error}; until then, nothing checks that the owner has the layout in {key}.layout"
-        )
+        files.odd.append(f"{key}.{error}; until then, nothing checks that the owner has the layout in {key}.layout")
         return own
     if own is not None and not old and own.hash != offer.layout.hash:
         raise ConfigError(
@@ -280,7 +278,7 @@ def _mirrored(key: str, source: Source, config: Config, files: LayoutFiles) -> L
             "has the owner's layout"
         )
     if old and own is None:
-        files.warnings.append(f"{key}: the layout is the one that {file.name} has kept: {old}")
+        files.odd.append(f"{key}.cell: the layout of {mirror} is the one that {file} has kept: {old}")
     source.period_ms, source.stale_ms = offer.period_ns / 1e6, source.stale_ms or offer.stale_ns / 1e6
     return own or offer.layout
 
