@@ -156,6 +156,9 @@ async def connect(
     client = FabricClient()
     try:
         await client.connect(**options)
+    except asyncio.CancelledError:  # the library would leave its connection open
+        await client.abandon()
+        raise
     except (OSError, errors.Error) as error:  # a time-out is an OSError
         await client.abandon()
         refused = attempts.refused or _is_refusal(error)

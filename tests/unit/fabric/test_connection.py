@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 from contextlib import suppress
 
 import pytest
@@ -12,6 +13,7 @@ from shmio.config.model import MqttTls
 from shmio.errors import RemoteError
 from shmio.fabric.client import FabricClient
 from shmio.fabric.connection import Access, connect, connect_or_stop
+from shmio.fabric.tasks import end
 
 TIMEOUT_S = 20
 
@@ -123,6 +125,39 @@ def test_waiting_for_a_server_can_be_stopped_although_a_cancellation_is_lost(
         monkeypatch.setattr(FabricClient, "close", close)
         assert await asyncio.wait_for(connect_or_stop(Access(("nats://127.0.0.1:1",)), "x", stop), TIMEOUT_S) is None
         assert stop.is_set()
-        assert len(clients) == (not connects), "a connection that was made is closed"
+        assert not clients, "the connection stays open"
+
+    asyncio.run(work())
+
+
+@pytest.mark.parametrize("greets", [False, True])
+def test_a_connection_is_closed_if_the_wait_for_its_server_is_cancelled(greets: bool) -> None:
+    """The server accepts the connection, and never answers a ping."""
+
+    async def work() -> None:
+        came, left = asyncio.Event(), asyncio.Event()
+
+        async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            if greets:
+                writer.write(b'INFO {"server_id": "x", "version": "2.10.0", "max_payload": 1000}\r\n')
+                await reader.readline()
+            came.set()
+            with suppress(ConnectionError):
+                await reader.read()
+            left.set()
+            writer.close()
+
+        server = await asyncio.start_server(serve, "127.0.0.1", 0)
+        url = f"nats://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+        connecting = asyncio.create_task(connect(Access((url,)), "test"))
+        await asyncio.wait_for(came.wait(), TIMEOUT_S)
+        gc.disable()  # which would close the connection, too, with a warning
+        try:
+            await end(connecting)
+            await asyncio.wait_for(left.wait(), TIMEOUT_S)
+        finally:
+            gc.enable()
+        server.close()
+        await server.wait_closed()
 
     asyncio.run(work())
