@@ -65,7 +65,6 @@ ONE_AFTER_THE_OTHER = (
     ("tests/system/test_overlay.py",),
     ("tests/system/test_running.py",),
     ("tests/system/test_step.py",),
-    ("tests/system/test_takeover.py",),
     ("tests/system/test_web_browser.py",),
     ("tests/system/test_web_page_changes.py",),
     ("tests/system/test_write.py",),

@@ -246,12 +246,12 @@ def test_what_cannot_be_saved_is_named_and_can_be_left_out(plan: Callable[..., P
         cell.step(0.02)
 
 
-@pytest.mark.parametrize("name", ["", "a/b", "../up", ".hidden", "x" * 64, "ä", "a\0"])
-def test_names_that_are_no_file_names_are_refused(plan: Callable[..., Plan], name: str) -> None:
+def test_names_that_are_no_file_names_are_refused(plan: Callable[..., Plan]) -> None:
     with Laboratory(plan()) as lab, lab.attach() as cell:
-        for call in (cell.save_snapshot, cell.restore_snapshot, cell.delete_snapshot):
-            with pytest.raises(SnapshotError, match="name"):
-                call(name)
+        for name in ("", "a/b", "../up", ".hidden", "x" * 64, "ä", "a\0"):
+            for call in (cell.save_snapshot, cell.restore_snapshot, cell.delete_snapshot):
+                with pytest.raises(SnapshotError, match="name"):
+                    call(name)
 
 
 def test_a_campaign_starts_from_a_snapshot(plan: Callable[..., Plan], tmp_path: Path) -> None:
