@@ -86,8 +86,8 @@ def run(
     return status
 
 
-def load(command: str) -> Callable[[argparse.Namespace], int]:
-    """Import and return the function of a verb.
+def load(command: str) -> Callable[..., int]:
+    """Import and return a function of a verb: the one that runs it, or the one that adds its arguments.
 
     Only the modules that this verb needs are imported. During the import, Ctrl-C ends the process
     at once.
@@ -97,8 +97,8 @@ def load(command: str) -> Callable[[argparse.Namespace], int]:
     """
     module, _, function = command.partition(":")
     with ended_by_interrupt():
-        execute: Callable[[argparse.Namespace], int] = getattr(importlib.import_module(module), function)
-    return execute
+        found: Callable[..., int] = getattr(importlib.import_module(module), function)
+    return found
 
 
 class _VerbParser(argparse.ArgumentParser):

@@ -5,14 +5,12 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
-from shmio.cli import completion, inject, read, replay, snapshot, step
-from shmio.cli import set as set_verb
 from shmio.cli.common import add_json, add_verbs, complete, ended_by_interrupt, load, run, verb_first
 from shmio.config.address import UNIX, Address
 from shmio.errors import ConfigError, UnknownClientError
@@ -27,39 +25,63 @@ SHELL_HELP = "Print the code with which a shell completes command lines: see doc
 
 
 class Verb(NamedTuple):
-    """A verb that acts on an instance: its help, and the functions that add its arguments and run it."""
+    """A verb that acts on an instance.
+
+    Attributes:
+        help: Its help.
+        arguments: Module and function that add its arguments to a parser.
+        execute: Module and function that run it.
+        writable: Whether it may change the instance.
+    """
 
     help: str
-    arguments: Callable[[argparse.ArgumentParser], None]
-    execute: Callable[[Cell, argparse.Namespace], int]
+    arguments: str
+    execute: str
     writable: bool = True
 
 
+# Each command imports the modules of its own verb only.
 VERBS = {
-    "list": Verb("List registers with their types.", read.list_arguments, read.list_registers, writable=False),
+    "list": Verb(
+        "List registers with their types.",
+        "shmio.cli.read:list_arguments",
+        "shmio.cli.read:list_registers",
+        writable=False,
+    ),
     "get": Verb(
-        "Print the present values of registers, with quality and age.", read.get_arguments, read.get, writable=False
+        "Print the present values of registers, with quality and age.",
+        "shmio.cli.read:get_arguments",
+        "shmio.cli.read:get",
+        writable=False,
     ),
     "watch": Verb(
         "Print registers whenever they change, the present values first; on a terminal, as a table.",
-        read.watch_arguments,
-        read.watch,
+        "shmio.cli.read:watch_arguments",
+        "shmio.cli.read:watch",
         writable=False,
     ),
-    "set": Verb("Write values of registers, and print the result of each.", set_verb.arguments, set_verb.execute),
+    "set": Verb(
+        "Write values of registers, and print the result of each.", "shmio.cli.set:arguments", "shmio.cli.set:execute"
+    ),
     "inject": Verb(
-        "Give consumers, or with /in the device, other values until Ctrl-C.", inject.arguments, inject.execute
+        "Give consumers, or with /in the device, other values until Ctrl-C.",
+        "shmio.cli.inject:arguments",
+        "shmio.cli.inject:execute",
     ),
     "step": Verb(
         "Step the instance's time: after the first step only steps move it, until it is released.",
-        step.arguments,
-        step.execute,
+        "shmio.cli.step:arguments",
+        "shmio.cli.step:execute",
     ),
     "snapshot": Verb(
-        "Save the state of an instance in virtual time, and restore it.", snapshot.arguments, snapshot.execute
+        "Save the state of an instance in virtual time, and restore it.",
+        "shmio.cli.snapshot:arguments",
+        "shmio.cli.snapshot:execute",
     ),
     "replay": Verb(
-        "Show how recordings play, and control them: pause, play, seek, and more.", replay.arguments, replay.execute
+        "Show how recordings play, and control them: pause, play, seek, and more.",
+        "shmio.cli.replay:arguments",
+        "shmio.cli.replay:execute",
     ),
 }
 
@@ -67,19 +89,27 @@ VERBS = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``shmio`` and return its exit status."""
     words = verb_first(sys.argv[1:] if argv is None else argv)
-    parser = _parser()
+    chosen = words[0] if words else ""
+    parser = _parser(chosen)
     complete(parser)
-    arguments = parser.parse_args(set_verb.shield(words) if words[:1] in (["set"], ["inject"]) else words)
+    if chosen in ("set", "inject"):
+        from shmio.cli.set import shield  # noqa: PLC0415
+
+        words = shield(words)
+    arguments = parser.parse_args(words)
 
     def command() -> int:
         if arguments.verb == "fabric":
             return load("shmio.cli.fabric.verbs:execute")(arguments)
         verb: Verb | None = VERBS.get(arguments.verb)
         if verb is None:
-            print(completion.script(arguments.shell))
+            from shmio.cli.completion import script  # noqa: PLC0415
+
+            print(script(arguments.shell))
             return 0
+        execute = load(verb.execute)
         with _opened(arguments, writable=verb.writable) as cell:
-            return verb.execute(cell, _spelled(cell, arguments))
+            return execute(cell, _spelled(cell, arguments))
 
     return run(PROGRAM, command, arguments)
 
@@ -148,7 +178,8 @@ def _spelled(cell: Cell, arguments: argparse.Namespace) -> argparse.Namespace:
     return arguments
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(chosen: str) -> argparse.ArgumentParser:
+    """Return the parser. If ``chosen`` is a verb, the other verbs have no arguments."""
     parser = argparse.ArgumentParser(prog=PROGRAM, description="Read and write the registers of a running instance.")
     parser.add_argument("--version", action="version", version=f"shmio {__version__}")
     common = argparse.ArgumentParser(add_help=False)
@@ -171,13 +202,21 @@ def _parser() -> argparse.ArgumentParser:
         "--token-in-plain-text", action="store_true", help="send the token to another host even without TLS"
     )
     verbs = add_verbs(parser)
+
+    def needs(name: str) -> bool:
+        return chosen == name or chosen not in (*VERBS, "fabric", "completion")
+
     for name, verb in VERBS.items():
         sub = verbs.add_parser(name, parents=[common], help=verb.help, description=verb.help)
-        verb.arguments(sub)
+        if needs(name):
+            load(verb.arguments)(sub)
     if find_spec("shmio.fabric") is not None:  # not part of shmio-client
-        from shmio.cli.fabric.verbs import add_arguments  # noqa: PLC0415
+        sub = verbs.add_parser("fabric", help=FABRIC_HELP, description=FABRIC_HELP)
+        if needs("fabric"):
+            load("shmio.cli.fabric.verbs:add_arguments")(sub)
+    sub = verbs.add_parser("completion", help=SHELL_HELP, description=SHELL_HELP)
+    if needs("completion"):
+        from shmio.cli.completion import SHELLS  # noqa: PLC0415
 
-        add_arguments(verbs.add_parser("fabric", help=FABRIC_HELP, description=FABRIC_HELP))
-    shell = verbs.add_parser("completion", help=SHELL_HELP, description=SHELL_HELP)
-    shell.add_argument("shell", choices=completion.SHELLS, metavar="SHELL", help=", ".join(completion.SHELLS))
+        sub.add_argument("shell", choices=SHELLS, metavar="SHELL", help=", ".join(SHELLS))
     return parser

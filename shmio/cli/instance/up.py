@@ -21,6 +21,7 @@ from shmio.cli.instance.detach import Configured, Failed, Started, StartMessage,
 from shmio.cli.target import config_file
 from shmio.config import Address
 from shmio.errors import ShmioError
+from shmio.libraries import skip_package_code
 from shmio.plan.prepare import Prepared, peer, prepare
 from shmio.plan.processes import BROKER, Job, Plan
 from shmio.segment import State, instances
@@ -89,6 +90,7 @@ def _detached(file: Path, mode: str, keys: Mapping[str, Any], report: int) -> in
 
     try:
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        skip_package_code("snap7")  # as in shmio.emulators
         prepared = prepare(file, mode, keys)
         plan = prepared.plan
         send(Configured(printable(str(_log_file(plan))), tuple(map(printable, plan.warnings))))
