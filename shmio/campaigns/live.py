@@ -8,9 +8,10 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from itertools import groupby
 from math import ceil
 from pathlib import Path
-from typing import Final
+from typing import Final, cast
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from shmio.local.attach import Attachment
 from shmio.model.snapshot import SnapshotInfo
 from shmio.recorder.file_output import Output
 from shmio.recorder.instance_follower import InstanceEntry, InstanceFollower, StartPositions
-from shmio.recorder.recorder import CLOSE_S, AttachedFiles, Recorder, no_attachments
+from shmio.recorder.recorder import CLOSE_S, AttachedFiles, Recorder, frame_of, no_attachments
 from shmio.recording.block_follower import BlockEntry
 from shmio.recording.injection_times import InjectionTimes
 from shmio.recording.judge import GoldenRecordings
@@ -238,14 +239,13 @@ class LiveRun:
 
     def _judge(self, entries: Sequence[BlockEntry | InstanceEntry]) -> None:
         frames: dict[int, tuple[Block, list[Frame]]] = {}
-        for entry in entries:
-            if isinstance(entry, InstanceEntry):
-                continue
-            block = entry.follower.block
-            if isinstance(entry.item, Event):
-                self.injections.follow(block.source, entry.item)
-            elif isinstance(entry.item, Frame) and block.source in self._blocks:
-                frames.setdefault(block.section, (block, []))[1].append(entry.item)
+        for follower, group in groupby(entries, frame_of):
+            if follower is None:
+                for entry in group:
+                    if isinstance(entry.item, Event) and isinstance(entry, BlockEntry):
+                        self.injections.follow(entry.follower.block.source, entry.item)
+            elif (block := follower.block).source in self._blocks:
+                frames.setdefault(block.section, (block, []))[1].extend(cast("Frame", one.item) for one in group)
         for block, some in frames.values():
             source = block.source
             if block is not self._blocks[source]:
@@ -262,15 +262,14 @@ def frames_of(frames: Sequence[Frame], size: int, *, raws: bool) -> Frames:
         size: Size of an image in bytes.
         raws: Whether the judge also needs the images that the source delivered, without injections.
     """
+    fields = tuple(zip(*frames, strict=True)) or ((),) * len(Frame._fields)
+    number, _, _, clock_ns, _, _, quality, _, _, delay_us, _, raw, effective = fields
+    shown = [one if other is None else other for one, other in zip(raw, effective, strict=True)]
 
-    def images(some: Iterator[bytes]) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+    def images(some: Sequence[bytes]) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
         return np.frombuffer(b"".join(some), np.uint8).reshape(len(frames), size)
 
     return Frames(
-        np.array([frame.number for frame in frames], np.uint64),
-        np.array([frame.clock_ns for frame in frames], np.int64),
-        np.array([int(frame.quality) for frame in frames], np.uint8),
-        np.array([frame.delay_us for frame in frames], np.uint32),
-        images(frame.image for frame in frames),
-        images(frame.raw for frame in frames) if raws else None,
-    )
+        np.array(number, np.uint64), np.array(clock_ns, np.int64), np.frombuffer(bytes(quality), np.uint8),
+        np.array(delay_us, np.uint32), images(shown), images(raw) if raws else None,
+    )  # fmt: skip

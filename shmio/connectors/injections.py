@@ -303,7 +303,7 @@ class DeclaredInjections:
                 return reason
             if self._output.advance is None:  # evaluate the injection from the next cycle on
                 injections = self._publisher.injections
-                injections.now = injections.now._replace(cycle=self._output.cycle)
+                injections.now = msgspec.structs.replace(injections.now, cycle=self._output.cycle)
             self._settle()
             for record in _injected_events(layer, command):  # before any frame: the layer changes nothing yet
                 self._output.writer.event(record)

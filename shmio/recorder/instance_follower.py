@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from operator import itemgetter
 from typing import Final, NamedTuple
 
 from shmio.model.clock import Clock
@@ -208,7 +209,7 @@ class InstanceFollower:
         self._lively = most > LIVELY
         self.followers = [follower for follower in self.followers if not follower.done]
         self._watching = [follower for follower in self._watching if not follower.done]
-        entries.sort(key=lambda entry: entry.log_ns)  # stable: entries of a block stay in order
+        entries.sort(key=itemgetter(0))  # by log time; stable: entries of a block stay in order
         if state.virtual and state.done != self.done and not more:
             entries += self._step(state)
         now_s = time.monotonic()

@@ -301,7 +301,7 @@ class Recorder:
             for entry in entries:
                 self._lose(entry)
         else:
-            for source, group in groupby(entries, _frame_of):
+            for source, group in groupby(entries, frame_of):
                 if source is None:
                     for entry in group:
                         self._write(entry)
@@ -429,8 +429,9 @@ class Recorder:
     def _write_frames(self, follower: BlockFollower, entries: Iterable[BlockEntry]) -> None:
         """Record consecutive entries of one block, which are all frames."""
         self.empty = False
-        keep = follower.part.keep
-        frames = [(log_ns, keep(item)) for log_ns, _, item in entries if isinstance(item, Frame)]
+        frames = [(log_ns, cast("Frame", item)) for log_ns, _, item in entries]
+        if not follower.part.whole:
+            frames = [(log_ns, follower.part.keep(frame)) for log_ns, frame in frames]
         followed = self._known(follower)
         if followed.lost:
             self._tell_lost(followed, frames[0][0])
@@ -471,7 +472,7 @@ class Recorder:
             followed.come_to(gap.what, gap.last, log_ns)
 
 
-def _frame_of(entry: BlockEntry | InstanceEntry) -> BlockFollower | None:
+def frame_of(entry: BlockEntry | InstanceEntry) -> BlockFollower | None:
     """Return the follower of the block if an entry is a frame, else None."""
     return entry.follower if isinstance(entry, BlockEntry) and isinstance(entry.item, Frame) else None
 

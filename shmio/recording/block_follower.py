@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Generic, NamedTuple, TypeVar
+from functools import partial
+from itertools import repeat
+from typing import Final, Generic, NamedTuple, TypeVar
 
 from shmio.recording.format.encoding import BlockPosition, Gap, Reason
 from shmio.recording.selection import RecordedRegisters
@@ -19,6 +21,10 @@ class BlockEntry(NamedTuple):
     log_ns: int
     follower: BlockFollower
     item: Frame | Event | Gap
+
+
+_ENTRY: Final = partial(tuple.__new__, BlockEntry)
+"""Makes an entry of a tuple, faster than BlockEntry() of three arguments."""
 
 
 class _Stream(Generic[Item]):
@@ -122,10 +128,12 @@ class BlockFollower:
 
     def _consecutive(self, frames: Sequence[Frame]) -> list[BlockEntry]:
         """Return the entries for frames that follow the last one without a gap."""
-        entries, log_ns, utc_ns = [], self._log_ns, self._started_utc_ns
+        log_ns, utc_ns = self._log_ns, self._started_utc_ns
+        times = []
         for frame in frames:
             log_ns = max(log_ns, utc_ns + frame.clock_ns)  # as in _entries()
-            entries.append(BlockEntry(log_ns, self, frame))
+            times.append(log_ns)
+        entries = list(map(_ENTRY, zip(times, repeat(self), frames)))
         side = self._frames
         side.last, side.log_ns, side.reason = frames[-1].number, log_ns, Reason.OVERTAKEN
         self._log_ns = log_ns

@@ -495,7 +495,7 @@ _MIN_I64: Final = -(2**63)
 _MAX_I64: Final = 2**63 - 1
 
 
-class Stamp(NamedTuple):
+class Stamp(msgspec.Struct, frozen=True, gc=False):  # each step makes one: faster than a tuple
     """The times of one publication, in ns.
 
     Attributes:
@@ -577,7 +577,7 @@ class BlockWriter:
                 now_ns = self.block.now_ns() if self.at_ns is None else self.at_ns
                 clock_ns = self._clock_ns(now_ns)
             else:
-                now_ns, clock_ns, _ = at
+                now_ns, clock_ns = at.publish_ns, at.clock_ns
             self._quality = quality
             return self._frames.publish(
                 raw,
@@ -589,7 +589,7 @@ class BlockWriter:
                 quality,
                 provenance,
                 self._events.head(),
-                0 if asked_ns is None else min(-(-max(0, now_ns - asked_ns) // 1000), _MAX_DELAY_US),
+                0 if asked_ns is None or asked_ns >= now_ns else min(-(-(now_ns - asked_ns) // 1000), _MAX_DELAY_US),
                 cut(reason, REASON_SIZE) if reason else b"",
             )
 
@@ -636,14 +636,14 @@ class BlockWriter:
             The event's number.
         """
         with self._lock:
-            now_ns, clock_ns, utc_ns = at or self._present()
+            at = at or self._present()
             number = self._events.publish(
                 record.pack(),
                 None,
                 self.cycle,
-                now_ns,
-                clock_ns,
-                utc_ns or time.time_ns(),
+                at.publish_ns,
+                at.clock_ns,
+                at.utc_ns or time.time_ns(),
                 self._quality if quality is None else quality,
                 Provenance.LIVE,
                 self._frames.head(),

@@ -11,6 +11,8 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Final, cast
 
+import msgspec
+
 from shmio.connectors.commands import CommandProcessor
 from shmio.connectors.injections import Blocks, OwnerOf
 from shmio.connectors.models.stepped import StepClock
@@ -235,7 +237,7 @@ class Player:
             event.size, event.data, event.injection,
         )  # fmt: skip
         self._writer.cycle = event.cycle
-        self._writer.event(record, quality=event.quality, at=at._replace(utc_ns=event.utc_ns))
+        self._writer.event(record, quality=event.quality, at=msgspec.structs.replace(at, utc_ns=event.utc_ns))
 
     def _change_quality(self, quality: Quality, reason: str, at: Stamp) -> None:
         self._writer.event(Record(EventKind.QUALITY, reason), quality=quality, at=at)
