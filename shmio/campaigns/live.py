@@ -245,7 +245,8 @@ class LiveRun:
                     if isinstance(entry.item, Event) and isinstance(entry, BlockEntry):
                         self.injections.follow(entry.follower.block.source, entry.item)
             elif (block := follower.block).source in self._blocks:
-                frames.setdefault(block.section, (block, []))[1].extend(cast("Frame", one.item) for one in group)
+                new = cast("list[Frame]", [entry.item for entry in group])
+                frames.setdefault(block.section, (block, []))[1].extend(new)
         for block, some in frames.values():
             source = block.source
             if block is not self._blocks[source]:

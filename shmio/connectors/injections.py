@@ -170,6 +170,7 @@ class DeclaredInjections:
 
     def __init__(self, publisher: LayerPublisher, blocks: Blocks) -> None:
         self._publisher = publisher
+        self._stack = publisher.injections
         self._output = publisher.output
         self._own = publisher.output.writer.block
         self._blocks_of = blocks
@@ -364,7 +365,7 @@ class DeclaredInjections:
         a cycle, because the number of further images depends on timing, which must not influence
         the result.
         """
-        stack, cycle = self._publisher.injections, image.cycle
+        stack, cycle = self._stack, image.cycle
         looked = stack.now.cycle
         time_ns = image.at.clock_ns if image.at else self._time_ns(cycle)
         stack.now = CycleImage(cycle, time_ns, image.raw)
@@ -499,6 +500,7 @@ class InjectionProcessor:
         self._look_ns = 0  # time of the next check by CLOCK_MONOTONIC
         self._publisher = LayerPublisher(output, writable, refuse_in)
         self.declared = DeclaredInjections(self._publisher, blocks)
+        self.release = self.declared.release
         self._resume()
         self.declared.follow()
 
@@ -518,10 +520,6 @@ class InjectionProcessor:
     def overload(self) -> str:
         """Why the source can accept no write at present; empty if it can accept writes."""
         return self.declared.overload
-
-    def release(self, cycle: int) -> list[tuple[DeclaredLayer, Write]]:
-        """Return the delayed writes that are due in ``cycle``, each with the injection that delayed it."""
-        return self.declared.release(cycle)
 
     def forget(self, reason: str) -> None:
         """Discard all delayed writes, because the connection to the device was lost."""

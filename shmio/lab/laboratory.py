@@ -26,7 +26,7 @@ from shmio.judging.source import Rows
 from shmio.local.attach import Attachment
 from shmio.local.snapshots import Refusals
 from shmio.local.time_control import Coordinator, Step
-from shmio.model.clock import Clock, check_step
+from shmio.model.clock import check_step
 from shmio.plan.prepare import prepare
 from shmio.plan.processes import Job, Plan
 from shmio.recorder.recorder import AttachedFiles, ConfigFiles
@@ -264,30 +264,32 @@ class _LabCoordinator(Coordinator):
 
         """
         lab, page = self._lab, self._lab.page
-        moving, loops, write = lab.moving, tuple(lab.loops.items()), page.write
+        moving, begin_step, loops = lab.moving, page.begin_step, tuple(lab.loops.items())
         with self._lock:
             if not self.owns:
                 self.take_over(steps=True)
-            mode, step, time_ns, _, done, size_ns, playing, rate, _, owner, _, *wall = page.last_written()
-            dt_ns = size_ns if dt_ns is None else dt_ns
+            before = page.last_written()
+            dt_ns = before.step_size_ns if dt_ns is None else dt_ns
             check_step(dt_ns)
-            problem, end = "", step + count
+            step, time_ns, done, problem = before.step, before.time_ns, before.done, ""
+            end = step + count
             try:
                 while step < end and not problem:
                     step, time_ns, problem = step + 1, time_ns + dt_ns, "it was cancelled"
-                    asked = Clock(mode, step, time_ns, dt_ns, done, size_ns, playing, rate, True, owner, "", *wall)
                     with moving:  # between two steps, other threads carry out commands
                         lab.stepping = True
                         try:
-                            write(asked, ring=False)
-                            problem = "; ".join([f"{name}: {why}" for name, loop in loops if (why := loop.step(asked))])
+                            begin_step(before, step, time_ns, dt_ns, done)
+                            problem = "; ".join(
+                                [f"{name}: {why}" for name, loop in loops if (why := loop.step(step, time_ns, dt_ns))]
+                            )
                         finally:
                             lab.stepping = False
                     done = done if problem else step
             finally:
                 note = f"step {step} failed: {problem}" if problem else ""
-                ended = Clock(mode, step, time_ns, dt_ns, done, size_ns, playing, rate, False, owner, note, *wall)
-                write(ended, ring=False)
+                ended = before._replace(step=step, time_ns=time_ns, dt_ns=dt_ns, done=done, stepping=False, note=note)
+                page.write(ended, ring=False)
             if problem:
                 raise TimeError(f"step {step}: {problem}")
             return Step(step, time_ns, dt_ns)

@@ -429,7 +429,7 @@ class Recorder:
     def _write_frames(self, follower: BlockFollower, entries: Iterable[BlockEntry]) -> None:
         """Record consecutive entries of one block, which are all frames."""
         self.empty = False
-        frames = [(log_ns, cast("Frame", item)) for log_ns, _, item in entries]
+        frames = cast("list[tuple[int, Frame]]", [(log_ns, item) for log_ns, _, item in entries])
         if not follower.part.whole:
             frames = [(log_ns, follower.part.keep(frame)) for log_ns, frame in frames]
         followed = self._known(follower)

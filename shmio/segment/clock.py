@@ -204,6 +204,20 @@ class ClockPage:
         if ring:
             self.bell.ring()
 
+    def begin_step(self, before: Clock, step: int, time_ns: int, dt_ns: int, done: int) -> None:
+        """Write that a step of virtual time has begun, faster than :meth:`write` does. No doorbell rings.
+
+        Args:
+            before: The state of the clock before, which was virtual. Its other fields remain.
+            step: Number of the step.
+            time_ns: The instance's clock after the step, in ns.
+            dt_ns: Length of the step, in ns.
+            done: Number of the last step that is done.
+        """
+        flags = _STEPPING | _PLAYING if before.playing else _STEPPING
+        rest = before.step_size_ns, before.rate, before.owner, b""
+        self._state.write(_STATE.pack(before.mode, flags, step, time_ns, dt_ns, done, *rest))
+
     def now_ns(self) -> int:
         """Return the present publish time in ns, from which the age of frames on the instance clock is computed.
 

@@ -329,7 +329,7 @@ class SteppedLoop:
         Then wait, and return whether the loop must stop.
         """
         if state.stepping and state.step != self._handled:
-            self.step(state)
+            self.step(state.step, state.time_ns, state.dt_ns)
         elif not state.stepping:
             self._handled = self._writer.cycle = state.step
             self._stand(state.time_ns)
@@ -344,11 +344,11 @@ class SteppedLoop:
                 self._carry_out()
         return self._clock.wait_ns(wait_ns)
 
-    def step(self, state: Clock) -> str:
-        """Compute a requested step; return "", or why the step failed."""
-        self._handled = state.step
-        self._stand(state.time_ns)
-        return self._compute(state.step, state.time_ns, state.dt_ns)
+    def step(self, number: int, time_ns: int, dt_ns: int) -> str:
+        """Compute a requested step, whose times are in ns; return "", or why the step failed."""
+        self._handled = number
+        self._stand(time_ns)
+        return self._compute(number, time_ns, dt_ns)
 
     def _stand(self, time_ns: int) -> None:
         """Give all frames and events the time ``time_ns`` of virtual time, until the next call."""
