@@ -474,7 +474,7 @@ class Recorder:
 
 def frame_of(entry: BlockEntry | InstanceEntry) -> BlockFollower | None:
     """Return the follower of the block if an entry is a frame, else None."""
-    return entry.follower if isinstance(entry, BlockEntry) and isinstance(entry.item, Frame) else None
+    return entry.follower if isinstance(entry.item, Frame) else None
 
 
 def is_process_change(entry: BlockEntry | InstanceEntry) -> bool:

@@ -94,29 +94,56 @@ static PyObject *Ring_begin(Ring *self, PyObject *args)
     return PyLong_FromUnsignedLong(self->incarnation);
 }
 
-static PyObject *Ring_publish(Ring *self, PyObject *args)
+/* Reads the numbers of a frame: cycle, publish_ns, clock_ns, source_ns, quality, provenance, event, delay_us. Returns
+ * false with an exception. */
+static bool frame_numbers(PyObject *const *args, slot_info *info)
 {
-    Py_buffer raw, reason, effective = {0};
-    PyObject *effective_object, *result = NULL;
+    long long times[3];
+    unsigned long bytes[2];
+    info->cycle = PyLong_AsUnsignedLongLongMask(args[0]);
+    if (PyErr_Occurred()) return false;
+    for (int i = 0; i < 3; i++) {
+        times[i] = PyLong_AsLongLong(args[1 + i]);
+        if (times[i] == -1 && PyErr_Occurred()) return false;
+    }
+    for (int i = 0; i < 2; i++) {
+        bytes[i] = PyLong_AsUnsignedLong(args[4 + i]);
+        if (bytes[i] == (unsigned long)-1 && PyErr_Occurred()) return false;
+        if (bytes[i] > UINT8_MAX) {
+            PyErr_SetString(PyExc_OverflowError, "quality and provenance are at most 255");
+            return false;
+        }
+    }
+    info->event = PyLong_AsUnsignedLongLongMask(args[6]);
+    if (PyErr_Occurred()) return false;
+    info->delay_us = (uint32_t)PyLong_AsUnsignedLongMask(args[7]);
+    if (PyErr_Occurred()) return false;
+    info->publish_ns = times[0];
+    info->clock_ns = times[1];
+    info->source_ns = times[2];
+    info->quality = (uint8_t)bytes[0];
+    info->provenance = (uint8_t)bytes[1];
+    return true;
+}
+
+static PyObject *Ring_publish(Ring *self, PyObject *const *args, Py_ssize_t given)
+{
+    Py_buffer raw = {0}, reason = {0}, effective = {0};
+    PyObject *result = NULL;
     slot_info info = {0};
-    unsigned long long cycle, event;
-    unsigned int delay_us;
-    long long publish_ns, clock_ns, source_ns;
-    if (!PyArg_ParseTuple(args, "y*OKLLLBBKIy*", &raw, &effective_object, &cycle, &publish_ns, &clock_ns, &source_ns,
-                          &info.quality, &info.provenance, &event, &delay_us, &reason))
+    if (given != 11) {
+        PyErr_SetString(PyExc_TypeError, "two images, eight numbers and a reason are needed");
         return NULL;
-    if (effective_object != Py_None && PyObject_GetBuffer(effective_object, &effective, PyBUF_SIMPLE) < 0) goto done;
+    }
+    if (!frame_numbers(args + 2, &info)) return NULL;
+    if (PyObject_GetBuffer(args[0], &raw, PyBUF_SIMPLE) < 0) goto done;
+    if (args[1] != Py_None && PyObject_GetBuffer(args[1], &effective, PyBUF_SIMPLE) < 0) goto done;
+    if (PyObject_GetBuffer(args[10], &reason, PyBUF_SIMPLE) < 0) goto done;
     if (!Ring_begun(self)) goto done;
     if (raw.len != self->ring.frame_size || (effective.obj && effective.len != self->ring.frame_size)) {
         PyErr_Format(PyExc_ValueError, "a frame of this ring has %u bytes", self->ring.frame_size);
         goto done;
     }
-    info.cycle = cycle;
-    info.publish_ns = publish_ns;
-    info.clock_ns = clock_ns;
-    info.source_ns = source_ns;
-    info.event = event;
-    info.delay_us = delay_us;
     info.incarnation = self->incarnation;
     info.reason_size = (uint16_t)(reason.len < (Py_ssize_t)REASON_SIZE ? reason.len : (Py_ssize_t)REASON_SIZE);
     if (effective.obj && !self->ring.effective_offset) {
@@ -126,8 +153,8 @@ static PyObject *Ring_publish(Ring *self, PyObject *args)
     result = PyLong_FromUnsignedLongLong(ring_publish(&self->ring, info, reason.buf, raw.buf, effective.buf));
 done:
     if (effective.obj) PyBuffer_Release(&effective);
-    PyBuffer_Release(&reason);
-    PyBuffer_Release(&raw);
+    if (reason.obj) PyBuffer_Release(&reason);
+    if (raw.obj) PyBuffer_Release(&raw);
     return result;
 }
 
@@ -405,7 +432,7 @@ static PyGetSetDef Ring_fields[] = {
 #define METHOD(type, name, flags, doc) {#name, (PyCFunction)(void (*)(void))type##_##name, flags, doc}
 static PyMethodDef Ring_methods[] = {
     METHOD(Ring, begin, METH_VARARGS, "Start to write with the next incarnation, or the given one; return it."),
-    METHOD(Ring, publish, METH_VARARGS, "Write the next frame, wake all waiters, and return the frame's number."),
+    METHOD(Ring, publish, METH_FASTCALL, "Write the next frame, wake all waiters, and return the frame's number."),
     METHOD(Ring, head, METH_NOARGS, "Return the number of the newest complete frame; 0: there is none yet."),
     METHOD(Ring, latest, METH_NOARGS, "Return a validated copy of the newest frame, or None."),
     METHOD(Ring, read, METH_O, "Return a validated copy of one frame; None if it is not in the ring."),

@@ -534,6 +534,7 @@ class BlockWriter:
         None: events get the present UTC time.
         """
         self._quality = Quality.BAD
+        self._event = self._events.head()  # number of the last event
         self.incarnation = self._frames.begin()
         self._events.begin(self.incarnation)
         self.event(Record(EventKind.STARTED, f"pid {os.getpid()}"), at=at)
@@ -588,7 +589,7 @@ class BlockWriter:
                 time.time_ns() if source_ns is None else source_ns,
                 quality,
                 provenance,
-                self._events.head(),
+                self._event,
                 0 if asked_ns is None or asked_ns >= now_ns else min(-(-(now_ns - asked_ns) // 1000), _MAX_DELAY_US),
                 cut(reason, REASON_SIZE) if reason else b"",
             )
@@ -611,7 +612,7 @@ class BlockWriter:
         with self._lock:
             now_ns = self.now_ns()
             done = self._frames.publish_packed(
-                data, at, number, now_ns, self._clock_ns(now_ns), self._events.head(),
+                data, at, number, now_ns, self._clock_ns(now_ns), self._event,
                 max(_MIN_I64, min(made_ns, _MAX_I64)), max(0, min(late_ns, 1000 * _MAX_DELAY_US)),
             )  # fmt: skip
             if done[0]:
@@ -637,7 +638,7 @@ class BlockWriter:
         """
         with self._lock:
             at = at or self._present()
-            number = self._events.publish(
+            number = self._event = self._events.publish(
                 record.pack(),
                 None,
                 self.cycle,

@@ -216,7 +216,7 @@ def encode_frame_v2(frame: Frame, sequence: int, log_ns: int, publish_ns: int) -
     """
     (number, cycle, published_ns, clock_ns, source_ns, incarnation, quality, provenance, event, delay_us, text, raw,
      effective) = frame  # fmt: skip
-    reason = text.encode()
+    reason = text.encode() if text else b""
     head = _FRAME_V2.pack(
         number - sequence & _MAX_U64, cycle - number & _MAX_U64, published_ns - clock_ns & _MAX_U64,
         clock_ns - log_ns & _MAX_U64, source_ns - publish_ns & _MAX_U64, event, incarnation, quality, provenance,

@@ -142,6 +142,22 @@ def test_publishing_needs_a_writer_a_writable_buffer_and_the_right_size() -> Non
     assert ring.head() == 0
 
 
+def test_publishing_refuses_wrong_arguments() -> None:
+    ring = Ring(ring_memory(), 0, len(ring_memory()))
+    ring.begin()
+    right = [bytes(20), bytes(20), 1, 10, 20, 30, 2, 0, 0, 0, b""]
+    for place, value in (
+        (0, "text"), (1, 1), (2, 1.5), (3, 2**63), (5, None), (6, 256), (6, -1), (7, 2**70), (8, "1"), (9, None),
+        (10, ""),
+    ):  # fmt: skip
+        wrong = [*right[:place], value, *right[place + 1 :]]
+        with pytest.raises((TypeError, OverflowError)):
+            cast("Any", ring).publish(*wrong)
+    with pytest.raises(TypeError):
+        cast("Any", ring).publish(*right[:10])
+    assert ring.head() == 0
+
+
 def test_a_long_reason_is_cut() -> None:
     memory = ring_memory()
     ring = Ring(memory, 0, len(memory))
