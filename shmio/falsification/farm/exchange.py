@@ -9,6 +9,7 @@ server has stored the result. The server delivers a task again if it hears nothi
 from __future__ import annotations
 
 import asyncio
+import logging
 import socket
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Annotated, Final, TypeVar
@@ -18,6 +19,7 @@ import msgspec
 from shmio.errors import ConfigError, RemoteError
 from shmio.fabric.connection import FARM, INSTALL, RETRY_S, Access, RefusedError, call_once
 from shmio.libraries import library
+from shmio.wording import counted
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
@@ -49,6 +51,8 @@ MAX_DELIVERIES: Final = 10
 _Id = Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{16}\Z")]
 _Text = Annotated[str, msgspec.Meta(max_length=4096)]
 _Result = TypeVar("_Result")
+
+log = logging.getLogger("shmio.fabric")
 
 
 class Offer(msgspec.Struct, frozen=True):
@@ -148,13 +152,18 @@ async def try_access(access: Access) -> None:
 async def contact(client: Client) -> None:
     """Check that the server has JetStream and gives access to the queue. Create the queue if it is missing.
 
+    If the queue and the bundles were created on a single server that has joined a cluster since, let as
+    many servers keep them as those of a new cluster.
+
     Raises:
         RemoteError: It does not, or its cluster has too few servers.
 
     """
     errors, js = library("nats.errors", INSTALL), library("nats.js.errors", INSTALL)
     try:
-        await open_queue(client)
+        if not await open_queue(client):
+            for name in (NAME, f"OBJ_{NAME}"):
+                await _replicate(client, name)
     except js.ServiceUnavailableError:
         raise RemoteError(
             "the NATS server has no JetStream; start it with -js, or set jetstream in its configuration"
@@ -187,6 +196,26 @@ async def _replicated(create: Callable[[int], Awaitable[_Result]]) -> _Result:
         if error.err_code != _NO_CLUSTER:
             raise
         return await create(1)
+
+
+async def _replicate(client: Client, name: str) -> None:
+    """Let a cluster keep an existing stream on ``REPLICAS`` servers; if it cannot, log a warning."""
+    errors, stream = library("nats.js.errors", INSTALL), client.jetstream()
+    try:
+        config = (await stream.stream_info(name)).config
+    except errors.NotFoundError:
+        return
+    if (config.num_replicas or 1) >= REPLICAS:
+        return
+    try:
+        await stream.update_stream(config.evolve(num_replicas=REPLICAS))
+    except errors.APIError as error:
+        if error.err_code != _NO_CLUSTER:
+            log.warning(
+                "%s is kept by only %s of the NATS cluster, so the loss of one may end a search: %s; start its "
+                "servers, or run nats stream edit %s --replicas %d",
+                name, counted(config.num_replicas or 1, "server"), error.description or error, name, REPLICAS,
+            )  # fmt: skip
 
 
 async def open_queue(client: Client) -> bool:

@@ -26,9 +26,10 @@ from nats.aio.msg import Msg
 from shmio.cli.campaign import main
 from shmio.errors import ConfigError, RemoteError
 from shmio.fabric.client import FabricClient
-from shmio.fabric.connection import Access
+from shmio.fabric.connection import Access, call_once
 from shmio.falsification.farm.bundle import Bundle, make_bundle
 from shmio.falsification.farm.environment import environment_of, own
+from shmio.falsification.farm.exchange import open_queue, open_store, try_access
 from shmio.falsification.farm.pool import FarmPool
 from shmio.falsification.farm.worker import Worker
 from shmio.falsification.trial import Result, Task
@@ -467,6 +468,38 @@ def test_a_cluster_that_cannot_keep_the_queue_is_named(
     monkeypatch.setattr(FabricClient, "request", request)
     with pytest.raises(RemoteError, match=said), pool(server, bundle, []):
         pass
+
+
+STATE = ("messages", "bytes", "first_seq", "last_seq", "consumer_count")
+
+
+@pytest.mark.parametrize(
+    ("code", "said"), [(0, ""), (10_005, "kept by only 1 server.*no suitable peers"), (10_074, "")]
+)
+def test_a_queue_of_a_single_server_is_kept_by_the_cluster_that_it_joins(
+    code: int, said: str, server: NatsServer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    ask, asked = FabricClient.request, dict[str, int]()
+
+    async def request(client: FabricClient, subject: str, data: bytes, *arguments: Any, **options: Any) -> Msg:
+        if "STREAM.UPDATE" not in subject:
+            return await ask(client, subject, data, *arguments, **options)
+        config = json.loads(data)
+        asked[config["name"]] = config["num_replicas"]
+        error = {"code": 400, "err_code": code, "description": "no suitable peers"}
+        answer = {"error": error} if code else {"config": config, "state": dict.fromkeys(STATE, 0)}
+        return Msg(client, data=json.dumps(answer).encode())
+
+    async def prepare(client: Any) -> None:
+        await open_queue(client)
+        await open_store(client)
+
+    asyncio.run(call_once(Access((server.url,)), prepare))
+    monkeypatch.setattr(FabricClient, "request", request)
+    asyncio.run(try_access(Access((server.url,))))
+    assert asked == {"shmio_farm": 3, "OBJ_shmio_farm": 3}
+    assert re.search(said, caplog.text)
+    assert bool(caplog.text) is bool(said)
 
 
 def test_hostile_messages_do_not_stop_a_worker(server: NatsServer, bundle: Bundle) -> None:
