@@ -391,7 +391,7 @@ def _uploads() -> list[bytes]:
 def _check_upload(data: bytes) -> None:
     head, _, rest = data.partition(b"\n")
     describe(data)
-    with suppress(ValueError, TypeError, KeyError, RecursionError, OverflowError):  # with sizes that fit
+    with suppress(ValueError, TypeError, LookupError, RecursionError, OverflowError):  # with sizes that fit
         files = json.loads(head)
         files[-1]["size"] += len(rest) - sum(int(file["size"]) for file in files)
         describe(json.dumps(files).encode() + b"\n" + rest)

@@ -288,9 +288,10 @@ class MqttConnector(Connector):
         """Publish messages until the maximum number is unacknowledged."""
         while sending.left and link.await_room(0.0):
             command = sending.left[0]
-            if link.fits(command.publication):
-                self._store.expect(command.publication.topic, command.publication.payload)
-                command.number = link.publish(command.publication)
+            message = command.publication
+            if link.fits(message):
+                self._store.expect(message.topic, message.payload, retain=message.retain)
+                command.number = link.publish(message)
                 sending.sent.append(command)  # from here on, the broker may have it
             else:
                 command.outcome = "the message is larger than the broker accepts"

@@ -71,7 +71,7 @@ class Group:
                 return BAD_TIMEOUT
             if message.retained:  # its age is unknown
                 return UNCERTAIN_LAST_USABLE_VALUE
-        return GOOD
+        return UNCERTAIN_LAST_USABLE_VALUE if self.origin.doubtful else GOOD
 
 
 class Store:
@@ -347,11 +347,12 @@ class Store:
         with self._changed:
             return list(self.host.requests(now_ns))
 
-    def expect(self, topic: str, payload: bytes) -> None:
+    def expect(self, topic: str, payload: bytes, *, retain: bool) -> None:
         """Remember that a payload is about to be published and will come back; do nothing if its topic is not read."""
         with self._changed:
             if topic in self._topics and not self._topics[topic].refused:
                 self._expected[topic] = payload
+                self._topics[topic].unretained |= not retain
 
     def await_expected(self, until_s: float) -> bool:
         """Wait until all expected payloads have come back.

@@ -53,6 +53,11 @@ class Origin(ABC):
         """The status that makes all registers of this origin bad; GOOD if there is none."""
 
     @property
+    def doubtful(self) -> bool:
+        """True if the newest message may be older than one that was seen before."""
+        return False
+
+    @property
     def offline(self) -> str:
         """Why a command would not reach the device; "" if there is no known reason."""
         return ""
@@ -92,6 +97,10 @@ class Topic(Origin):
         """For each register, by index, the path of its value in JSON; None if the payload is the value as text."""
         self.refused = False
         """True if the broker refuses the subscription."""
+        self.unretained = False
+        """True if this source has published a message on the topic that the broker did not retain."""
+        self._seen: bytes | None = None
+        """The payload of the last message on the connection before; None if there was none."""
         self._time, self._max_bytes = time, max_bytes
         self._document: Any = None
         self._decoded: Message | None = None
@@ -100,6 +109,12 @@ class Topic(Origin):
     def fault(self) -> int:
         """The status that makes all registers of the topic bad; GOOD if there is none."""
         return BAD_USER_ACCESS_DENIED if self.refused else GOOD
+
+    @property
+    def doubtful(self) -> bool:
+        """True if the newest message is retained, and may be older than what this source has published."""
+        message = self.message
+        return self.unretained and message is not None and message.retained and message.payload != self._seen
 
     def order_of(self, index: int) -> int:  # noqa: ARG002  each message is for all registers
         """Return the ``order`` of the newest message, which has values for all registers."""
@@ -137,13 +152,16 @@ class Topic(Origin):
         return 0
 
     def reset(self) -> None:
-        """Forget the newest message."""
+        """Forget the newest message, except its payload."""
+        if self.message is not None:
+            self._seen = self.message.payload
         self.message = self._document = self._decoded = None
         self.refused = False
 
     def inherit(self, other: Topic) -> None:
         """Take over the message of ``other``, the same topic in the layout before a reload."""
         self.message, self.refused = other.message, other.refused
+        self.unretained, self._seen = other.unretained, other._seen
 
 
 def time_ns(found: Any) -> int:

@@ -338,6 +338,26 @@ def test_a_write_whose_echo_is_lost_with_the_connection(plant: Plant, retain: bo
         assert source.value("speed") == (2.5 if retain else 1.0)
 
 
+def test_a_retained_message_that_may_be_older_than_a_write_is_uncertain(plant: Plant) -> None:
+    plant.device.publish("w/speed", "1.0", retain=True)
+    with connected(plant.address, WRITABLE) as source:
+        source.until(lambda: source.value("speed") == 1.0)
+        assert source.write(speed=2.5) == [""]
+        for _ in range(2):
+            source.connector.connect()
+            source.until(lambda: source.value("speed") == 1.0)
+            assert source.code("speed") == statuses.UNCERTAIN_LAST_USABLE_VALUE
+            plant.device.publish("w/speed", "3.0")
+            source.until(lambda: source.value("speed") == 3.0)
+            assert source.code("speed") == 0
+        plant.device.publish("w/speed", "4.0", retain=True)
+        source.until(lambda: source.value("speed") == 4.0)
+        source.connector.connect()
+        source.until(lambda: source.value("speed") == 4.0)
+        assert source.code("speed") == 0, "nothing newer was seen"
+    plant.device.clear("w/speed")
+
+
 def test_without_a_connection_nothing_is_written(plant: Plant) -> None:
     with connected(plant.address, WRITABLE) as source:
         source.connector.close()
