@@ -347,6 +347,7 @@ class SubscribeCall:
                 self._step = None
                 yield batch + field(STEP, wire.Step(number=step.number, time_ns=step.time_ns).SerializeToString())
                 self._report_taken()
+                await self._wait()  # whatever has come since the batch has woken the stream
             elif batch:
                 yield batch
             elif self._moved:
