@@ -17,6 +17,7 @@ from shmio.wire import shmio_v1_pb2 as ours
 from shmio.wire import simlog_v1_pb2 as v1
 from shmio.wire import simlog_v2_pb2 as v2
 from shmio.wire import simserver_pb2 as sim
+from shmio.wire.shmio_v1_pb2_grpc import ShmioStub
 from tests.unit.endpoints import http2
 from tests.unit.endpoints.grpc.services.test_simlog_v2 import write
 from tests.unit.endpoints.grpc.services.test_simlog_v2_subscribers import messages
@@ -626,6 +627,38 @@ def test_wall_time_runs_until_a_client_takes_control(instance: str) -> None:
         while (last := (await asyncio.wait_for(clock.read(), TIMEOUT_S)).timeStamp.stamp.nsec) <= at_ns:
             pass
         assert last == at_ns + 50 * MS
+
+    simulate(instance, test, virtual=False)
+
+
+def test_wake_ups_pause_between_steps_until_an_outcome_or_real_time_cannot_wait(
+    instance: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shmio.endpoints.grpc.wakeups.PAUSE_S", 1000.0)
+
+    async def test(served: Endpoint, models: Models) -> None:
+        api: Any = ShmioStub(served.channel)  # type: ignore[no-untyped-call]
+        (wake_up,) = served.wake_ups._wake_ups.values()
+        updates = api.Subscribe(ours.SubscribeRequest(patterns=["sim/count"]), timeout=TIMEOUT_S)
+        stream = await served.subscriber("one", "sim/count")
+        await messages(stream, 1)
+
+        async def paused() -> bool:
+            assert await step(served) == 0
+            await messages(stream, 1)
+            return wake_up._pausing is not None
+
+        for number in (1, 2):
+            await served.until(paused)
+            await write(served, "SIM://goal/in", number)
+        await served.until(paused)
+        await api.Release(ours.ReleaseRequest(), timeout=TIMEOUT_S)
+        models["sim"].image[3] = 200
+        models["sim"].publish(served.segment.clock.read().step + 1)
+        assert await messages(stream, 1) == [("sim/count", 200.0)]
+        async with asyncio.timeout(TIMEOUT_S):
+            while not (answer := await updates.read()).updates or answer.updates[-1].cycle < models["sim"].writer.cycle:
+                pass
 
     simulate(instance, test, virtual=False)
 
