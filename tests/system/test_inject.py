@@ -152,7 +152,7 @@ def test_a_source_that_is_not_armed_refuses_injections(cell: Cell) -> None:
     refused = cell.run("shmio", "inject", "unarmed/Outputs/100/in", "7")
     assert refused.returncode == 1
     assert refused.stderr == (
-        "unarmed: an injection toward a device needs `armed = true` in the source's configuration\n"
+        "unarmed: an injection toward a device needs `armed = true` in the configuration of source 'unarmed'\n"
     )
 
 
