@@ -8,7 +8,6 @@ import shutil
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from datetime import UTC, datetime
 from typing import Any
 
 from shmio import garbage
@@ -21,6 +20,7 @@ from shmio.layout.values.literal import literal_text
 from shmio.layout.values.text import json_value
 from shmio.model.cell import Cell
 from shmio.model.values import Provenance, Quality, Reading
+from shmio.times import local_text, utc_text
 from shmio.wording import printable
 
 TABLE_EVERY_S = 0.2
@@ -192,12 +192,12 @@ def _width(readings: Sequence[Reading]) -> int:
 def clock(reading: Reading) -> str:
     """Return the time of a value as text; the present time if the value is bad."""
     if reading.quality is Quality.BAD:
-        when = datetime.now(UTC)
+        when_s = time.time()
     elif reading.source_time is None:
         return "-" * CLOCK_CHARACTERS
     else:
-        when = datetime.fromtimestamp(reading.source_time, UTC)
-    return when.astimezone().strftime("%H:%M:%S.%f")[:-3]
+        when_s = reading.source_time
+    return local_text(when_s).partition(" ")[2]
 
 
 def object_of(reading: Reading) -> dict[str, Any]:
@@ -207,7 +207,7 @@ def object_of(reading: Reading) -> dict[str, Any]:
         "quality": str(reading.quality),
         "reason": reading.reason,
         "provenance": reading.provenance,
-        "source_time": reading.source_time and _iso(reading.source_time),
+        "source_time": reading.source_time and utc_text(reading.source_time),
         "age_s": reading.age_s,
     }
 
@@ -231,7 +231,3 @@ def shown(value: Value, register: Register, limit: int | None) -> str:
     """
     text = "-" if value is None else printable(literal_text(value, register)) or '""'
     return text if limit is None or len(text) <= limit else f"{text[: max(limit - len(CUT), 0)]}{CUT}"
-
-
-def _iso(seconds: float) -> str:
-    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="microseconds").replace("+00:00", "Z")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable
-from datetime import datetime
 from typing import Final
 
 import msgspec
@@ -12,6 +11,7 @@ import msgspec
 from shmio.cli.common import dumps
 from shmio.model.cell import Cell
 from shmio.model.replay import ReplayChanges, ReplayStatus
+from shmio.times import local_text
 from shmio.wording import printable
 
 _VERBS: Final = {
@@ -101,7 +101,7 @@ def _number(options: argparse.Namespace) -> float:
 def _lines(found: Iterable[ReplayStatus]) -> Iterable[str]:
     for one in found:
         state = "over" if one.over else "paused" if one.paused else "playing"
-        at = datetime.fromtimestamp(one.time_s).astimezone().isoformat(" ", timespec="milliseconds")[:23]
+        at = local_text(one.time_s)
         until = f", until {one.until_s:.3f} s" if one.until_s is not None else ""
         loop = ", in a loop" if one.loop else ""
         yield (

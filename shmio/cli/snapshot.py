@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable, Iterator
-from datetime import datetime
 from typing import Any, Final
 
 import msgspec
@@ -12,6 +11,7 @@ import msgspec
 from shmio.cli.common import dumps
 from shmio.model.cell import Cell
 from shmio.model.snapshot import SnapshotInfo
+from shmio.times import local_text
 from shmio.wording import printable
 
 _ACTIONS: Final = {
@@ -74,7 +74,7 @@ def _lines(found: Iterable[SnapshotInfo]) -> Iterator[str]:
         if one.problem:
             yield f"{one.name}: {one.problem}"
             continue
-        saved = datetime.fromtimestamp(one.saved_s).astimezone().isoformat(" ", timespec="seconds")[:19]
+        saved = local_text(one.saved_s, "seconds")
         yield f"{one.name}: {one.time_ns / 1e9:.3f} s, step {one.step}, saved {saved}, {one.size_bytes / 1e6:.2f} MB"
         for process, why in one.left_out.items():
             yield f"  without {process}: {why}"

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
-
 from shmio.recording.format.records import Damage
+from shmio.times import local_text, utc_text
 
 
 def iso(time_ns: int) -> str:
     """Format a time in ns as UTC with µs, for JSON and tables."""
-    return _datetime(time_ns).isoformat(timespec="microseconds").replace("+00:00", "Z")
+    return utc_text(_seconds(time_ns))
 
 
 def local(time_ns: int) -> str:
     """Format a time in ns as local date and time with ms, for people."""
-    return _datetime(time_ns).astimezone().isoformat(" ", timespec="milliseconds")[:23]
+    return local_text(_seconds(time_ns))
 
 
 def span(first_ns: int, last_ns: int) -> str:
@@ -29,6 +28,6 @@ def lost(damage: Damage) -> str:
     return f"lost {begin}, {end} (bytes {damage.first} to {damage.last}): {damage.why}"
 
 
-def _datetime(time_ns: int) -> datetime:
-    """Convert a time in ns to a datetime. Clamp it, because a damaged file may have any time."""
-    return datetime.fromtimestamp(min(time_ns, 253_000_000_000 * 10**9) // 1000 / 1e6, UTC)
+def _seconds(time_ns: int) -> float:
+    """Convert a time in ns to s. Clamp it, because a damaged file may have any time."""
+    return min(time_ns, 253_000_000_000 * 10**9) // 1000 / 1e6

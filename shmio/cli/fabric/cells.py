@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import time
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -15,6 +15,7 @@ from shmio.cli.fabric.access import with_client
 from shmio.cli.instance.status import columns
 from shmio.fabric.fleet import Member, changes, members
 from shmio.fabric.registry import RENEW_S, Registry
+from shmio.times import local_text, utc_text
 from shmio.wording import printable
 
 if TYPE_CHECKING:
@@ -53,16 +54,12 @@ def table(found: Sequence[Member]) -> list[str]:
 async def _follow(registry: Registry, found: Sequence[Member], *, as_json: bool) -> None:
     before = {one.cell: one for one in found}
     for one in found if as_json else ():
-        say(dumps({"cell": one.cell, "event": one.state, "at": _utc(datetime.now(UTC))}))
+        say(dumps({"cell": one.cell, "event": one.state, "at": utc_text(time.time(), "seconds")}))
     while True:
         await asyncio.sleep(RENEW_S)
         now = {one.cell: one for one in await members(registry)}
         for cell, text in changes(before, now):
-            at = datetime.now(UTC)
-            local = at.astimezone().isoformat(" ", timespec="seconds")[:19]
-            say(dumps({"cell": cell, "event": text, "at": _utc(at)}) if as_json else f"{local}  {cell}  {text}")
+            now_s = time.time()
+            record = dumps({"cell": cell, "event": text, "at": utc_text(now_s, "seconds")})
+            say(record if as_json else f"{local_text(now_s, 'seconds')}  {cell}  {text}")
         before = now
-
-
-def _utc(at: datetime) -> str:
-    return at.isoformat(timespec="seconds").replace("+00:00", "Z")
