@@ -90,6 +90,8 @@ class Link:
         self._thread = threading.Thread(target=self._run, name="fabric", daemon=True)
         self.problem = "the fabric is not connected yet"
         """Why there is no connection; empty if there is one."""
+        self.stalled = False
+        """True while the server answers nothing, although the connection does not count as lost."""
         self.host = ""
         """Name of the owner's host; empty until an entry of the owner has come."""
 
@@ -203,18 +205,32 @@ class Link:
         try:
             await client.publish(self._cell.missing(self._source), request, reply=inbox)
             while True:
-                answer = await answers.next_msg(timeout=IDLE_S)
+                try:
+                    answer = await answers.next_msg(timeout=IDLE_S)
+                except TimeoutError:
+                    await self._await_server(client)
+                    if not answers.pending_msgs:
+                        return  # the loop repeats the request, or gives up
+                    continue
                 if answer.headers and answer.headers.get("Status") == "503":
                     return  # no uplink runs: the request is repeated
                 if not answer.data:
                     self._told(missing)
                     return
                 self._received(answer.data)
-        except (TimeoutError, errors.Error):
-            return  # the loop repeats the request, or gives up
+        except errors.Error:
+            return  # the connection is lost
         finally:
             with suppress(errors.Error):
                 await answers.unsubscribe()
+
+    async def _await_server(self, client: FabricClient) -> None:
+        """Wait until all that the server has sent so far has come, or the connection is lost."""
+        self.stalled = True
+        try:
+            await client.confirm()
+        finally:
+            self.stalled = False
 
     async def _request_state(self) -> None:
         if self._client is not None and self._client.is_connected:

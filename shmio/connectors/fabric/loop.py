@@ -221,7 +221,7 @@ class MirrorLoop:
             else:
                 self._order.announce(one)
         now_ns = self._clock.now_ns()
-        if self._link.connected:
+        if self._link.connected and not self._link.stalled:
             self._ready += self._order.expired(now_ns)
         else:
             self._order.suspend(now_ns)

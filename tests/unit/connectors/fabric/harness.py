@@ -71,7 +71,7 @@ class FakeLink:
         self.all: list[CommandRequest] = []
         self.reply = CommandReply([], [])
         self.sent = threading.Semaphore(0)
-        self.silent = False
+        self.silent = self.stalled = False
         self.number = self.states = 0
         self.states_asked = threading.Event()
 

@@ -147,6 +147,21 @@ def test_a_hole_is_not_given_up_while_there_is_no_connection(mirroring: Mirrorin
     assert [one.cycle for one in found if one.quality is Quality.GOOD] == [1008, 1009, 1010]
 
 
+def test_a_hole_is_not_given_up_while_the_connection_stalls(
+    mirroring: Mirroring, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shmio.connectors.fabric.order.PATIENCE_NS", 500_000_000)
+    mirroring.send(frame(7, 1))
+    mirroring.next()
+    missed = mirroring.link.message(frame(8, 2))
+    mirroring.link.stalled = True
+    mirroring.send(frame(9, 3))
+    assert mirroring.next().quality is Quality.BAD, "it has waited for its stale age"
+    mirroring.link.stalled = False
+    mirroring.link.send(missed)
+    assert [mirroring.next().cycle for _ in range(2)] == [1008, 1009]
+
+
 def test_frames_of_a_restarted_owner_are_no_gap(mirroring: Mirroring) -> None:
     mirroring.send(frame(7, 1), zero_ns=5)
     mirroring.send(frame(900, 2), zero_ns=6)
