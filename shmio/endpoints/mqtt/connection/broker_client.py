@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ssl
 import struct
+import time
 from collections.abc import Callable, Container
 from typing import Final
 
@@ -117,6 +118,7 @@ class BrokerClient(Client):
         """Read from the socket. Return False if the broker has closed the connection."""
         data = self._read_socket(READ_BYTES)
         self._unread = bytearray(data) if not self._unread else self._unread + data
+        self._last_bytes_received = time.monotonic()  # else paho would see no life in acknowledgements
         return bool(data)
 
     def _packet_read(self) -> MQTTErrorCode:

@@ -257,6 +257,26 @@ def test_joined_messages_arrive_as_they_were_sent() -> None:
             broker.close()
 
 
+def test_acknowledgements_keep_a_connection_alive(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The answer to a ping may wait behind large messages for longer than the keep-alive time."""
+    now_s = 1000.0
+    for clock in ("time.monotonic", "paho.mqtt.client.time_func"):
+        monkeypatch.setattr(clock, lambda: now_s)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        broker = Broker(server)
+        connection = broker.connection
+        try:
+            for number in range(1, 51):
+                now_s += 2.0
+                connection.send(Message("t", b"1", 1, retain=False))
+                connection.push()
+                broker.put(f"40 02 00 {number:02x}")
+                broker.turn_until(lambda: not connection.in_flight)
+                assert connection.up, connection.problem
+        finally:
+            broker.close()
+
+
 def test_sending_stops_while_the_broker_does_not_read() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         broker = Broker(server)
