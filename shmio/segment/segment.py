@@ -552,8 +552,9 @@ class Segment:
         with self._lock:
             if not self.outdated:
                 return False
-            self.blocks = self._find_blocks()
+            blocks = self._find_blocks()
             self.processes = ProcessTable(self.shared, self.memory, self.header)
+            self.blocks = blocks  # last: whoever sees new blocks also sees their processes
             return True
 
     def require_blocks(self, count: int) -> None:

@@ -139,9 +139,10 @@ class Delivery:
             self._timer = self._loop.call_at(self._due_s, self._check)
 
     def _taken(self, stream: StepStream) -> None:
-        self._late.discard(stream)
-        if not self._late:
-            self._advance()
+        if stream in self._late:  # it is not after stop()
+            self._late.discard(stream)
+            if not self._late:
+                self._advance()
 
     def _check(self) -> None:
         self._timer = None

@@ -395,14 +395,15 @@ class Stepper:
 
     async def _steer(self) -> None:
         """Take control of time. The caller holds the lock, and calls :meth:`_leave` in any case."""
-        await self.timeline.delivered()
         if self._segment.outdated:
             await asyncio.to_thread(self._segment.refresh)
-        self.timeline.steered = True
         if not self._owns:
+            self.timeline.update()  # another program may just have returned to real time
             self._coordinator.take_over()
             self._own(True)
-            self.timeline.update()
+            self.timeline.update()  # begins to deliver the last step of the program that controlled time before
+        await self.timeline.delivered()
+        self.timeline.steered = True
 
     def _leave(self) -> None:
         self.timeline.steered = False
@@ -427,6 +428,7 @@ class Stepper:
 
     async def _release(self) -> None:
         async with self._lock:
+            await self.timeline.delivered()  # streams would send the values of the next step with this one
             if not self._player.on:
                 self._own(False)
                 self._coordinator.close()
@@ -457,6 +459,7 @@ class Stepper:
         async with self._changing:
             await self._player.end()
             async with self._lock:
+                await self.timeline.delivered()
                 self._coordinator.release()
                 self._own(False)
                 self.timeline.ended = False

@@ -185,6 +185,7 @@ class Timeline:
         self._reported = self._status(state)[1:]
         self._delivered = state.done
         self._awaited = False  # whether steps wait for this process's delivery
+        self._postponed = False  # whether update() has to be called when the present delivery ends
         open_streams.changed = self._attend
         virtual_time.update = self.update
         self._attend()
@@ -251,19 +252,28 @@ class Timeline:
         state = self._clock.read()
         if state.virtual and not self.virtual_time.on:
             self._begin(_before(state))
-        elif self.virtual_time.on and not state.virtual and not self._delivery.busy:  # if busy, at the next call
+        if self._delivery.busy:
+            self._postponed = True
+            return state
+        if self.virtual_time.on and not state.virtual:
             self._end(state)
-        if state.virtual and state.done < self.virtual_time.moment.number and not self.steered:
-            self.virtual_time.moment = Moment(state.done - 1, state.present_ns)  # a snapshot has set time back
-        if state.virtual and state.done > self.virtual_time.moment.number and not self.steered:
-            if not self._delivery.busy:  # if it is, at its end
-                step = Step(state.done, state.present_ns, state.dt_ns)
-                self._delivery.begin(step, partial(self._mark, step))
-            if self._page is not None and not self._awaited:
-                self._page.pause()  # no stream is open
-        elif (status := self._status(state))[1:] != self._reported:
+        if state.virtual and not self.steered and self.alive and self._adopt(state):
+            return state
+        if (status := self._status(state))[1:] != self._reported:
             self._report(status, state)
         return state
+
+    def _adopt(self, state: Clock) -> bool:
+        """Begin to deliver the last step, if another program has made it. Return whether it has."""
+        if state.done < self.virtual_time.moment.number:
+            self.virtual_time.moment = Moment(state.done - 1, state.present_ns)  # a snapshot has set time back
+        if state.done == self.virtual_time.moment.number:
+            return False
+        step = Step(state.done, state.present_ns, state.dt_ns)
+        self._delivery.begin(step, partial(self._mark, step))
+        if self._page is not None and not self._awaited:
+            self._page.pause()  # no stream is open
+        return True
 
     def _begin(self, moment: Moment) -> None:
         """Switch to virtual time. The step ``moment`` counts as delivered."""
@@ -289,8 +299,13 @@ class Timeline:
         self._delivered = self.virtual_time.moment.number
         if self._awaited:
             self._clock.deliver(self._slot.index, self._delivered)
-        if not self.steered:
-            self.update()  # another program may have made a step meanwhile
+        if self._postponed:
+            self._postponed = False
+            self._loop.call_soon(self._catch_up)  # not at once: a fast program would nest the calls without end
+
+    def _catch_up(self) -> None:
+        if self.alive:
+            self.update()
 
     def _attend(self) -> None:
         """Make steps wait for this process while it has open streams, and only then."""

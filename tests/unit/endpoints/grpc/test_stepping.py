@@ -10,7 +10,10 @@ import grpc
 import pytest
 from google.protobuf.empty_pb2 import Empty
 
-from shmio.endpoints.grpc.time import delivery
+from shmio.endpoints.grpc.streams.outbox import StateLane
+from shmio.endpoints.grpc.time import delivery, stepper
+from shmio.endpoints.grpc.time.timeline import TimeStatus
+from shmio.errors import TimeError
 from shmio.local.time_control import Coordinator
 from shmio.segment import Segment
 from shmio.wire import shmio_v1_pb2 as ours
@@ -289,6 +292,80 @@ def test_steps_of_another_program_are_delivered_and_acknowledged(instance: str) 
         ]
 
     simulate(instance, test)
+
+
+def test_the_last_step_of_a_program_that_ended_comes_before_the_first_step_of_a_client(instance: str) -> None:
+    async def test(served: Endpoint, models: Models) -> None:
+        stream = await served.subscriber("one", "sim/count", "SIMLOG://step")
+        with Segment.open(instance, writable=True) as other:
+            local = Coordinator(other)
+            local.step()  # blocks the event loop, which notices nothing before the client's step
+            local.close()
+            await served.service.stepper.step()
+        assert await messages(stream, 5) == [
+            ("sim/count", 0.0),
+            *(pair for n in (1.0, 2.0) for pair in (("sim/count", n), ("SIMLOG://step", n))),
+        ]
+
+    simulate(instance, test)
+
+
+def test_another_program_may_step_faster_than_the_endpoint_follows(instance: str) -> None:
+    async def test(served: Endpoint, models: Models) -> None:
+        timeline, told = served.service.stepper.timeline, list[int]()
+        with Segment.open(instance, writable=True) as other:
+            local = Coordinator(other)
+
+            def watch(status: TimeStatus) -> None:
+                told.append(status.clock_ns)
+                if len(told) < 500:
+                    local.step()
+
+            async def seen() -> bool:
+                return len(told) == 500
+
+            timeline.watch(watch)
+            local.step()
+            timeline.update()
+            await served.until(seen)
+            assert told == [50 * MS * n for n in range(1, 501)]
+            local.close()
+
+    simulate(instance, test)
+
+
+def test_time_is_neither_given_up_nor_released_while_a_step_is_delivered(
+    instance: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise streams of shmio.v1 would send later values with the step."""
+    monkeypatch.setattr(stepper, "REST_S", 0.01)
+
+    async def test(served: Endpoint, models: Models) -> None:
+        moving, clock = served.service.stepper, served.segment.clock
+
+        async def idle() -> bool:
+            return moving._rest is None
+
+        async def asked() -> bool:
+            return clock.read().done > 0
+
+        with served.service._outboxes.opened() as outbox:  # of a client that takes nothing
+            StateLane(outbox).keep(b"value")
+            call = served.time.step(sim.StepRequest(), timeout=TIMEOUT_S)
+            await served.until(asked)
+            call.cancel()
+            await served.until(idle)
+            await asyncio.sleep(0)
+            with Segment.open(instance, writable=True) as other, pytest.raises(TimeError, match="is moved by"):
+                Coordinator(other).take_over()
+            released = asyncio.create_task(moving.release())
+            for _ in range(10):
+                await asyncio.sleep(0)
+            assert clock.read().virtual
+        await released
+        assert not clock.read().virtual
+
+    simulate(instance, test, virtual=False)
 
 
 def test_a_local_step_waits_for_the_endpoint_only_while_it_has_streams(instance: str) -> None:

@@ -101,14 +101,17 @@ def test_streams_that_take_nothing_end_and_others_continue(monkeypatch: pytest.M
     asyncio.run(test())
 
 
-def test_a_delivery_that_is_stopped_lets_its_callers_go() -> None:
+def test_a_delivery_that_is_stopped_lets_its_callers_go_and_does_not_end() -> None:
     async def test() -> None:
-        delivery = Delivery(VirtualTime(), {}, Outboxes(), lambda: None)
-        delivery.receivers.append(Receiver())
+        receiver, ended = Receiver(), list[bool]()
+        delivery = Delivery(VirtualTime(), {}, Outboxes(), lambda: ended.append(True))
+        delivery.receivers.append(receiver)
         delivery.begin(Step(1, 50, 50), lambda: None)
         caller = asyncio.ensure_future(delivery.over())
         await asyncio.sleep(0)
         delivery.stop()
         await caller
+        receiver.take()  # when the stream ends
+        assert not ended
 
     asyncio.run(test())
