@@ -389,9 +389,10 @@ class Bridge:
         self.steps.close()
         until_s = time.monotonic() + LEAVE_S
         self._drain(until_s, lambda: not self.outbox.busy)
-        for feed in self._feeds.values():
-            self.connection.send(status(feed.status.topic, Quality.BAD, STOPPED, feed.missed))
-        self.connection.send(Message(self._status.topic, OFFLINE, 1, True))
+        last = [status(feed.status.topic, Quality.BAD, STOPPED, feed.missed) for feed in self._feeds.values()]
+        for message in [*last, Message(self._status.topic, OFFLINE, 1, True)]:
+            self._drain(until_s, lambda: self.connection.room > 0)  # a broker may end the connection at too many
+            self.connection.send(message)
         self.connection.push()
         self._drain(until_s, lambda: not (self.connection.in_flight or self.command_connection.connection.in_flight))
         self.command_connection.connection.close()
