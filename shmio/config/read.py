@@ -114,15 +114,23 @@ DERIVED: Final[Mapping[type[Section], tuple[str, ...]]] = {Config: ("folder",), 
 _Table = TypeVar("_Table", bound=Section)
 
 
-def load(file: Path) -> Config:
+REMEDY: Final = "; create it with shmio-supervisor init"
+"""Text that the message about a missing ``supervisor.toml`` ends with."""
+
+
+def load(file: Path, text: str | None = None) -> Config:
     """Read and check a ``supervisor.toml``, and make its paths absolute.
+
+    Args:
+        file: The file.
+        text: Its text; None: read it.
 
     Raises:
         ConfigError: The file cannot be read or is not TOML, it has unknown keys or values of a
             wrong type, or it breaks other rules. The message has a line for each fault.
 
     """
-    found = examine(file)
+    found = examine(file, text)
     found.faults.raise_any()
     return found.config
 
@@ -136,14 +144,19 @@ class Examined(NamedTuple):
     """For each faulty source, by index: connector, its keys in the section, and its keys in the properties file."""
 
 
-def examine(file: Path) -> Examined:
+def examine(file: Path, text: str | None = None) -> Examined:
     """Read a ``supervisor.toml``, and collect its faults.
+
+    Args:
+        file: The file.
+        text: Its text; None: read it.
 
     Raises:
         ConfigError: The file cannot be read or is not TOML.
 
     """
-    text = read_text(file, "; create it with shmio-supervisor init")
+    if text is None:
+        text = read_text(file, REMEDY)
     tables = parse(file, text)
     return _examine(tables, file.resolve().parent, Faults(file, tables, text))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 from shmio.injection import _numbers
@@ -72,6 +73,7 @@ class Expression(NamedTuple):
         return _numbers.evaluate(self.codes, self.operands, values, memory.seen)
 
 
+@lru_cache(maxsize=1024)  # the runs of a search have the same texts
 def parse(text: str) -> Expression:
     """Parse a condition, and return it as an expression that can be evaluated.
 

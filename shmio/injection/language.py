@@ -36,6 +36,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Final
 
 from shmio.errors import ConfigError
@@ -118,6 +119,7 @@ def parse_condition(text: str) -> Tree:
     return _Parser(text, "condition", _KEYWORDS).whole()
 
 
+@lru_cache(maxsize=1024)  # the runs of a search have the same texts
 def parse_formula(text: str) -> Tree:
     """Parse the text of a formula.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
-from functools import partial
+from functools import lru_cache, partial
 from typing import Final
 
 import numpy as np
@@ -101,6 +101,7 @@ class Registers:
             raise ConfigError(str(error).partition(": ")[2]) from None
 
 
+@lru_cache(maxsize=1024)  # the runs of a search have the same formulas
 def check(tree: Tree) -> None:
     """Check a formula for errors that the grammar allows.
 

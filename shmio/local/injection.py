@@ -414,9 +414,9 @@ class Campaign(Following[InjectionEvent]):
     def close(self) -> None:
         """Lift the remaining injections, unless they were created with ``keep``."""
         super().close()
-        for one in () if self._keep or not self._segment.shared.current() else self._left.values():
-            with suppress(CommandError):  # the injection is over, or another program has lifted it
-                one.lift()
+        if not self._keep and self._segment.shared.current():
+            with suppress(CommandError):  # the source does not answer
+                lift_all((one.source_writer, one.number) for one in self._left.values())
         self._left.clear()
 
 
@@ -427,7 +427,7 @@ def lift_all(injections: Iterable[tuple[SourceWriter, int]]) -> None:
         CommandError: Some injections could not be lifted. The message gives the reasons.
     """
     asked: list[tuple[SourceWriter, PendingCommand]] = []
-    chosen, reasons = [one for one in injections if _is_present(*one)], dict[str, None]()
+    chosen, reasons = _present(injections), dict[str, None]()
     for source_writer, number in chosen:
         try:
             asked.append((source_writer, source_writer.ask_to_lift(number)))
@@ -438,13 +438,22 @@ def lift_all(injections: Iterable[tuple[SourceWriter, int]]) -> None:
             source_writer.expect_lifted(ticket)
         except CommandError as error:
             reasons[str(error)] = None
-    left = sum(_is_present(*one) for one in chosen)
+    left = len(_present(chosen))
     if left:
         raise CommandError(f"{left} of {len(chosen)} injections were not lifted: {'; '.join(reasons)}")
 
 
-def _is_present(source_writer: SourceWriter, number: int) -> bool:
-    return any(one.number == number and not one.lifted for one in source_writer.block.injections.read())
+def _present(injections: Iterable[tuple[SourceWriter, int]]) -> list[tuple[SourceWriter, int]]:
+    """Return the injections that exist and are not lifted."""
+    numbers: dict[int, set[int]] = {}  # by section of the block, whose list is read once
+    found = []
+    for source_writer, number in injections:
+        block = source_writer.block
+        if block.section not in numbers:
+            numbers[block.section] = {one.number for one in block.injections.read() if not one.lifted}
+        if number in numbers[block.section]:
+            found.append((source_writer, number))
+    return found
 
 
 def by_path(topics: Iterable[Topic], values: Mapping[str, object]) -> dict[str, object]:

@@ -37,13 +37,15 @@ class Following(Generic[Item]):
     """Base of iterators over frames or events of several blocks.
 
     One thread may iterate; any thread may close the iterator. For each block that the iterator
-    follows, a :class:`Relay` wakes it at each frame and each event.
+    follows, a :class:`Relay` wakes it at each frame and each event. The relays' threads start with the
+    first item that the program asks for.
     """
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._lock = threading.Lock()  # locked while the mapped memory is read: close waits for it
         self._relays: dict[int, Relay] = {}  # by section of the block
+        self._unheard: dict[int, Block] = {}  # the blocks without a relay yet, by section
         self._stop = weakref.finalize(self, _stop, self._relays)  # also if the program does not close it
         self._closed = False
         self._due_s = math.inf
@@ -58,6 +60,9 @@ class Following(Generic[Item]):
             with self._lock:
                 if self._closed:
                     raise StopIteration
+                while self._unheard:
+                    section, block = self._unheard.popitem()
+                    self._relays[section] = Relay(block.ring, f"following-{block.source}", round(TURN_S * 1e9))
                 for relay in self._relays.values():
                     relay.acknowledge()  # before reading
                 found = self._take()
@@ -82,11 +87,12 @@ class Following(Generic[Item]):
 
     def _follow(self, block: Block) -> None:
         """Make the frames and events of a block wake this iterator."""
-        self._relays[block.section] = Relay(block.ring, f"following-{block.source}", round(TURN_S * 1e9))
+        self._unheard[block.section] = block
 
     def _leave(self, block: Block) -> None:
         """Stop a block from waking this iterator."""
-        self._relays.pop(block.section).join()
+        if self._unheard.pop(block.section, None) is None:
+            self._relays.pop(block.section).join()
 
     def end(self) -> None:
         """End the iteration, and wait until no thread reads the mapped memory any more."""

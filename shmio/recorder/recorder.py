@@ -17,6 +17,7 @@ from shmio.backoff import Backoff
 from shmio.config import Recorder as Settings
 from shmio.config import load
 from shmio.config.masking import mask
+from shmio.config.read import REMEDY, read_text
 from shmio.errors import ConfigError, RecordingError
 from shmio.recorder.file_output import Output, create
 from shmio.recorder.instance_follower import (
@@ -85,13 +86,11 @@ class ConfigFiles:
         if source is None:
             return [one._replace(data=_masked(one.data)) for one in self._read("config", [self._file], TOML)]
         try:
-            config = load(self._file)
+            files = _layout_files(self._file, read_text(self._file, REMEDY))
         except ConfigError as error:
             self._log_once(f"the layout files of source {source} are not attached to the recording: {error}")
             return []
-        layouts = [section.layout for section in config.source if section.name == source and section.layout]
-        names = [name for layout in layouts for name in ([layout] if isinstance(layout, str) else layout)]
-        return self._read(f"sources/{source}/{block}", [config.path(name) for name in names], TEXT)
+        return self._read(f"sources/{source}/{block}", files.get(source, []), TEXT)
 
     def _read(self, folder: str, files: list[Path], media_type: str) -> list[AttachedFile]:
         found = []
@@ -114,6 +113,22 @@ class ConfigFiles:
         if why not in self._logged:
             self._logged.add(why)
             log.warning("%s", why)
+
+
+@lru_cache(1)  # each recording of a search asks for them
+def _layout_files(file: Path, text: str) -> dict[str, list[Path]]:
+    """Return the files of each source's layout, by source, from the text of a configuration.
+
+    Raises:
+        ConfigError: The configuration has faults.
+    """
+    config = load(file, text)
+    found: dict[str, list[Path]] = {}
+    for section in config.source:
+        layout = section.layout or []
+        names = [layout] if isinstance(layout, str) else layout
+        found.setdefault(section.name, []).extend(map(config.path, names))
+    return found
 
 
 @lru_cache(1)  # the file is read again and again

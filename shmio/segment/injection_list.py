@@ -117,7 +117,7 @@ class ListCell(Generic[_Item]):
         data = _atomics.cell_read(self._memory, self._offset, LIST_SIZE)
         if data is None:
             return None
-        document = data.rstrip(b"\0")
+        document = data[: data.find(0)] if data.endswith(b"\0") else data
         try:
             return self._decoder.decode(document) if document else ()
         except msgspec.MsgspecError:

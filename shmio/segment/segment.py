@@ -423,7 +423,10 @@ class Segment:
         try:
             shared.try_lock(SUPERVISOR_LOCK)
             _build_segment(shared, instance, blocks, processes, mode, "", stepped=True)
-            return cls(shared, instance)
+            segment = cls(shared, instance)
+            for block in blocks:
+                segment.blocks[block.source].layout = block.layout  # the same as in the segment, and already checked
+            return segment
         except BaseException:
             shared.close()
             raise
@@ -432,7 +435,10 @@ class Segment:
         """Open a private segment once more, as another process would open the segment of an instance."""
         shared = self.shared.again()
         try:
-            return Segment(shared, self.instance)
+            segment = Segment(shared, self.instance)
+            for source, block in segment.blocks.items():
+                block.layout = self.blocks[source].layout
+            return segment
         except BaseException:
             shared.close()
             raise
