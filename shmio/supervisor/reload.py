@@ -208,15 +208,17 @@ class InstanceChange:
         return policy.all_gone([(managed.rank, managed.life) for managed in leaving])
 
     def _apply(self) -> None:
-        """Change blocks and jobs, after the old processes have ended."""
-        if self.changes.add or self.changes.retire:
-            self._segment.change(self.changes.add, self.changes.retire)
-        for spec in self.plan.blocks:  # running processes follow this change without a restart
-            self._declare(self._segment.blocks[spec.source], spec.declared)
+        """Change jobs and blocks, after the old processes have ended."""
         for name in self.changes.stopped:
             self._fleet.drop(name)
         for job in self._coming:
             self._fleet.assign(job)
+        if self.changes.add or self.changes.retire or self.changes.started or self.changes.stopped:
+            # After the change of the process table, which others read anew because of this change. Without the new
+            # processes, whoever moves time would neither ring their doorbells nor wait until they deliver a step.
+            self._segment.change(self.changes.add, self.changes.retire)
+        for spec in self.plan.blocks:  # running processes follow this change without a restart
+            self._declare(self._segment.blocks[spec.source], spec.declared)
         self._followers.go_on()
 
     def _declare(self, block: Block, declared: bytes) -> None:

@@ -107,6 +107,17 @@ def test_a_source_is_removed_and_its_place_is_used_again(launch: Launch) -> None
     assert [slot.name for slot in segment.processes.external] == ["guest-1", "guest-2", "guest-3", "guest-4"]
 
 
+def test_other_processes_notice_a_new_process_that_has_no_block(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    with Segment.open(cell.instance) as segment:
+        robot = ("robot", "emulator", ["good"])
+        for jobs, names in (([*CELL, robot], {"robot"}), (CELL, set())):
+            cell.reload(jobs)
+            assert segment.refresh()
+            assert {slot.name for slot in segment.processes} == {"plc", "cell", "grpc", *names}
+
+
 def test_a_process_with_a_changed_configuration_is_replaced(launch: Launch) -> None:
     cell = launch()
     cell.wait_state("running")
