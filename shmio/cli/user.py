@@ -178,7 +178,7 @@ def _spelled(cell: Cell, arguments: argparse.Namespace) -> argparse.Namespace:
     return arguments
 
 
-def _parser(chosen: str) -> argparse.ArgumentParser:
+def _parser(chosen: str = "") -> argparse.ArgumentParser:
     """Return the parser. If ``chosen`` is a verb, the other verbs have no arguments."""
     parser = argparse.ArgumentParser(prog=PROGRAM, description="Read and write the registers of a running instance.")
     parser.add_argument("--version", action="version", version=f"shmio {__version__}")
