@@ -76,13 +76,15 @@ def _check_embedded(fabric: Fabric) -> None:
 
 def _check_external(fabric: Fabric) -> None:
     """Check the keys for servers that others run."""
-    if fabric.listen is not None:
-        raise ConfigError('fabric.listen: this key is only for server = "embedded"; remove it')
     for index, url in enumerate(fabric.servers):
         key = "fabric.server" if isinstance(fabric.server, str) else f"fabric.server[{index}]"
         address = server_address(key, url, "in fabric.credentials", ', or "embedded"')
         if not (address.loopback or fabric.tls or fabric.insecure or url.startswith("tls:")):
             raise ConfigError(f"{key}: shmio would send plain text over the network to {address}; {_REMEDY}")
+    if fabric.listen is not None:
+        raise ConfigError(
+            f'fabric.listen: this key is only for server = "embedded", but server is {fabric.server!r}; remove it'
+        )
 
 
 def server_address(key: str, url: str, credentials: str, others: str = "") -> Address:

@@ -21,6 +21,9 @@ from shmio.config.toml_tokens import TOKEN
 from shmio.errors import ConfigError, LayoutError
 from shmio.wording import brief, unknown
 
+_WITH_SECRETS: Final = frozenset({"account", "command"})
+"""Keys whose values contain secrets if they are written as in other programs, such as ``name:password``."""
+_FILE_SUFFIX: Final = re.compile(r"_(?:file|path|dir)$")
 MAX_KEY: Final = 1_000
 """Maximum number of characters of a key, with all its dotted parts."""
 MAX_PARTS: Final = 64
@@ -167,11 +170,14 @@ def _bare(token: str) -> str:
 
 
 def but_found(key: str, value: Any) -> str:
-    """Return ``, found VALUE`` for the end of a message about a value; empty if the value may be a secret."""
+    """Return ``, found VALUE`` for the end of a message about a value; empty if the value may be a secret.
+
+    The value is wrong, so it may be a secret where the name of a file with the secret, or a table, is expected.
+    """
     from shmio.config.masking import is_secret, mask_value  # noqa: PLC0415  compiles many patterns, for messages only
 
-    names = re.findall(r"[A-Za-z0-9_-]+", re.sub(r"\[[^\]]*\]|^grpc\.token\b", "", key))
-    if any(map(is_secret, names)):
+    names = re.findall(r"[A-Za-z0-9_-]+", re.sub(r"^grpc\.token\[\d+\]\.|\[[^\]]*\]", "", key))
+    if any(name in _WITH_SECRETS or is_secret(_FILE_SUFFIX.sub("", name)) for name in names):
         return ""
     return f", found {str(value).lower() if isinstance(value, bool) else brief(mask_value('', value))}"
 
@@ -210,6 +216,8 @@ def explain(error: ValidationError, key: str, kind: Any, value: Any) -> str:
         text = unknown(name, word[1], _words(kind, at.rstrip("`")))
     elif field := re.search(r"unknown field `([^`]*)`", text):
         text = f"unknown key {field[1]!r}"
+        if not at and isinstance(kind, type) and issubclass(kind, Struct):
+            text = unknown("key", field[1], (one.encode_name for one in fields(kind)))
     elif text.endswith("of length >= 1"):
         text = "must not be empty"
     text = re.sub(r"`([a-z]+(?: \| [a-z]+)*)`", _types, text)

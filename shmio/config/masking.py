@@ -32,6 +32,8 @@ _KEY_FILES: Final = re.compile(r"""["']?[^"']*\.(?:pem|key|der|crt|p8)["']?""", 
 """Matches the path of a key file, which is not masked if it is the value of the key ``key``."""
 _WORD: Final = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 _USER: Final = re.compile(r"(?<=://)[^\s/\"']*(?=@)")
+_LOGIN: Final = re.compile(r"(?<![\w.+:/-])[\w.+-]{1,256}+:[^\s/\"'@]{1,256}+(?=@)")
+"""Matches a name with a password before a host, without the scheme of a URL."""
 _SHAPES: Final = re.compile(
     r"(?<![A-Za-z0-9_-])(?:gh[oprsu]_[A-Za-z0-9]{16,}|github_pat_\w{16,}|glpat-[\w-]{16,}|xox[a-z]-[\w-]{10,}"
     r"|sk-[\w-]{16,}|A[KS]IA[0-9A-Z]{16}|eyJ[\w-]{8,}\.[\w-]{8,}(?:\.[\w-]*)?)"
@@ -100,7 +102,7 @@ def mask_line(line: str, assigned: re.Pattern[str] = _ASSIGNED) -> str:
         assigned: Matches a key and the sign that separates it from its value.
 
     """
-    line = _SHAPES.sub(MASK, _USER.sub(MASK, line))
+    line = _SHAPES.sub(MASK, _LOGIN.sub(MASK, _USER.sub(MASK, line)))
     line = _WEB_URL.sub(lambda url: _URL_PARTS.sub(_mask_url_part, url[0]), line)
     for pattern in (assigned, _OPTION):
         for match in pattern.finditer(line):

@@ -450,7 +450,8 @@ def _present(injections: Iterable[tuple[SourceWriter, int]]) -> list[tuple[Sourc
     for source_writer, number in injections:
         block = source_writer.block
         if block.section not in numbers:
-            numbers[block.section] = {one.number for one in block.injections.read() if not one.lifted}
+            entries = () if block.retired else block.injections.read()  # an injection ends with its block
+            numbers[block.section] = {one.number for one in entries if not one.lifted}
         if number in numbers[block.section]:
             found.append((source_writer, number))
     return found

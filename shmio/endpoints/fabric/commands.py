@@ -51,6 +51,8 @@ DENIED: Final = "denied"
 MAX_CHECKS: Final = 32
 """Maximum number of declarations that are checked at the same time; others are rejected."""
 _ACTIONS: Final = {"inject": "inject", "shadow": "feed", "lift": "lift", "declare": "declare"}
+_THERE: Final = "that cell's supervisor.toml, and reload it"
+"""Where a rejected command can be allowed. The reason names the cell, and has to fit an event."""
 _KINDS: Final = {
     "inject": CommandKind.INJECT,
     "shadow": CommandKind.SHADOW,
@@ -239,7 +241,6 @@ class CommandReceiver:
         """Number of commands that were not sent to a source."""
         self._cell, self._allow, self._writer, self._now_ns = cell, allow, writer, now_ns
         self._host = socket.gethostname()
-        self._there = f"the supervisor.toml of {cell}, and reload that instance"
         self._reply, self._server, self._feeds = reply, server, feeds
         self._clients: dict[int, CommandClient] = {}
         self._checks: set[asyncio.Task[None]] = set()
@@ -297,8 +298,8 @@ class CommandReceiver:
         role = "write" if request.injection is None else "inject"
         if not self._may(sender, role):
             why = (
-                f"no [[fabric.allow]] of cell {self._cell} gives {sender} the role {role}; to allow it, "
-                f"{self._permission(sender, role)} in the supervisor.toml of {self._cell}, and reload that instance"
+                f"no [[fabric.allow]] there gives {sender} the role {role}; to allow it, "
+                f"{self._permission(sender, role)} in {_THERE}"
             )
             return OutcomeKind.REJECTED, why, DENIED
         if feed is None:
@@ -380,13 +381,13 @@ class CommandReceiver:
     def _unwritable(self, feed: Feed, items: Sequence[WriteItem]) -> str:
         """Return which registers the source does not let commands write; empty if it does."""
         paths = self.client(feed).unwritable(_writes(items))
-        return not_writable(paths, self._there) if paths else ""
+        return not_writable(paths, _THERE) if paths else ""
 
     def _permission(self, sender: str, role: str) -> str:
         """Return what to add to the configuration, so that a cell has a role."""
         if any(matches_cell(pattern, sender) for one in self._allow for pattern in one.patterns):
             return f"add {role!r} to its roles"
-        return f'add the lines [[fabric.allow]], sender = "{sender}" and roles = ["{role}"]'
+        return f'add the lines [[fabric.allow]], sender = "{sender}", roles = ["{role}"]'
 
     def _answer(self, subject: str, reply: CommandReply) -> None:
         """Send an answer. A reason why this instance rejects a command names the cell and the host."""

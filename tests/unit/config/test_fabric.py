@@ -58,7 +58,7 @@ def test_sound_sections(tmp_path: Path, text: str) -> None:
         ('server = ["tls://a.example", "nats://b"]\n', r"fabric\.server\[1\]: .*plain text"),
         ('server = "tls://a"\nlisten = "127.0.0.1:4222"\n', r"fabric\.listen: .*embedded"),
         ('server = "http://127.0.0.1"\n', r"fabric\.server: .*not a NATS server"),
-        ('server = "embeded"\n', r"fabric\.server: .*not a NATS server"),
+        ('server = "embeded"\nlisten = "127.0.0.1:4222"\n', r"fabric\.server: 'embeded' is not a NATS server"),
         ('server = "nats://127.0.0.1:99999"\n', r"fabric\.server: .*not a NATS server"),
         ('server = "nats://me:secret@127.0.0.1"\n', r"fabric\.server: .*password"),
         (f'{EMBEDDED}[[fabric.rule]]\nmatch = "*"\n', r"fabric\.rule: .*fabric\.cell"),

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 import pytest
 
-from shmio.config.faults import explain
+from shmio.config.faults import but_found, explain
 from shmio.config.model import NAME_PATTERN, NAME_RULE
 
 
@@ -67,6 +67,9 @@ def test_msgspec_words_its_errors_as_explain_expects(value: Any, words: str, wan
 
 class Secretive(msgspec.Struct):
     password: int = 0
+    password_file: str = ""
+    account: list[str] = []
+    command: list[str] = []
     servers: list[int] = []
 
 
@@ -74,6 +77,10 @@ class Secretive(msgspec.Struct):
     ("value", "wanted"),
     [
         ({"password": "swordfish"}, "password: expected a whole number, got text"),
+        ({"password_file": ["swordfish"]}, "password_file: expected text, got a list in [ ]"),
+        ({"account": "me:swordfish"}, "account: expected a list in [ ], got text"),
+        ({"command": "curl -u me:swordfish"}, "command: expected a list in [ ], got text"),
+        ({"servers": ["me:swordfish@h"]}, "servers[0]: expected a whole number, found '•••@h'"),
         ({"servers": [1, "nats://u:swordfish@h"]}, "servers[1]: expected a whole number, found 'nats://•••@h'"),
         ({"servers": [{"token": "swordfish"}]}, "servers[0]: expected a whole number, found {'token': '•••'}"),
         ({"servers": ["\x1b[2J" + "x" * 100]}, rf"servers[0]: expected a whole number, found '\x1b[2J{'x' * 51}…"),
@@ -83,3 +90,9 @@ def test_the_wrong_value_is_shown_escaped_bounded_and_without_secrets(value: Any
     with pytest.raises(msgspec.ValidationError) as caught:
         msgspec.convert(value, Secretive)
     assert explain(caught.value, "", Secretive, value) == wanted
+
+
+@pytest.mark.parametrize("key", ["grpc.token", "grpc.token[0]", "grpc.token[0].sha256", "mqtt.account", "a.password"])
+def test_a_value_in_the_place_of_a_table_with_secrets_is_not_shown(key: str) -> None:
+    assert but_found(key, "swordfish") == ""
+    assert but_found("grpc.token[0].name", 3) == ", found 3"

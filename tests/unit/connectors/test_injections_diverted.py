@@ -14,6 +14,8 @@ from shmio.connectors.injection_layers import Owner
 from shmio.errors import CommandError, PathError
 from shmio.layout.values.codec import Value
 from shmio.local.attach import Attachment
+from shmio.local.injection import lift_all
+from shmio.local.writer import SourceWriter
 from shmio.segment import EventKind, Segment
 from shmio.segment.injection_list import InjectionEntry, encode
 from tests.unit.connectors import test_injections as test_injector
@@ -184,6 +186,15 @@ def test_lift_all_lifts_the_injections_of_all_clients(rig: Rig, local: Attachmen
     assert {one.source for one in lifted} == {"cell"}
     assert local.injections() == []
     assert local.lift_all() == []
+
+
+def test_an_injection_whose_block_a_reload_has_retired_is_lifted(rig: Rig) -> None:
+    """The list of the retired block still has it, but nobody answers there."""
+    number = rig.client.inject(["speed"])
+    rig.stop()
+    rig.segment.change(retire=["cell"])
+    assert [one.number for one in rig.block.injections.read()] == [number]
+    lift_all([(SourceWriter(rig.block, GUEST), number)])
 
 
 def test_campaign_ends_even_if_its_reader_missed_the_end(rig: Rig, local: Attachment) -> None:

@@ -91,6 +91,7 @@ WRONG = {
     "[registers]\n'a/b' = 'INT'\na = 'INT'": "a is already a register",
     "[registers]\n'a.b' = 'INT'\n'a%2Eb' = 'INT'": "given twice",
     "[registers]\na = { type = 'INT', initial = 40000 }": "cell.toml:2:1: error: a: ",
+    "[[tag]]\npath = 'a'": "unknown key 'tag'; valid: registers, ",
     "[registers]\na = { type = 'INT', start = 4 }": "a: unknown key 'start'; valid: type, initial, comment",
     "[registers]\nb = 'INT'\na = { initial = 4 }": "cell.toml:3:1: error: a: type: this key is needed",
     f"[registers]\na = {'9' * 5000}": "cell.toml:2:1: error: a number has too many digits",

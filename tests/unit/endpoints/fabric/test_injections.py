@@ -36,6 +36,7 @@ from shmio.fabric.messages import (
 from shmio.layout.values.write import Write
 from shmio.local.writer import SourceWriter
 from shmio.segment import CommandKind, Event, EventKind, Segment
+from shmio.segment._atomics import REASON_SIZE
 from tests.nats_server import NatsServer
 from tests.unit.endpoints.fabric.harness import CELL, TIMEOUT_S, Listener, decoded, in_loop, listening, until, uplink
 from tests.unit.endpoints.plant import GUEST, Plant
@@ -168,6 +169,8 @@ async def test_the_role_is_needed_and_the_audit_names_the_sender(
             reply = await twin.declare(sender="plant7.line1.unnamed")
             for word in ("lines [[fabric.allow]]", 'sender = "plant7.line1.unnamed"', 'roles = ["inject"]'):
                 assert word in reply.reasons[0]
+            assert reply.reasons[0].endswith("reload it")
+            assert len(reply.reasons[0]) <= REASON_SIZE
             await twin.declare()
             await twin.send("lift", 7, injection=NUMBER)
     finally:
