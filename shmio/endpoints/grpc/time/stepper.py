@@ -401,7 +401,6 @@ class Stepper:
             self.timeline.update()  # another program may just have returned to real time
             self._coordinator.take_over()
             self._own(True)
-            self.timeline.update()  # begins to deliver the last step of the program that controlled time before
         await self.timeline.delivered()
         self.timeline.steered = True
 

@@ -17,6 +17,7 @@ from shmio.errors import SegmentError
 from shmio.local.time_control import Step
 from shmio.model.clock import Clock
 from shmio.segment import ProcessSlot, Segment
+from shmio.segment.clock import StateAction
 
 log = logging.getLogger("shmio.grpc")
 
@@ -179,6 +180,7 @@ class Timeline:
         self._delivery = Delivery(virtual_time, feeds, outboxes, self._end_delivery)
         self._watchers: list[Callable[[TimeStatus], None]] = []
         self._page: WakeUp | None = None  # calls update() when the clock page is written
+        self._restored = self._clock.state_request().number  # the last request that has moved time
         state = self._clock.read()
         if state.virtual:
             self._begin(Moment(state.done, state.present_ns))
@@ -232,8 +234,11 @@ class Timeline:
         return self._status(self.update())
 
     async def delivered(self) -> None:
-        """Wait until no step is being delivered."""
-        await self._delivery.over()
+        """Wait until no step is being delivered, and all steps of other programs have been."""
+        self.update()
+        while self._delivery.busy:
+            await self._delivery.over()
+            self.update()
 
     async def deliver(self, step: Step) -> None:
         """Deliver the values and the marker of a step to all streams. Return when all clients have taken them.
@@ -250,23 +255,32 @@ class Timeline:
         This is also called periodically: if a program dies while it is playing, no wake-up comes.
         """
         state = self._clock.read()
-        if state.virtual and not self.virtual_time.on:
-            self._begin(_before(state))
         if self._delivery.busy:
             self._postponed = True
             return state
-        if self.virtual_time.on and not state.virtual:
+        if self.virtual_time.on and (not state.virtual or self._was_real(state)):
             self._end(state)
+        if state.virtual and not self.virtual_time.on:
+            self._begin(_before(state))
         if state.virtual and not self.steered and self.alive and self._adopt(state):
             return state
         if (status := self._status(state))[1:] != self._reported:
             self._report(status, state)
         return state
 
+    def _was_real(self, state: Clock) -> bool:
+        """Return whether time has been real since the last call, so that its cycles were no steps."""
+        if state.dt_ns or state.done <= self.virtual_time.moment.number:
+            return False
+        request = self._clock.state_request()
+        before, self._restored = self._restored, request.number  # a snapshot moves time without a step, too
+        return request.number == before or request.action is StateAction.SAVE
+
     def _adopt(self, state: Clock) -> bool:
         """Begin to deliver the last step, if another program has made it. Return whether it has."""
         if state.done < self.virtual_time.moment.number:
             self.virtual_time.moment = Moment(state.done - 1, state.present_ns)  # a snapshot has set time back
+            self._restored = self._clock.state_request().number
         if state.done == self.virtual_time.moment.number:
             return False
         step = Step(state.done, state.present_ns, state.dt_ns)

@@ -310,6 +310,25 @@ def test_the_last_step_of_a_program_that_ended_comes_before_the_first_step_of_a_
     simulate(instance, test)
 
 
+def test_real_time_between_two_steps_has_no_marker(instance: str) -> None:
+    async def test(served: Endpoint, models: Models) -> None:
+        stream = await served.subscriber("one", "SIMLOG://step")
+        with Segment.open(instance, writable=True) as other:
+            local = Coordinator(other)
+            numbers = [(await asyncio.to_thread(local.step)).number]
+            assert await message(stream) == ("SIMLOG://step", numbers[0])
+            local.release()  # the event loop does not run in real time
+            models["sim"].publish(numbers[0] + 100)
+            local.take_over()
+            assert local.read().done == numbers[0] + 100
+            served.service.stepper.timeline.update()
+            numbers.append((await asyncio.to_thread(local.step)).number)
+            assert await message(stream) == ("SIMLOG://step", numbers[1])
+            local.close()
+
+    simulate(instance, test, virtual=False)
+
+
 def test_another_program_may_step_faster_than_the_endpoint_follows(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         timeline, told = served.service.stepper.timeline, list[int]()
