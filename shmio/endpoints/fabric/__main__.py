@@ -67,6 +67,7 @@ async def _publish(worker: Worker) -> None:
         await _first_attempt(worker, uplink, running, stopping)
         worker.running()
         while not stopping.is_set():
+            uplink.follow_start()
             uplink.follow_reloads()
             worker.report(uplink.counters, note=uplink.problem)
             worker.report_readers(uplink.readers)

@@ -117,6 +117,7 @@ class Uplink:
         self._missed = 0
         self._connected = asyncio.Event()
         self._changed = asyncio.Event()
+        self._starting = True
         self._client: FabricClient | None = None
         self._claimed = self._closing = False
         self._revision = 0
@@ -143,6 +144,13 @@ class Uplink:
     async def start(self) -> None:
         """Follow all sources from now on."""
         self._add(await asyncio.to_thread(self._read_blocks, ()))
+
+    def follow_start(self) -> None:
+        """Tell the fabric as soon as the instance has started, and not with the next renewal."""
+        starting = self._segment.supervisor[1] is State.STARTING
+        if self._starting and not starting:
+            self._changed.set()
+        self._starting = starting
 
     def follow_reloads(self) -> None:
         """Add and remove sources after a reload. A thread reads new layouts, because that may take seconds."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 from contextlib import suppress
 from dataclasses import replace
 
@@ -12,12 +13,13 @@ import pytest
 from nats.aio.msg import Msg
 
 from shmio.config.model import FabricRule
+from shmio.endpoints.fabric import uplink as uplink_module
 from shmio.endpoints.fabric.uplink import Uplink
 from shmio.errors import ConfigError
 from shmio.fabric.connection import Access, connect
 from shmio.fabric.registry import Registry
 from shmio.fabric.tasks import end
-from shmio.segment import BlockSpec, Frame, ProcessSpec, Quality, Segment
+from shmio.segment import BlockSpec, Frame, ProcessSpec, Quality, Segment, State
 from tests.nats_server import NatsServer, link
 from tests.unit.endpoints.fabric.harness import (
     CELL,
@@ -77,6 +79,23 @@ async def test_the_registry_knows_the_cell(segment: Segment, server: NatsServer)
     assert seen is not None
     assert seen.entry.state == "stopped"
     await client.close()
+
+
+@in_loop
+async def test_the_fabric_learns_at_once_that_the_instance_has_started(
+    segment: Segment, server: NatsServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(uplink_module, "RENEW_S", 10 * TIMEOUT_S)
+    segment.set_state(os.getpid(), State.STARTING)
+    async with uplink(segment, server.url) as found:
+        await until(lambda: found.publisher.up)
+        found.follow_start()
+        await until(lambda: not found._changed.is_set())  # the entry has the sources
+        segment.set_state(os.getpid(), State.RUNNING)
+        before = found._revision
+        found.follow_start()
+        assert found._changed.is_set()
+        await until(lambda: found._revision > before)
 
 
 @in_loop
