@@ -228,13 +228,15 @@ class LiveRun:
     def _turns(self, tap: InstanceFollower, recorder: Recorder | None) -> Iterator[None]:
         """In each iteration, record and judge what is new."""
         while True:
-            more = True
+            more, new = True, False
             while more:
                 entries, more = tap.take()
                 if recorder is not None:
                     recorder.put(entries)
                 self._judge(entries)
-            self._seen(self.judge.turn())
+                new = new or bool(entries)
+            if new:
+                self._seen(self.judge.turn())
             yield
 
     def _judge(self, entries: Sequence[BlockEntry | InstanceEntry]) -> None:

@@ -57,6 +57,7 @@ class Registers:
         self._layouts = layouts
         self.found: dict[Signal, Register] = {}
         """The register of each signal."""
+        self._signals: dict[tuple[str, str], Signal] = {}  # by path and aspect
 
     def signal(self, reference: Reference, aspect: str = "value") -> Signal:
         """Return the signal of a register.
@@ -69,6 +70,9 @@ class Registers:
             ConfigError: There is no such register, or it is neither a number nor a BOOL.
 
         """
+        key = reference.path, aspect
+        if key in self._signals:
+            return self._signals[key]
         try:
             source, register = number_register(reference.path, self._layouts)
         except PathError as error:
@@ -76,7 +80,7 @@ class Registers:
         except ConfigError as error:
             text = str(error).replace("a condition reads", "a formula reads")
             raise ConfigError(f"at character {reference.at}: {text}") from None
-        signal = Signal(source, register.path, aspect)
+        signal = self._signals[key] = Signal(source, register.path, aspect)
         self.found[signal] = register
         return signal
 

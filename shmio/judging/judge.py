@@ -80,8 +80,9 @@ class Judge:
         self._origin_ns: int | None = None
         self.end_ns: int | None = None
         """End of the judged time, in ns; None before :meth:`finish`."""
-        for name in self._sources:
-            self.follow(name, layouts[name], stale_ns[name])
+        for name, source in self._sources.items():
+            known = {signal.path: registers.found[signal] for signal in source.signals}
+            source.follow(layouts[name], known, stale_ns[name])
 
     @property
     def sources(self) -> tuple[str, ...]:

@@ -387,7 +387,7 @@ def export_mcap(
     streams += [_events(dump, source, writer, from_ns, to_ns) for source in sources]
     count = 0
     for row in heapq.merge(*streams, key=lambda row: row.log_ns):
-        writer.add_messages(row.channel, [(row.log_ns, row.publish_ns, 0, row.data)])
+        writer.add_messages(row.channel, [(row.log_ns, row.publish_ns, 0, (row.data,))])
         progress(row.log_ns - dump.begin_ns)
         count += 1
     writer.finish()

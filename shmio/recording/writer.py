@@ -155,23 +155,23 @@ class Writer:
     def event(self, channels: Channels, event: Event, log_ns: int) -> None:
         """Add an event with the log time ``log_ns``."""
         publish_ns = event.utc_ns if event.utc_ns > 0 else log_ns
-        message = log_ns, publish_ns, event.number & 0xFFFFFFFF, encode_event(event)
+        message = log_ns, publish_ns, event.number & 0xFFFFFFFF, (encode_event(event),)
         self._mcap.add_messages(channels.events, [message])
 
     def gap(self, gap: Gap, log_ns: int) -> None:
         """Add a gap. Call this before you add the entry that follows the gap."""
         channel = self._channel(GAPS_TOPIC, "shmio.gap.v1", GAP_SCHEMA)
-        self._mcap.add_messages(channel, [(log_ns, log_ns, 0, encode_json(gap))])
+        self._mcap.add_messages(channel, [(log_ns, log_ns, 0, (encode_json(gap),))])
 
     def step(self, mark: StepMark, log_ns: int) -> None:
         """Add the end of a step. Call this after you have added all frames of the step."""
         channel = self._channel(STEPS_TOPIC, "shmio.step.v1", STEP_SCHEMA)
-        self._mcap.add_messages(channel, [(log_ns, log_ns, mark.step & 0xFFFFFFFF, encode_json(mark))])
+        self._mcap.add_messages(channel, [(log_ns, log_ns, mark.step & 0xFFFFFFFF, (encode_json(mark),))])
 
     def process(self, change: ProcessChange, log_ns: int) -> None:
         """Add a process change."""
         channel = self._channel(PROCESSES_TOPIC, "shmio.process.v1", PROCESS_SCHEMA)
-        self._mcap.add_messages(channel, [(log_ns, log_ns, 0, encode_json(change))])
+        self._mcap.add_messages(channel, [(log_ns, log_ns, 0, (encode_json(change),))])
 
     def _channel(self, topic: str, schema: str, text: bytes) -> int:
         """Return the number of a channel that belongs to no block. Create it if necessary."""

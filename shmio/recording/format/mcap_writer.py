@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
@@ -39,8 +39,8 @@ CHUNK_BYTES: Final = 1 << 20
 _MESSAGE: Final = struct.Struct("<BQHIQQ")  # opcode, size; channel, sequence, log time, publish time
 _MESSAGE_OPCODE: Final = int(Opcode.MESSAGE)
 
-Message = tuple[int, int, int, bytes]
-"""Log time and publish time in ns, sequence, data."""
+Message = tuple[int, int, int, Sequence[bytes]]
+"""Log time and publish time in ns, sequence, the parts of the data."""
 
 
 class Output(Protocol):
@@ -195,8 +195,8 @@ class McapWriter:
     def add_messages(self, channel: int, messages: Iterable[Message]) -> None:
         """Add messages of one channel."""
         for log_ns, publish_ns, sequence, data in messages:
-            size = _MESSAGE.size - HEAD.size + len(data)
-            self._parts += _MESSAGE.pack(_MESSAGE_OPCODE, size, channel, sequence, log_ns, publish_ns), data
+            size = _MESSAGE.size - HEAD.size + sum(map(len, data))
+            self._parts += _MESSAGE.pack(_MESSAGE_OPCODE, size, channel, sequence, log_ns, publish_ns), *data
             index = self._indexes.get(channel)
             if index is None:
                 index = self._indexes[channel] = []

@@ -138,7 +138,7 @@ def test_frames_of_the_second_version_are_encoded_to_the_same_bytes() -> None:
         assert times == (other.sequence, other.log_time, other.publish_time)
         if encoding == FRAME:
             frames += 1
-            assert (second, encode_frame_v2(decode_frame(one.data), *times)) == (FRAME_V2, other.data)
+            assert (second, b"".join(encode_frame_v2(decode_frame(one.data), *times))) == (FRAME_V2, other.data)
             assert restore(other.data, *times) == one.data
         else:
             assert (second, other.data) == (encoding, one.data)

@@ -40,7 +40,7 @@ def test_a_frame(fields: tuple[int, ...], images: tuple[bytes, bytes | None], he
     frame = Frame._make((*fields, *images))
     data = encode_frame(frame)
     assert decode_frame(data) == frame
-    assert restore(encode_frame_v2(frame, *header), *header) == data
+    assert restore(b"".join(encode_frame_v2(frame, *header)), *header) == data
 
 
 @given(

@@ -16,7 +16,7 @@ from shmio.recording.format import mcap_writer
 from shmio.recording.format.mcap_writer import McapWriter, Message
 
 u64, u32, names = st.integers(0, 2**64 - 1), st.integers(0, 2**32 - 1), st.text(max_size=8)
-message = st.tuples(u64, u64, u32, st.binary(max_size=60))
+message = st.tuples(u64, u64, u32, st.lists(st.binary(max_size=30), max_size=3))
 calls = st.lists(
     st.one_of(
         st.tuples(st.just("schema"), names, st.binary(max_size=20)),
@@ -36,7 +36,7 @@ class LibraryWriter(Writer):
 
     def add_messages(self, channel: int, messages: Iterable[Message]) -> None:
         for log_ns, publish_ns, sequence, data in messages:
-            self.add_message(channel, log_ns, data, publish_ns, sequence)
+            self.add_message(channel, log_ns, b"".join(data), publish_ns, sequence)
 
 
 def ours(made: list[Any]) -> bytes:
@@ -85,10 +85,10 @@ def test_the_same_bytes_as_those_of_the_library(made: list[Any]) -> None:
 
 
 def test_the_library_reads_every_message() -> None:
-    messages = [(number, 2 * number, number, bytes(number)) for number in range(100)]
+    messages = [(number, 2 * number, number, (b"head", bytes(number))) for number in range(100)]
     stream = BytesIO(ours([("messages", 0, messages)]))
     read = [
         (one.log_time, one.publish_time, one.sequence, one.data)
         for _, _, one in make_reader(stream, validate_crcs=True).iter_messages()
     ]
-    assert read == messages
+    assert read == [(*times, b"".join(data)) for *times, data in messages]
