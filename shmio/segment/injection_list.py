@@ -9,6 +9,7 @@ configured injections.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import groupby
 from typing import Generic, TypeVar
 
 import msgspec
@@ -66,14 +67,12 @@ _Item = TypeVar("_Item")
 
 def ranges_of(cover: bytes) -> tuple[tuple[int, int, int], ...]:
     """Return the set bits of an image as ranges (offset, size, mask): one for each run of equal bytes except 0."""
-    ranges: list[tuple[int, int, int]] = []
-    for at, bits in enumerate(cover):
-        if not bits:
-            continue
-        if ranges and ranges[-1][2] == bits and ranges[-1][0] + ranges[-1][1] == at:
-            ranges[-1] = ranges[-1][0], ranges[-1][1] + 1, bits
-        else:
-            ranges.append((at, 1, bits))
+    ranges, at = list[tuple[int, int, int]](), 0
+    for bits, run in groupby(cover):
+        size = len(bytes(run))
+        if bits:
+            ranges.append((at, size, bits))
+        at += size
     return tuple(ranges)
 
 
