@@ -172,7 +172,7 @@ def layouts() -> None:
         """
         header = frame.number & 0xFFFFFFFF, START_NS + frame.clock_ns, frame.source_ns
         frame = frame._replace(raw=bytes(map(frame.raw.__getitem__, order))) if sort else frame
-        data = encode_frame_v2(frame, *header) if once else encode_frame(frame)
+        data = b"".join(encode_frame_v2(frame, *header)) if once else encode_frame(frame)
         return struct.pack("<BQHIQQ", 5, 22 + len(data), 1, *header) + data
 
     plain = [message(frame) for frame in some]
