@@ -127,7 +127,9 @@ def verb_first(words: Sequence[str]) -> list[str]:
     at = 0
     while at < len(words) and words[at].startswith(_TARGETS):
         at += 2 if words[at] in _TARGETS else 1
-    return [*words[at : at + 1], *words[:at], *words[at + 1 :]]
+    if at >= len(words):
+        return []  # the message about the missing verb is the same
+    return [words[at], *words[:at], *words[at + 1 :]]
 
 
 def complete(parser: argparse.ArgumentParser) -> None:

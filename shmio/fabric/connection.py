@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import re
 import ssl
 from collections.abc import Awaitable, Callable, Coroutine
@@ -430,4 +431,7 @@ def reason(error: BaseException) -> str:
     """Return in words why a server cannot be reached, or why a request failed."""
     if isinstance(error, TimeoutError):  # its text is empty, or says less
         return "the server does not answer"
+    if isinstance(error, OSError) and not isinstance(error, ssl.SSLError) and error.errno and error.strerror:
+        text = os.strerror(error.errno) if error.errno > 0 else error.strerror  # negative: of the name's resolution
+        return text[:1].lower() + text[1:]
     return str(error) or type(error).__name__

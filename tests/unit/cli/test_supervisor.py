@@ -832,7 +832,7 @@ def test_the_options_for_the_instance_may_come_before_the_verb(
     assert f"{instance}.toml: No such file" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["-c", "list"])
-    assert "VERB" in capsys.readouterr().err
+    assert "required: VERB" in capsys.readouterr().err
 
 
 def test_down_without_an_instance_does_not_suggest_up(instance: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,6 +14,7 @@ from shmio.errors import RemoteError
 from shmio.fabric.client import FabricClient
 from shmio.fabric.connection import Access, connect, connect_or_stop
 from shmio.fabric.tasks import end
+from shmio.testing.ports import reserved_port
 
 TIMEOUT_S = 20
 
@@ -161,3 +162,8 @@ def test_a_connection_is_closed_if_the_wait_for_its_server_is_cancelled(greets: 
         await server.wait_closed()
 
     asyncio.run(work())
+
+
+def test_the_reason_is_in_words() -> None:
+    with reserved_port() as place, pytest.raises(RemoteError, match=r"can be reached: connection refused$"):
+        asyncio.run(connect(Access((f"nats://{place}",)), "test", patient=False))
