@@ -86,4 +86,4 @@ def line_of(entry: Entry) -> str:
 
 
 def _shown(key: str, value: Any) -> str:
-    return f"{key} = {value if isinstance(value, str) else dumps(value)}"
+    return f"{key} = {value if value and isinstance(value, str) else dumps(value)}"

@@ -53,7 +53,7 @@ def test_entries_of_all_files_are_printed_in_order(printed: Callable[..., list[s
     Path("logs/audit.jsonl.2").write_text(entry(2, "bert"))
     Path("logs/audit.jsonl.old").write_text(entry(3, "nobody"))
     Path("logs/audit.jsonl").write_text(
-        '{"torn' + "\n" + entry(4, "anna\x1b[31m", action="lift", source="cell", injection=7)
+        '{"torn' + "\n" + entry(4, "anna\x1b[31m", action="lift", source="cell", name="")
     )
     assert [file.name for file in present_files(Path("logs/audit.jsonl"))] == [
         "audit.jsonl.10", "audit.jsonl.2", "audit.jsonl"
@@ -61,7 +61,7 @@ def test_entries_of_all_files_are_printed_in_order(printed: Callable[..., list[s
     assert printed() == [
         "2026-11-21T01:00:00.000000Z grpc: token anna (10.0.0.1): write cell/Outputs/1 = 5: written",
         "2026-11-21T02:00:00.000000Z grpc: token bert (10.0.0.1): write cell/Outputs/1 = 5: written",
-        r"2026-11-21T04:00:00.000000Z grpc: token anna\x1b[31m (10.0.0.1): lift source = cell, injection = 7: written",
+        r'2026-11-21T04:00:00.000000Z grpc: token anna\x1b[31m (10.0.0.1): lift source = cell, name = "": written',
     ]
     assert len(printed("-n", "1")) == 1
     assert json.loads(printed("--json", "-n", "1")[0])["from"] == "10.0.0.1"
