@@ -129,6 +129,11 @@ async def connect(
     from shmio.fabric.client import FabricClient  # noqa: PLC0415  it needs the extra
 
     attempts = _Attempts(access, failed, patient=patient)
+    connected = False
+
+    async def on_lost() -> None:
+        if connected and lost is not None:  # the library also calls this for a connection that it gives up
+            await lost()
 
     async def on_error(error: BaseException) -> None:
         attempts.add(error, up=client.is_connected)
@@ -142,7 +147,7 @@ async def connect(
         "servers": list(access.servers),
         "name": name,
         "error_cb": on_error,
-        "disconnected_cb": lost,
+        "disconnected_cb": on_lost,
         "reconnected_cb": on_back,
         "connect_timeout": CONNECT_S,
         "reconnect_time_wait": RETRY_S,
@@ -164,6 +169,7 @@ async def connect(
         await client.abandon()
         refused = attempts.refused or _is_refusal(error)
         raise (RefusedError if refused else RemoteError)(attempts.why or _why(access, error)) from None
+    connected = True
     attempts.clear()
     return client
 
