@@ -78,6 +78,10 @@ def shortest(value: float, element: ElementType) -> float:
 
 def _shortest_real(value: float) -> float:
     """Do what ``float(str(numpy.float32(value)))`` does: a command prints a value before it has imported numpy."""
+    try:
+        (value,) = _REAL.unpack(_REAL.pack(value))
+    except OverflowError:
+        return math.copysign(math.inf, value)
     if abs(value) <= _EXACT and value.is_integer():
         return value
     digits = 7  # most values need 7 or 8

@@ -6,7 +6,7 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from shmio.errors import ValueRangeError
@@ -73,6 +73,12 @@ def test_real_has_the_same_digits_as_in_numpy() -> None:
     numbers = np.array([*patterns, *range(1000), 0x3DCCCCCD, 0x7F7FFFFF], np.uint32).view(np.float32)
     for number in [*numbers, *-numbers]:
         assert to_text(float(number), register("REAL")) == repr(float(str(number)))
+
+
+@given(st.floats(-3.4e38, 3.4e38))
+@example(0.1)
+def test_a_number_that_is_no_real_has_the_text_of_the_nearest_one(value: float) -> None:
+    assert to_text(value, register("REAL")) == repr(float(str(np.float32(value))))
 
 
 @given(st.floats(allow_nan=False))
