@@ -62,6 +62,7 @@ _PLAIN: Final = {
     "Domain name not found": "there is no host of that name",
     "Cancelling all calls": "the endpoint has stopped",
     "Socket closed": "the endpoint has stopped",
+    "CANCELLED": "the endpoint has stopped",
 }
 """Short texts that replace error messages of gRPC, by a part of the message."""
 _TLS: Final = {
@@ -121,6 +122,8 @@ class Target:
     def error(self, error: Any) -> ShmioError:
         """Convert the error of a gRPC call to an error of shmio."""
         code, details = error.code(), error.details() or ""
+        if code is grpc.StatusCode.CANCELLED and details == "CANCELLED":  # an endpoint that stops ends some calls so
+            code = grpc.StatusCode.UNAVAILABLE
         if "message larger than max" in details:  # text of gRPC
             details = f"the values are too large for one message; send or request fewer at once ({details})"
         if kind := _ERRORS.get(code):
