@@ -133,7 +133,7 @@ class LayerStack:
         self._effective = bytearray(self.size)
         self._image = np.frombuffer(self._effective, np.uint8)
         self._shown: tuple[list[Layer], tuple[Change, ...] | None] | None = None
-        """The result of :meth:`_find_shown`; None: it must be found anew."""
+        """The result of :meth:`_find_shown`; None after a change, which makes the last result invalid."""
 
     def add(self, injection: Layer) -> str:
         """Add a layer; return the reason why it cannot be added, or "" if it was added."""

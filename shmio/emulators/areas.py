@@ -20,11 +20,6 @@ _LEAST: Final = dict.fromkeys(_LETTERS, 1024) | {Area.TIMER: 512, Area.COUNTER: 
 """Minimum sizes of these areas in bytes, about those of an S7-300."""
 
 
-def is_table(layout: Layout) -> bool:
-    """Return whether a layout is a tag table with addresses, rather than a data block."""
-    return layout.addressed
-
-
 def place_name(place: Place) -> str:
     """Return the name of an area in TIA Portal's notation."""
     return f"DB{place[1]}" if place[0] is Area.BLOCK else _LETTERS[place[0]]

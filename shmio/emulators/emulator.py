@@ -12,7 +12,7 @@ from snap7.server import CPUState
 from snap7.type import SrvArea
 
 from shmio.config.address import Address
-from shmio.emulators.areas import Place, TableMemory, is_table, place_name
+from shmio.emulators.areas import Place, TableMemory, place_name
 from shmio.emulators.cycle import Cycle
 from shmio.emulators.device import Served
 from shmio.emulators.programs import BUILT_IN, Idle, Program, UserCode, program
@@ -206,12 +206,12 @@ class _Contents:
         self.program = own
         self.memory: dict[Place, bytearray] = {}
         self._blocks: dict[Place, Layout] = {}
-        self._table = TableMemory(layouts[0]) if is_table(layouts[0]) else None
+        self._table = TableMemory(layouts[0]) if layouts[0].addressed else None
         self.frame = bytearray(layouts[0].size) if self._table else self._add_block(layouts[0], db_number)
         for other in layouts[1:]:
-            if not is_table(other):
+            if not other.addressed:
                 self._add_block(other, None)
-        others = [TableMemory(one) for one in layouts[1:] if is_table(one)]
+        others = [TableMemory(one) for one in layouts[1:] if one.addressed]
         self._tables = [self._table, *others] if self._table else others
         self._add_tables()
 

@@ -33,7 +33,7 @@ HANG_MOST_S: Final = 20.0
 
 
 class Probe(NamedTuple):
-    """How to find out whether a server answers.
+    """A question that a running server answers at once, and the connection for it.
 
     Attributes:
         connect: Opens a connection, and returns its socket. It may take ``CONNECT_S``, and may raise
@@ -117,7 +117,7 @@ class ServerProcess:
 
     @property
     def problem(self) -> str:
-        """What is wrong with the server, which is running; empty if nothing is."""
+        """The problem of the running server; empty if there is none."""
         return self._liveness.problem
 
     def check(self) -> None:
@@ -167,7 +167,7 @@ class Liveness:
         self._checked_s = self._answered_s = time.monotonic()
         self._quiet_s = 0.0
         self._waited_ns: int | None = None
-        """How long the server had waited for a processor when its answer was first late; None: it is not late."""
+        """Time in ns that the server had waited for a processor when its answer became late; None: it is not late."""
         self.problem = ""
         """That the server does not answer; empty if it does."""
         self.hangs = False
@@ -222,10 +222,11 @@ class Liveness:
     def _judge(self, pid: int) -> None:
         if self._quiet_s < LATE_S:
             return
+        present_ns = waited_ns(pid)
         if self._waited_ns is None:
-            self._waited_ns = waited_ns(pid)
+            self._waited_ns = present_ns
         self.problem = f"{self._name} has not answered for {self._quiet_s:.0f} s"
-        overloaded = 2 * (waited_ns(pid) - self._waited_ns) >= self._quiet_s * 1e9
+        overloaded = 2 * (present_ns - self._waited_ns) >= self._quiet_s * 1e9
         if self._quiet_s >= (HANG_MOST_S if overloaded else HANG_S):
             self.hangs = True
             raise EndpointError(f"{self._name} hangs: it has not answered for {self._quiet_s:.0f} s, so it was killed")
@@ -245,7 +246,7 @@ class Server(Protocol):
 
     @property
     def problem(self) -> str:
-        """What is wrong with the server, which is running."""
+        """The problem of the running server; empty if there is none."""
 
     def check(self) -> None:
         """Check that the server is running, and that it answers."""

@@ -50,7 +50,7 @@ class SeededRandom:
     def __init__(self, seed: int, name: str) -> None:
         """Create the generator. For the same seed, different names give different numbers."""
         self.key = int.from_bytes(hashlib.sha256(f"{seed}/{name}".encode()).digest()[:8], "little")
-        """What determines all numbers."""
+        """The number that determines all random numbers: it stands for seed and name."""
 
     def words(self, run: int, place: int, purpose: Purpose, count: int) -> Words:
         """Return ``count`` random 64-bit integers: an array of shape (count,) and type uint64."""

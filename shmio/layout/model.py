@@ -249,7 +249,7 @@ class Layout:
 
     @cached_property
     def addressed(self) -> bool:
-        """Whether registers have addresses in a device, as in a tag table."""
+        """True if this is a tag table: its registers have addresses in a device."""
         return any(register.address for register in self.registers)
 
     @cached_property

@@ -448,7 +448,7 @@ class Coordinator:
 
 
 class _Roles(NamedTuple):
-    """What the blocks and processes of a segment do in each step, until a reload changes them.
+    """The blocks and processes that take part in each step, until a reload changes them.
 
     Attributes:
         blocks: The segment's blocks when the roles were determined.

@@ -113,7 +113,7 @@ class Event(msgspec.Struct, frozen=True):
 
     @property
     def sender(self) -> str:
-        """Who caused the event, for messages: for a program of the instance's host, its pid."""
+        """The program that caused the event, as messages name it; on the instance's host, by its pid."""
         if self.by == "fabric":
             return "a program of another cell, which shmio-supervisor audit names"
         pid = pid_of(self.command) if self.by.startswith("program ") else 0

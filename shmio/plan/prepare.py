@@ -20,7 +20,7 @@ from shmio.config.credentials import read_accounts
 from shmio.config.faults import Faults
 from shmio.config.read import examine
 from shmio.config.web import http_sections
-from shmio.emulators.areas import TableMemory, is_table, place_name
+from shmio.emulators.areas import TableMemory, place_name
 from shmio.emulators.device import Served
 from shmio.emulators.kinds import FAULTY, KINDS, S7, create
 from shmio.emulators.programs import IDLE, is_user_code
@@ -261,7 +261,7 @@ def _check_emulator(index: int, emulator: Emulator, config: Config, files: Layou
 def _check_served(key: str, emulator: Emulator, served: Sequence[Served], config: Config) -> tuple[Served, ...]:
     """Check that an emulator can serve these layouts; return them."""
     served = [one._replace(layout=one.layout.base) for one in served]
-    blocks = [one.layout for one in served if not is_table(one.layout)] if emulator.kind == S7 else []
+    blocks = [one.layout for one in served if not one.layout.addressed] if emulator.kind == S7 else []
     if emulator.kind != S7:
         pass
     elif emulator.dbNumber is None:
@@ -298,7 +298,7 @@ def _read_from(key: str, emulator: Emulator, config: Config, files: LayoutFiles)
             continue
         number = source.options.get("dbNumber")
         layout = files.get(f"source[{index}]", source, number, optimized=emulator.kind != S7)
-        if emulator.kind != S7 or is_table(layout):
+        if emulator.kind != S7 or layout.addressed:
             served = Served(layout, {name: source.options[name] for name in DEVICE_KEYS if name in source.options})
             if served not in tables:
                 tables.append(served)
@@ -474,7 +474,7 @@ def _not_served(config: Config, layouts: dict[str, Layout], emulated: dict[str, 
         layout = layouts[source.name]
         number = source.options.get("dbNumber") or layout.number
         wanted = [f"DB{number}"] if number else []
-        if source.connector == "s7" and is_table(layout):
+        if source.connector == "s7" and layout.addressed:
             wanted = [place_name(place) for place in TableMemory(layout).needs]
         for emulator in config.emulator:
             if not wanted or emulator.kind != S7 or not _reads(source, emulator):
@@ -491,7 +491,7 @@ def _served(emulator: Emulator, served: Sequence[Served]) -> dict[str, None]:
     """Return the names of the blocks and areas that an emulator serves, in order."""
     names: dict[str, None] = {}
     for layout in (one.layout for one in served):
-        if is_table(layout):
+        if layout.addressed:
             names |= {place_name(place): None for place in sorted(TableMemory(layout).needs)}
         else:
             names[f"DB{emulator.dbNumber or layout.number}"] = None

@@ -236,9 +236,9 @@ def write_config(memory: memoryview, file: Path) -> None:
 
 def read_config(memory: memoryview) -> Path | None:
     """Read the path of the configuration file that the instance was started from; None: unknown."""
-    path = bytes(memory[CONFIG_OFFSET : CONFIG_OFFSET + CONFIG_SIZE]).split(b"\0", 1)[0]
     from pathlib import Path  # noqa: PLC0415  programs that attach need no path
 
+    path = bytes(memory[CONFIG_OFFSET : CONFIG_OFFSET + CONFIG_SIZE]).split(b"\0", 1)[0]
     return Path(os.fsdecode(path)) if path else None
 
 

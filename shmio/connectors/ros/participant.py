@@ -182,7 +182,7 @@ class Participant:
         self._changes: Any = None
         """The readers and writers whose publishers or subscribers have changed since they were counted."""
         self._counted = False
-        """Whether all present readers and writers were counted. DDS does not report that one was deleted."""
+        """False if readers or writers were created or deleted since the last count: DDS does not report a deletion."""
         self._without_publisher: frozenset[str] = frozenset()
         self.discovery = Discovery()
         try:

@@ -162,7 +162,7 @@ class NatsServer:
 
     @property
     def problem(self) -> str:
-        """What is wrong with the server, which is running; empty if nothing is."""
+        """The problem of the running server; empty if there is none."""
         return self._process.problem
 
     def check(self) -> None:

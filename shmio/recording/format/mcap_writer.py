@@ -86,7 +86,7 @@ class IndexedChunk:
 
 @dataclass
 class Summary:
-    """What the end of a file says about the file. Schemas and channels are encoded records, by number."""
+    """The content of the records at the end of a file. Schemas and channels are encoded already, by number."""
 
     schemas: dict[int, bytes] = field(default_factory=dict)
     channels: dict[int, bytes] = field(default_factory=dict)

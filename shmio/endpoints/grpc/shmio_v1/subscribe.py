@@ -314,8 +314,8 @@ class SubscribeCall:
         """Queue the marker of a step. The marker is sent after the changes of the step.
 
         Returns:
-            Whether the client has to take them. If the call is not open yet, it has not, because
-            :meth:`open` can take seconds.
+            True if the step has to wait until the client has taken them. False if the call is not open
+            yet, because :meth:`open` can take seconds.
 
         """
         if self.late or not self._opened:

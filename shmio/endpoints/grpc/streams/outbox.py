@@ -144,7 +144,7 @@ class Outbox:
 
     @property
     def delivery_pending(self) -> bool:
-        """True if the client has not yet taken all messages that :meth:`require_delivery` marked."""
+        """True until the client has taken all messages that :meth:`require_delivery` marked."""
         return self._taken < self._required and not self.failure
 
     def give_up(self, reason: str) -> None:

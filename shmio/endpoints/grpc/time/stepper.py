@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Awaitable, Callable, Coroutine, Mapping
-from contextlib import closing, suppress
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
+from contextlib import asynccontextmanager, closing, suppress
 from functools import partial
 from typing import Any, Final, TypeVar
 
@@ -374,40 +374,35 @@ class Stepper:
 
     async def _make(self, dt_ns: int | None) -> Step:
         """Make a step and deliver it."""
-        async with self._lock:
-            try:
-                await self._steer()
-                step = await self._driver.step(dt_ns)
-                await self.timeline.deliver(step)
-                return step
-            finally:
-                self._leave()
+        async with self._steering():
+            step = await self._driver.step(dt_ns)
+            await self.timeline.deliver(step)
+            return step
 
     async def _change(self, call: Callable[[], None], *, end: bool = False) -> None:
         """Take control of time, and call a method of the coordinator that changes how time moves."""
+        async with self._steering():
+            call()
+            self.timeline.ended = end
+
+    @asynccontextmanager
+    async def _steering(self) -> AsyncIterator[None]:
+        """Take control of time. Until the block ends, no other client of this endpoint can move time."""
         async with self._lock:
             try:
-                await self._steer()
-                call()
-                self.timeline.ended = end
+                if self._segment.outdated:
+                    await asyncio.to_thread(self._segment.refresh)
+                if not self._owns:
+                    self.timeline.update()  # another program may just have returned to real time
+                    self._coordinator.take_over()
+                    self._own(True)
+                await self.timeline.delivered()
+                self.timeline.steered = True
+                yield
             finally:
-                self._leave()
-
-    async def _steer(self) -> None:
-        """Take control of time. The caller holds the lock, and calls :meth:`_leave` in any case."""
-        if self._segment.outdated:
-            await asyncio.to_thread(self._segment.refresh)
-        if not self._owns:
-            self.timeline.update()  # another program may just have returned to real time
-            self._coordinator.take_over()
-            self._own(True)
-        await self.timeline.delivered()
-        self.timeline.steered = True
-
-    def _leave(self) -> None:
-        self.timeline.steered = False
-        self.timeline.update()
-        self._set_rest()
+                self.timeline.steered = False
+                self.timeline.update()
+                self._set_rest()
 
     def _own(self, owns: bool) -> None:
         self._owns = owns
@@ -436,12 +431,8 @@ class Stepper:
         if self._player.on:
             raise TimeError("time is playing; pause it first")
         check_virtual(self._segment.clock.read())
-        async with self._lock:
-            try:
-                await self._steer()
-                return await asyncio.to_thread(work, self._coordinator)
-            finally:
-                self._leave()
+        async with self._steering():
+            return await asyncio.to_thread(work, self._coordinator)
 
     # ---- playing ---------------------------------------------------------------------------------------------------
 

@@ -169,7 +169,7 @@ class Mosquitto:
 
     @property
     def problem(self) -> str:
-        """What is wrong with mosquitto, which is running; empty if nothing is."""
+        """The problem of the running mosquitto; empty if there is none."""
         return self._process.problem
 
     def check(self) -> None:
