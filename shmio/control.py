@@ -385,9 +385,8 @@ def request(
         except TimeoutError:
             raise ControlError(f"the supervisor has not answered within {timeout_s:g} s") from None
         except OSError as error:
-            raise UnreachableError(
-                f"the supervisor cannot be reached at {path or '(no path)'}: {error.strerror}"
-            ) from None
+            where = f" at {path}: {error.strerror}" if path else ": the instance names no control socket"
+            raise UnreachableError(f"the supervisor cannot be reached{where}") from None
     try:
         answer = msgspec.json.decode(received, type=dict[str, Any])
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):

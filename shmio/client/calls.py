@@ -119,8 +119,8 @@ class Target:
         """The gRPC metadata of every call: the token, if there is one."""
         return () if self.token is None else (("authorization", f"Bearer {self.token}"),)
 
-    def error(self, error: Any) -> ShmioError:
-        """Convert the error of a gRPC call to an error of shmio."""
+    def error(self, error: Any, *, answered: bool = False) -> ShmioError:
+        """Convert the error of a gRPC call to an error of shmio; ``answered``: the call had answers before."""
         code, details = error.code(), error.details() or ""
         if code is grpc.StatusCode.CANCELLED and details == "CANCELLED":  # an endpoint that stops ends some calls so
             code = grpc.StatusCode.UNAVAILABLE
@@ -131,7 +131,7 @@ class Target:
         error_type = _REMOTE.get(code, RemoteError)
         if tls := next((meaning for words, meaning in _TLS.items() if words in details), None):
             return error_type(f"{self.address}: {tls}")
-        closed = "Socket closed" in details and not self.address.startswith(_UNIX)
+        closed = "Socket closed" in details and not answered and not self.address.startswith(_UNIX)
         details = next((plain for words, plain in _PLAIN.items() if words in details), details)
         if closed and self.ca is None:
             details += ", or it speaks TLS; then name the CA of its certificate (ca, --ca)"
@@ -139,9 +139,9 @@ class Target:
             details += ", or it needs a client certificate (certificate and key)"
         return error_type(f"{self.address}: {_MEANING.get(code, code.name)}{f': {details}' if details else ''}")
 
-    def fail(self, error: Any) -> NoReturn:
-        """Raise the error of a gRPC call as an error of shmio."""
-        raise self.error(error) from None
+    def fail(self, error: Any, *, answered: bool = False) -> NoReturn:
+        """Raise the error of a gRPC call as an error of shmio; ``answered``: the call had answers before."""
+        raise self.error(error, answered=answered) from None
 
 
 def unanswered(target: Target) -> RemoteError:

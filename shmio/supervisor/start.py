@@ -26,16 +26,17 @@ def check_startable(plan: Plan) -> None:
         EndpointError: A port is in use.
 
     """
-    _refuse_second(plan)
+    refuse_running(plan)
     if not stale_segment.living(plan.instance):
         try:
             check_ports(plan)
         except EndpointError:
-            _refuse_second(plan)  # an instance that has just started may use them
+            refuse_running(plan)  # an instance that has just started may use them
             raise
 
 
-def _refuse_second(plan: Plan) -> None:
+def refuse_running(plan: Plan) -> None:
+    """Raise AlreadyRunningError if the instance is running; the message says from which file, and how to stop it."""
     try:
         refuse_second(plan.instance)
     except AlreadyRunningError as error:

@@ -304,7 +304,7 @@ def test_request_returns_the_answer_or_raises_its_error(served: Served) -> None:
 def test_request_fails_without_a_server_or_without_an_answer(tmp_path: Path) -> None:
     with pytest.raises(ControlError, match="cannot be reached"):
         control.request(str(tmp_path / "none.sock"), Stop(), 1)
-    with pytest.raises(ControlError, match="cannot be reached"):
+    with pytest.raises(ControlError, match="cannot be reached: the instance names no control socket"):
         control.request("", Stop(), 1)
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as deaf:
         deaf.bind(str(tmp_path / "deaf.sock"))

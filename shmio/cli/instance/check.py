@@ -13,13 +13,14 @@ from shmio.cli.common import dumps
 from shmio.cli.target import config_file
 from shmio.config import Address, Alert, Source
 from shmio.connectors.request_count import Requests
-from shmio.errors import ConfigError, ShmioError
+from shmio.errors import AlreadyRunningError, ConfigError, ShmioError
 from shmio.layout.topic import shorten
 from shmio.plan.ports import served, taken
 from shmio.plan.prepare import Prepared, peer, prepare
 from shmio.plan.processes import Plan
 from shmio.plan.request_count import source_requests, writable_registers
 from shmio.segment import PREFIX, BlockSpec, Segment
+from shmio.supervisor.start import refuse_running
 from shmio.wording import counted, printable
 
 MAX_PATTERNS: Final = 200
@@ -60,15 +61,20 @@ def check(arguments: argparse.Namespace) -> int:
 
 
 def _taken(file: Path, plan: Plan) -> list[str]:
-    """Return a note for each address that another program uses.
+    """Return a note if an instance of another file has the same name, and one for each address in use.
 
-    If the instance runs, or its processes have survived their supervisor, there are no notes: these
+    If the instance runs from this file, or its processes have survived their supervisor, there are no notes: these
     processes use the addresses, and ``up`` takes them over.
     """
     with suppress(ShmioError), Segment.open(plan.instance, config=file) as segment:
         if segment.supervised or any(slot.alive() for slot in segment.processes):
             return []
-    return [f"note: up would fail at present: {problem}" for problem in taken(plan)]
+    problems = list(taken(plan))
+    try:
+        refuse_running(plan)
+    except AlreadyRunningError as error:
+        problems.insert(0, str(error))
+    return [f"note: up would fail at present: {problem}" for problem in problems]
 
 
 def _unserved(prepared: Prepared) -> list[str]:

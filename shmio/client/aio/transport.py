@@ -62,6 +62,7 @@ class Stream(AsyncIterator[Any]):
     def __init__(self, channel: Channel, method: Any, *request: Any, timeout_s: float | None = None) -> None:
         self._channel = channel
         self._closed = False
+        self._answered = False
         self._call = method(*request, timeout=timeout_s, metadata=channel.target.metadata)
 
     async def __anext__(self) -> Any:
@@ -71,9 +72,10 @@ class Stream(AsyncIterator[Any]):
                 found = await self._call.read()
         except grpc.RpcError as error:
             if not (self._closed or self._channel.closed):
-                self._channel.target.fail(error)
+                self._channel.target.fail(error, answered=self._answered)
         if found is grpc.aio.EOF:
             raise StopAsyncIteration
+        self._answered = True
         return found
 
     async def first(self) -> Any:

@@ -62,15 +62,18 @@ class Stream(Iterator[Any]):
     def __init__(self, channel: Channel, method: Any, request: Any, *, timeout_s: float | None = None) -> None:
         self._channel = channel
         self._closed = False
+        self._answered = False
         self._call = method(request, timeout=timeout_s, metadata=channel.target.metadata)
 
     def __next__(self) -> Any:
         try:
-            return next(self._call)
+            found = next(self._call)
         except grpc.RpcError as error:
             if self._closed or self._channel.closed:
                 raise StopIteration from None
-            self._channel.target.fail(error)
+            self._channel.target.fail(error, answered=self._answered)
+        self._answered = True
+        return found
 
     def first(self) -> Any:
         """Return the first answer; None if the stream was closed. Raise RemoteError if none comes in time."""

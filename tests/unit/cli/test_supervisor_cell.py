@@ -114,6 +114,7 @@ def test_up_status_restart_logs_and_down(cell: Cell) -> None:
     (cell.folder / "other.toml").write_text(configured.read_text())
     refused = cell.run("up", "-c", "other.toml", status=1)
     assert f", started from {configured}; shmio-supervisor down --instance {cell.instance} stops it; " in refused.stderr
+    assert f"note: up would fail at present: {refused.stderr}" in cell.run("check", "-c", "other.toml", status=0).stdout
 
     pids = {process["name"]: process["pid"] for process in status["processes"]}
     os.kill(pids["plc"], signal.SIGKILL)

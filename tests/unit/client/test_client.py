@@ -14,9 +14,11 @@ import pytest
 import trustme
 
 from shmio.client import Column, Quality, connect, connect_aio
+from shmio.config import Address
 from shmio.errors import EndpointError, LostError, PathError, QualityError, RemoteError, ValueRangeError
 from shmio.segment import Quality as FrameQuality
 from shmio.segment import Segment
+from shmio.testing.proxy import FaultProxy
 from tests.unit.client.both import BOTH, Connect
 from tests.unit.endpoints.conftest import segment as segment  # noqa: PLC0414  the fixture
 from tests.unit.endpoints.grpc.shmio_v1.test_subscribe import OTHER, reload
@@ -252,6 +254,21 @@ def test_tls_faults_are_named(tmp_path: Path, serves: str, ca: str | None, told:
             cell.status()
     finally:
         server.stop(None).wait()
+
+
+@BOTH
+def test_lost_stream_that_had_answers_needs_no_other_settings(segment: Segment, connects: Connect) -> None:
+    async def test(served: Endpoint) -> None:
+        served.publish(image(1.5, 2.5, True, b"", 0))
+        with FaultProxy(Address("127.0.0.1", served.port), framing=None) as proxy:
+            async with connects(str(proxy.address)) as cell, cell.subscribe("cell/axis") as stream:
+                await anext(stream)
+                proxy.cut()
+                with pytest.raises(LostError, match="the endpoint has stopped") as caught:
+                    await anext(stream)
+        assert "TLS" not in str(caught.value)
+
+    serve(segment, test)
 
 
 def test_token_for_another_host_needs_tls() -> None:
