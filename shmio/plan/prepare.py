@@ -208,7 +208,9 @@ def _warn_besides(config: Config, layouts: dict[str, Layout], faults: Faults) ->
 
 
 def peer(source: Source) -> str:
-    """Return the address of a checked source's device: a URL, host:port, or a host; "" if the source has no device."""
+    """Return what a source reads: a device's URL, host:port or host; CELL/SOURCE for a mirror; "" if none is named."""
+    if source.connector == "fabric" and (cell := source.options.get("cell")):
+        return f"{cell}/{source.options.get('source') or source.name}"
     if url := source.options.get("url"):
         return str(url)
     host, port = source.options.get("host"), source.options.get("port")

@@ -27,7 +27,7 @@ from tests.nats_server import NatsServer, nats_server
 LAYOUT = Layout(
     "DB1", 1, 4, False, (Register("a", "INT", (), 0, None, 2, 1), Register("b/c", "INT", (), 2, None, 2, 1))
 )
-NEAR, FAR = "plant1.line3.a50", "plant1.line3.b60"
+NEAR, FAR, EMPTY = "plant1.line3.a50", "plant1.line3.b60", "plant1.line3.c70"
 
 
 @pytest.fixture
@@ -39,7 +39,9 @@ def server(tmp_path: Path) -> Iterator[NatsServer]:
 def entry(cell: str, **more: Any) -> CellEntry:
     told: dict[str, Any] = {"version": __version__, "state": "running", "quality": "good", "reason": ""} | more
     source = SourceEntry("cell", LAYOUT.hash.hex(), 20_000_000, 500_000_000, 7, told["quality"], told["reason"], 2)
-    return CellEntry(cell, "near", "a50", told["version"], "0", told["state"], 1, 2, sources=(source,))
+    return CellEntry(
+        cell, "near", "a50", told["version"], "0", told["state"], 1, 2, sources=told.get("sources", (source,))
+    )
 
 
 def register(server: NatsServer, *entries: CellEntry) -> None:
@@ -79,7 +81,12 @@ def test_status_shows_sources_and_names_similar_cells(server: NatsServer, capsys
     out = capsys.readouterr().out
     assert "instance a50 on near" in out
     assert "20 ms" in out
+    assert "QUALITY" in out
     assert run(server, "status", FAR) == 1  # stopped
+    register(server, entry(EMPTY, sources=()))
+    capsys.readouterr()
+    assert run(server, "status", EMPTY) == 0
+    assert "QUALITY" not in capsys.readouterr().out
     assert run(server, "status", "plant1.line3.a5") == 1
     assert f"did you mean '{NEAR}'" in capsys.readouterr().err
     assert run(server, "status", "a50") == 1

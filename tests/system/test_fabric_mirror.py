@@ -147,9 +147,10 @@ def test_faults_in_the_configuration_of_a_mirror_are_named(cells: tuple[Cell, Ce
         assert "source[0].source" in done.stderr
         assert "did you mean 'belt'" in done.stderr
         file.write_text(text.replace('cell = "plant1.line3.near"', 'cell = "plant1.line3.neer"'))
-        assert "did you mean 'plant1.line3.near'" in far.supervisor("check").stderr
+        assert "did you mean 'plant1.line3.near'? (or start that cell first" in far.supervisor("check").stderr
         file.write_text(re.sub(r"nats://\S+:\d+", "nats://127.0.0.1:1", text))
         said = far.output("shmio-supervisor", "check")
+        assert "source mirrored at plant1.line3.near/belt: " in said
         assert "supervisor.toml: warning: source[0].cell: the layout of plant1.line3.near/belt is the one that" in said
     finally:
         file.write_text(text)

@@ -53,4 +53,4 @@ def _lines(found: Member) -> list[str]:
          f"{one.quality}: {one.reason}" if one.reason else one.quality)
         for one in found.sources
     ]  # fmt: skip
-    return lines + columns([_HEADINGS, *rows])
+    return lines + (columns([_HEADINGS, *rows]) if rows else [])

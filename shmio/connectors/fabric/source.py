@@ -125,7 +125,8 @@ async def _look_up(mirror: Mirror, client: Client) -> Offer:
     if seen is None:
         names = [other.entry.cell for other in await registry.cells()]
         what = unknown("cell", str(mirror.cell), names, "the fabric")
-        raise ConfigError(f"cell: {what}; start that cell first: it tells the fabric its layout")
+        remedy = "start that cell first: it tells the fabric its layout"
+        raise ConfigError(f"cell: {what} (or {remedy})" if what.endswith("?") else f"cell: {what}; {remedy}")
     found = seen.entry.source(mirror.source)
     if found is None:
         names = [source.name for source in seen.entry.sources]
