@@ -43,7 +43,8 @@ class Receiver:
 def test_each_stage_waits_for_the_streams_and_the_caller_may_be_gone() -> None:
     async def test() -> None:
         outboxes, receiver, marked, ended = Outboxes(), Receiver(), list[int](), list[bool]()
-        delivery = Delivery(VirtualTime(), {}, outboxes, lambda: ended.append(delivery.busy))
+        time = VirtualTime()
+        delivery = Delivery(time, {}, outboxes, lambda: ended.append(delivery.busy))
         delivery.receivers.append(receiver)
         with outboxes.opened() as outbox:
             lane = StateLane(outbox)
@@ -54,6 +55,7 @@ def test_each_stage_waits_for_the_streams_and_the_caller_may_be_gone() -> None:
 
             lane.keep(b"value")
             delivery.begin(Step(1, 50, 50), mark)
+            assert time.moment == (1, 50)
             caller = asyncio.ensure_future(delivery.over())
             await asyncio.sleep(0)
             assert await outbox.pop() == b"value"
@@ -97,6 +99,62 @@ def test_streams_that_take_nothing_end_and_others_continue(monkeypatch: pytest.M
             delivery.begin(Step(2, 100, 50), lambda: None)
             assert not delivery.busy  # no stream has anything to take
             popping.cancel()
+
+    asyncio.run(test())
+
+
+def test_the_marker_for_a_single_stream_does_not_wait_for_the_values() -> None:
+    async def test() -> None:
+        outboxes, marked, ended = Outboxes(), list[bool](), list[bool]()
+        delivery = Delivery(VirtualTime(), {}, outboxes, lambda: ended.append(True))
+        with outboxes.opened() as outbox:
+            lane = StateLane(outbox)
+            lane.keep(b"value")
+
+            def mark() -> None:
+                marked.append(True)
+                lane.keep(b"marker")
+
+            delivery.begin(Step(1, 50, 50), mark)
+            assert marked
+            assert [await outbox.pop() for _ in range(2)] == [b"value", b"marker"]
+            assert not ended
+            popping = asyncio.ensure_future(outbox.pop())
+            await delivery.over()
+            assert ended
+            popping.cancel()
+
+    asyncio.run(test())
+
+
+def test_each_step_has_the_whole_time_and_who_waits_waits_for_the_last_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def test() -> None:
+        loop, start_s = asyncio.get_running_loop(), asyncio.get_running_loop().time()
+        late_s = 0.0
+        monkeypatch.setattr(loop, "time", lambda: start_s + late_s)
+        outboxes, receiver = Outboxes(), Receiver()
+        following = iter([Step(2, 100, 50)])
+
+        def follow() -> None:
+            nonlocal late_s
+            late_s = 0.7 * module.PATIENCE_S
+            for step in following:
+                delivery.begin(step, lambda: None)
+
+        delivery = Delivery(VirtualTime(), {}, outboxes, follow)
+        delivery.receivers.append(receiver)
+        delivery.begin(Step(1, 50, 50), lambda: None)
+        waiting = asyncio.ensure_future(delivery.over())
+        await asyncio.sleep(0)
+        receiver.take()
+        for share in (1.3, 1.6):
+            late_s = share * module.PATIENCE_S
+            for _ in range(5):
+                await asyncio.sleep(0)
+            assert (receiver.steps, receiver.reason, waiting.done()) == ([1, 2], "", False)
+        late_s = 1.8 * module.PATIENCE_S
+        await waiting
+        assert "has not taken the values" in receiver.reason
 
     asyncio.run(test())
 
