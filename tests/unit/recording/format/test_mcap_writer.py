@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from io import BytesIO
+from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from mcap.records import Message as Record
+from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
 from shmio.recording.format import mcap_writer
@@ -79,7 +83,13 @@ def small_chunks() -> Iterator[None]:
         yield
 
 
+FULL = ("messages", 0, [(1, 1, 1, [bytes(CHUNK_BYTES - 100)])])
+
+
 @given(calls)
+@example([FULL, ("schema", "s", bytes(100)), FULL])
+@example([FULL, ("channel", "t", "e", {"k": "v" * 100}), FULL])
+@example([FULL, ("flush",), FULL, ("flush",)])
 def test_the_same_bytes_as_those_of_the_library(made: list[Any]) -> None:
     assert ours(made) == theirs(made)
 
@@ -92,3 +102,15 @@ def test_the_library_reads_every_message() -> None:
         for _, _, one in make_reader(stream, validate_crcs=True).iter_messages()
     ]
     assert read == [(*times, b"".join(data)) for *times, data in messages]
+
+
+def test_a_flush_passes_all_messages_on_to_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "a.mcap"
+    with file.open("wb", buffering=1 << 20) as stream:
+        writer = McapWriter(stream, "profile", "library")
+        channel = writer.register_channel("first", "", writer.register_schema("s", "e", b""))
+        writer.add_messages(channel, [(1, 2, 3, (b"head", b"rest"))])
+        writer.flush()
+        records = StreamReader(BytesIO(file.read_bytes())).records
+        (message,) = [one for one in islice(records, 4) if isinstance(one, Record)]
+    assert message.data == b"headrest"
