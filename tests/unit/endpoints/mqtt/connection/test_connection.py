@@ -5,6 +5,7 @@ from __future__ import annotations
 import selectors
 import socket
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -107,10 +108,18 @@ class Broker:
         self._socket.settimeout(TIMEOUT_S)
 
     def turn_until(self, until: Callable[[], bool]) -> None:
+        deadline_s = time.monotonic() + TIMEOUT_S
         while not until():
-            self.connection.run_once()
-            for key, events in self._selector.select(0.1):
-                key.data(events)
+            assert time.monotonic() < deadline_s
+            self.turn(0.1)
+
+    def turn(self, wait_s: float = 0.0) -> int:
+        """Let the connection work once; return how many events there were."""
+        self.connection.run_once()
+        found = self._selector.select(wait_s)
+        for key, events in found:
+            key.data(events)
+        return len(found)
 
     def close(self) -> None:
         self.connection.close()
@@ -220,6 +229,34 @@ def test_acknowledgements_come_in_any_form_and_in_pieces(size: int) -> None:
             broker.turn_until(lambda: len(received) == 2)
             assert (connection.in_flight, received) == (0, [("a", b"hi"), ("b", b"ho")])
             assert connection.problem.endswith("refuses messages: reason code 0xee: t4")
+        finally:
+            broker.close()
+
+
+def test_messages_that_arrive_together_are_all_handled() -> None:
+    """Although one turn handles only a few, and the socket has nothing more to read."""
+    received: list[bytes] = []
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        broker = Broker(server)
+        broker.connection.on_message = lambda message: received.append(bytes(message.payload))
+        try:
+            broker.put("".join(f"30 05 00 01 61 00 {number:02x}" for number in range(200)))
+            broker.turn_until(lambda: len(received) == 200)
+            assert received == [bytes((number,)) for number in range(200)]
+        finally:
+            broker.close()
+
+
+def test_the_rest_of_an_acknowledgement_is_awaited_without_work() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        broker = Broker(server)
+        try:
+            broker.connection.send(Message("t", b"1", 1, retain=False))
+            broker.connection.push()
+            broker.put("40 02 00")
+            assert broker.turn(TIMEOUT_S), "it arrives"
+            assert [broker.turn() for _ in range(3)][1:] == [0, 0]
+            broker.say("01", lambda: not broker.connection.in_flight)
         finally:
             broker.close()
 
