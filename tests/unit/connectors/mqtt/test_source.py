@@ -306,16 +306,18 @@ def test_a_write_is_confirmed_when_frames_show_it(plant: Plant) -> None:
 
 
 def test_the_outcome_of_a_write_that_frames_do_not_show_is_unknown(plant: Plant) -> None:
-    with kept_back(plant, timeout=500) as (source, _):
-        with pytest.raises(UnconfirmedError, match="not sent it back within 500 ms") as raised:
+    with kept_back(plant, timeout=1500) as (source, _):
+        with pytest.raises(UnconfirmedError, match="not sent it back within 1500 ms") as raised:
             source.write(speed=2.5, lamp=True)
         assert raised.value.outcomes[0] is Lost.UNKNOWN
         assert raised.value.outcomes[1] is not Lost.UNKNOWN
         plant.device.publish("w/read", "1")  # the connection still works
         source.until(lambda: source.value("speed") == 2.5)
         assert source.write(speed=2.5) == [""]  # frames show it already
-    with kept_back(plant, value=None) as (source, _):
+    with kept_back(plant, value=None, timeout=20_000) as (source, _):
+        begin_s = time.monotonic()
         assert source.write(speed=2.5) == [""]  # frames show no older value
+        assert time.monotonic() - begin_s < 10, "it does not wait for the time-out"
         source.read()
         assert source.code("speed") == statuses.BAD_WAITING_FOR_INITIAL_DATA
 
