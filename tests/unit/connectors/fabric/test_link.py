@@ -73,22 +73,24 @@ def test_an_answer_that_a_stalled_connection_delays_is_not_lost(tmp_path: Path) 
     with nats_server(tmp_path / "nats") as server, FaultProxy(Address("127.0.0.1", server.port), framing=len) as proxy:
         loop = asyncio.new_event_loop()
         thread = threading.Thread(target=loop.run_until_complete, args=(answer(server.url),))
-        thread.start()
         url = f"nats://{proxy.address}"
         answered = threading.Event()
         link = Link(Access((url,)), owner, "cell", "test", None, received.append, lambda _: answered.set())
+        thread.start()
         link.start()
-        until(lambda: not link.problem, "the link is connected", PATIENCE_S)
-        assert ready.wait(PATIENCE_S)
-        proxy.hold()
-        link.request(Missing(7, 1, 1))
-        assert came.wait(PATIENCE_S)
-        until(lambda: link.stalled, "the link waits for the server", PATIENCE_S)
-        assert link.connected
-        proxy.release()
-        assert answered.wait(PATIENCE_S)
-        assert received == [b"missing"]
-        link.close()
-        loop.call_soon_threadsafe(ends.set)
-        thread.join(PATIENCE_S)
-        loop.close()
+        try:
+            until(lambda: not link.problem, "the link is connected", PATIENCE_S)
+            assert ready.wait(PATIENCE_S)
+            proxy.hold()
+            link.request(Missing(7, 1, 1))
+            assert came.wait(PATIENCE_S)
+            until(lambda: link.stalled, "the link waits for the server", PATIENCE_S)
+            assert link.connected
+            proxy.release()
+            assert answered.wait(PATIENCE_S)
+            assert received == [b"missing"]
+        finally:
+            link.close()
+            loop.call_soon_threadsafe(ends.set)
+            thread.join(PATIENCE_S)
+            loop.close()

@@ -157,8 +157,8 @@ def test_a_hole_is_not_given_up_while_the_connection_stalls(
     mirroring.link.stalled = True
     mirroring.send(frame(9, 3))
     assert mirroring.next().quality is Quality.BAD, "it has waited for its stale age"
-    mirroring.link.stalled = False
     mirroring.link.send(missed)
+    mirroring.link.stalled = False
     assert [mirroring.next().cycle for _ in range(2)] == [1008, 1009]
 
 
