@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from shmio.errors import LayoutError
 from shmio.layout.compiler import Compiled, Source, compile_sources
-from shmio.layout.document import load_layout
+from shmio.layout.document import load_layout, load_part
 from shmio.layout.image import initial_frame
 from shmio.layout.model import INTEGERS, Layout, Register, element_type
 from shmio.layout.topic import find
@@ -84,6 +84,17 @@ def test_a_stored_layout_keeps_the_names() -> None:
     layout = overlaid(NAMES)
     assert load_layout(layout.to_json()) == layout
     assert load_layout(layout.with_statuses().to_json()) == layout.with_statuses()
+
+
+def test_a_part_of_a_layout_with_names_has_own_registers_only() -> None:
+    """The layout of a name alone would not be one: its block has no register."""
+    layout = overlaid(NAMES)
+    for path in ("DoorClosed", "door/Speed", "lamps/3", "Both"):
+        find(layout, path)
+        assert load_part(layout.to_json(), path) is None
+    part = load_part(layout.to_json(), "Robot_800/Axs1_Pos")
+    assert part is not None
+    assert find(part, "Robot_800/Axs1_Pos") == find(layout, "Robot_800/Axs1_Pos")
 
 
 def test_a_csv_names_bits_too() -> None:

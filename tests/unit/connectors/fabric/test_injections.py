@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any, Final
 
 import msgspec
@@ -230,7 +231,10 @@ def test_the_end_of_the_instance_does_not_wait_long_for_an_owner_that_is_gone(
     monkeypatch.setattr(injections, "LEAVE_S", 0.01)
     injected(mirroring, writer_of(mirroring))
     mirroring.ending = mirroring.link.silent = True
-    mirroring.stop()
+    stopping = threading.Thread(target=mirroring.stop)
+    stopping.start()
+    stopping.join(5.0)
+    assert not stopping.is_alive()
     assert sent(mirroring, "lift")
 
 
