@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import select
 
 import pytest
 
@@ -109,6 +110,32 @@ def test_a_bell_rests_while_all_listeners_are_patient(segment: Segment, monkeypa
             while not heard:  # noqa: ASYNC110  another thread changes it
                 await asyncio.sleep(0)
         wake_ups.close()
+
+    asyncio.run(test())
+
+
+@pytest.mark.parametrize("pauses_first", [True, False])
+def test_a_muted_bell_has_no_pause_that_would_end_its_silence(segment: Segment, pauses_first: bool) -> None:
+    async def test() -> None:
+        heard = asyncio.Event()
+        bell = WakeUp(segment.blocks["cell"].ring, "bell", turn_ns=10**15)
+        bell.listeners[heard.set] = None
+        bell.patient.add(heard.set)
+        try:
+            for act in (bell.pause, bell.mute) if pauses_first else (bell.mute, bell.pause):
+                act()
+            bell.resume()
+            segment.writer("cell").publish(image(), cycle=1)
+            assert select.select([bell._relay.descriptor], [], [], TIMEOUT_S)[0]
+            for _ in range(3):
+                await asyncio.sleep(0)
+            assert not heard.is_set()
+            bell.unmute()
+            async with asyncio.timeout(TIMEOUT_S):
+                await heard.wait()
+        finally:
+            bell.stop()
+            bell.join()
 
     asyncio.run(test())
 
