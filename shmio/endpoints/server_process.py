@@ -164,7 +164,9 @@ class Liveness:
         self._name, self._probe = name, probe
         self._socket: socket.socket | None = None
         self._asked = False
-        self._checked_s = self._answered_s = time.monotonic()
+        self._answered_s = time.monotonic()
+        self._checked_s: float | None = None
+        """When the server was asked, or when its answer was last looked for; None: no answer is due."""
         self._quiet_s = 0.0
         self._waited_ns: int | None = None
         """Time in ns that the server had waited for a processor when its answer became late; None: it is not late."""
@@ -183,15 +185,15 @@ class Liveness:
 
         """
         now_s = time.monotonic()
-        # If this process was paused (host suspended, container paused), so was the server: this time does not count.
-        elapsed_s, self._checked_s = min(now_s - self._checked_s, CONNECT_S + 2 * BEAT_S), now_s
+        if self._checked_s is not None:
+            # If this process was paused (host suspended, container paused), so was the server, and this time does not
+            # count.
+            self._quiet_s += min(now_s - self._checked_s, CONNECT_S + 2 * BEAT_S)
+        elif now_s - self._answered_s < ASK_S:
+            return
+        self._checked_s = now_s
         try:
-            if self._asked:
-                answered = self._answered()
-            elif now_s - self._answered_s < ASK_S:
-                return
-            else:
-                answered = self._ask()
+            answered = self._answered() if self._asked else self._ask()
         except (BlockingIOError, TimeoutError, ssl.SSLWantReadError):
             answered = False
         except OSError:  # that the server ends or refuses the connection is an answer, too
@@ -199,9 +201,8 @@ class Liveness:
             answered = True
         if answered:
             self._asked, self._answered_s, self._quiet_s = False, now_s, 0.0
-            self._waited_ns, self.problem = None, ""
+            self._checked_s, self._waited_ns, self.problem = None, None, ""
         else:
-            self._quiet_s += elapsed_s
             self._judge(pid)
 
     def _ask(self) -> bool:

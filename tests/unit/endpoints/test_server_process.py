@@ -25,11 +25,13 @@ class Rig:
     def __init__(self) -> None:
         self.now_s, self.waited_s = 1000.0, 500.0
         self.connections: list[socket.socket] = []
-        self.refuses = False
+        self.refuses = self.is_full = False
 
     def connect(self) -> socket.socket:
         if self.refuses:
             raise ConnectionRefusedError
+        if self.is_full:
+            raise TimeoutError
         ours, theirs = socket.socketpair()
         theirs.setblocking(False)
         self.connections.append(theirs)
@@ -109,6 +111,15 @@ def test_a_pause_of_both_processes_does_not_count(rig: Rig) -> None:
         assert "the server has not answered for" in rig.beat(3600.0)
     rig.connections[0].send(b"yes")
     assert rig.beat() == ""
+
+
+@pytest.mark.parametrize("full", [False, True], ids=["no answer yet", "no connection yet"])
+def test_the_time_before_the_question_does_not_count(rig: Rig, *, full: bool) -> None:
+    """As when the host was suspended while no answer was due."""
+    rig.is_full = full
+    assert rig.beat(3600.0) == ""
+    assert rig.beat() == ""
+    assert "the server has not answered for 1 s" in rig.beat(LATE_S)
 
 
 def test_a_connection_that_the_server_closes_or_refuses_is_an_answer(rig: Rig) -> None:
