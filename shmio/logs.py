@@ -16,8 +16,8 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping
-from contextlib import nullcontext, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext, suppress
 from datetime import UTC, datetime
 from io import TextIOWrapper
 from pathlib import Path
@@ -237,3 +237,23 @@ class LogRateLimit(logging.Filter):
         if count > MAX_LINES:
             record.msg = f"{text} ({count - MAX_LINES} similar lines before this one were left out)"
         return True
+
+
+@contextmanager
+def rate_limited(*loggers: str) -> Iterator[None]:
+    """Limit the rate of the lines that clients and devices can cause, by a :class:`LogRateLimit` for each logger.
+
+    All lines of another library's logger are of one kind.
+
+    Args:
+        loggers: The names of the loggers.
+
+    """
+    limits = {name: LogRateLimit(one_kind=not name.startswith("shmio.")) for name in loggers}
+    for name, limit in limits.items():
+        logging.getLogger(name).addFilter(limit)
+    try:
+        yield
+    finally:
+        for name, limit in limits.items():
+            logging.getLogger(name).removeFilter(limit)

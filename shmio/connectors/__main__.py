@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
 
@@ -21,6 +21,7 @@ from shmio.connectors.models.stepped import PageClock, SteppedLoop, connected_in
 from shmio.connectors.poll_loop import Schedule, SourceLoop, WallClock
 from shmio.errors import ConfigError, ConnectorError, ShmioError
 from shmio.local.state_requests import StateRequests
+from shmio.logs import rate_limited
 from shmio.segment import Segment, State
 from shmio.worker import BEAT_S, Reload, Worker
 
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from shmio.connectors.fabric.loop import MirrorLoop
     from shmio.connectors.replay.loop import ReplayLoop
 
+LOGGERS: Final = ("shmio.source", "shmio.source.mqtt")
+"""Loggers whose lines a device can cause in great number. The rate of these lines is limited."""
 SWITCH_S = 0.0005  # with Python's default of 5 ms, other threads would delay the poll thread too long
 RELOAD_S = 120.0
 LAST_WORDS_S = 4.0  # less than the supervisor's grace period
@@ -55,6 +58,11 @@ def run(worker: Worker) -> None:
     woken = threading.Event()
     worker.on_stop(woken.set)
     worker.on_reread(woken.set)
+    with rate_limited(*LOGGERS):
+        _run(worker, woken)
+
+
+def _run(worker: Worker, woken: threading.Event) -> None:
     running = _Running(_loop_of(worker))
     worker.running()
     rate = _Rate()

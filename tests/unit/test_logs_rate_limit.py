@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import logging
+import sys
+from contextlib import suppress
+from types import SimpleNamespace
+from typing import NoReturn, cast
 
 import pytest
 
-from shmio.logs import MAX_LINES, TURN_S, LogRateLimit
+from shmio.connectors import __main__ as source_process
+from shmio.logs import MAX_LINES, TURN_S, LogRateLimit, rate_limited
+from shmio.worker import Worker
 
 
 def test_lines_of_a_kind_are_rate_limited_and_the_rest_is_counted(caplog: pytest.LogCaptureFixture) -> None:
@@ -31,3 +37,31 @@ def test_lines_of_a_kind_are_rate_limited_and_the_rest_is_counted(caplog: pytest
         ]  # fmt: skip
     finally:
         log.removeFilter(rate_limit)
+
+
+def test_all_lines_of_another_library_are_of_one_kind(caplog: pytest.LogCaptureFixture) -> None:
+    for name, written in (("library", MAX_LINES), ("shmio.test", 2 * MAX_LINES)):
+        log = logging.getLogger(name)
+        caplog.clear()
+        with rate_limited(name, "another"):
+            for number in range(MAX_LINES):
+                log.warning(f"failure {number}")
+                log.warning(f"error {number}")
+        assert len(caplog.records) == written
+        assert not log.filters
+
+
+def test_a_device_cannot_fill_the_log_of_its_source(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def flood(worker: Worker) -> NoReturn:
+        for number in range(3 * MAX_LINES):
+            logging.getLogger("shmio.source").warning("malformed message %d", number)
+        raise EOFError
+
+    monkeypatch.setattr(source_process, "_loop_of", flood)
+    monkeypatch.setattr(sys, "setswitchinterval", lambda _: None)
+    worker = SimpleNamespace(on_stop=lambda _: None, on_reread=lambda _: None)
+    with suppress(EOFError):
+        source_process.run(cast("Worker", worker))
+    assert len(caplog.records) == MAX_LINES

@@ -54,8 +54,6 @@ LEAVE_S: Final = 1.0
 """Longest wait in s for the owner when the instance ends."""
 MAX_TIME_NS: Final = (1 << 63) - 1
 """Latest time that a command or an injection can have; a faulty owner may send later ones."""
-REPORT_NS: Final = 60_000_000_000
-"""Shortest time in ns between two reports of the same kind."""
 MAX_S: Final = 1e9
 """Latest start and end of an injection, in s."""
 MAX_SENT: Final = 256
@@ -188,7 +186,8 @@ class MirroredInjections:
         self._present = set(self._held)  # numbers in the owner's list
         self._clock: _OwnersClock | None = None
         self._shown: bytes | None = None
-        self._reported_ns = self._refused_ns = -REPORT_NS
+        self._all_shown = True
+        self._refusal = ""  # why the owner did not renew injections when it was asked last
         self._numbers = count(first_number(os.getpid()) + 1)
         self._look_ns = self._renew_ns = 0
 
@@ -376,13 +375,16 @@ class MirroredInjections:
 
     def _on_renewed(self, reply: Future[CommandReply]) -> None:
         """Tell why the owner will end injections of this instance. The link's thread calls this."""
-        if reply.cancelled() or reply.exception() is not None or OutcomeKind.REJECTED not in reply.result().outcomes:
+        if reply.cancelled() or reply.exception() is not None:
             return
-        now_ns = time.monotonic_ns()
-        if now_ns - self._refused_ns >= REPORT_NS:
-            self._refused_ns = now_ns
-            why = next(filter(None, reply.result().reasons), "it gives no reason")
-            log.warning("cell %s does not renew the injections of this instance, so it ends them: %s", self._cell, why)
+        refusal = ""
+        if OutcomeKind.REJECTED in reply.result().outcomes:
+            refusal = next(filter(None, reply.result().reasons), "it gives no reason")
+        if refusal not in ("", self._refusal):
+            log.warning(
+                "cell %s does not renew the injections of this instance, so it ends them: %s", self._cell, refusal
+            )
+        self._refusal = refusal
 
     # ---- in the loop's thread ------------------------------------------------------------------------------------
 
@@ -438,8 +440,8 @@ class MirroredInjections:
         items = [msgspec.json.encode(one) for one in entries]
         ends = list(accumulate(len(item) + 1 for item in items))
         fit = bisect_right(ends, LIST_SIZE - 1)  # each item has a comma or a bracket after it, and the list one before
-        if fit < len(items) and (now_ns := self._now_ns()) - self._reported_ns >= REPORT_NS:
-            self._reported_ns = now_ns
+        all_shown, self._all_shown = self._all_shown, fit == len(items)
+        if all_shown and not self._all_shown:
             log.warning(
                 "only %d of %s of cell %s are shown here, because their list is too long",
                 fit, counted(len(items), "injection"), self._cell,

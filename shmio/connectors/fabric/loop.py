@@ -61,8 +61,7 @@ BUSY_NS: Final = 100_000_000
 """Longest wait of the loop in ns while outcomes of commands about injections are awaited."""
 RELOAD_NS: Final = 30_000_000_000
 """Time in ns after which the mirror asks again for a reload, if the layout is still another one."""
-REPORT_NS: Final = 10_000_000_000
-"""Shortest time in ns between two reports of malformed messages."""
+MALFORMED: Final = "%s sent a malformed message: %s"
 _LEFT_OUT: Final = frozenset({EventKind.STARTED, EventKind.STOPPED, EventKind.QUALITY})
 """Events of the owner that the mirror replaces by its own."""
 
@@ -155,7 +154,6 @@ class MirrorLoop:
         self._last_ns = clock.now_ns()  # when the last frame was published
         self._open = False
         self._bad = True  # the last frame was bad
-        self._reported_ns = -REPORT_NS
         self._state_of = 0  # number of the stream from which the owner's injections are known
         self._state_ns = -STATE_NS  # when the mirror asked for them last
         self._problem, self._problem_ns = "", clock.now_ns()  # of the link, and when it last had it
@@ -180,7 +178,7 @@ class MirrorLoop:
         try:
             header = decode_header(data)
         except ValueError as error:
-            self._report(error)
+            log.warning(MALFORMED, self._mirror, error)
             return
         self._received_bytes += len(data)
         self._inbox.append(Received(header, data, self._clock.now_ns()))
@@ -283,7 +281,7 @@ class MirrorLoop:
             for entry in entries:
                 self._publish(entry, late_ns + _waited_ns(one.header, entry))
         except ValueError as error:
-            self._report(error)
+            log.warning(MALFORMED, self._mirror, error)
 
     def _publish(self, entry: Entry, late_ns: int) -> None:
         if isinstance(entry, Frame):
@@ -430,12 +428,6 @@ class MirrorLoop:
         if not self._own_layout and now_ns - self._reload_ns >= RELOAD_NS:
             self._reload_ns = now_ns  # not only once: the owner may publish before the registry has its new layout
             self._changed()
-
-    def _report(self, error: ValueError) -> None:
-        now_ns = self._clock.now_ns()
-        if now_ns - self._reported_ns >= REPORT_NS:
-            self._reported_ns = now_ns
-            log.warning("%s sent a malformed message: %s", self._mirror, error)
 
     # ---- commands ------------------------------------------------------------------------------------------------
 

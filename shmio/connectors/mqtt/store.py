@@ -22,7 +22,6 @@ from shmio.errors import ConfigError, PathError, ValueRangeError
 from shmio.layout.glob import Glob
 from shmio.layout.model import Layout
 from shmio.layout.values.codec import Value
-from shmio.logs import LogRateLimit
 from shmio.model.statuses import (
     BAD_OUT_OF_RANGE,
     BAD_TIMEOUT,
@@ -88,7 +87,6 @@ class Store:
 
         """
         self.layout, self._options = layout, options
-        log.filters[:] = [LogRateLimit()]  # a process has one source
         self._changed = threading.Condition()
         """Guards all attributes below; waiting threads are notified at each message."""
         self._waiting = 0

@@ -17,7 +17,7 @@ from shmio.endpoints.alerts.dispatcher import Dispatcher
 from shmio.endpoints.alerts.monitor import Monitor
 from shmio.endpoints.alerts.state_file import FILE_NAME, AlertState, State, StateWriter, digest, read_state
 from shmio.layout.topic import shorten
-from shmio.logs import LogRateLimit
+from shmio.logs import rate_limited
 from shmio.segment.doorbell import Relay
 from shmio.worker import BEAT_S, Worker
 
@@ -128,9 +128,7 @@ class Alerts:
 
 def run(worker: Worker) -> None:
     """Evaluate the alerts and deliver their notices, until the worker is stopped."""
-    rate_limit = LogRateLimit()
-    log.addFilter(rate_limit)
-    try:
+    with rate_limited(log.name):
         alerts = Alerts(worker, msgspec.convert(worker.config, Settings))
         worker.on_stop(alerts.wake)
         log.info("this process watches %d alerts", len(worker.config["alert"]))
@@ -139,8 +137,6 @@ def run(worker: Worker) -> None:
             alerts.run_once()
         alerts.close()
         alerts.report()
-    finally:
-        log.removeFilter(rate_limit)
 
 
 if __name__ == "__main__":

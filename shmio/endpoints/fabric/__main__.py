@@ -14,7 +14,7 @@ from shmio import worker
 from shmio.endpoints.fabric.server import NatsServer, ServerSettings
 from shmio.endpoints.server_process import serve
 from shmio.fabric.tasks import end
-from shmio.logs import LogRateLimit
+from shmio.logs import rate_limited
 from shmio.worker import BEAT_S, Worker
 
 if TYPE_CHECKING:
@@ -32,17 +32,11 @@ log = logging.getLogger("shmio.fabric")
 
 def run(worker: Worker) -> None:
     """Run the uplink or the server, depending on the worker's name, until the worker is stopped."""
-    limits = {name: LogRateLimit(one_kind=name != "shmio.fabric") for name in LOGGERS}
-    for name, limit in limits.items():
-        logging.getLogger(name).addFilter(limit)
-    try:
+    with rate_limited(*LOGGERS):
         if worker.name == SERVER:
             _serve(worker)
         else:
             asyncio.run(_publish(worker))
-    finally:
-        for name, limit in limits.items():
-            logging.getLogger(name).removeFilter(limit)
 
 
 def _serve(worker: Worker) -> None:

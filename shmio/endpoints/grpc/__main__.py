@@ -21,25 +21,19 @@ from shmio.endpoints.grpc.services.services import Services
 from shmio.endpoints.grpc.streams.feed import Feeds, VirtualTime
 from shmio.endpoints.grpc.wakeups import WakeUps
 from shmio.errors import SegmentError, ShmioError
-from shmio.logs import LogRateLimit, fields
+from shmio.logs import fields, rate_limited
 from shmio.worker import BEAT_S, Worker
 
 CALLS_S: Final = 1.0
-FOREIGN_LOGGERS: Final = ("asyncio", "grpc._cython.cygrpc")
-"""Loggers of libraries whose log lines clients can cause. The rate of these lines is limited."""
+LOGGERS: Final = ("shmio.grpc", "asyncio", "grpc._cython.cygrpc")
+"""Loggers whose lines clients can cause in great number. The rate of these lines is limited."""
 
 
 def run(worker: Worker) -> None:
     """Serve clients until the worker is stopped."""
     limits.limit_arenas()
-    rate_limits = {name: LogRateLimit(one_kind=name != "shmio.grpc") for name in ("shmio.grpc", *FOREIGN_LOGGERS)}
-    for name, rate_limit in rate_limits.items():
-        logging.getLogger(name).addFilter(rate_limit)
-    try:
+    with rate_limited(*LOGGERS):
         asyncio.run(_serve(worker))
-    finally:
-        for name, rate_limit in rate_limits.items():
-            logging.getLogger(name).removeFilter(rate_limit)
 
 
 async def _serve(worker: Worker) -> None:

@@ -13,7 +13,7 @@ from shmio.endpoints.mqtt.broker.directory import folder, prepare, remove
 from shmio.endpoints.mqtt.broker.mosquitto import Mosquitto
 from shmio.endpoints.mqtt.broker.program import choose_broker
 from shmio.endpoints.server_process import serve
-from shmio.logs import LogRateLimit
+from shmio.logs import rate_limited
 from shmio.worker import BEAT_S, Worker
 
 BROKER = "broker"
@@ -24,15 +24,11 @@ log = logging.getLogger("shmio.mqtt")
 
 def run(worker: Worker) -> None:
     """Run the bridge or the broker, depending on the worker's name, until the worker is stopped."""
-    rate_limit = LogRateLimit()
-    log.addFilter(rate_limit)
-    try:
+    with rate_limited(log.name):
         if worker.name == BROKER:
             run_broker(worker)
         else:
             _run_bridge(worker)
-    finally:
-        log.removeFilter(rate_limit)
 
 
 def _run_bridge(worker: Worker) -> None:

@@ -13,7 +13,7 @@ from shmio import worker
 from shmio.config import OpcUa
 from shmio.config.opcua import EXTRA
 from shmio.errors import ConfigError
-from shmio.logs import LogRateLimit
+from shmio.logs import rate_limited
 from shmio.worker import BEAT_S, Worker
 
 LOGGERS: Final = ("shmio.opcua", "asyncua", "asyncio")
@@ -25,14 +25,8 @@ def run(worker: Worker) -> None:
     if importlib.util.find_spec("asyncua") is None:
         raise ConfigError(EXTRA)
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # it logs every request of every client
-    limits = {name: LogRateLimit(one_kind=name != "shmio.opcua") for name in LOGGERS}
-    for name, limit in limits.items():
-        logging.getLogger(name).addFilter(limit)
-    try:
+    with rate_limited(*LOGGERS):
         asyncio.run(_serve(worker))
-    finally:
-        for name, limit in limits.items():
-            logging.getLogger(name).removeFilter(limit)
 
 
 async def _serve(worker: Worker) -> None:

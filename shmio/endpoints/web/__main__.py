@@ -14,7 +14,7 @@ from shmio.config.credentials import read_tokens
 from shmio.config.model import Metrics, Token, Web
 from shmio.config.web import check_library
 from shmio.local.attach import attach
-from shmio.logs import LogRateLimit
+from shmio.logs import rate_limited
 from shmio.worker import BEAT_S, Worker
 
 LOGGERS: Final = ("shmio.web", "shmio.fabric", "uvicorn", "asyncio", "websockets", "nats")
@@ -25,16 +25,10 @@ FOLDERS: Final = "folders"
 def run(worker: Worker) -> None:
     """Serve clients until the worker is stopped."""
     check_library(worker.name)
-    limits = {name: LogRateLimit(one_kind=not name.startswith("shmio.")) for name in LOGGERS}
-    for name, limit in limits.items():
-        logging.getLogger(name).addFilter(limit)
     for name in ("uvicorn", "websockets"):
         logging.getLogger(name).setLevel(logging.WARNING)
-    try:
+    with rate_limited(*LOGGERS):
         asyncio.run(_serve(worker))
-    finally:
-        for name, limit in limits.items():
-            logging.getLogger(name).removeFilter(limit)
 
 
 async def _serve(worker: Worker) -> None:

@@ -199,6 +199,10 @@ def test_refused_renewals_are_reported_once(
         assert sent(mirroring, "renew").renewed == [number]
     assert sent(mirroring, "renew").renewed == [number]  # the second reply was evaluated
     assert ["the role is missing" in one for one in caplog.messages].count(True) == 1
+    mirroring.link.reply = CommandReply(["rejected"], ["the cell is read-only"])
+    for _ in range(3):
+        sent(mirroring, "renew")
+    assert ["the cell is read-only" in one for one in caplog.messages].count(True) == 1
 
 
 def test_an_injection_that_stays_is_neither_renewed_nor_lifted(
@@ -271,7 +275,13 @@ def test_as_many_injections_as_fit_are_shown(mirroring: Mirroring, caplog: pytes
     found = mirroring.block.injections.read()
     assert [one.number for one in found] == list(range(5, 5 + len(found)))
     assert len(msgspec.json.encode(found)) <= LIST_SIZE < len(msgspec.json.encode([*found, found[0]]))
-    assert [f"only {len(found)} of 100 injections" in one for one in caplog.messages].count(True) == 1
+    reported = f"only {len(found)} of 100 injections"
+    assert [reported in one for one in caplog.messages].count(True) == 1
+    for entries in (many[:1], many):
+        mirroring.link.send(mirroring.link.state(state(*entries)))
+    mirroring.send(frame(8, 1))
+    mirroring.next()
+    assert [reported in one for one in caplog.messages].count(True) == 2, "the list had fitted in between"
 
 
 def test_a_number_is_sent_once(mirroring: Mirroring) -> None:
