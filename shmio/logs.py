@@ -18,12 +18,12 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
-from datetime import UTC, datetime
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Final
 
 from shmio.errors import ConfigError
+from shmio.times import utc_text
 from shmio.wording import printable
 
 MAX_FILE_BYTES = 5_000_000
@@ -45,7 +45,7 @@ class LineFormatter(logging.Formatter):
         """Return the record's line, with its traceback if there is one."""
         fields = self._always | getattr(record, "fields", {})
         message = printable(with_fields(record.getMessage(), fields))
-        line = f"{stamp(record.created)} {record.levelname:<7} {self._process} {message}"
+        line = f"{utc_text(record.created)} {record.levelname:<7} {self._process} {message}"
         if record.exc_info:
             line += "\n    " + self.formatException(record.exc_info).replace("\n", "\n    ")
         return line
@@ -63,7 +63,7 @@ class JsonFormatter(logging.Formatter):
         """Return the record's line."""
         fields = self._always | getattr(record, "fields", {})
         line = {
-            "time": stamp(record.created),  # first, as in a line of text: a reader sorts by it
+            "time": utc_text(record.created),  # first, as in a line of text: a reader sorts by it
             "level": record.levelname,
             "process": self._process,
             "pid": os.getpid(),
@@ -189,11 +189,6 @@ def setup(
 def fields(**values: object) -> dict[str, dict[str, object]]:
     """Return extra fields for a record: ``log.info("connected", extra=fields(pdu=960))``."""
     return {"fields": values}
-
-
-def stamp(time_s: float) -> str:
-    """Return a UNIX time as UTC in ISO 8601; such texts sort by time."""
-    return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
 
 
 def with_fields(message: str, fields: Mapping[str, object]) -> str:

@@ -30,7 +30,7 @@ import msgspec
 
 from shmio.audit.file import AuditFile, AuditSettings
 from shmio.errors import ShmioError
-from shmio.logs import stamp
+from shmio.times import utc_text
 
 MAX_WAITING: Final = 10_000
 """Maximum number of entries that wait to be written. Further entries are discarded, and only counted."""
@@ -430,7 +430,7 @@ class Trail:
         except Exception as error:  # noqa: BLE001  whatever the client has sent, there is an entry
             what = {"error": f"this value cannot be shown: {type(error).__name__}"}
         entry = Entry(
-            stamp(waiting.time_s), self._instance, self.process, os.getpid(), who.endpoint, who.actor.kind,
+            utc_text(waiting.time_s), self._instance, self.process, os.getpid(), who.endpoint, who.actor.kind,
             _cut(who.actor.name), _cut(who.actor.origin), waiting.action, waiting.outcome,
             _cut(waiting.reason, MAX_REASON), what, getattr(what, "left_out", 0),
             waiting.times, waiting.command, waiting.event,

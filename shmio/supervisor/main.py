@@ -21,7 +21,7 @@ from shmio.audit.reading import SUPERVISOR, last_events
 from shmio.audit.trail import Acting, Actor, program_of, uid_actor
 from shmio.control import Answer, ControlServer, Peer, Reload, Request, Restart, Stop, Where, socket_path
 from shmio.errors import ShmioError
-from shmio.logs import fields, stamp
+from shmio.logs import fields
 from shmio.plan.processes import MODULES, Plan
 from shmio.segment import Segment
 from shmio.segment import State as InstanceState
@@ -32,6 +32,7 @@ from shmio.supervisor.local_commands import LocalCommands
 from shmio.supervisor.policy import Event, Limits, State
 from shmio.supervisor.reload import Reloader
 from shmio.supervisor.takeover import take_over
+from shmio.times import utc_text
 from shmio.wording import unknown
 
 START_TICK_S: Final = 0.01
@@ -132,7 +133,7 @@ class Supervisor:
             )
             fresh.pop_all()
             if self._plan.audit is not None:
-                began = stamp(self._segment.header.started_utc_ns / 1e9)
+                began = utc_text(self._segment.header.started_utc_ns / 1e9)
                 known = last_events(Path(self._plan.audit.path), began) if found else {}
                 stack.callback(LocalCommands(self._plan.instance, known).close)
             self._loop()

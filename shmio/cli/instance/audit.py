@@ -20,8 +20,8 @@ from shmio.config import load
 from shmio.errors import ConfigError
 from shmio.local.log_files import Follower
 from shmio.local.supervisor import ask_supervisor
-from shmio.logs import stamp
 from shmio.plan.processes import AUDIT_FILE
+from shmio.times import utc_text
 from shmio.wording import printable
 
 WHERE_S: Final = 5.0
@@ -32,7 +32,7 @@ def audit(arguments: argparse.Namespace) -> int:
     newest = _where(arguments) / AUDIT_FILE
     since_s = arguments.since or 0.0
     wanted = EntryFilter(
-        stamp(since_s) if since_s else "", arguments.who or "", arguments.action or "", arguments.pattern or ""
+        utc_text(since_s) if since_s else "", arguments.who or "", arguments.action or "", arguments.pattern or ""
     )
     try:
         if not present_files(newest) and not (arguments.follow and newest.parent.is_dir()):

@@ -6,7 +6,6 @@ import logging
 import selectors
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from datetime import UTC, datetime
 from functools import partial
 from typing import Final
 
@@ -19,6 +18,7 @@ from shmio.model.clock import Clock
 from shmio.segment import Block, Frame, Segment
 from shmio.segment.block import FrameFollower, QualityChange
 from shmio.segment.doorbell import TURN_NS, Relay
+from shmio.times import utc_text
 
 TURN_S: Final = TURN_NS / 1e9
 LOOK_S: Final = 0.1
@@ -267,7 +267,7 @@ class Monitor:
             provenance=finding.provenance,
             clock_s=now_ns / 1e9,
             since_s=progress.since_ns / 1e9,
-            time=datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z"),
+            time=utc_text(time.time(), "milliseconds"),
             suppressed=progress.suppressed,
         )
 

@@ -11,7 +11,7 @@ import pytest
 
 from shmio.audit.reading import EntryFilter, present_files
 from shmio.cli.supervisor import main
-from shmio.logs import stamp
+from shmio.times import utc_text
 
 CONFIG = """
 [instance]
@@ -100,4 +100,4 @@ def test_a_filter_without_wishes_chooses_all() -> None:
     found = parse_entry(entry(1, "anna").encode())
     assert found is not None
     assert EntryFilter().chooses(found)
-    assert not EntryFilter(since=stamp(2e9)).chooses(found)
+    assert not EntryFilter(since=utc_text(2e9)).chooses(found)
