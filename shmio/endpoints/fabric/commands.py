@@ -53,6 +53,10 @@ MAX_CHECKS: Final = 32
 _ACTIONS: Final = {"inject": "inject", "shadow": "feed", "lift": "lift", "declare": "declare"}
 _THERE: Final = "that cell's supervisor.toml, and reload it"
 """Where a rejected command can be allowed. The reason names the cell, and has to fit an event."""
+_HERE: Final = "this cell's supervisor.toml, and reload it"
+"""The same place in the audit log of this cell."""
+_MAX_NAMED_BYTES: Final = 4096
+"""Most bytes of a denied command whose registers are named, so that it costs little time."""
 _KINDS: Final = {
     "inject": CommandKind.INJECT,
     "shadow": CommandKind.SHADOW,
@@ -280,7 +284,9 @@ class CommandReceiver:
             answer(CommandReply([str(kind)], [why]))
             return
         what: Any = {"source": source}
-        if feed is not None and (refusal is None or refusal[2] != DENIED):  # others may not fill the log
+        if refusal is not None and refusal[2] == DENIED:
+            what |= _named(feed, request)
+        elif feed is not None:
             what = partial(_described, feed.block, request)
         with acting(Actor("cell", sender, f"server {self._server}"), "fabric"):
             attempt = Attempt("write" if request.injection is None else _ACTIONS[request.injection.kind], what)
@@ -298,7 +304,7 @@ class CommandReceiver:
         role = "write" if request.injection is None else "inject"
         if not self._may(sender, role):
             why = (
-                f"no [[fabric.allow]] there gives {sender} the role {role}; to allow it, "
+                f"no [[fabric.allow]] gives {sender} the role {role}; to allow it, "
                 f"{self._permission(sender, role)} in {_THERE}"
             )
             return OutcomeKind.REJECTED, why, DENIED
@@ -375,7 +381,8 @@ class CommandReceiver:
     def _refuse(self, request: CommandRequest, attempt: Attempt, answer: Answer, refusal: Refusal) -> None:
         kind, why, outcome = refusal
         self.refused += 1
-        attempt.end(outcome, why, refused=True)
+        own = f"{why.removesuffix(_THERE)}{_HERE}" if why.endswith(_THERE) else why
+        attempt.end(outcome, own, refused=True)
         answer(CommandReply([str(kind)] * request.outcomes, [why] * request.outcomes))
 
     def _unwritable(self, feed: Feed, items: Sequence[WriteItem]) -> str:
@@ -421,6 +428,19 @@ def _rejected(why: str) -> Refusal:
 
 def _writes(items: Sequence[WriteItem]) -> list[Write]:
     return [Write(item.offset, item.mask, item.data) for item in items]
+
+
+def _named(feed: Feed | None, request: CommandRequest) -> Mapping[str, Any]:
+    """Name the registers of a denied command for the audit log.
+
+    The keys are always the same, so that the log merges the commands of a sender that tries all registers.
+    """
+    items = request.writes if request.injection is None else request.injection.items
+    if feed is None or not items or not request.layout or request.layout != feed.digest[: len(request.layout)]:
+        return {}
+    if sum(len(item.data) for item in items) > _MAX_NAMED_BYTES:
+        return {}
+    return {"paths": [f"{feed.block.source}/{path}" for path in paths_of(feed.block.layout, _writes(items), MAX_NAMED)]}
 
 
 def _described(block: Block, request: CommandRequest) -> Mapping[str, Any]:

@@ -126,7 +126,45 @@ async def test_only_allowed_cells_write(segment: Segment, server: NatsServer, pl
         ("cell", "plant2.line1.twin", "fabric", "denied"),
         ("cell", FRIEND, "fabric", "written"),
     ]
+    assert entries[0]["what"] == {"source": "cell", "paths": ["cell/count.%B3"]}
+    assert entries[0]["reason"].endswith("in this cell's supervisor.toml, and reload it")
     assert list(entries[1]["what"]) == ["cell/count.%B0"]
+
+
+@in_loop
+async def test_the_audit_says_which_registers_of_this_cell_are_not_writable(
+    segment: Segment, server: NatsServer, plant: Plant, tmp_path: Path
+) -> None:
+    file = tmp_path / "audit.jsonl"
+    trail.open_trail(AuditSettings(str(file), 1 << 20, 2), segment.instance, "fabric")
+    try:
+        async with commander(segment, server.url) as client:
+            reply = await client.write((4, 0, b"\1\2\3\4"))
+            assert "name it in the source's `writable` in that cell's supervisor.toml" in reply.reasons[0]
+    finally:
+        trail.close_trail()
+    (entry,) = map(json.loads, file.read_text().splitlines())
+    assert entry["what"].keys() == {"cell/other"}
+    assert entry["reason"].endswith("name it in the source's `writable` in this cell's supervisor.toml, and reload it")
+
+
+@in_loop
+async def test_a_denied_cell_cannot_fill_the_audit_log_with_registers(
+    segment: Segment, server: NatsServer, tmp_path: Path
+) -> None:
+    file = tmp_path / "audit.jsonl"
+    trail.open_trail(AuditSettings(str(file), 1 << 20, 2), segment.instance, "fabric")
+    try:
+        async with commander(segment, server.url) as client:
+            for number in range(50):
+                await client.write((number % 8, 0, b"\1"), sender="plant2.line1.twin")
+            for wrong in ((1 << 40, 0, b"\1"), (0, 0, bytes(1 << 16))):
+                await client.write(wrong, sender="plant2.line1.twin")
+    finally:
+        trail.close_trail()
+    entries = [json.loads(line) for line in file.read_text().splitlines()]
+    assert sum(one["count"] for one in entries) == 52
+    assert len(entries) < 25
 
 
 @in_loop
