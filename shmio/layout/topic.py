@@ -25,6 +25,7 @@ from shmio.config.reserved import RESERVED_SOURCES
 from shmio.errors import PathError
 from shmio.layout.model import INTEGERS, MAX_DEPTH, MAX_DIMENSIONS, MAX_PATH, Layout, Register, array_size
 from shmio.wording import did_you_mean, unknown
+from shmio.wording import near as similar_name
 
 Direction = Literal["in", "out"]
 
@@ -178,7 +179,7 @@ def parse_topic(text: str, sources: Collection[str], default: str | None) -> Top
         else:
             named = False
     if source is None:
-        raise PathError(f"{shorten(text)}: {_which(shorten(text.partition('/')[0]), sources)}")
+        raise PathError(f"{shorten(text)}: {_which(text, sources)}")
     head, _, last = rest.rpartition("/")
     direction: Direction | None = None
     if last in ("in", "out"):
@@ -199,13 +200,17 @@ def _source_of_scheme(scheme: str, sources: Collection[str]) -> str:
     raise PathError(unknown("source", scheme, sources))
 
 
-def _which(first: str, sources: Collection[str]) -> str:
-    """Return a message for a path that must begin with a source, but begins with ``first``."""
+def _which(text: str, sources: Collection[str]) -> str:
+    """Return a message for a topic that must begin with a source, but begins with another name."""
     if not sources:
         return "there are no sources"
-    some = [f"{source}/…" for source in sources][:_SOURCES_SHOWN]
-    more = ", …" if len(sources) > len(some) else ""
-    return f"{first!r} is not one of the {len(sources)} sources; begin the path with {' or '.join(some)}{more}"
+    first, _, rest = text.partition("/")
+    if rest and (like := similar_name(first, sources)):
+        remedy = did_you_mean([shorten(f"{like[0]}/{rest}")])
+    else:
+        some = [f"{source}/…" for source in sources][:_SOURCES_SHOWN]
+        remedy = f"begin the path with {' or '.join(some)}{', …' if len(sources) > len(some) else ''}"
+    return f"{shorten(first)!r} is not one of the {len(sources)} sources; {remedy}"
 
 
 def look_up(layout: Layout, topic: Topic) -> Register:
@@ -215,12 +220,12 @@ def look_up(layout: Layout, topic: Topic) -> Register:
 
 def look_up_each(layout: Layout, topic: Topic) -> list[Register]:
     """Return the registers that a topic names. Like :func:`find_each`, but a PathError also names the source."""
-    return _with_source_in_errors(layout, topic, lambda layout, path: list(find_each(layout, path)))
+    return _with_source_in_errors(layout, topic, lambda *where: list(find_each(*where)))
 
 
-def _with_source_in_errors(layout: Layout, topic: Topic, search: Callable[[Layout, str], _Found]) -> _Found:
+def _with_source_in_errors(layout: Layout, topic: Topic, search: Callable[[Layout, str, str], _Found]) -> _Found:
     try:
-        return search(layout, topic.path)
+        return search(layout, topic.path, topic.source)
     except PathError as error:
         if topic.named and topic.path:
             raise PathError(f"{topic.source}/{error}") from None
@@ -229,8 +234,14 @@ def _with_source_in_errors(layout: Layout, topic: Topic, search: Callable[[Layou
         raise PathError(f"{error} (searched in source {topic.source!r}, because the path names no source)") from None
 
 
-def find(layout: Layout, path: str) -> Register:
+def find(layout: Layout, path: str, source: str = "") -> Register:
     """Return the register, element, slice, bit or other part that a canonical path names.
+
+    Args:
+        layout: The layout.
+        path: The path.
+        source: Name of the source with this layout, with which suggested paths begin. Empty: they begin with a
+            member of the layout.
 
     Raises:
         PathError: The layout has nothing at this path; the message suggests similar paths.
@@ -241,7 +252,7 @@ def find(layout: Layout, path: str) -> Register:
         return layout.registers[index]
     head, _, last = path.rpartition("/")
     if part := _PART.fullmatch(last):
-        whole = find(layout, path[: -len(last) + part.end("head")])
+        whole = find(layout, path[: -len(last) + part.end("head")], source)
         return part_of(layout, whole, part["kind"], int(part["number"]))
     if bounds := _RANGE.fullmatch(last):
         if (found := _array(layout, head)) is None:
@@ -251,7 +262,7 @@ def find(layout: Layout, path: str) -> Register:
         array, indices = found
         if _INDEX.fullmatch(last):
             return layout.element(array, (*indices, int(last)))
-    raise PathError(_unknown(layout, path))
+    raise PathError(_unknown(layout, path, source))
 
 
 def part_of(layout: Layout, register: Register, kind: str, number: int) -> Register:
@@ -331,14 +342,16 @@ def holder(layout: Layout, register: Register) -> str:
     return next(path for path in holders(register.path) if path in layout.by_path)
 
 
-def find_each(layout: Layout, path: str) -> Iterator[Register]:
+def find_each(layout: Layout, path: str, source: str = "") -> Iterator[Register]:
     """Yield the register that a canonical path names, or each element of the slice it names.
+
+    The arguments are those of :func:`find`.
 
     Raises:
         PathError: The layout has nothing at this path: see :func:`find`.
 
     """
-    register = find(layout, path)
+    register = find(layout, path, source)
     head, _, last = path.rpartition("/")
     if path in layout.by_path or not _RANGE.fullmatch(last):
         yield register
@@ -359,7 +372,7 @@ def _array(layout: Layout, path: str) -> tuple[Register, tuple[int, ...]] | None
     return layout.registers[index], indices
 
 
-def _unknown(layout: Layout, path: str) -> str:
+def _unknown(layout: Layout, path: str, source: str) -> str:
     if not path:
         return f"{layout.name}: the path names a source, not a register"
     if below := layout.members(path):
@@ -370,8 +383,15 @@ def _unknown(layout: Layout, path: str) -> str:
     if names and all(map(_INDEX.fullmatch, names)):
         numbers = sorted(map(int, names))
         return f"{shorten(prefix + missing)}: the index is outside {numbers[0]}..{numbers[-1]}"
-    like = near(layout, path)
+    like = _near_topics(layout, path, source) if source else near(layout, path)
     return f"{shorten(path)}: {layout.name} has no such register{f'; {did_you_mean(like)}' if like else ''}"
+
+
+def _near_topics(layout: Layout, path: str, source: str) -> list[str]:
+    """Return up to three topics that resemble a path, whose first segment may be a misspelt source."""
+    first, _, rest = path.partition("/")
+    like = near(layout, rest) if rest and similar_name(first, [source]) else []
+    return [f"{source}/{one}" for one in like or near(layout, path)]
 
 
 def near(layout: Layout, path: str) -> list[str]:

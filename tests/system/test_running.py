@@ -49,5 +49,5 @@ def test_the_shmio_command_reads_the_cell(running: Cell) -> None:
     assert [json.loads(line)["path"] for line in watched.stdout.splitlines()] == [AXIS] * 3
     wrong = running.run("shmio", "get", "cell/Robot_800/Axs7_Pos")
     assert (wrong.returncode, wrong.stdout) == (1, "")
-    assert "did you mean 'Robot_800/Axs6_Pos'" in wrong.stderr
+    assert "did you mean 'cell/Robot_800/Axs6_Pos'" in wrong.stderr
     assert wrong.stderr.count("\n") == 1

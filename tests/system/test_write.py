@@ -114,7 +114,7 @@ def test_a_refused_write_gives_one_clear_line(cell: Cell) -> None:
     for path, value, message in [
         ("cell/Inputs/0", "1", "cell/Inputs/0 is not writable; name it in the source's"),
         ("cell/Outputs/100.%X8", "1", "Outputs/100.%X8: BYTE has bits 0 to 7"),
-        ("cell/Robot_800/Axs7_Pos", "1", "did you mean 'Robot_800/Axs6_Pos'"),
+        ("cell/Robot_800/Axs7_Pos", "1", "did you mean 'cell/Robot_800/Axs6_Pos'"),
         ("cell/Outputs/100", "256", "cell/Outputs/100: BYTE: 256 is out of range"),
         ("cell/Outputs", "[1, 2]", "cell/Outputs: expected all of the array's 1100 elements, found 2"),
     ]:

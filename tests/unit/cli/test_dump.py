@@ -207,7 +207,7 @@ def test_an_end_before_its_beginning_is_refused(file: str, verb: list[str], said
 
 def test_path_without_a_register_is_refused(file: str, said: Output) -> None:
     assert main(["cat", file, "cell/cout"]) == 1
-    assert said() == ([], ["cell/cout: DB1 has no such register; did you mean 'count'?"])
+    assert said() == ([], ["cell/cout: DB1 has no such register; did you mean 'cell/count'?"])
     assert main(["cat", file, "cell/x*"]) == 1
     assert said()[1] == ["cell/x*: this recording has no such register"]
     assert main(["cat", file, "cell/speed"]) == 0, "only the second layout has speed"

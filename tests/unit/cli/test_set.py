@@ -209,7 +209,7 @@ def test_json_output_is_an_object_by_path(device: Device, capsys: pytest.Capture
     [
         (["cell/nothing", "1"], "cell/nothing: DB1 has no such register"),
         (["nothing/count", "1"], "'nothing' is not one of the 2 sources; begin the path with cell/… or other/…"),
-        (["cell/COUNT", "1"], "did you mean 'count'"),
+        (["cell/COUNT", "1"], "did you mean 'cell/count'"),
         (["nope://count", "1"], "unknown source 'nope'; valid: cell, other"),
         (["cell/count/out", "1"], "leave out /out"),
         (["model/clock", "1"], "unknown source 'model'"),

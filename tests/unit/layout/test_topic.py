@@ -17,6 +17,7 @@ from shmio.layout.topic import (
     encode_segment,
     find,
     look_up,
+    look_up_each,
     parse_topic,
 )
 
@@ -109,6 +110,27 @@ def test_without_default_the_source_must_be_named() -> None:
         parse_topic("a", [], None)
     with pytest.raises(PathError, match=r"unknown source 'nope'; valid: cell, sim, Robot"):
         parse_topic("nope://a", SOURCES, "cell")
+
+
+def test_a_misspelt_source_is_corrected_in_the_whole_topic() -> None:
+    with pytest.raises(PathError, match=r"^cel/a/1: 'cel' is not one of the 3 sources; did you mean 'cell/a/1'\?$"):
+        parse_topic("cel/a/1", SOURCES, None)
+
+
+@pytest.mark.parametrize(
+    ("text", "suggested"),
+    [
+        ("cel/Inputs/5", "'cell/Inputs/5'"),
+        ("Cell/inputs/5", "'cell/Inputs/5'"),
+        ("cel/Robot/Axs3", "'cell/Robot/Axs2' or 'cell/Robot/Axs1'"),
+        ("cell/robot/axs2", "'cell/Robot/Axs2'"),
+        ("robot/axs2", "'cell/Robot/Axs2'"),
+    ],
+)
+def test_suggestions_are_whole_topics(layout: Layout, text: str, suggested: str) -> None:
+    for search in (look_up, look_up_each):
+        with pytest.raises(PathError, match=rf"DB1 has no such register; did you mean {suggested}\?"):
+            search(layout, parse_topic(text, ["cell"], "cell"))
 
 
 def test_error_for_a_path_without_a_source_names_the_searched_source(layout: Layout) -> None:

@@ -33,7 +33,7 @@ def test_sound_alerts(tmp_path: Path, alert: str) -> None:
     ("alert", "fault"),
     [
         ('when = "cell/Level >"\n', "toml:8: alert[0].when: at character 13: expected a register or a number"),
-        ('when = "cell/Lewel > 5"\n', "alert[0].when: cell/Lewel: DB7 has no such register; did you mean 'Level'"),
+        ('when = "cell/Lewel > 5"\n', "alert[0].when: cell/Lewel: DB7 has no such register; did you mean 'cell/Level'"),
         ('when = "cell/Inputs > 5"\n', "alert[0].when: cell/Inputs is an array"),
         ('process = "sell"\n', "alert[0].process: unknown process 'sell'; did you mean 'cell'?"),
         ('name = "x"\nprocess = "alerts"\n', "alert[0].process: unknown process 'alerts'; valid: cell"),
