@@ -38,6 +38,7 @@ Without this limit, a message could quote a text as long as the whole file.
 """
 _KEY: Final = re.compile(r"[A-Za-z0-9_-]+(?:\[[0-9]+\]|\.[A-Za-z0-9_-]+)*(?=[:\s])")
 _PLACE: Final = re.compile(r"\b(source|emulator|injection|expect|alert)\[([0-9]+)\]")
+_SOURCE: Final = re.compile(r"source\[([0-9]+)\]")
 _QUOTES: Final = "'"
 _DOUBLE: Final = ("Cannot overwrite", "Cannot declare", "Duplicate inline table key")
 _ESCAPE: Final = ("Unescaped", "Invalid hex", "Escaped character", "Illegal character")
@@ -348,6 +349,8 @@ class Faults:
         self._elsewhere: dict[str, str] = {}
         self._warnings: list[str] = []
         self._layout: LayoutError | None = None
+        self._sources: float = math.inf
+        """Number of sources that the file has; the others are those of a recording."""
         self.count = 0
         self.places: Mapping[str, Sequence[int]] = {}
         """For each kind of section, the indices in the file of the sections that passed the first check.
@@ -372,15 +375,23 @@ class Faults:
         if self.full:
             self.count += 1
             return
-        text = _shortened(named(_PLACE.sub(self._place, message), self._tables))
+        where, text, line = self._located(named(_PLACE.sub(self._place, message), self._tables))
+        self._note(f"{where}: {text}", line)
+
+    def _located(self, message: str) -> tuple[str, str, int]:
+        """Return the file with the line of the key that a message begins with, the message, and its line in this file.
+
+        The line is 0 if the message is about the whole file.
+        """
+        text = _shortened(message)
         key = _KEY.match(text)
-        line = self._lines.of(key[0]) if key else 0
+        source = _SOURCE.match(text)
+        line = self._lines.of(key[0]) if key and not (source and int(source[1]) >= self._sources) else 0
         own = text.partition(":")[0]
         if own in self._elsewhere:
             table, _, _ = own.partition(".")
-            self._note(f"{self._elsewhere[own]}: {text.removeprefix(f'{table}.')}", line)
-        else:
-            self._note(f"{self._file}{f':{line}' if line else ''}: {text}", line)
+            return self._elsewhere[own], text.removeprefix(f"{table}."), line
+        return f"{self._file}{f':{line}' if line else ''}", text, line
 
     def lies_in(self, file: str, table: str, lines: Mapping[str, int]) -> None:
         """Remember that some keys of a table come from another file, so that messages name that file.
@@ -393,6 +404,19 @@ class Faults:
         """
         for name, line in lines.items():
             self._elsewhere[f"{table}.{name}"] = f"{self._file.parent / file}:{line}"
+
+    def play(self, sources: Sequence[str]) -> None:
+        """Expect messages about the sources of a recording, which take the place of those of the file.
+
+        Args:
+            sources: The names of the recording's sources, as later messages number them.
+
+        """
+        own = [str(table.get("name")) for table in self._tables.get("source", ())]
+        self._sources = len(own)
+        order = [*own, *(name for name in sources if name not in own)]
+        self._tables = {**self._tables, "source": [{"name": name} for name in order]}
+        self.places = {"source": [order.index(name) for name in sources]}
 
     def _note(self, message: str, line: float) -> None:
         """Record a fault at this line of the file, unless it is already recorded."""
@@ -408,7 +432,12 @@ class Faults:
 
     def warn(self, message: str) -> None:
         """Add a warning with the message ``key: what is unusual``; it is shown after the faults."""
-        self._warnings.append(f"{self._file}: warning: {_shortened(_PLACE.sub(self._place, message))}")
+        self._warnings.append(self.warning(message))
+
+    def warning(self, message: str) -> str:
+        """Return a warning with its file and line; ``message`` is ``key: what is unusual``."""
+        where, text, _ = self._located(_PLACE.sub(self._place, message))
+        return f"{where}: warning: {text}"
 
     def _place(self, match: re.Match[str]) -> str:
         places, index = self.places.get(match[1], ()), int(match[2])

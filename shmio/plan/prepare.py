@@ -7,12 +7,11 @@ load numpy, and no process of the instance starts before the plan is ready.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
 from msgspec.structs import replace
 
 from shmio.config import Address, Alert, Config, Emulator, Mqtt, Source
@@ -58,6 +57,8 @@ class Prepared:
     """All blocks and tag tables that each emulator serves, by emulator name."""
     injections: tuple[str, ...]
     """A line about each declared injection."""
+    warning: Callable[[str], str]
+    """Returns a further warning with its file and line, for ``key: what is unusual``."""
     notes: tuple[str, ...] = ()
     """Remarks for the user that are not about faults."""
 
@@ -89,7 +90,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
             with faults.catching():
                 config, origin, notices = replayed(config, keys or {}, recordings)
             faults.raise_any()
-            faults = Faults(file, msgspec.to_builtins(config))  # with the recording's sources
+            faults.play([source.name for source in config.source])
         files = LayoutFiles(config)
         notices += check_host(config, faults.catching)
         if not faults:
@@ -139,7 +140,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
         with faults.catching():
             odd += found()
     faults.raise_any()
-    warnings = [*files.warnings, *(f"{file}: warning: {text}" for text in odd)]
+    warnings = [*files.warnings, *map(faults.warning, odd)]
     plan = make_plan(
         config,
         layouts,
@@ -157,7 +158,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
         scene=scene,
     )
     open_to = None if mode == "log" else exposure(config)  # mode log has no endpoints
-    return Prepared(config, plan, layouts, emulated, described, (open_to,) if open_to else ())
+    return Prepared(config, plan, layouts, emulated, described, faults.warning, (open_to,) if open_to else ())
 
 
 def _spelled(config: Config, layouts: dict[str, Layout]) -> Config:

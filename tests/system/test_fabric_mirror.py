@@ -151,6 +151,10 @@ def test_faults_in_the_configuration_of_a_mirror_are_named(cells: tuple[Cell, Ce
         file.write_text(re.sub(r"nats://\S+:\d+", "nats://127.0.0.1:1", text))
         said = far.output("shmio-supervisor", "check")
         assert "source mirrored at plant1.line3.near/belt: " in said
-        assert "supervisor.toml: warning: source[0].cell: the layout of plant1.line3.near/belt is the one that" in said
+        line = 1 + text.splitlines().index('cell = "plant1.line3.near"')
+        assert (
+            f"supervisor.toml:{line}: warning: source[0].cell: the layout of plant1.line3.near/belt is the one that"
+            in said
+        )
     finally:
         file.write_text(text)

@@ -112,7 +112,10 @@ def test_a_new_layout_keeps_the_streams_of_registers_that_remain(cell: Cell, stu
 def test_reload_prints_the_same_warnings_as_check(cell: Cell) -> None:
     edit(cell, "period_ms = 20", 'period_ms = 20\nwritable = ["Outpts"]')
     file = cell.folder / "supervisor.toml"
-    warning = f"{file}: warning: source[0].writable: 'Outpts' matches no register of DB201; did you mean 'Outputs'?"
+    line = 1 + file.read_text().splitlines().index('writable = ["Outpts"]')
+    warning = (
+        f"{file}:{line}: warning: source[0].writable: 'Outpts' matches no register of DB201; did you mean 'Outputs'?"
+    )
     dry = cell.supervisor("reload", "--dry-run")
     assert (dry.returncode, dry.stderr) == (0, f"{warning}\n")
     assert dry.stdout.splitlines() == [

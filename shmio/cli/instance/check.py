@@ -49,7 +49,7 @@ def check(arguments: argparse.Namespace) -> int:
         "segment": f"{PREFIX}{plan.instance}",
         "segment_bytes": plan.segment_bytes,
         "notes": [*prepared.notes, *_unserved(prepared), *would_fail],
-        "warnings": [*plan.warnings, *(f"{file}: warning: {text}" for text in slow)],
+        "warnings": [*plan.warnings, *map(prepared.warning, slow)],
     }
     if prepared.config.replay and prepared.config.replay.file:
         replay = prepare(file, "replay").plan

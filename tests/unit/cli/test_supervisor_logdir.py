@@ -27,8 +27,8 @@ def test_full_disk_is_only_a_warning(
     assert main(["check", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["warnings"] == [
-        f"supervisor.toml: warning: {key}: {tmp_path}/{folder} cannot be created in {tmp_path}: the disk is full; "
-        "make room, or choose another folder"
-        for key, folder in (("instance.log_dir", "logs"), ("recorder.directory", "dumps"))
+        f"supervisor.toml:{line}: warning: {key}: {tmp_path}/{folder} cannot be created in {tmp_path}: the disk is "
+        "full; make room, or choose another folder"
+        for key, folder, line in (("instance.log_dir", "logs", 3), ("recorder.directory", "dumps", 36))
     ]
     assert sorted(tmp_path.iterdir()) == before

@@ -5,12 +5,13 @@ A hostile file causes a bounded number of lines.
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 
 import pytest
 
 from shmio.config import load
-from shmio.config.faults import Lines
+from shmio.config.faults import Faults, Lines
 from shmio.errors import ConfigError
 from shmio.plan.prepare import prepare
 
@@ -188,3 +189,17 @@ def test_a_secret_is_not_quoted(tmp_path: Path, line: str) -> None:
     (message,) = refused(tmp_path, f'[[source]]\nname = "cell"\n{line}\n')
     assert "hunter2" not in message
     assert "(at line 3, column " in message
+
+
+def test_warnings_have_their_lines_also_for_the_sources_of_a_recording(tmp_path: Path) -> None:
+    text = '[[source]]\nname = "cell"\n[[source]]\nname = "press"\nwritable = ["x"]\n[mqtt]\nport = 1\n'
+    faults = Faults(tmp_path / "F", tomllib.loads(text), text)
+    assert faults.warning("source[1].writable: odd") == f"{tmp_path}/F:5: warning: source[1].writable: odd"
+    assert faults.warning("there is nothing") == f"{tmp_path}/F: warning: there is nothing"
+    faults.play(["press", "robot"])
+    assert faults.warning("source[0].writable: odd") == f"{tmp_path}/F:5: warning: source[1].writable: odd"
+    assert faults.warning("source[1].writable: odd") == f"{tmp_path}/F: warning: source[2].writable: odd"
+    assert faults.warning("mqtt.port: odd") == f"{tmp_path}/F:7: warning: mqtt.port: odd"
+    faults.add("source[1].layout: wrong")
+    with pytest.raises(ConfigError, match=r'F: source\[2\].layout: wrong \(source "robot"\)$'):
+        faults.raise_any()
