@@ -19,13 +19,14 @@ from shmio.connectors.base import Connector, Lost, UnconfirmedError, WriteLostEr
 from shmio.connectors.browsing import Browsed, Wanted
 from shmio.connectors.mqtt.browse import Listener
 from shmio.connectors.mqtt.commands import Command, plan
-from shmio.connectors.mqtt.link import Link, Publication, UnsupportedVersionError, version_of
+from shmio.connectors.mqtt.link import PRIVATE_NAMES, Link, Publication, UnsupportedVersionError, version_of
 from shmio.connectors.mqtt.options import MqttOptions
 from shmio.connectors.mqtt.store import Store
 from shmio.connectors.request_count import CycleRequests
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.model import Layout
 from shmio.layout.values.write import Write
+from shmio.libraries import check_paho
 from shmio.wording import counted
 
 TIMEOUTS: Final = 4
@@ -74,6 +75,7 @@ class MqttConnector(Connector):
         self._link: Link | None = None
         self._last_number = 0
         self._sending = _Sending([], [], 0.0, deque())
+        check_paho(PRIVATE_NAMES)
         _secrets(options)  # here, a wrong file is a ConfigError; when connecting, it is a ConnectorError
 
     @classmethod

@@ -54,6 +54,17 @@ _LOGIN: Final = frozenset({0x86, 0x87})
 _TAKEN_OVER: Final = 0x8E
 _NO_SUBSCRIBERS: Final = 0x10
 
+PRIVATE_NAMES: Final = (
+    "_create_socket",
+    "_handle_pingresp",
+    "_handle_publish",
+    "_in_packet",
+    "_last_mid",
+    "_send_pingreq",
+    "_sock_recv",
+)
+"""The private names of paho's client that this module uses or replaces."""
+
 log = logging.getLogger("shmio.source.mqtt")
 
 

@@ -13,6 +13,7 @@ from shmio.endpoints.mqtt.broker.directory import folder, prepare, remove
 from shmio.endpoints.mqtt.broker.mosquitto import Mosquitto
 from shmio.endpoints.mqtt.broker.program import choose_broker
 from shmio.endpoints.server_process import serve
+from shmio.libraries import check_paho
 from shmio.logs import rate_limited
 from shmio.worker import BEAT_S, Worker
 
@@ -33,7 +34,9 @@ def run(worker: Worker) -> None:
 
 def _run_bridge(worker: Worker) -> None:
     from shmio.endpoints.mqtt.bridge import Bridge  # noqa: PLC0415  the broker's process does not need it
+    from shmio.endpoints.mqtt.connection.broker_client import PRIVATE_NAMES  # noqa: PLC0415
 
+    check_paho(PRIVATE_NAMES)
     bridge = Bridge(worker.segment, worker.slot, msgspec.convert(worker.config, Mqtt))
     worker.on_stop(bridge.wake)
     worker.running()

@@ -17,6 +17,19 @@ from paho.mqtt.client import Client, MQTTv5
 from paho.mqtt.enums import MessageType, MQTTErrorCode
 from paho.mqtt.properties import Properties
 
+PRIVATE_NAMES: Final = (
+    "_in_packet",
+    "_last_bytes_received",
+    "_mid_generate",
+    "_out_packet",
+    "_pack_remaining_length",
+    "_packet_queue",
+    "_packet_read",
+    "_protocol",
+    "_raise_for_invalid_topic",
+    "_sock_recv",
+)
+"""The private names of paho's client that this module uses or replaces."""
 JOINED_BYTES: Final = 32_768
 """Size in bytes from which joined packets get no further packet."""
 READ_BYTES: Final = 16_384
