@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import logging
 import os
 import struct
 import zlib
@@ -30,6 +31,7 @@ from shmio.recording.format.records import (
     stream,
 )
 from shmio.recording.reading.reader import Reader
+from shmio.wording import counted
 
 CHECKED: Final = 128
 """Number of chunks at the end of a file to verify, because they may contain zeros after a power cut."""
@@ -38,9 +40,14 @@ ZEROS_BYTES: Final = 1 << 20
 _MESSAGE: Final = struct.Struct("<HIQ")  # channel, sequence, log time
 _ENTRY_BYTES: Final = 16
 
+log = logging.getLogger("shmio.recorder")
+
 
 def finalise(file: Path, beat: Callable[[], object] = lambda: None) -> bool:
     """Close a recording that a recorder of this user has left unclosed.
+
+    Cut off damaged chunks at its end, of which nothing can be read, so that programs that read a file from
+    front to back reach its end. Damaged chunks before an intact one remain, but are not in the index.
 
     Args:
         file: The file.
@@ -52,7 +59,7 @@ def finalise(file: Path, beat: Callable[[], object] = lambda: None) -> bool:
     Raises:
         RecordingError: The file is not a recording, or is so damaged that only ``shmio-dump
             recover`` can read it.
-        OSError: The disk is full. The file is unchanged, except that its incomplete end is cut off.
+        OSError: The disk is full. The file is unchanged, except that its incomplete or damaged end is cut off.
     """
     with Reader(file, own=True, beat=beat) as reader:
         fd = os.open(file, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
@@ -64,7 +71,11 @@ def finalise(file: Path, beat: Callable[[], object] = lambda: None) -> bool:
             before = os.fstat(fd)
             if before.st_size != reader.records.size:
                 return False
-            _write(fd, _RecordingEnd(reader))
+            ending = _RecordingEnd(reader)
+            _write(fd, ending)
+            if ending.dropped:
+                what = counted(ending.dropped, "damaged chunk")
+                log.warning("%s ended with %s, of which nothing could be read; cut off", file, what)
             os.utime(fd, ns=(before.st_atime_ns, before.st_mtime_ns))  # keep the times: nothing was recorded since
         finally:
             os.close(fd)
@@ -72,7 +83,7 @@ def finalise(file: Path, beat: Callable[[], object] = lambda: None) -> bool:
 
 
 def _write(fd: int, ending: _RecordingEnd) -> None:
-    """Cut off the incomplete end of a file, and append the index and the footer."""
+    """Cut off the incomplete or damaged end of a file, and append the index and the footer."""
     data = ending.data()
     os.ftruncate(fd, ending.cut)
     try:
@@ -86,7 +97,7 @@ def _write(fd: int, ending: _RecordingEnd) -> None:
 
 
 class _RecordingEnd:
-    """Builds the index and the footer that close a recording after its last complete record."""
+    """Builds the index and the footer that close a recording after its last intact record."""
 
     def __init__(self, reader: Reader) -> None:
         """Read the file.
@@ -99,10 +110,20 @@ class _RecordingEnd:
         self._summary = Summary()
         self._chunks: list[tuple[Record, IndexedChunk]] = []
         self.cut = len(MAGIC)
-        """Offset in the file at which the last complete record ends."""
+        """Offset in the file at which the last intact record ends."""
+        self.dropped = 0
+        """Number of damaged chunks after it."""
+        self._described_in: dict[int, Record] = {}
+        """The first chunk with messages of a channel, by the channel's number. It has the channel's description."""
+        self._besides = 0
+        """Offset of the last record that is neither a chunk nor the index of one."""
         self._anew = b""
         """New message indexes for the last chunk, which replace those in the file."""
         self._walk()
+        self._drop_damaged()
+        self._describe_all()
+        if self._chunks and self._chunks[-1][0].start > self._besides:
+            self._index_anew(*self._chunks[-1])
         self._check()
 
     def _walk(self) -> None:
@@ -120,17 +141,17 @@ class _RecordingEnd:
                 self._chunk(record)
             elif opcode == Opcode.MESSAGE_INDEX and last in (Opcode.CHUNK, Opcode.MESSAGE_INDEX):
                 self._index(record)
-            elif opcode == Opcode.ATTACHMENT:
-                self._attachment(record)
-            elif opcode == Opcode.METADATA:
-                self._metadatum(record)
+            else:
+                self._besides = record.start
+                if opcode == Opcode.ATTACHMENT:
+                    self._attachment(record)
+                elif opcode == Opcode.METADATA:
+                    self._metadatum(record)
             self.cut = record.at + record.size
             last = opcode
         self._reader.require_ours()
         if not over:
             self._tail()
-        if last in (Opcode.CHUNK, Opcode.MESSAGE_INDEX) and self._chunks:
-            self._index_anew(*self._chunks[-1])
 
     def _tail(self) -> None:
         """Check that only zeros or the start of one record follow the last complete record."""
@@ -174,17 +195,31 @@ class _RecordingEnd:
         self._chunks.append((record, IndexedChunk(index)))
 
     def _index(self, record: Record) -> None:
-        """Add a message index to the last chunk.
-
-        If its channel is new, read the channel's description.
-        """
+        """Add a message index to the last chunk."""
         of, chunk = self._chunks[-1]
         number, size = INDEX.unpack(self._records.read(record.at, INDEX.size))
-        if number not in self._summary.channels:
-            self._describe(of)
+        self._described_in.setdefault(number, of)
         chunk.index.message_index_offsets[number] = record.start
         chunk.index.message_index_length += record.size + HEAD.size
         chunk.counts[number] = size // _ENTRY_BYTES
+
+    def _drop_damaged(self) -> None:
+        """Cut off the damaged chunks after the last intact record."""
+        while self._chunks and self._chunks[-1][0].start > self._besides and not self._intact(self._chunks[-1][0]):
+            self.cut = self._chunks.pop()[0].start
+            self.dropped += 1
+
+    def _intact(self, chunk: Record) -> bool:
+        with suppress(RecordingError):
+            self._records.check_crc(chunk)
+            return True
+        return False
+
+    def _describe_all(self) -> None:
+        """Read the descriptions of all channels that the remaining chunks have."""
+        for number, chunk in self._described_in.items():
+            if number not in self._summary.channels and chunk.start < self.cut:
+                self._describe(chunk)
 
     def _describe(self, chunk: Record) -> None:
         for opcode, content in self._records.chunk(chunk):
@@ -228,12 +263,8 @@ class _RecordingEnd:
 
     def _check(self) -> None:
         """Leave damaged chunks near the end of the file out of the index."""
-        whole = self._chunks[:-CHECKED]
-        for chunk in self._chunks[-CHECKED:]:
-            with suppress(RecordingError):
-                self._records.check_crc(chunk[0])
-                whole.append(chunk)
-        self._chunks = whole
+        last = self._chunks[-CHECKED:]
+        self._chunks = [*self._chunks[:-CHECKED], *(chunk for chunk in last if self._intact(chunk[0]))]
 
     def data(self) -> bytes:
         """Return the bytes to write at offset :attr:`cut`: the index and the footer."""

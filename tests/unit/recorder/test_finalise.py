@@ -119,6 +119,49 @@ def test_zeros_at_the_end_after_a_power_failure(whole: Path, tmp_path: Path) -> 
         assert sorted(messages(whole)) == before
 
 
+@pytest.mark.parametrize("damaged", [1, 2, CHUNKS])
+def test_damaged_chunks_at_the_end_are_cut_off(
+    whole: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, damaged: int
+) -> None:
+    """With all messages before them, the file is valid for programs that read it from front to back."""
+    [(over, _)] = records(whole, Opcode.DATA_END)
+    content = bytearray(whole.read_bytes()[:over])
+    chunks = records(whole, Opcode.CHUNK)
+    for _, end in chunks[-damaged:]:
+        content[end - 5] ^= 0xFF  # the indexes after it are intact
+    begin = chunks[-damaged][0]
+    before = expected(bytes(content), tmp_path, begin)
+    whole.write_bytes(content)
+    assert finalise(whole)
+    assert sorted(messages(whole)) == before
+    with whole.open("rb") as stream:
+        found = mcap.reader.NonSeekingReader(stream, validate_crcs=True).iter_messages(log_time_order=False)
+        assert sorted((channel.topic, message.log_time, message.data) for _, channel, message in found) == before
+    with Reader(whole) as reader:
+        assert check(reader).whole
+    assert f"{whole} ended with {damaged} damaged chunk" in caplog.text
+
+
+@pytest.mark.parametrize("what", ["chunk", "attachment"])
+def test_nothing_that_can_be_read_is_cut_off(whole: Path, tmp_path: Path, what: str) -> None:
+    [(over, _)] = records(whole, Opcode.DATA_END)
+    content = bytearray(whole.read_bytes()[:over])
+    attached = content[slice(*records(whole, Opcode.ATTACHMENT)[0])]
+    chunks = records(whole, Opcode.CHUNK)
+    index = -2 if what == "chunk" else -1
+    content[chunks[index][1] - 5] ^= 0xFF
+    content += attached if what == "attachment" else b""
+    whole.write_bytes(content)
+    assert finalise(whole)
+    assert whole.read_bytes()[: len(content)] == content
+    assert records(whole, Opcode.CHUNK) == chunks
+    with whole.open("rb") as stream:
+        summary = mcap.reader.make_reader(stream).get_summary()
+    assert summary is not None
+    assert len(summary.chunk_indexes) == len(chunks) - 1
+    assert len(summary.attachment_indexes) == len(records(whole, Opcode.ATTACHMENT))
+
+
 def test_a_last_chunk_of_zeros_is_not_in_the_index(whole: Path, tmp_path: Path) -> None:
     content = whole.read_bytes()
     begin, end = records(whole, Opcode.CHUNK)[-1]
