@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 import grpc
 import pytest
+import uvloop
 
 from shmio.endpoints.grpc.__main__ import _follow, _take_anew, run
 from shmio.segment import Segment
@@ -46,7 +47,7 @@ def test_no_call_starts_between_new_feeds_and_the_move_of_open_calls() -> None:
         await asyncio.create_task(_follow(worker, feeds, services))
         await asyncio.sleep(0)
 
-    asyncio.run(test())
+    uvloop.run(test())
     assert done == ["feeds", "move ['cell']", "call"]
 
 
@@ -188,5 +189,5 @@ def test_of_two_concurrent_reloads_the_later_one_applies(monkeypatch: pytest.Mon
         waits.cancel()
 
     monkeypatch.setattr("shmio.endpoints.grpc.__main__.load", load)
-    asyncio.run(test())
+    uvloop.run(test())
     assert taken == [0, 1]

@@ -6,6 +6,7 @@ import asyncio
 import select
 
 import pytest
+import uvloop
 
 from shmio.endpoints.grpc.wakeups import WakeUp, WakeUps
 from shmio.segment import Segment
@@ -44,7 +45,7 @@ def test_listeners_of_a_block_are_called_in_the_order_of_joining(segment: Segmen
         assert ("first", 101) not in heard
         wake_ups.close()
 
-    asyncio.run(test())
+    uvloop.run(test())
 
 
 def test_a_listener_that_leaves_during_a_ring_leaves_others_listening(segment: Segment) -> None:
@@ -61,7 +62,7 @@ def test_a_listener_that_leaves_during_a_ring_leaves_others_listening(segment: S
         wake_ups.leave(block, over.set)
         wake_ups.close()
 
-    asyncio.run(test())
+    uvloop.run(test())
 
 
 def test_a_bell_rests_while_all_listeners_are_patient(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -111,7 +112,7 @@ def test_a_bell_rests_while_all_listeners_are_patient(segment: Segment, monkeypa
                 await asyncio.sleep(0)
         wake_ups.close()
 
-    asyncio.run(test())
+    uvloop.run(test())
 
 
 @pytest.mark.parametrize("pauses_first", [True, False])
@@ -137,7 +138,7 @@ def test_a_muted_bell_has_no_pause_that_would_end_its_silence(segment: Segment, 
             bell.stop()
             bell.join()
 
-    asyncio.run(test())
+    uvloop.run(test())
 
 
 def test_a_bell_that_has_rested_rings_once_and_continues(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -163,4 +164,4 @@ def test_a_bell_that_has_rested_rings_once_and_continues(segment: Segment, monke
         writer.publish(image(), cycle=2)  # wakes its thread
         bell.join()
 
-    asyncio.run(test())
+    uvloop.run(test())

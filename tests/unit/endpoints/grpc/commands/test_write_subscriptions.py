@@ -8,6 +8,7 @@ from typing import Any
 
 import grpc
 import pytest
+import uvloop
 
 import shmio
 from shmio.local.writer import CommandSender
@@ -31,7 +32,7 @@ def with_plant(segment: Segment, test: Callable[[Endpoint, Plant], Awaitable[Non
             finally:
                 device.stop()
 
-    asyncio.run(run())
+    uvloop.run(run())
 
 
 async def joined(served: Endpoint, *paths: str) -> list[Any]:

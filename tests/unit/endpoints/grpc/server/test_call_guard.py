@@ -9,6 +9,7 @@ from typing import Any
 
 import grpc
 import pytest
+import uvloop
 
 from shmio.endpoints.grpc.server.access import NEEDS, client_of
 from shmio.endpoints.grpc.server.call_guard import LINES, CallLimits, Refusals, check_version, cygrpc
@@ -235,7 +236,7 @@ def test_refusals_beyond_a_few_lines_are_logged_as_a_count(caplog: pytest.LogCap
         assert caplog.records[-1].getMessage() == "publish refused: once more"
 
     with caplog.at_level(logging.WARNING):
-        asyncio.run(test())
+        uvloop.run(test())
 
 
 def test_bytes_of_answers_and_streams_are_counted(segment: Segment) -> None:

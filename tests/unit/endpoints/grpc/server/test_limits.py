@@ -7,6 +7,7 @@ import resource
 import time
 
 import pytest
+import uvloop
 
 from shmio.endpoints.grpc.server.limits import (
     AFTER_S,
@@ -87,5 +88,5 @@ def test_other_tasks_run_between_slow_items() -> None:
     async def both() -> None:
         await asyncio.gather(work(), other())
 
-    asyncio.run(both())
+    uvloop.run(both())
     assert seen == ["0", "a", "1", "b", "2"]

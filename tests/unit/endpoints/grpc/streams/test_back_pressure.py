@@ -7,6 +7,7 @@ from collections.abc import Awaitable, Callable
 from contextlib import closing
 
 import pytest
+import uvloop
 
 from shmio.endpoints.grpc import wakeups
 from shmio.endpoints.grpc.streams import back_pressure, outbox
@@ -94,7 +95,7 @@ def follow(segment: Segment, test: Callable[[Followed], Awaitable[None]], *behin
         finally:
             followed.stop()
 
-    asyncio.run(run())
+    uvloop.run(run())
 
 
 @pytest.fixture(autouse=True)
@@ -206,7 +207,7 @@ def test_a_stream_of_several_sources_gets_the_newest_of_each(instance: str) -> N
 
     with Segment.create(instance, blocks, processes) as segment:
         with closing(segment):
-            asyncio.run(run(segment))
+            uvloop.run(run(segment))
         segment.unlink()
 
 
