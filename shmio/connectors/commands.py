@@ -420,10 +420,13 @@ class CommandProcessor:
         self._injections.forget(reason)
         self._make_room()
 
-    def settle(self) -> None:
-        """Wait until all items whose acceptance was published also wait for :meth:`carry_out`."""
+    def settle(self) -> bool:
+        """Wait until all items whose acceptance was published also wait for :meth:`carry_out`.
+
+        Return whether any items wait.
+        """
         with self._verdict:
-            pass
+            return bool(self._items)
 
     def release(self, cycle: int) -> None:
         """Accept delayed writes: those whose delay by an injection ends in this cycle.

@@ -7,7 +7,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from typing import Final, NamedTuple
 
 import msgspec
@@ -224,17 +224,20 @@ class Coordinator:
                 process did not answer within the hard time-out.
             ValueRangeError: The length is not between 1 us and 1 h.
         """
-        with self._lock, closing(self.stepping(dt_ns)) as stepping:
-            while True:
-                try:
+        with self._lock:
+            stepping = self.stepping(dt_ns)
+            try:
+                while True:
                     block, seen, rest_ns = next(stepping)
-                except StopIteration as over:
-                    step: Step = over.value
-                    return step
-                if block is None:
-                    self._segment.clock.delivered_bell.wait(seen, rest_ns)
-                else:
-                    block.ring.wait(seen, rest_ns)
+                    if block is None:
+                        self._segment.clock.delivered_bell.wait(seen, rest_ns)
+                    else:
+                        block.ring.wait(seen, rest_ns)
+            except StopIteration as over:
+                step: Step = over.value
+                return step
+            finally:
+                stepping.close()
 
     def steps(self, dt_ns: int | None, count: int) -> Step:
         """Do ``count`` steps, each as :meth:`step` does; return the last one."""
@@ -250,30 +253,32 @@ class Coordinator:
         If you do not run the generator to its end, close it. Until then, call no other method of
         this coordinator.
         """
-        self.take_over(steps=True)
-        before = self.read()
+        if not self._owns:
+            self.take_over(steps=True)
+        page = self._segment.clock
+        before = page.last_written()
         dt_ns = before.step_size_ns if dt_ns is None else dt_ns
         check_step(dt_ns)
-        step = Step(before.step + 1, before.time_ns + dt_ns, dt_ns)
+        number, time_ns = before.step + 1, before.time_ns + dt_ns
         roles = self._current_roles()
-        unmoved = _unmoved_note(self._segment, roles.participants)
-        asked = before._replace(step=step.number, time_ns=step.time_ns, dt_ns=dt_ns, stepping=True, note="")
+        unmoved = "" if roles.always_move else _unmoved_note(self._segment, roles.participants)
         problem = "it was cancelled"
         try:
-            heads = {block: block.ring.head() for block in roles.participants}
-            self._segment.clock.write(asked, ring=False)  # processes need not deliver a step before it is done
+            waiting = [(block, block.ring.head()) for block in roles.participants]
+            page.begin_step(before, number, time_ns, dt_ns, before.done)
             for bell in roles.bells:
                 bell.ring()
-            problem = yield from self._await_frames(step.number, heads, asked)
+            problem = yield from self._await_frames(number, waiting)
         finally:
-            note = f"step {step.number} failed: {problem}" if problem else unmoved
-            done = before.done if problem else step.number
-            self._write(asked._replace(done=done, stepping=False, note=note))
+            note = f"step {number} failed: {problem}" if problem else unmoved
+            page.end_step(before, number, time_ns, dt_ns, before.done if problem else number, note)
+        step = Step(number, time_ns, dt_ns)
         if not problem:
             self._deliver(step)
-            problem = yield from self._await_delivery(step.number, roles.dispatchers)
+            if roles.dispatchers:
+                problem = yield from self._await_delivery(number, roles.dispatchers)
         if problem:
-            raise TimeError(f"step {step.number}: {problem}")
+            raise TimeError(f"step {number}: {problem}")
         return step
 
     def jump(self, state: Clock) -> None:
@@ -374,35 +379,34 @@ class Coordinator:
         for slot in self._segment.processes:
             self._segment.clock.slot_bell(slot.index).ring()
 
-    def _await_frames(self, number: int, heads: Mapping[Block, int], asked: Clock) -> Generator[StepWait, None, str]:
+    def _await_frames(self, number: int, waiting: list[tuple[Block, int]]) -> Generator[StepWait, None, str]:
         """Wait until each source has done a step.
 
-        ``heads`` has the number of each source's newest frame before the step. Return a text about
-        the sources that failed; empty: none failed.
+        ``waiting`` has the block of each source and the number of its newest frame before the step.
+        Return a text about the sources that failed; empty: none failed.
         """
         begun_ns = time.monotonic_ns()
-        waiting = list(heads)
         problems: list[str] = []
         warned = False
         while waiting:
-            block = waiting[0]
+            block, head = waiting[0]
             seen = block.ring.doorbell()  # before reading
-            found = _step_answer(block, number, heads[block])
+            found = _step_answer(block, number, head)
             if found is not None:
-                waiting.remove(block)
+                del waiting[0]
                 problems += [f"{block.source}: {found}"] if found else []
                 continue
             passed_ns = time.monotonic_ns() - begun_ns
             if passed_ns >= self._hard_ns:
-                silent = [block for block in waiting if _step_answer(block, number, heads[block]) is None]
+                silent = [block for block, head in waiting if _step_answer(block, number, head) is None]
                 problems += [_describe_silence(self._segment, block, self._hard_ns) for block in silent]
                 return "; ".join(problems)
             if passed_ns >= self._soft_ns and not warned:
                 warned = True
-                names = [block.source for block in waiting if _step_answer(block, number, heads[block]) is None]
+                names = [block.source for block, head in waiting if _step_answer(block, number, head) is None]
                 note = f"step {number} waits for {', '.join(names)}"
                 log.warning(note)
-                self._write(asked._replace(note=note))
+                self._write(self.read()._replace(note=note))
             yield StepWait(block, seen, (self._hard_ns if warned else min(self._soft_ns, self._hard_ns)) - passed_ns)
         return "; ".join(problems)
 
@@ -456,12 +460,14 @@ class _Roles(NamedTuple):
             answers come through a process that may itself wait.
         bells: The doorbells of their sources.
         dispatchers: The other processes that deliver steps.
+        always_move: True if each step has an effect on all participants, and there are some.
     """
 
     blocks: Mapping[str, Block]
     participants: list[Block]
     bells: list[Doorbell]
     dispatchers: list[ProcessSlot]
+    always_move: bool
 
     @classmethod
     def of(cls, segment: Segment, own: ProcessSlot | None) -> _Roles:
@@ -474,6 +480,7 @@ class _Roles(NamedTuple):
             sorted(stepped, key=lambda block: block.model_channel is None),
             [segment.clock.slot_bell(slot.index) for slot in slots if slot.name in sources],
             [slot for slot in slots if slot.kind in _DISPATCHERS],
+            bool(stepped) and all(block.playhead is None for block in stepped),
         )
 
 
@@ -506,7 +513,9 @@ class Timekeeper:
         """
         if self._player is not None:
             raise TimeError("time is playing; pause it before you step it")
-        self._take_over()
+        self._segment.require_running()
+        if not self._coordinator.owns:
+            self._coordinator.take_over(_PATIENCE_S)
         return self._coordinator.steps(dt_ns, count)
 
     @contextmanager

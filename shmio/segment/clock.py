@@ -56,6 +56,20 @@ _REQUEST_COPY: Final = 128
 _REFUSED: Final = 1 << 63
 
 
+class StepRequest(NamedTuple):
+    """The part of the clock's state that a computed source needs in each turn of its loop.
+
+    In virtual time, the attributes are those of :class:`shmio.model.clock.Clock`. In wall time,
+    only ``virtual`` has a meaning.
+    """
+
+    virtual: bool
+    stepping: bool
+    step: int
+    time_ns: int
+    dt_ns: int
+
+
 class StateAction(IntEnum):
     """What a :class:`StateRequest` asks processes to do with their state."""
 
@@ -193,6 +207,15 @@ class ClockPage:
             self._last = data, state
         return state
 
+    def step_request(self) -> StepRequest:
+        """Return the last requested step. This is faster than :meth:`read`.
+
+        Raises:
+            SegmentError: The page is corrupt.
+        """
+        mode, flags, step, time_ns, dt_ns = _TIME.unpack(self._state.read(_TIME.size))
+        return StepRequest(mode != 0, flags & _STEPPING != 0, step, time_ns, dt_ns)
+
     def write(self, state: Clock, *, ring: bool = True) -> None:
         """Write the state of the clock, and ring the page's doorbell. Only the owner of time may call this.
 
@@ -217,6 +240,15 @@ class ClockPage:
         flags = _STEPPING | _PLAYING if before.playing else _STEPPING
         rest = before.step_size_ns, before.rate, before.owner, b""
         self._state.write(_STATE.pack(before.mode, flags, step, time_ns, dt_ns, done, *rest))
+
+    def end_step(self, before: Clock, step: int, time_ns: int, dt_ns: int, done: int, note: str) -> None:
+        """Write that a step of virtual time has ended, and ring the page's doorbell.
+
+        ``note`` is the new note of the clock. The other arguments are those of :meth:`begin_step`,
+        but ``done`` is the number of the last step that is done now.
+        """
+        mode, _, _, _, _, step_size_ns, playing, rate, _, owner, *_ = before
+        self.write(Clock(mode, step, time_ns, dt_ns, done, step_size_ns, playing, rate, False, owner, note))
 
     def now_ns(self) -> int:
         """Return the present publish time in ns, from which the age of frames on the instance clock is computed.

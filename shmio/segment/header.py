@@ -193,6 +193,11 @@ def table_state(memory: memoryview) -> tuple[int, int]:
     return word & 0xFFFFFFFF, word >> 32
 
 
+def generation(memory: memoryview) -> int:
+    """Return the generation of the section table; see :func:`table_state`."""
+    return _atomics.load64(memory, GENERATION_OFFSET) & 0xFFFFFFFF
+
+
 def retired(memory: memoryview, header: Header, index: int) -> bool:
     """Return whether the entry of the section table with this index is retired."""
     return _atomics.load64(memory, header.sections_offset + index * SECTION_SIZE) & _RETIRED != 0

@@ -238,7 +238,7 @@ def read_block(
 
     return Block(
         described.name, layout, part_with, frames, events, queues, (memory, injections, declared), readers, attributes,
-        lambda: header.retired(memory, head, layout_at), layout_at, clock, channel, playhead,
+        partial(header.retired, memory, head, layout_at), layout_at, clock, channel, playhead,
     )  # fmt: skip
 
 
@@ -535,12 +535,12 @@ class Segment:
     @property
     def generation(self) -> int:
         """Generation of the section table, which changes when a reload adds or retires blocks."""
-        return header.table_state(self.memory)[0]
+        return header.generation(self.memory)
 
     @property
     def outdated(self) -> bool:
         """True if a reload has changed the segment since the last :meth:`refresh`."""
-        return self.generation != self._generation
+        return header.generation(self.memory) != self._generation
 
     def refresh(self) -> bool:
         """Update the blocks and the process table after a reload.
@@ -669,7 +669,7 @@ class Segment:
             raise NotRunningError(f"instance {self.instance!r} has stopped")
 
     def _require_open(self) -> None:
-        if self.closed:
+        if self.shared.closed:
             raise SegmentError(f"detached from instance {self.instance!r}")
 
     def set_state(self, pid: int, state: State, note: str = "") -> None:

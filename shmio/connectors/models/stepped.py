@@ -25,7 +25,7 @@ from shmio.local.state_requests import StateRequests
 from shmio.model.clock import Clock
 from shmio.model.statuses import trusted_codec
 from shmio.segment import Block, BlockWriter, EventKind, Frame, Provenance, Quality, Record, Segment, Stamp
-from shmio.segment.clock import ClockPage
+from shmio.segment.clock import ClockPage, StepRequest
 
 NO_DATA: Final = "no data yet"
 _GOOD, _UNCERTAIN, _SIMULATED = Quality.GOOD, Quality.UNCERTAIN, Provenance.SIMULATED
@@ -242,7 +242,8 @@ class SteppedLoop:
         """Compute cycles and steps until the clock stops the loop, then publish a bad frame."""
         try:
             self.begin()
-            while not (self._live(state) if (state := self._page.read()).virtual else self._free_run()):
+            page = self._page
+            while not (self._live(request) if (request := page.step_request()).virtual else self._free_run()):
                 pass
         finally:
             self.commands.stop()
@@ -323,20 +324,21 @@ class SteppedLoop:
 
     # ---- virtual time --------------------------------------------------------------------------------------------
 
-    def _live(self, state: Clock) -> bool:
+    def _live(self, request: StepRequest) -> bool:
         """Compute the requested step; between steps, carry out commands and publish new results.
 
         Then wait, and return whether the loop must stop.
         """
-        if state.stepping and state.step != self._handled:
-            self.step(state.step, state.time_ns, state.dt_ns)
-        elif not state.stepping:
-            self._handled = self._writer.cycle = state.step
-            self._stand(state.time_ns)
+        _, stepping, step, time_ns, dt_ns = request
+        if stepping and step != self._handled:
+            self.step(step, time_ns, dt_ns)
+        elif not stepping:
+            self._handled = self._writer.cycle = step
+            self._stand(time_ns)
             if self.state_requests is not None:
                 self.state_requests.serve()
             if self._source.has_changed():
-                self._show(state.step)
+                self._show(step)
         wait_ns = None
         if self.commands.waiting:
             wait_ns = max(0, self._output.next_ns - self._clock.now_ns()) if self._source.prompt else 0
@@ -417,7 +419,8 @@ class SteppedLoop:
         self._carry_out()
         if self._published:
             return ""  # a prompt source published the frame when it was written
-        asked_ns, counters, doubt = self._writer.now_ns(), self.counters, ""
+        at, counters, doubt = self._at, self.counters, ""
+        asked_ns = self._writer.now_ns() if at is None else at.publish_ns
         counters.busy_since_ns = begun_ns = self._clock.now_ns()
         try:
             if self._inputs is not None:
@@ -447,8 +450,7 @@ class SteppedLoop:
 
     def _carry_out(self) -> None:
         """Carry out all accepted commands."""
-        self.commands.settle()
-        if self.commands.waiting:
+        if self.commands.settle():
             self.commands.carry_out(self._write)
 
     def _write(self, writes: Sequence[Write]) -> list[str]:

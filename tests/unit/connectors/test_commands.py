@@ -385,12 +385,13 @@ def test_a_connection_lost_while_a_command_is_being_accepted(
         (number, EventKind.EXPIRED, "the source is not connected: cable out"),
     ]
     bench.processor.open()
-    bench.processor.settle()
+    assert not bench.processor.settle()
     assert not bench.processor.waiting
 
 
 def test_refusal_of_the_later_value_applies_to_the_superseded_one(bench: Bench) -> None:
     first, second = bench.accepted(Write(0, 0, b"\0\1")), bench.accepted(Write(0, 0, b"\0\2"))
+    assert bench.processor.settle()
     bench.processor.carry_out(lambda writes: ["no"] * len(writes))
     ends = [bench.event() for _ in range(2)]
     assert [(end.command, end.kind, end.text) for end in ends] == [

@@ -113,6 +113,30 @@ def test_the_last_state_is_readable_after_a_writer_died_half_way(segment: Segmen
     assert segment.clock.read().step == 13
 
 
+def test_the_begin_and_the_end_of_a_step_change_only_what_belongs_to_the_step(segment: Segment, instance: str) -> None:
+    before = STATE._replace(stepping=False, note="a note of the step before")
+    page = segment.clock
+    with Segment.open(instance) as reader:
+        page.write(before)
+        seen = reader.clock.bell.value()
+        page.begin_step(before, 13, 9_000_000_000, 50_000_000, before.done)
+        begun = before._replace(step=13, time_ns=9_000_000_000, dt_ns=50_000_000, stepping=True, note="")
+        assert reader.clock.last_written() == page.last_written() == begun
+        assert reader.clock.bell.value() == seen, "nobody has to act on a step before it is done"
+        page.end_step(before, 13, 9_000_000_000, 50_000_000, 13, "a replay did not move")
+        ended = begun._replace(stepping=False, done=13, note="a replay did not move")
+        assert reader.clock.last_written() == page.last_written() == ended
+        assert reader.clock.bell.value() != seen
+
+
+@pytest.mark.parametrize("stepping", [True, False])
+def test_a_source_reads_the_requested_step(segment: Segment, instance: str, stepping: bool) -> None:
+    with Segment.open(instance) as reader:
+        assert not reader.clock.step_request().virtual
+        segment.clock.write(STATE._replace(stepping=stepping))
+        assert reader.clock.step_request() == (True, stepping, STATE.step, STATE.time_ns, STATE.dt_ns)
+
+
 def test_an_invalid_rate_is_read_as_one(segment: Segment) -> None:
     segment.clock.write(STATE._replace(rate=float("nan")))
     assert segment.clock.read().rate == 1.0
