@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Final, NamedTuple, NoReturn
 
 import msgspec
-import uvloop
 
 from shmio import worker
 from shmio.audit.trail import close_trail
@@ -34,7 +33,7 @@ def run(worker: Worker) -> None:
     """Serve clients until the worker is stopped."""
     limits.limit_arenas()
     with rate_limited(*LOGGERS):
-        uvloop.run(_serve(worker))  # a quarter less CPU time than asyncio's own loop
+        asyncio.run(_serve(worker))
 
 
 async def _serve(worker: Worker) -> None:

@@ -406,9 +406,7 @@ class SubscribeCall:
         if math.isinf(due_s):
             await self._wake.wait()
             return
-        loop = asyncio.get_running_loop()
-        delay_ms = math.ceil(1000 * (due_s - loop.time()))  # uvloop would round down, too, and so wake this early
-        handle = loop.call_later(delay_ms / 1000, self._wake.set)
+        handle = asyncio.get_running_loop().call_at(due_s, self._wake.set)
         try:
             await self._wake.wait()
         finally:

@@ -11,7 +11,6 @@ from typing import Any
 
 import grpc
 import pytest
-import uvloop
 
 from shmio.endpoints.grpc.server.connections import connected, peer_of
 from shmio.segment import Segment
@@ -385,7 +384,7 @@ def test_the_peer_of_an_open_connection_is_found() -> None:
         server.close()
         await server.wait_closed()
 
-    uvloop.run(test())
+    asyncio.run(test())
 
 
 @pytest.mark.parametrize("text", ["unix:", "unix:/tmp/x", "", "ipv4:300.0.0.1:5", "ipv6:::1", "ipv4:1.2.3.4:99999999"])

@@ -15,7 +15,6 @@ from typing import Any, Literal
 
 import grpc
 import pytest
-import uvloop
 
 from shmio.endpoints.grpc.__main__ import _follow, _take_anew, run
 from shmio.segment import Segment
@@ -47,7 +46,7 @@ def test_no_call_starts_between_new_feeds_and_the_move_of_open_calls() -> None:
         await asyncio.create_task(_follow(worker, feeds, services))
         await asyncio.sleep(0)
 
-    uvloop.run(test())
+    asyncio.run(test())
     assert done == ["feeds", "move ['cell']", "call"]
 
 
@@ -189,5 +188,5 @@ def test_of_two_concurrent_reloads_the_later_one_applies(monkeypatch: pytest.Mon
         waits.cancel()
 
     monkeypatch.setattr("shmio.endpoints.grpc.__main__.load", load)
-    uvloop.run(test())
+    asyncio.run(test())
     assert taken == [0, 1]

@@ -8,7 +8,6 @@ from typing import Any
 
 import grpc
 import pytest
-import uvloop
 from google.protobuf.empty_pb2 import Empty
 
 from shmio.endpoints.grpc.streams.outbox import StateLane
@@ -597,7 +596,7 @@ def test_an_endpoint_continues_the_playing_of_its_predecessor_only(instance: str
                 assert await step(served) == 0, "no program plays time"
 
         try:
-            uvloop.run(run())
+            asyncio.run(run())
         finally:
             model.stop()
 

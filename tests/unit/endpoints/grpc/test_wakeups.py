@@ -6,7 +6,6 @@ import asyncio
 import select
 
 import pytest
-import uvloop
 
 from shmio.endpoints.grpc.wakeups import WakeUp, WakeUps
 from shmio.segment import Segment
@@ -45,7 +44,7 @@ def test_listeners_of_a_block_are_called_in_the_order_of_joining(segment: Segmen
         assert ("first", 101) not in heard
         wake_ups.close()
 
-    uvloop.run(test())
+    asyncio.run(test())
 
 
 def test_a_listener_that_leaves_during_a_ring_leaves_others_listening(segment: Segment) -> None:
@@ -62,7 +61,7 @@ def test_a_listener_that_leaves_during_a_ring_leaves_others_listening(segment: S
         wake_ups.leave(block, over.set)
         wake_ups.close()
 
-    uvloop.run(test())
+    asyncio.run(test())
 
 
 def test_a_bell_rests_while_all_listeners_are_patient(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -112,7 +111,7 @@ def test_a_bell_rests_while_all_listeners_are_patient(segment: Segment, monkeypa
                 await asyncio.sleep(0)
         wake_ups.close()
 
-    uvloop.run(test())
+    asyncio.run(test())
 
 
 @pytest.mark.parametrize("pauses_first", [True, False])
@@ -138,7 +137,7 @@ def test_a_muted_bell_has_no_pause_that_would_end_its_silence(segment: Segment, 
             bell.stop()
             bell.join()
 
-    uvloop.run(test())
+    asyncio.run(test())
 
 
 def test_a_bell_that_has_rested_rings_once_and_continues(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -164,4 +163,4 @@ def test_a_bell_that_has_rested_rings_once_and_continues(segment: Segment, monke
         writer.publish(image(), cycle=2)  # wakes its thread
         bell.join()
 
-    uvloop.run(test())
+    asyncio.run(test())

@@ -8,7 +8,6 @@ from typing import Any
 
 import grpc
 import pytest
-import uvloop
 
 import shmio
 from shmio.local.writer import CommandSender
@@ -32,7 +31,7 @@ def with_plant(segment: Segment, test: Callable[[Endpoint, Plant], Awaitable[Non
             finally:
                 device.stop()
 
-    uvloop.run(run())
+    asyncio.run(run())
 
 
 async def joined(served: Endpoint, *paths: str) -> list[Any]:

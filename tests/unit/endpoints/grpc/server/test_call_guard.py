@@ -9,7 +9,6 @@ from typing import Any
 
 import grpc
 import pytest
-import uvloop
 
 from shmio.endpoints.grpc.server.access import NEEDS, client_of
 from shmio.endpoints.grpc.server.call_guard import LINES, CallLimits, Refusals, check_version, cygrpc
@@ -236,7 +235,7 @@ def test_refusals_beyond_a_few_lines_are_logged_as_a_count(caplog: pytest.LogCap
         assert caplog.records[-1].getMessage() == "publish refused: once more"
 
     with caplog.at_level(logging.WARNING):
-        uvloop.run(test())
+        asyncio.run(test())
 
 
 def test_bytes_of_answers_and_streams_are_counted(segment: Segment) -> None:

@@ -7,7 +7,6 @@ import resource
 import time
 
 import pytest
-import uvloop
 
 from shmio.endpoints.grpc.server.limits import (
     AFTER_S,
@@ -88,5 +87,5 @@ def test_other_tasks_run_between_slow_items() -> None:
     async def both() -> None:
         await asyncio.gather(work(), other())
 
-    uvloop.run(both())
+    asyncio.run(both())
     assert seen == ["0", "a", "1", "b", "2"]

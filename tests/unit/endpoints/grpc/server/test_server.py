@@ -13,7 +13,6 @@ from urllib.parse import quote
 import grpc
 import pytest
 import trustme
-import uvloop
 
 from shmio.config import Address, Tls, UnixAddress
 from shmio.endpoints.grpc.server.server import Server
@@ -115,7 +114,7 @@ def test_grpcio_without_the_needed_internals_is_refused_at_start(
             await test(served)
             monkeypatch.undo()
 
-    uvloop.run(run())
+    asyncio.run(run())
 
 
 def test_a_stopped_server_is_not_alive(segment: Segment) -> None:

@@ -14,7 +14,6 @@ from typing import Any
 
 import grpc
 import pytest
-import uvloop
 
 import shmio
 from shmio.endpoints.grpc.server.call_guard import LINES, TURN_S
@@ -65,7 +64,7 @@ def with_plant(segment: Segment, test: Callable[[Endpoint, Plant], Awaitable[Non
         async with endpoint(segment) as served, plant(served, running=running) as device:
             await test(served, device)
 
-    uvloop.run(run())
+    asyncio.run(run())
 
 
 @pytest.mark.parametrize(
@@ -331,7 +330,7 @@ def test_commands_for_an_earlier_process_of_the_source_are_never_done(
         async with endpoint(segment) as served:
             await test(served)
 
-    uvloop.run(run())
+    asyncio.run(run())
     assert "the source was restarted meanwhile" in caplog.text
     assert caplog.text.count("the source was restarted after the command was sent") == 2
 
@@ -353,7 +352,7 @@ def test_a_source_that_does_not_answer_delays_publishers_only_briefly(
                 await publish(served, [message("cell/step", "3")])
                 assert device.written[-1].data == b"\0\3"
 
-    uvloop.run(run())
+    asyncio.run(run())
     assert "the source gave no answer in time" in caplog.text
 
 

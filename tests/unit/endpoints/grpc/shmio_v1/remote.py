@@ -6,8 +6,6 @@ import asyncio
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 
-import uvloop
-
 from shmio.connectors.models.remote import Remote
 from shmio.layout.compiler import Source, compile_sources
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Quality, Segment
@@ -68,7 +66,7 @@ def serve_remote(
             await test(served, drive)
 
     with remote_segment(instance, virtual=virtual) as segment, Running(segment, "drive", source(timeout_ms)) as drive:
-        uvloop.run(run(segment, drive))
+        asyncio.run(run(segment, drive))
 
 
 async def shown(drive: Running, quality: Quality) -> None:

@@ -12,7 +12,6 @@ from typing import Any
 import grpc
 import numpy as np
 import pytest
-import uvloop
 
 from shmio.client import Client, Simulation, connect, connect_aio
 from shmio.client.model import Values
@@ -344,7 +343,7 @@ def test_a_reload_ends_a_model_which_may_join_the_new_block(instance: str) -> No
             assert (code, text) == (Status.UNAVAILABLE, "drive: a reload changed or removed this source; join again")
 
     with remote_segment(instance) as segment:
-        uvloop.run(run(segment))
+        asyncio.run(run(segment))
 
 
 def test_an_endpoint_that_stops_during_a_step_releases_control_once(
@@ -618,9 +617,9 @@ def test_simulate_rejoins_a_restarted_endpoint_and_sends_all_outputs(instance: s
                 assert (found["axis/count"], found["axis/name"]) == (8, "kept")
                 assert [one.computed for one in serving.simulations] == [False, True]
 
-        serving, port = uvloop.run(first())
+        serving, port = asyncio.run(first())
         try:
-            uvloop.run(second(port, serving))
+            asyncio.run(second(port, serving))
         finally:
             serving.close()
 

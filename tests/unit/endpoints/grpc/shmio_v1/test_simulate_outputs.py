@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
+
 import pytest
-import uvloop
 
 from shmio.endpoints.grpc.shmio_v1.simulate import OutputEncoder
 from shmio.endpoints.grpc.shmio_v1.tables import Selection
@@ -24,11 +25,11 @@ def test_the_number_of_values_by_path_is_limited(instance: str) -> None:
             fill = OutputEncoder(Selection(1, segment.blocks["line"], ROWS.registers))
             given = [wire.Assignment(path=f"rows/{at}", value=value_to_wire(at, "rows")) for at in range(MAX_VALUES)]
             image = bytearray(ROWS.size)
-            uvloop.run(fill.decode_assignments(given, image))
+            asyncio.run(fill.decode_assignments(given, image))
             assert image[4 * 4095 : 4 * 4096] == (4095).to_bytes(4, "big")
             with pytest.raises(
                 ValueRangeError, match=r"4097 values are given by path, at most 4096 are allowed; use slots"
             ):
-                uvloop.run(fill.decode_assignments([*given, given[0]], image))
+                asyncio.run(fill.decode_assignments([*given, given[0]], image))
         finally:
             segment.unlink()

@@ -8,7 +8,6 @@ from typing import Any
 
 import grpc
 import pytest
-import uvloop
 
 from shmio.client import Stepped, connect_aio
 from shmio.endpoints.grpc.shmio_v1 import clock
@@ -176,4 +175,4 @@ def test_steps_wait_while_the_client_does_not_read(monkeypatch: pytest.MonkeyPat
         assert sum(sizes) == stepper.made == 100
         assert max(sizes) == 5
 
-    uvloop.run(test())
+    asyncio.run(test())

@@ -7,7 +7,6 @@ from collections.abc import Awaitable, Callable
 from contextlib import closing
 
 import pytest
-import uvloop
 
 from shmio.endpoints.grpc import wakeups
 from shmio.endpoints.grpc.streams import back_pressure, outbox
@@ -95,7 +94,7 @@ def follow(segment: Segment, test: Callable[[Followed], Awaitable[None]], *behin
         finally:
             followed.stop()
 
-    uvloop.run(run())
+    asyncio.run(run())
 
 
 @pytest.fixture(autouse=True)
@@ -207,7 +206,7 @@ def test_a_stream_of_several_sources_gets_the_newest_of_each(instance: str) -> N
 
     with Segment.create(instance, blocks, processes) as segment:
         with closing(segment):
-            uvloop.run(run(segment))
+            asyncio.run(run(segment))
         segment.unlink()
 
 

@@ -8,7 +8,6 @@ import threading
 import weakref
 
 import pytest
-import uvloop
 
 from shmio.endpoints.grpc import wakeups as ringing
 from shmio.endpoints.grpc.encoding import Subject
@@ -57,7 +56,7 @@ def test_a_replaced_feed_is_dropped_when_its_streams_have_left(segment: Segment,
         wake_ups.close()
 
     with Segment.open(instance, writable=True) as opened:
-        uvloop.run(run(opened))
+        asyncio.run(run(opened))
 
 
 def test_the_event_loop_runs_while_a_new_layout_is_read(segment: Segment, instance: str) -> None:
@@ -90,7 +89,7 @@ def test_the_event_loop_runs_while_a_new_layout_is_read(segment: Segment, instan
         wake_ups.close()
 
     with Segment.open(instance, writable=True) as opened, pytest.MonkeyPatch.context() as monkeypatch:
-        uvloop.run(run(opened, monkeypatch))
+        asyncio.run(run(opened, monkeypatch))
 
 
 COUNT = Subject("raw", "count", (MODEL_LAYOUT.registers[0],), lambda picture: bytes((picture.number, picture.image[3])))
@@ -124,7 +123,7 @@ def test_a_model_replaced_by_a_reload_in_virtual_time_is_shown_step_by_step(inst
         wake_ups.close()
 
     with stepped_segment(instance, "sim") as segment:
-        uvloop.run(run(segment))
+        asyncio.run(run(segment))
 
 
 def test_a_held_feed_skips_no_frames(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -154,4 +153,4 @@ def test_a_held_feed_skips_no_frames(instance: str, monkeypatch: pytest.MonkeyPa
         wake_ups.close()
 
     with stepped_segment(instance, "sim", virtual=False) as segment:
-        uvloop.run(run(segment))
+        asyncio.run(run(segment))

@@ -6,7 +6,6 @@ import asyncio
 from types import SimpleNamespace
 
 import pytest
-import uvloop
 
 from shmio.endpoints.grpc.streams import back_pressure
 from shmio.endpoints.grpc.streams import outbox as module
@@ -39,7 +38,7 @@ def test_a_slow_reader_gets_the_newest_value_and_the_loss_is_counted() -> None:
         lane.deliver(b"x")
         assert await popped == b"x"
 
-    uvloop.run(test())
+    asyncio.run(test())
 
 
 def test_a_stream_far_behind_gets_no_old_values(
@@ -70,7 +69,7 @@ def test_a_stream_far_behind_gets_no_old_values(
         now_s += back_pressure.WINDOW_S
         assert await offered() == [b"a", b"b", b"c", b"d"], "it has lost none, so it is no longer behind"
 
-    uvloop.run(test())
+    asyncio.run(test())
 
 
 def test_of_values_that_come_at_once_a_stream_far_behind_gets_the_recent_ones() -> None:
@@ -88,7 +87,7 @@ def test_of_values_that_come_at_once_a_stream_far_behind_gets_the_recent_ones() 
                 outbox.losses.behind = behind
             assert await rest(outbox) == left
 
-    uvloop.run(test())
+    asyncio.run(test())
 
 
 def test_topics_share_a_stream_in_the_order_of_their_values() -> None:
@@ -104,7 +103,7 @@ def test_topics_share_a_stream_in_the_order_of_their_values() -> None:
         assert await rest(outbox) == [b"2a", b"2b", b"2c", b"1d"]
         assert outbox.dropped == 2
 
-    uvloop.run(test())
+    asyncio.run(test())
 
 
 @pytest.mark.parametrize(("bound", "count"), [("STATE_BOUND", 6), ("BOUND_BYTES", 60)])
@@ -127,7 +126,7 @@ def test_beyond_the_streams_bound_each_topic_keeps_its_newest_value(
         assert outbox.dropped == 80 - len(kept)
         assert (outbox.states.count, outbox.states.size) == (0, 0)
 
-    uvloop.run(test())
+    asyncio.run(test())
 
 
 def test_all_events_are_queued_or_the_stream_ends(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -157,7 +156,7 @@ def test_all_events_are_queued_or_the_stream_ends(monkeypatch: pytest.MonkeyPatc
         assert await many.pop() is None
         assert many.dropped == 5
 
-    uvloop.run(test())
+    asyncio.run(test())
 
 
 def test_dropped_values_of_ended_streams_are_still_counted() -> None:
@@ -205,7 +204,7 @@ def test_an_ended_outbox_can_be_used_again() -> None:
         StateLane(outbox).deliver(b"x")
         assert await popped == b"x"
 
-    uvloop.run(test())
+    asyncio.run(test())
 
 
 def test_a_failure_is_reported_once_in_a_later_turn() -> None:
@@ -220,7 +219,7 @@ def test_a_failure_is_reported_once_in_a_later_turn() -> None:
         await asyncio.sleep(0)
         assert told == ["too slow"]
 
-    uvloop.run(test())
+    asyncio.run(test())
 
 
 def test_all_values_of_a_step_are_queued_or_the_stream_ends(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -242,7 +241,7 @@ def test_all_values_of_a_step_are_queued_or_the_stream_ends(monkeypatch: pytest.
         )
         assert not outbox.delivery_pending
 
-    uvloop.run(test())
+    asyncio.run(test())
 
 
 def test_values_of_a_step_are_limited_in_bytes_too(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -259,7 +258,7 @@ def test_values_of_a_step_are_limited_in_bytes_too(monkeypatch: pytest.MonkeyPat
         lane.keep(b"1")
         assert outbox.failure == "2 values are waiting: too many values change in one step for this stream"
 
-    uvloop.run(test())
+    asyncio.run(test())
 
 
 def test_a_message_counts_as_taken_when_the_reader_asks_for_the_next() -> None:
@@ -279,4 +278,4 @@ def test_a_message_counts_as_taken_when_the_reader_asks_for_the_next() -> None:
         assert taken == [outbox]
         assert not outbox.delivery_pending
 
-    uvloop.run(test())
+    asyncio.run(test())

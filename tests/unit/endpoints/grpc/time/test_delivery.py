@@ -7,7 +7,6 @@ from collections.abc import Callable
 from contextlib import ExitStack
 
 import pytest
-import uvloop
 
 from shmio.endpoints.grpc.streams.feed import VirtualTime
 from shmio.endpoints.grpc.streams.outbox import Outboxes, StateLane, StepStream
@@ -73,7 +72,7 @@ def test_each_stage_waits_for_the_streams_and_the_caller_may_be_gone() -> None:
             assert ended == [False]
             popping.cancel()
 
-    uvloop.run(test())
+    asyncio.run(test())
 
 
 def test_streams_that_take_nothing_end_and_others_continue(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,7 +100,7 @@ def test_streams_that_take_nothing_end_and_others_continue(monkeypatch: pytest.M
             assert not delivery.busy  # no stream has anything to take
             popping.cancel()
 
-    uvloop.run(test())
+    asyncio.run(test())
 
 
 def test_the_marker_for_a_single_stream_does_not_wait_for_the_values() -> None:
@@ -125,7 +124,7 @@ def test_the_marker_for_a_single_stream_does_not_wait_for_the_values() -> None:
             assert ended
             popping.cancel()
 
-    uvloop.run(test())
+    asyncio.run(test())
 
 
 def test_each_step_has_the_whole_time_and_who_waits_waits_for_the_last_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -157,7 +156,7 @@ def test_each_step_has_the_whole_time_and_who_waits_waits_for_the_last_one(monke
         await waiting
         assert "has not taken the values" in receiver.reason
 
-    uvloop.run(test())
+    asyncio.run(test())
 
 
 def test_a_delivery_that_is_stopped_lets_its_callers_go_and_does_not_end() -> None:
@@ -173,4 +172,4 @@ def test_a_delivery_that_is_stopped_lets_its_callers_go_and_does_not_end() -> No
         receiver.take()  # when the stream ends
         assert not ended
 
-    uvloop.run(test())
+    asyncio.run(test())

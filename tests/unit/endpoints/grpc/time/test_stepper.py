@@ -6,8 +6,6 @@ import asyncio
 from collections.abc import Callable, Generator
 from typing import Any
 
-import uvloop
-
 from shmio.endpoints.grpc.time.stepper import StepDriver
 from shmio.local.time_control import Step, StepWait
 
@@ -65,7 +63,7 @@ def test_a_source_that_rings_often_before_it_answers_does_not_block_the_loop() -
         assert await driver.step(None) == DONE
         await beside
 
-    uvloop.run(test())
+    asyncio.run(test())
     assert len(waits) < MANY
 
 
@@ -86,4 +84,4 @@ def test_a_source_with_a_remote_model_does_not_block_the_loop() -> None:
         driver = StepDriver(Coordinator(), None, Bells())  # type: ignore[arg-type]  # only what the driver uses
         assert await driver.step(None) == DONE
 
-    uvloop.run(test())
+    asyncio.run(test())
