@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from operator import itemgetter
 from typing import Any, Final, NamedTuple, Protocol
 
@@ -22,6 +22,8 @@ _NUMBERS: Final = frozenset({int, float, np.float64})
 _PYTHON: Final = frozenset({bool, int, float, str, list, tuple})
 _NUMPY: Final = (np.ndarray, np.generic)
 _BYTES: Final = (bytes, bytearray)
+_ALL: Final = 0xFF
+_MANY_PIECES: Final = 24
 
 
 class Images:
@@ -47,8 +49,8 @@ class Images:
         self._computed = covering(outputs, layout.size)
         self.limited: Sequence[RegisterPort] = ()
         """The ports of commanded registers with limits. A write outside the limits is refused."""
-        self._given = ~_array(covering((*outputs, *inouts), layout.size))
-        self._all_computed = not self._given.any()
+        given = ~_array(covering((*outputs, *inouts), layout.size))
+        self._given = _Bits(given.tobytes())
 
     def write(self, writes: Sequence[Write]) -> list[str]:
         """Write bytes and bits into the commanded image.
@@ -84,9 +86,13 @@ class Images:
 
     def with_given(self, image: bytes | bytearray) -> bytes:
         """Return a copy of ``image`` with the commanded values of all registers that the model does not compute."""
-        if self._all_computed:
-            return bytes(image)
-        return (_array(self.commanded) & self._given | _array(image) & ~self._given).tobytes()
+        shown = bytearray(image)
+        self._given.copy(self.commanded, shown)
+        return bytes(shown)
+
+    def show_given(self) -> None:
+        """Show the commanded values of all registers that the model does not compute."""
+        self._given.copy(self.commanded, self.shown)
 
     def _write(self, write: Write) -> str:
         offset, mask, data = write
@@ -103,6 +109,36 @@ class Images:
                 self.commanded[offset:stop] = before
                 return fault
         return ""
+
+
+class _Bits:
+    """Some bits of an image, which can be copied to another image."""
+
+    def __init__(self, mask: bytes) -> None:
+        """Create the object for the bits that are set in ``mask``, an image of the same size."""
+        ranges: list[tuple[int, int]] = []  # whole bytes
+        parts: list[tuple[int, int]] = []  # offset and mask of bytes of which only some bits are copied
+        for at, bits in enumerate(mask):
+            if bits == _ALL and ranges and ranges[-1][1] == at:
+                ranges[-1] = ranges[-1][0], at + 1
+            elif bits == _ALL:
+                ranges.append((at, at + 1))
+            elif bits:
+                parts.append((at, bits))
+        self._ranges, self._parts = ranges, parts
+        # numpy takes the same time for any number of pieces, which is longer than for a few
+        self._mask = _array(mask) if len(ranges) + len(parts) > _MANY_PIECES else None
+
+    def copy(self, source: bytearray, target: bytearray) -> None:
+        """Copy the bits from ``source`` to ``target``."""
+        if self._mask is not None:
+            array = _array(target)
+            array[:] = _array(source) & self._mask | array & ~self._mask
+            return
+        for begin, end in self._ranges:
+            target[begin:end] = source[begin:end]
+        for at, bits in self._parts:
+            target[at] = target[at] & ~bits | source[at] & bits
 
 
 def _array(data: bytes | bytearray) -> npt.NDArray[np.uint8]:
@@ -185,7 +221,8 @@ class RegisterPort:
         self._image = image
         self._start, self._stop = register.offset, register.offset + register.size
         self._is_row = register.type == "BYTE" and len(register.dims) == 1
-        self._is_native = register.element.base in NUMBERS and byte_order == sys.byteorder
+        self.is_native = register.element.base in NUMBERS and byte_order == sys.byteorder
+        """Whether C can read the register's bytes as numbers on this machine."""
 
     def read(self) -> Any:
         """Return the value.
@@ -205,7 +242,9 @@ class RegisterPort:
                 unchanged.
 
         """
-        if self._limits is not None and (fault := self.fault(value)):
+        limits = self._limits
+        within = limits is None or (type(value) is float and limits[0] <= value <= limits[1])
+        if not within and (fault := self.fault(value)):
             raise ValueRangeError(f"{self._path}: {fault}")
         if self._is_row and isinstance(value, _BYTES) and len(value) == self._stop - self._start:
             self._image[self._start : self._stop] = value
@@ -215,11 +254,6 @@ class RegisterPort:
         except ValueRangeError as error:
             text = str(error)
             raise ValueRangeError(text if text.startswith(f"{self._path}:") else f"{self._path}: {text}") from None
-
-    @property
-    def native(self) -> memoryview | None:
-        """The register's bytes in the image, if C can read them as numbers on this machine; else None."""
-        return memoryview(self._image)[self._start : self._stop] if self._is_native else None
 
     def overlaps(self, start: int, stop: int) -> bool:
         """Return whether the register has bytes in the range of the image from ``start`` to ``stop``, exclusive."""
@@ -234,6 +268,17 @@ class RegisterPort:
             if isinstance(one, int | float | np.number) and not low <= one <= high:  # NaN too
                 return f"{one:g} is outside the limits of {low:g} to {high:g}"
         return ""
+
+
+def joined_bytes(ports: Iterable[RegisterPort]) -> list[memoryview]:
+    """Return the bytes of registers in their image, in this order, those of adjacent registers together."""
+    joined: list[tuple[bytearray, int, int]] = []
+    for port in ports:
+        if joined and joined[-1][0] is port._image and joined[-1][2] == port._start:
+            joined[-1] = port._image, joined[-1][1], port._stop
+        else:
+            joined.append((port._image, port._start, port._stop))
+    return [memoryview(image)[start:stop] for image, start, stop in joined]
 
 
 class _StructurePort:

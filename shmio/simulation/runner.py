@@ -174,7 +174,7 @@ class ModelRunner:
         if not self._started:
             self.begin()
         before = self.image
-        self._images.shown[:] = self._images.with_given(before)
+        self._images.show_given()
         self._run(self._model.step, time_ns / 1e9, dt_ns / 1e9, instead=before)
         return self.image
 

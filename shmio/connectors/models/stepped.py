@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Final, Protocol
+from typing import Final, NamedTuple, Protocol
 
 from shmio.connectors.base import Computed
 from shmio.connectors.commands import CommandProcessor
@@ -18,16 +18,19 @@ from shmio.connectors.output import Image, Output
 from shmio.connectors.poll_loop import Counters, QualityLog, Schedule
 from shmio.errors import PathError, SegmentError, ShmioError
 from shmio.layout.topic import Topic, find, parse_topic
-from shmio.layout.values.codec import RegisterCodec, Value
+from shmio.layout.values.codec import Value
 from shmio.layout.values.write import Write
 from shmio.local.reading import holds_none, status_of
 from shmio.local.state_requests import StateRequests
 from shmio.model.clock import Clock
 from shmio.model.statuses import trusted_codec
 from shmio.segment import Block, BlockWriter, EventKind, Frame, Provenance, Quality, Record, Segment, Stamp
+from shmio.segment.block import read_frames
 from shmio.segment.clock import ClockPage, StepRequest
 
 NO_DATA: Final = "no data yet"
+_FEW: Final = 8
+"""Number of frames that are read one after another; with more, only the newest one is read."""
 _GOOD, _UNCERTAIN, _SIMULATED = Quality.GOOD, Quality.UNCERTAIN, Provenance.SIMULATED
 """Each step needs these, and looking up a member of an enum is slow."""
 RESTARTED: Final = "the source's process was restarted during this step; it continues with the next step"
@@ -52,7 +55,8 @@ class Inputs:
         """
         self._segment = segment
         self._connections = connections
-        self._found: dict[str, tuple[Block, RegisterCodec]] = {}
+        self._upstreams: list[_Upstream] = []
+        self._wanted: list[_Wanted] | None = None  # None: not yet found, or not all of them
 
     def read(self, step: int | None) -> tuple[dict[str, Value], str]:
         """Return the values of inputs by path, and why other inputs have no value.
@@ -60,35 +64,101 @@ class Inputs:
         The reason is empty if all inputs have a value. ``step`` is the present step; None in wall
         time.
         """
-        if self._segment.refresh():
-            self._found = {}
+        refreshed, wanted = self._segment.refresh(), self._wanted
+        if refreshed or wanted is None:
+            wanted = self._find_all()
+        frames = [upstream.frame(step) for upstream in self._upstreams]
         values: dict[str, Value] = {}
         missing: list[str] = []
-        frames: dict[str, tuple[Frame | None, str]] = {}
-        for path, topic in self._connections.items():
-            try:
-                block, decoder = self._find(path, topic)
-                if block.source not in frames:
-                    frames[block.source] = _frame(block, step)
-            except (PathError, SegmentError) as error:
-                missing.append(f"input {path}: {error}")
+        for path, topic, place, decode, problem in wanted:
+            if decode is None:
+                missing.append(f"input {path}: {problem}")
                 continue
-            frame, reason = frames[block.source]
-            value = None if frame is None else decoder.decode(frame.image)
-            if holds_none(value):
-                why = reason or _why_none(block, topic, frame)
-                missing.append(f"input {path} keeps its value: {block.source}: {why}")
+            frame, reason = frames[place]
+            value = None if frame is None else decode(frame.image)
+            if value is None or (type(value) is list and holds_none(value)):
+                missing.append(f"input {path}{reason or self._upstreams[place].why_none(topic, frame)}")
             else:
                 values[path] = value
         return values, "; ".join(missing)
 
-    def _find(self, path: str, topic: Topic) -> tuple[Block, RegisterCodec]:
-        if path not in self._found:
-            block = self._segment.blocks.get(topic.source)
-            if block is None:
-                raise PathError(f"source {topic.source!r} no longer exists")
-            self._found[path] = block, trusted_codec(find(block.layout, topic.path), block.layout)
-        return self._found[path]
+    def _find_all(self) -> list[_Wanted]:
+        """Find the sources and registers of all connections. Those that do not exist are searched for again."""
+        upstreams: dict[str, _Upstream] = {}
+        wanted: list[_Wanted] = []
+        for path, topic in self._connections.items():
+            try:
+                block = self._segment.blocks.get(topic.source)
+                if block is None:
+                    raise PathError(f"source {topic.source!r} no longer exists")
+                decode = trusted_codec(find(block.layout, topic.path), block.layout).decode
+            except (PathError, SegmentError) as error:
+                wanted.append(_Wanted(path, topic, 0, None, str(error)))
+                continue
+            upstreams.setdefault(block.source, _Upstream(block))
+            wanted.append(_Wanted(path, topic, list(upstreams).index(block.source), decode, ""))
+        self._upstreams = list(upstreams.values())
+        self._wanted = None if any(one.problem for one in wanted) else wanted
+        return wanted
+
+
+class _Wanted(NamedTuple):
+    """A register that is connected to the input ``path``; ``decode`` is None if there is a problem.
+
+    ``place`` is the index of its source.
+    """
+
+    path: str
+    topic: Topic
+    place: int
+    decode: Callable[[bytes], Value] | None
+    problem: str
+
+
+class _Upstream:
+    """A source whose registers are connected to inputs."""
+
+    def __init__(self, block: Block) -> None:
+        self._block = block
+        self._frames: list[Frame] = []  # the frame used last, and the later ones that have been read
+
+    def frame(self, step: int | None) -> tuple[Frame | None, str]:
+        """Return the frame to use and "", or None and the end of a message why there is no usable frame."""
+        block = self._block
+        try:
+            frame = block.latest() if step is None else self._before(step)
+            if frame is None:
+                return None, self._keeps(NO_DATA)
+            quality, reason = block.assess(frame)
+        except SegmentError as error:
+            return None, f": {error}"
+        if quality is Quality.BAD:
+            return None, self._keeps(reason if frame.quality is Quality.BAD else "stale")
+        return frame, ""
+
+    def _before(self, step: int) -> Frame | None:
+        """Return the newest frame before a step. Each frame is read only once."""
+        block, frames = self._block, self._frames
+        head = block.ring.head()
+        last = frames[-1].number if frames else 0
+        if 0 < head - last <= _FEW:
+            frames += read_frames(block.ring, last + 1, head - last)
+        if frames and frames[-1].number == head:
+            for place in range(len(frames) - 1, -1, -1):
+                if not block.came_with(frames[place], step):
+                    del frames[:place]
+                    return frames[0]
+        found = newest(block, step)
+        self._frames = [] if found is None else [found]
+        return found
+
+    def why_none(self, topic: Topic, frame: Frame | None) -> str:
+        """Return the end of a message why a register has no value although its frame is good."""
+        status = frame and status_of(self._block, find(self._block.layout, topic.path), frame)
+        return self._keeps((status.reason if status else "") or "the bytes are not a valid value")
+
+    def _keeps(self, reason: str) -> str:
+        return f" keeps its value: {self._block.source}: {reason}"
 
 
 def connected_inputs(source: Computed, block: Block, opened: Callable[[], Segment]) -> Inputs | None:
@@ -104,23 +174,6 @@ def connected_inputs(source: Computed, block: Block, opened: Callable[[], Segmen
         segment,
         {path: parse_topic(topic, segment.blocks, block.source) for path, topic in source.connections.items()},
     )
-
-
-def _why_none(block: Block, topic: Topic, frame: Frame | None) -> str:
-    """Return why a register has no value although its frame is good."""
-    status = frame and status_of(block, find(block.layout, topic.path), frame)
-    return (status.reason if status else "") or "the bytes are not a valid value"
-
-
-def _frame(block: Block, step: int | None) -> tuple[Frame | None, str]:
-    """Return the frame to read and "", or None and the reason why there is no usable frame."""
-    frame = newest(block, step)
-    if frame is None:
-        return None, NO_DATA
-    quality, reason = block.assess(frame)
-    if quality is Quality.BAD:
-        return None, reason if frame.quality is Quality.BAD else "stale"
-    return frame, ""
 
 
 class StepClock(Protocol):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import logging
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,9 +13,10 @@ from shmio.errors import ModelError
 from shmio.layout.topic import shorten
 from shmio.logs import LogRateLimit
 from shmio.simulation.fmu.description import Description, Variable
-from shmio.simulation.images import Port, RegisterPort
+from shmio.simulation.images import Port, RegisterPort, joined_bytes
 from shmio.wording import printable
 
+WARNING: Final = 1
 DISCARD: Final = 2
 FATAL: Final = 4
 STATUSES: Final = ("ok", "warning", "discard", "error", "fatal", "pending")
@@ -36,7 +37,7 @@ _C_TYPES: Final[Mapping[str, Any]] = {
     "UInt64": ctypes.c_uint64,
     "String": ctypes.c_char_p,
 }
-_BOOLEAN: Final = {2: ctypes.c_int, 3: ctypes.c_bool}
+_BOOLEAN: Final[Mapping[int, Any]] = {2: ctypes.c_int, 3: ctypes.c_bool}
 
 log = logging.getLogger("shmio.fmu")
 log.addFilter(LogRateLimit(one_kind=True))
@@ -49,7 +50,8 @@ class FmuError(ModelError):
 class Instance:
     """An FMU whose library is loaded. Use it in one thread only.
 
-    A method that calls the FMU raises FmuError if the call fails.
+    A method that calls the FMU raises FmuError if the call fails. The calls of each step have
+    prepared arguments, and go past FMPy's functions, which would convert all arguments again.
     """
 
     def __init__(self, description: Description, folder: Path) -> None:
@@ -79,13 +81,20 @@ class Instance:
             )
         except Exception as error:  # noqa: BLE001  FMPy raises Exception
             raise FmuError(self._with_words(f"it cannot be loaded: {shorten(printable(str(error)), 300)}")) from None
+        self._component = ctypes.c_void_p(self._fmu.component)
+        self._call_do_step: Callable[..., int] = self._fmu.dll[f"fmi{self.version}DoStep"]
+        self._true = _BOOLEAN[self.version](1)
+        self._event, self._terminates, self._is_early = ctypes.c_bool(), ctypes.c_bool(), ctypes.c_bool()
+        self._reached_s = ctypes.c_double()
 
     def group(self, variables: Iterable[Variable], ports: Mapping[str, Port]) -> list[Group]:
         """Divide variables into groups. One call to the FMU reads or writes all variables of a group."""
         by_type: dict[str, list[Variable]] = {}
         for variable in variables:
             by_type.setdefault(variable.fmi_type, []).append(variable)
-        return [Group(self.version, self._fmu, type_, alike, ports) for type_, alike in by_type.items()]
+        return [
+            Group(self.version, self._fmu.dll, self._component, type_, alike, ports) for type_, alike in by_type.items()
+        ]
 
     def initialise(self, parameters: list[Group], inputs: list[Group]) -> None:
         """Set the parameters and inputs of the FMU, and initialise it.
@@ -94,21 +103,22 @@ class Instance:
         """
         with self._calling():
             for group in parameters:
-                group.set_other(self._fmu.component)
+                self._check(group.setter, group.set_other())
             if self.version == 2:
                 self._fmu.setupExperiment(startTime=self._start_s)
                 self._fmu.enterInitializationMode()
             else:
                 self._fmu.enterInitializationMode(startTime=self._start_s)
             for group in inputs:
-                group.set_changed(self._fmu.component)
+                self._check(group.setter, group.set_changed())
             self._fmu.exitInitializationMode()
 
     def set(self, groups: list[Group]) -> None:
         """Give the FMU the values of each group in which a value has changed since the last call."""
-        with self._calling():
-            for group in groups:
-                group.set_changed(self._fmu.component)
+        self.words = ""
+        for group in groups:
+            if (status := group.set_changed()) > WARNING:
+                raise self._failed(group.setter, status)
 
     def get(self, groups: list[Group]) -> None:
         """Read the values of all variables in ``groups`` from the FMU, and write them to the variables' ports.
@@ -117,9 +127,10 @@ class Instance:
             ValueRangeError: A value does not fit its register.
 
         """
-        with self._calling():
-            for group in groups:
-                group.get(self._fmu.component)
+        self.words = ""
+        for group in groups:
+            if (status := group.get()) > WARNING:
+                raise self._failed(group.getter, status)
         for group in groups:
             group.show()
 
@@ -157,20 +168,19 @@ class Instance:
             it has completed the step; None if it has discarded the step.
 
         """
-        with self._calling():
-            return self._do_step_2(now_s, size_s) if self.version == 2 else self._do_step_3(now_s, size_s)
+        self.words = ""
+        return self._do_step_2(now_s, size_s) if self.version == 2 else self._do_step_3(now_s, size_s)
 
     def _do_step_2(self, now_s: float, size_s: float) -> float | None:
-        try:
-            self._fmu.doStep(now_s, size_s)
-        except self._error as error:
-            if _status(error) != DISCARD:
-                raise
-            if self._asked(self._fmu.getBooleanStatus, _TERMINATED):
-                raise FmuError(self._with_words(f"it has ended its simulation at {now_s:g} s")) from None
-            reached_s: float | None = self._asked(self._fmu.getRealStatus, _LAST_SUCCESSFUL_TIME)
-            return reached_s
-        return math.inf
+        status = self._call_do_step(self._component, ctypes.c_double(now_s), ctypes.c_double(size_s), self._true)
+        if status <= WARNING:
+            return math.inf
+        if status != DISCARD:
+            raise self._failed("fmi2DoStep", status)
+        if self._asked(self._fmu.getBooleanStatus, _TERMINATED):
+            raise FmuError(self._with_words(f"it has ended its simulation at {now_s:g} s"))
+        reached_s: float | None = self._asked(self._fmu.getRealStatus, _LAST_SUCCESSFUL_TIME)
+        return reached_s
 
     def _asked(self, ask: Any, kind: int) -> Any:
         """Return a detail of a discarded step; None if the FMU does not know it."""
@@ -178,19 +188,23 @@ class Instance:
             return ask(kind)
         except self._error as error:
             if _status(error) != DISCARD:
-                raise
+                raise self.failed(error) from None
             return None
 
     def _do_step_3(self, now_s: float, size_s: float) -> float | None:
-        try:
-            _, terminates, is_early, reached_s = self._fmu.doStep(now_s, size_s)
-        except self._error as error:
-            if _status(error) != DISCARD:
-                raise
+        event, terminates, is_early, reached_s = self._event, self._terminates, self._is_early, self._reached_s
+        event.value = terminates.value = is_early.value = False
+        reached_s.value = 0.0
+        status = self._call_do_step(
+            self._component, ctypes.c_double(now_s), ctypes.c_double(size_s), self._true, ctypes.byref(event),
+            ctypes.byref(terminates), ctypes.byref(is_early), ctypes.byref(reached_s),
+        )  # fmt: skip
+        if status == DISCARD:
             return None
-        if terminates:
-            raise FmuError(self._with_words(f"it has ended its simulation at {reached_s:g} s"))
-        return float(reached_s) if is_early else math.inf
+        self._check("fmi3DoStep", status)
+        if terminates.value:
+            raise FmuError(self._with_words(f"it has ended its simulation at {reached_s.value:g} s"))
+        return reached_s.value if is_early.value else math.inf
 
     def close(self) -> None:
         """End the simulation, and unload the library."""
@@ -208,9 +222,15 @@ class Instance:
 
     def failed(self, error: Exception) -> FmuError:
         """Convert FMPy's exception about a failed call to an FmuError, and remember the call's status."""
-        self._status = max(self._status, _status(error))
-        function = getattr(error, "function", "a call")
-        status = _status(error)
+        return self._failed(getattr(error, "function", "a call"), _status(error))
+
+    def _check(self, function: str, status: int) -> None:
+        """Check the status that a function of the FMU has returned."""
+        if status > WARNING:
+            raise self._failed(function, status)
+
+    def _failed(self, function: str, status: int) -> FmuError:
+        self._status = max(self._status, status)
         name = STATUSES[status] if 0 <= status < len(STATUSES) else str(status)
         return FmuError(self._with_words(f"{function} failed with status {name}"))
 
@@ -255,47 +275,54 @@ class _Call:
 
 
 class Group:
-    """Variables of one type. One call to the FMU reads or writes all their values, in one array."""
+    """Variables of one type. One call to the FMU reads or writes all their values, in one array.
+
+    ``getter`` and ``setter`` are the names of the FMU's functions.
+    """
 
     def __init__(
-        self, version: int, fmu: Any, type_: str, variables: list[Variable], ports: Mapping[str, Port]
+        self,
+        version: int,
+        library: Any,
+        component: ctypes.c_void_p,
+        type_: str,
+        variables: list[Variable],
+        ports: Mapping[str, Port],
     ) -> None:
-        self._get: Callable[..., object] = getattr(fmu, f"fmi{version}Get{type_}")
-        self._set: Callable[..., object] = getattr(fmu, f"fmi{version}Set{type_}")
+        self.getter, self.setter = f"fmi{version}Get{type_}", f"fmi{version}Set{type_}"
+        self._get: Callable[..., int] = library[self.getter]
+        self._set: Callable[..., int] = library[self.setter]
         c_type: Any = _BOOLEAN[version] if type_ == "Boolean" else _C_TYPES[type_]
         self._is_boolean, self._is_text = type_ == "Boolean", type_ == "String"
-        self._references = (ctypes.c_uint * len(variables))(*(one.reference for one in variables))
+        references = (ctypes.c_uint * len(variables))(*(one.reference for one in variables))
         self._ports = [ports[one.name] for one in variables]
         self._arrays = any(one.shape for one in variables)
         self._shapes = [one.shape for one in variables]
         self._values = (c_type * sum(one.size for one in variables))()
-        self._parts = list(self._split())
         # FMI 3.0 has arrays, and therefore also needs the number of values.
-        counts = (len(self._values),) if version == 3 else ()
-        self._arguments = self._references, len(variables), self._values, *counts
-        views = [port.native if isinstance(port, RegisterPort) else None for port in self._ports]
-        self._views = [view for view in views if view is not None]
-        self._is_native = len(self._views) == len(views)  # then the bytes are copied as they are
-        self._given_bytes: list[bytes] = []
-        self._starts = [_start(one) for one in variables]
+        counts = (ctypes.c_size_t(len(self._values)),) if version == 3 else ()
+        self._arguments = component, references, ctypes.c_size_t(len(variables)), self._values, *counts
+        registers = [port for port in self._ports if isinstance(port, RegisterPort)]
+        self._is_native = all(port.is_native for port in registers)  # then the bytes are copied as they are
+        self._views = joined_bytes(registers)
+        self._parts = _split(memoryview(self._values).cast("B"), self._views) if self._is_native else []
+        self._pairs = list(zip(self._views, self._parts, strict=False))
+        self._given_bytes: list[bytes] | None = None
         self._given: list[object] = []
+        self._starts = [_start(one) for one in variables]
+        self._texts: list[bytes | None] = []
+        self._shown: tuple[list[bytes | None], list[bytes]] = [], []  # the texts shown last, and their registers' bytes
 
-    def _split(self) -> Iterator[memoryview]:
-        """Yield the bytes of each variable in the array."""
-        data = memoryview(self._values).cast("B")
-        item, place = ctypes.sizeof(self._values) // max(1, len(self._values)), 0
-        for shape in self._shapes:
-            size = item * math.prod(shape)
-            yield data[place : place + size]
-            place += size
-
-    def get(self, component: object) -> None:
-        """Read the values from the FMU into the array; :meth:`show` writes them to the ports."""
-        self._get(component, *self._arguments)
+    def get(self) -> int:
+        """Read the values from the FMU; :meth:`show` writes them to the ports. Return the call's status."""
+        status = self._get(*self._arguments)
+        if self._is_text and status <= WARNING:
+            self._texts = list(self._values)  # now, because they are the FMU's until the next call
+        return status
 
     def forget(self) -> None:
         """Make the next :meth:`set_changed` give the FMU all values, even if none has changed."""
-        self._given, self._given_bytes = [], []
+        self._given_bytes, self._given = None, []
 
     def show(self) -> None:
         """Write the values that :meth:`get` has read to the ports.
@@ -305,14 +332,23 @@ class Group:
 
         """
         if self._is_native:
-            for view, part in zip(self._views, self._parts, strict=True):
+            for view, part in self._pairs:
                 view[:] = part
-            return
-        values: list[Any] = list(self._values)
-        if self._is_boolean:
-            values = [bool(value) for value in values]
         elif self._is_text:
-            values = [(value or b"").decode(errors="replace") for value in values]
+            self._show_texts()
+        else:
+            self._show([bool(value) for value in self._values] if self._is_boolean else list(self._values))
+
+    def _show_texts(self) -> None:
+        texts, data = self._shown
+        if texts == self._texts:  # most texts never change
+            for view, one in zip(self._views, data, strict=True):
+                view[:] = one
+            return
+        self._show([(text or b"").decode(errors="replace") for text in self._texts])
+        self._shown = self._texts, [bytes(view) for view in self._views]
+
+    def _show(self, values: list[Any]) -> None:
         if not self._arrays:
             for port, value in zip(self._ports, values, strict=True):
                 port.write(value)
@@ -323,25 +359,36 @@ class Group:
             port.write(_shaped(values[place : place + count], shape))
             place += count
 
-    def set_other(self, component: object) -> None:
-        """Give the FMU the values of the ports, unless they all equal the FMU's own initial values."""
-        self._given = self._starts
-        self.set_changed(component)
+    def set_other(self) -> int:
+        """Give the FMU the values of the ports, unless they all equal its own initial values. Return the status."""
+        return 0 if [port.read() for port in self._ports] == self._starts else self.set_changed()
 
-    def set_changed(self, component: object) -> None:
-        """Give the FMU the values of all ports if any of them has changed since the last call."""
+    def set_changed(self) -> int:
+        """Give the FMU the values of all ports if any of them has changed since the last call. Return the status."""
+        given_bytes = [bytes(view) for view in self._views]
+        if given_bytes == self._given_bytes:
+            return 0
+        self._given_bytes = given_bytes
         if self._is_native:
-            given_bytes = [bytes(view) for view in self._views]
-            if given_bytes == self._given_bytes:
-                return
-            self._given_bytes = given_bytes
+            for part, data in zip(self._parts, given_bytes, strict=True):
+                part[:] = data
+            return self._set(*self._arguments)
         given = [port.read() for port in self._ports]
         if given == self._given:
-            return
+            return 0
+        self._given = given
         flat = [one for value in given for one in _flat(value)] if self._arrays else given
         self._values[:] = [one.encode() for one in flat] if self._is_text else flat
-        self._set(component, *self._arguments)
-        self._given = given
+        return self._set(*self._arguments)
+
+
+def _split(data: memoryview, views: Iterable[memoryview]) -> list[memoryview]:
+    """Return the bytes of an array of values, divided like the registers' bytes."""
+    parts, place = [], 0
+    for view in views:
+        parts.append(data[place : place + len(view)])
+        place += len(view)
+    return parts
 
 
 def _start(variable: Variable) -> object:
