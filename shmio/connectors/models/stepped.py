@@ -58,16 +58,20 @@ class Inputs:
         self._upstreams: list[_Upstream] = []
         self._wanted: list[_Wanted] | None = None  # None: not yet found, or not all of them
 
-    def read(self, step: int | None) -> tuple[dict[str, Value], str]:
+    def read(self, step: int | None, before_ns: int | None = None) -> tuple[dict[str, Value], str]:
         """Return the values of inputs by path, and why other inputs have no value.
 
-        The reason is empty if all inputs have a value. ``step`` is the present step; None in wall
-        time.
+        The reason is empty if all inputs have a value.
+
+        Args:
+            step: The present step; None in wall time.
+            before_ns: The publish time before the step; None: it is read from the segment.
+
         """
-        refreshed, wanted = self._segment.refresh(), self._wanted
-        if refreshed or wanted is None:
+        wanted, segment = self._wanted, self._segment
+        if wanted is None or (segment.outdated and segment.refresh()):
             wanted = self._find_all()
-        frames = [upstream.frame(step) for upstream in self._upstreams]
+        frames = [upstream.frame(step, before_ns) for upstream in self._upstreams]
         values: dict[str, Value] = {}
         missing: list[str] = []
         for path, topic, place, decode, problem in wanted:
@@ -84,6 +88,7 @@ class Inputs:
 
     def _find_all(self) -> list[_Wanted]:
         """Find the sources and registers of all connections. Those that do not exist are searched for again."""
+        self._segment.refresh()
         upstreams: dict[str, _Upstream] = {}
         wanted: list[_Wanted] = []
         for path, topic in self._connections.items():
@@ -120,16 +125,18 @@ class _Upstream:
 
     def __init__(self, block: Block) -> None:
         self._block = block
+        self._is_stepped = block.attributes.stepped and block.playhead is None
         self._frames: list[Frame] = []  # the frame used last, and the later ones that have been read
 
-    def frame(self, step: int | None) -> tuple[Frame | None, str]:
+    def frame(self, step: int | None, before_ns: int | None) -> tuple[Frame | None, str]:
         """Return the frame to use and "", or None and the end of a message why there is no usable frame."""
         block = self._block
         try:
             frame = block.latest() if step is None else self._before(step)
             if frame is None:
                 return None, self._keeps(NO_DATA)
-            quality, reason = block.assess(frame)
+            now_ns = block.now_ns() if before_ns is None or not self._is_stepped else before_ns
+            quality, reason = frame.assess(block.stale_ns, now_ns)
         except SegmentError as error:
             return None, f": {error}"
         if quality is Quality.BAD:
@@ -477,7 +484,8 @@ class SteppedLoop:
         counters.busy_since_ns = begun_ns = self._clock.now_ns()
         try:
             if self._inputs is not None:
-                values, doubt = self._inputs.read(self._handled if self._in_virtual_time else None)
+                step, before_ns = (None, None) if at is None else (self._handled, at.publish_ns - dt_ns)
+                values, doubt = self._inputs.read(step, before_ns)
                 self._source.connect(values, doubt)
             raw = self._source.step(time_ns, dt_ns)
         except ShmioError as error:

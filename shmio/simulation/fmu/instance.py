@@ -120,18 +120,22 @@ class Instance:
             if (status := group.set_changed()) > WARNING:
                 raise self._failed(group.setter, status)
 
-    def get(self, groups: list[Group]) -> None:
-        """Read the values of all variables in ``groups`` from the FMU, and write them to the variables' ports.
+    def get(self, outputs: Outputs) -> None:
+        """Read the values of all outputs from the FMU, and write them to the variables' ports.
 
         Raises:
             ValueRangeError: A value does not fit its register.
 
         """
         self.words = ""
-        for group in groups:
-            if (status := group.get()) > WARNING:
+        for call, arguments, group in outputs.calls:
+            if (status := call(*arguments)) > WARNING:
                 raise self._failed(group.getter, status)
-        for group in groups:
+            if group.is_text:
+                group.keep_texts()
+        for view, part in outputs.copies:
+            view[:] = part
+        for group in outputs.others:
             group.show()
 
     def save(self) -> bytes:
@@ -277,7 +281,8 @@ class _Call:
 class Group:
     """Variables of one type. One call to the FMU reads or writes all their values, in one array.
 
-    ``getter`` and ``setter`` are the names of the FMU's functions.
+    ``getter`` and ``setter`` are the names of the FMU's functions; ``call_get(*arguments)`` calls the
+    first one. ``is_native`` is true if the values have the same bytes in the array and in the registers.
     """
 
     def __init__(
@@ -290,10 +295,10 @@ class Group:
         ports: Mapping[str, Port],
     ) -> None:
         self.getter, self.setter = f"fmi{version}Get{type_}", f"fmi{version}Set{type_}"
-        self._get: Callable[..., int] = library[self.getter]
+        self.call_get: Callable[..., int] = library[self.getter]
         self._set: Callable[..., int] = library[self.setter]
         c_type: Any = _BOOLEAN[version] if type_ == "Boolean" else _C_TYPES[type_]
-        self._is_boolean, self._is_text = type_ == "Boolean", type_ == "String"
+        self._is_boolean, self.is_text = type_ == "Boolean", type_ == "String"
         references = (ctypes.c_uint * len(variables))(*(one.reference for one in variables))
         self._ports = [ports[one.name] for one in variables]
         self._arrays = any(one.shape for one in variables)
@@ -301,40 +306,35 @@ class Group:
         self._values = (c_type * sum(one.size for one in variables))()
         # FMI 3.0 has arrays, and therefore also needs the number of values.
         counts = (ctypes.c_size_t(len(self._values)),) if version == 3 else ()
-        self._arguments = component, references, ctypes.c_size_t(len(variables)), self._values, *counts
+        self.arguments = component, references, ctypes.c_size_t(len(variables)), self._values, *counts
         registers = [port for port in self._ports if isinstance(port, RegisterPort)]
-        self._is_native = all(port.is_native for port in registers)  # then the bytes are copied as they are
+        self.is_native = all(port.is_native for port in registers)
         self._views = joined_bytes(registers)
-        self._parts = _split(memoryview(self._values).cast("B"), self._views) if self._is_native else []
-        self._pairs = list(zip(self._views, self._parts, strict=False))
+        self._parts = _split(memoryview(self._values).cast("B"), self._views) if self.is_native else []
+        self.copies = list(zip(self._views, self._parts, strict=True)) if self.is_native else []
+        """The bytes of registers, and those of the array from which they are copied."""
         self._given_bytes: list[bytes] | None = None
         self._given: list[object] = []
         self._starts = [_start(one) for one in variables]
         self._texts: list[bytes | None] = []
         self._shown: tuple[list[bytes | None], list[bytes]] = [], []  # the texts shown last, and their registers' bytes
 
-    def get(self) -> int:
-        """Read the values from the FMU; :meth:`show` writes them to the ports. Return the call's status."""
-        status = self._get(*self._arguments)
-        if self._is_text and status <= WARNING:
-            self._texts = list(self._values)  # now, because they are the FMU's until the next call
-        return status
+    def keep_texts(self) -> None:
+        """Copy the texts that the FMU has returned, because they remain only until the next call."""
+        self._texts = list(self._values)
 
     def forget(self) -> None:
         """Make the next :meth:`set_changed` give the FMU all values, even if none has changed."""
         self._given_bytes, self._given = None, []
 
     def show(self) -> None:
-        """Write the values that :meth:`get` has read to the ports.
+        """Write the values that the FMU has returned to the ports.
 
         Raises:
             ValueRangeError: A value does not fit its register.
 
         """
-        if self._is_native:
-            for view, part in self._pairs:
-                view[:] = part
-        elif self._is_text:
+        if self.is_text:
             self._show_texts()
         else:
             self._show([bool(value) for value in self._values] if self._is_boolean else list(self._values))
@@ -369,17 +369,26 @@ class Group:
         if given_bytes == self._given_bytes:
             return 0
         self._given_bytes = given_bytes
-        if self._is_native:
+        if self.is_native:
             for part, data in zip(self._parts, given_bytes, strict=True):
                 part[:] = data
-            return self._set(*self._arguments)
+            return self._set(*self.arguments)
         given = [port.read() for port in self._ports]
         if given == self._given:
             return 0
         self._given = given
         flat = [one for value in given for one in _flat(value)] if self._arrays else given
-        self._values[:] = [one.encode() for one in flat] if self._is_text else flat
-        return self._set(*self._arguments)
+        self._values[:] = [one.encode() for one in flat] if self.is_text else flat
+        return self._set(*self.arguments)
+
+
+class Outputs:
+    """The outputs of an FMU, prepared for :meth:`Instance.get`."""
+
+    def __init__(self, groups: list[Group]) -> None:
+        self.calls = [(group.call_get, group.arguments, group) for group in groups]
+        self.copies = [copy for group in groups for copy in group.copies]
+        self.others = [group for group in groups if not group.is_native]
 
 
 def _split(data: memoryview, views: Iterable[memoryview]) -> list[memoryview]:

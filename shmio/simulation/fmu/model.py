@@ -11,7 +11,7 @@ import msgspec
 from shmio.errors import ModelError, ShmioError, SnapshotError
 from shmio.simulation.fmu.archive import Archive, Extracted
 from shmio.simulation.fmu.description import Description, describe
-from shmio.simulation.fmu.instance import FmuError, Group, Instance
+from shmio.simulation.fmu.instance import FmuError, Group, Instance, Outputs
 from shmio.simulation.model import Model
 
 SUFFIX: Final = ".fmu"
@@ -64,7 +64,7 @@ class FmuModel(Model):
     _folder: Extracted | None = None
     _failure = ""
     _inputs: list[Group]
-    _outputs: list[Group]
+    _outputs: Outputs
     _begun_ns: int | None = None  # instance time at the FMU's start
     _done_ns = 0  # time since then that the FMU has computed
     _fixed_ns = 0  # length of all steps, if the FMU needs that
@@ -77,10 +77,11 @@ class FmuModel(Model):
         try:
             self._folder = self.archive.extract()
             self._instance = instance = Instance(self.description, self._folder.path)
-            self._inputs, self._outputs, parameters = (
+            self._inputs, outputs, parameters = (
                 instance.group([one for one in self.description.variables if one.causality == causality], self._ports)
                 for causality in ("input", "output", "parameter")
             )
+            self._outputs = Outputs(outputs)
             self._now_s = self.description.start_s
             instance.initialise(parameters, self._inputs)
             instance.get(self._outputs)

@@ -7,11 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from shmio.errors import ModelError
 from shmio.layout.compiler import Source, compile_sources
-from shmio.layout.model import Layout
+from shmio.layout.model import Layout, Register
 from shmio.simulation import Input, Model, ModelRunner, Output
+from shmio.simulation.images import Images
 
 NUMBERS = {"a": "LREAL", "b": "INT", "c": "REAL", "d": "LREAL"}
 PACKED = struct.Struct("<dhxxfd")
@@ -101,3 +104,25 @@ END_DATA_BLOCK
     Told.tells = {"a": 1.5, "b": -2, "c": 0.25, "d": 4.0}
     image = ModelRunner(Told, layout).step(1, 1)
     assert struct.unpack_from(">dhhfd", image, 22) == (1.5, 9, -2, 0.25, 4.0)
+
+
+@given(st.lists(st.booleans(), min_size=1, max_size=120), st.randoms(use_true_random=False))
+def test_commanded_values_are_shown_except_those_that_the_model_computes(computed: list[bool], random: Any) -> None:
+    """Few pieces are copied in another way than many. Every fourth register is a number, the others are bits."""
+    registers = [
+        Register(f"r{place}", "BYTE", (), place // 4 * 2 + 1, None, 1, 1)
+        if place % 4 == 3
+        else Register(f"r{place}", "BOOL", (), place // 4 * 2, place % 4, 1, 1)
+        for place in range(len(computed))
+    ]
+    layout = Layout("l", None, (len(computed) + 3) // 4 * 2, False, tuple(registers))
+    images = Images(layout, [one for one, own in zip(registers, computed, strict=True) if own])
+    images.commanded[:], images.shown[:] = random.randbytes(layout.size), random.randbytes(layout.size)
+    expected = bytearray(images.commanded)
+    for register, own in zip(registers, computed, strict=True):
+        if own:
+            mask = 0xFF if register.bit is None else 1 << register.bit
+            expected[register.offset] ^= (expected[register.offset] ^ images.shown[register.offset]) & mask
+    assert images.with_given(images.shown) == expected
+    images.show_given()
+    assert images.shown == expected

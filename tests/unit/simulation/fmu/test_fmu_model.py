@@ -109,6 +109,15 @@ def test_arrays_and_all_types_of_fmi_3(run: Runner) -> None:
     assert shown["text_out"] == "<naïve>"
 
 
+def test_texts_and_negative_zero_reach_the_fmu_and_come_back(run: Runner) -> None:
+    runner = run("plant3")
+    for number, (text, small) in enumerate([("", 0.0), ("ab", -0.0), ("ab", 0.0), ("ä", 3.0), ("", -3.0)], 1):
+        runner.connect({"text": text, "small": small})
+        image = runner.step(number * 20 * MS, 20 * MS)
+        assert value(runner, "text_out", image) == f"<{text}>"
+        assert str(value(runner, "small_out", image)) == str(small / 3)
+
+
 @pytest.mark.parametrize("dt_ms", [20, 10, 15.625, 7])
 def test_results_equal_those_of_fmpy_bit_for_bit(run: Runner, folder: Path, dt_ms: float) -> None:
     dt_ns = round(dt_ms * MS)
