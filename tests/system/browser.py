@@ -48,10 +48,10 @@ def opened_browser(*options: str) -> Iterator[Any]:
 
 
 @contextmanager
-def opened_page(browser: Any, address: str) -> Iterator[Any]:
+def opened_page(browser: Any, address: str, **context_options: Any) -> Iterator[Any]:
     """Open a cell's page in a new context. The browser must report no error."""
     errors: list[str] = []
-    context = browser.new_context(viewport={"width": 1280, "height": 800})
+    context = browser.new_context(**{"viewport": {"width": 1280, "height": 800}, **context_options})
     page = context.new_page()
     page.set_default_timeout(PATIENCE_MS)
     page.on("pageerror", lambda error: errors.append(str(error)))

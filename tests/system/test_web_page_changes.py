@@ -20,7 +20,6 @@ from shmio.testing.ports import reserved_port
 from tests.system.browser import (
     AXIS,
     CHROMIUM,
-    PATIENCE_MS,
     SOFTWARE_GL,
     keep,
     open_tab,
@@ -366,11 +365,15 @@ class Fingers:
         self._send("touchEnd", [])
 
 
+@pytest.fixture
+def tablet(cell: Cell, address: str, browser: Any) -> Iterator[Any]:
+    """The cell's page, on a screen that senses fingers."""
+    with opened_page(browser, address, has_touch=True, viewport={"width": 1024, "height": 768}) as page:
+        yield page
+
+
 @pytest.mark.parametrize("scene", [SCENE])
-def test_fingers_move_plots_and_the_cell(address: str, page: Any) -> None:
-    tablet = page.context.browser.new_context(has_touch=True, viewport={"width": 1024, "height": 768}).new_page()
-    tablet.set_default_timeout(PATIENCE_MS)
-    tablet.goto(f"http://{address}/")
+def test_fingers_move_plots_and_the_cell(tablet: Any) -> None:
     tablet.get_by_role("tab", name="Plots").tap()
     search = tablet.get_by_label("Add a register")
     search.fill(AXIS)
@@ -412,4 +415,3 @@ def test_fingers_move_plots_and_the_cell(address: str, page: Any) -> None:
     small = green()
     fingers.move(((0.3, 0.5), (0.6, 0.5)))
     until(lambda: green() < small, "one finger turns it")
-    tablet.context.close()
