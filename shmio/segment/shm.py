@@ -165,8 +165,10 @@ class SharedObject:
         if self._private:
             return True
         try:
-            return os.stat(self._path).st_ino == self.inode  # noqa: PTH116  programs that attach do not load pathlib
-        except FileNotFoundError:
+            return os.fstat(self._fd).st_nlink > 0  # faster than the path, and each step of time asks
+        except OSError:  # this object is closed
+            with suppress(FileNotFoundError):
+                return os.stat(self._path).st_ino == self.inode  # noqa: PTH116  programs that attach do not load pathlib
             return False
 
     @property

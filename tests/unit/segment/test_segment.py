@@ -134,6 +134,24 @@ def test_a_new_segment_that_another_supervisor_has_locked_is_given_up(
     unlink(PREFIX + instance)
 
 
+def test_an_object_is_current_until_its_name_is_removed(instance: str) -> None:
+    name = PREFIX + instance
+    shared, closed = SharedObject.create(name), SharedObject.open(name, writable=False)
+    closed.close()
+    assert shared.current()
+    assert closed.current()
+    unlink(name)
+    assert not shared.current()
+    assert not closed.current()
+    other = SharedObject.create(name)
+    assert not shared.current(), "the name belongs to another object"
+    assert not closed.current(), "the name belongs to another object"
+    assert other.current()
+    unlink(name)
+    shared.close()
+    other.close()
+
+
 def test_a_ring_without_a_readable_frame_is_reported_with_the_remedy(instance: str) -> None:
     with Segment.create(instance, [block()], PROCESSES) as segment:
         writer = segment.writer("cell")
