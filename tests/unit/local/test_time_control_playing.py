@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -15,6 +16,7 @@ from shmio.segment import Attributes, BlockSpec, ProcessSpec, Quality, Segment
 
 LAYOUT = Layout("DB1", 1, 4, False, (Register("count", "UDINT", (), 0, None, 4, 1),))
 MS = 1_000_000
+PATIENCE_S = 20.0
 
 
 @pytest.fixture
@@ -59,8 +61,9 @@ def cell(instance: str, segment: Segment, source: dict[int, str]) -> Iterator[At
 
 
 def until_step(cell: Attachment, number: int) -> None:
-    block = cell.block()
+    block, deadline_s = cell.block(), time.monotonic() + PATIENCE_S
     while cell.clock.done < number and cell.clock.playing:
+        assert time.monotonic() < deadline_s, f"step {number} was not made"
         block.ring.wait(block.ring.doorbell(), 10 * MS)
 
 

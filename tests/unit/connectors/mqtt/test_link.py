@@ -101,6 +101,25 @@ def test_tls(make_broker: Callable[..., Address], tmp_path: Path) -> None:
             pass
 
 
+def test_a_message_that_an_mqtt_5_broker_refuses_is_not_awaited(
+    make_broker: Callable[..., Address], tmp_path: Path
+) -> None:
+    """The topic keeps its older value. This does not put the outcomes in doubt."""
+    rules, passwords = tmp_path / "rules", tmp_path / "accounts"
+    rules.write_text("topic readwrite a\ntopic read b\nuser owner\ntopic readwrite #\n")
+    passwords.write_text(f"owner:{hashed('right')}\n")
+    address = make_broker("allow_anonymous true", f"password_file {passwords}", f"acl_file {rules}")
+    tags = {name: {"type": "INT", "address": name, "writable": True} for name in ("a", "b")}
+    login = {"username": "owner", "password_file": secret(tmp_path, "right")}
+    with connected(address, tags, retain=True, **login) as owner:
+        assert owner.write(a=1, b=1) == ["", ""]
+    with connected(address, tags, retain=True, version="5") as source:
+        source.until(lambda: (source.value("a"), source.value("b")) == (1, 1))
+        assert source.write(a=2, b=2) == ["", "the broker refuses the message: Not authorized"]
+        source.read()
+        assert (source.value("a"), source.value("b")) == (2, 1)
+
+
 class Hostile:
     """A broker that answers CONNECT and each SUBSCRIBE correctly, and then sends the bytes of the test."""
 

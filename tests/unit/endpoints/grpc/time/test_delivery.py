@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from contextlib import ExitStack
+from typing import Any, Final
 
 import pytest
 
@@ -13,6 +14,13 @@ from shmio.endpoints.grpc.streams.outbox import Outboxes, StateLane, StepStream
 from shmio.endpoints.grpc.time import delivery as module
 from shmio.endpoints.grpc.time.delivery import Delivery
 from shmio.local.time_control import Step
+
+PATIENCE_S: Final = 20.0
+
+
+def run(test: Coroutine[Any, Any, None]) -> None:
+    """Run a test, which fails if it hangs."""
+    asyncio.run(asyncio.wait_for(test, PATIENCE_S))
 
 
 class Receiver:
@@ -72,7 +80,7 @@ def test_each_stage_waits_for_the_streams_and_the_caller_may_be_gone() -> None:
             assert ended == [False]
             popping.cancel()
 
-    asyncio.run(test())
+    run(test())
 
 
 def test_streams_that_take_nothing_end_and_others_continue(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -100,7 +108,7 @@ def test_streams_that_take_nothing_end_and_others_continue(monkeypatch: pytest.M
             assert not delivery.busy  # no stream has anything to take
             popping.cancel()
 
-    asyncio.run(test())
+    run(test())
 
 
 def test_the_marker_for_a_single_stream_does_not_wait_for_the_values() -> None:
@@ -124,7 +132,7 @@ def test_the_marker_for_a_single_stream_does_not_wait_for_the_values() -> None:
             assert ended
             popping.cancel()
 
-    asyncio.run(test())
+    run(test())
 
 
 def test_each_step_has_the_whole_time_and_who_waits_waits_for_the_last_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,7 +164,7 @@ def test_each_step_has_the_whole_time_and_who_waits_waits_for_the_last_one(monke
         await waiting
         assert "has not taken the values" in receiver.reason
 
-    asyncio.run(test())
+    asyncio.run(test())  # without a bound of its own: the test has the clock
 
 
 def test_a_delivery_that_is_stopped_lets_its_callers_go_and_does_not_end() -> None:
@@ -172,4 +180,4 @@ def test_a_delivery_that_is_stopped_lets_its_callers_go_and_does_not_end() -> No
         receiver.take()  # when the stream ends
         assert not ended
 
-    asyncio.run(test())
+    run(test())
