@@ -99,6 +99,28 @@ async def test_the_fabric_learns_at_once_that_the_instance_has_started(
 
 
 @in_loop
+async def test_a_jetstream_that_hangs_is_reported_and_delays_no_values(
+    segment: Segment, server: NatsServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The server still answers pings. A stream without acknowledgements plays the JetStream that hangs."""
+    monkeypatch.setattr(uplink_module, "RENEW_S", 0.1)
+    writer = segment.writer("cell")
+    publish(writer, 1)
+    async with listening(server.url) as listener, uplink(segment, server.url) as found:
+        await until(lambda: found.publisher.up)
+        streams = listener.client.jetstream()
+        await streams.delete_stream("KV_shmio_cells")
+        await streams.add_stream(name="silent", subjects=["$KV.shmio_cells.>"], no_ack=True)
+        await until(lambda: "the registry does not answer: the server does not answer" in found.problem)
+        assert found.publisher.up
+        publish(writer, 2)
+        await listener.until(2)
+        await streams.delete_stream("silent")
+        await Registry.open(listener.client)  # creates the bucket again
+        await until(lambda: found.problem == "")
+
+
+@in_loop
 async def test_a_second_cell_of_the_name_is_refused(segment: Segment, server: NatsServer, instance: str) -> None:
     async with uplink(segment, server.url) as found:
         await until(lambda: found.publisher.up)
