@@ -131,6 +131,7 @@ class WriteConformance(ConnectorConformance):
         run.good()
         return Writer(run)
 
+    @pytest.mark.usefixtures("patient")
     def test_a_value_written_is_in_the_next_frame(self, run: Run, writer: Writer, rig: WriteRig) -> None:
         """Every read that is requested after the confirmation returns the new value."""
         for number in range(1, 20):
@@ -138,6 +139,7 @@ class WriteConformance(ConnectorConformance):
             frame = writer.written(Write(rig.spare, 0, value))
             assert frame.raw[rig.spare : rig.spare + SPARE] == value
 
+    @pytest.mark.usefixtures("patient")
     def test_several_writes_in_one_command(self, run: Run, writer: Writer, rig: WriteRig) -> None:
         """A command that writes bytes and bits has an outcome for each of them."""
         frame = writer.written(
@@ -145,12 +147,14 @@ class WriteConformance(ConnectorConformance):
         )
         assert frame.raw[rig.spare : rig.spare + SPARE] == b"ab\0\0\x42\0\0\0"
 
+    @pytest.mark.usefixtures("patient")
     def test_a_bit_is_written_without_its_neighbours(self, run: Run, writer: Writer, rig: WriteRig) -> None:
         """While the device counts in the other bits of the byte, writing one bit loses no count."""
         for number in range(50):
             frame = writer.written(Write(rig.flags, 1, bytes([number & 1])))
             assert frame.raw[rig.flags] & 1 == number & 1
 
+    @pytest.mark.usefixtures("patient")
     def test_a_refused_item_among_good_ones(self, rig: WriteRig) -> None:
         """The device refuses one item, with a reason.
 

@@ -17,7 +17,7 @@ from shmio.layout.model import Layout
 from shmio.layout.tags import place_tags
 from shmio.layout.values.codec import codec
 from shmio.segment import EventKind, Quality, Write
-from shmio.testing.conformance import Run
+from shmio.testing.conformance import TIMEOUT_MS, Run
 from shmio.testing.proxy import FaultProxy
 from shmio.testing.table_conformance import TableConformance, Tags
 from shmio.testing.write_conformance import SPARE, WriteConformance, Writer
@@ -52,6 +52,7 @@ class ModbusRig:
 
     def __init__(self, proxy: FaultProxy, words: int, *, changed: bool = False) -> None:
         self.proxy = proxy
+        self.timeout_ms = TIMEOUT_MS
         self.layout = layout(words, changed=changed)
         registers = {one.path: one for one in self.layout.registers}
         self._codecs = [codec(registers[name], "little") for name in ("counted", "flags", "copy")]
@@ -67,7 +68,9 @@ class ModbusRig:
 
     def connector(self) -> Connector:
         address = self.proxy.address
-        return ModbusConnector(ModbusOptions(host=address.host, port=address.port, timeout=200), self.layout)
+        return ModbusConnector(
+            ModbusOptions(host=address.host, port=address.port, timeout=self.timeout_ms), self.layout
+        )
 
     def generation(self, raw: bytes) -> int:
         counted, flags, copy = (one.decode(raw) for one in self._codecs)

@@ -15,7 +15,7 @@ from shmio.connectors.mqtt.options import MqttOptions
 from shmio.layout.model import Layout
 from shmio.layout.values.codec import codec
 from shmio.segment import Write
-from shmio.testing.conformance import ConnectorConformance, Rig, Run
+from shmio.testing.conformance import TIMEOUT_MS, ConnectorConformance, Rig, Run
 from shmio.testing.mosquitto import Mosquitto, missing
 from shmio.testing.ports import reserved_port
 from shmio.testing.proxy import FaultProxy
@@ -50,6 +50,7 @@ class MqttRig:
 
     def __init__(self, proxy: FaultProxy, version: Literal["auto", "5", "3.1.1"], *, changed: bool = False) -> None:
         self.proxy = proxy
+        self.timeout_ms = TIMEOUT_MS
         self.layout = layout(changed=changed)
         self._version = version
         by_path = {register.path: register for register in self.layout.registers}
@@ -64,7 +65,7 @@ class MqttRig:
 
     def connector(self) -> Connector:
         options = MqttOptions(
-            url=f"mqtt://{self.proxy.address}", timeout=200, max_age_ms=0, version=self._version,
+            url=f"mqtt://{self.proxy.address}", timeout=self.timeout_ms, max_age_ms=0, version=self._version,
             retain=True,  # for the next connection, as a device would keep its values
         )  # fmt: skip
         return MqttConnector(options, self.layout)

@@ -14,7 +14,7 @@ from shmio.layout.model import Layout
 from shmio.layout.tags import place_tags
 from shmio.layout.values.codec import codec
 from shmio.segment import Write
-from shmio.testing.conformance import Run
+from shmio.testing.conformance import TIMEOUT_MS, Run
 from shmio.testing.proxy import FaultProxy
 from shmio.testing.table_conformance import TableConformance, Tags
 from shmio.testing.write_conformance import SPARE, WriteConformance, Writer, WriteRig
@@ -40,6 +40,7 @@ class OpcUaRig:
 
     def __init__(self, proxy: FaultProxy, mode: Literal["subscribe", "poll"], *, changed: bool = False) -> None:
         self.proxy = proxy
+        self.timeout_ms = TIMEOUT_MS
         self.layout = layout(changed=changed)
         self._mode = mode
         by_path = {register.path: register for register in self.layout.registers}
@@ -55,7 +56,11 @@ class OpcUaRig:
 
     def connector(self) -> Connector:
         options = OpcUaOptions(
-            url=f"opc.tcp://{self.proxy.address}", timeout=200, mode=self._mode, sampling_ms=5, publishing_ms=10
+            url=f"opc.tcp://{self.proxy.address}",
+            timeout=self.timeout_ms,
+            mode=self._mode,
+            sampling_ms=5,
+            publishing_ms=10,
         )
         return OpcUaConnector(options, self.layout)
 

@@ -73,6 +73,7 @@ class Ros2Rig:
     def __init__(self, peer: Peer, *, changed: bool = False) -> None:
         self.peer = peer
         self.proxy = NodeFaults(peer)
+        self.timeout_ms = 500
         counted = peer.address("counted", "std_msgs/Float64MultiArray data")
         tags: dict[str, object] = {}
         if changed:
@@ -97,7 +98,7 @@ class Ros2Rig:
         return Ros2Rig(self.peer, changed=True)
 
     def connector(self) -> Connector:
-        return Ros2Connector(Ros2Options(domain=self.peer.domain, timeout=500, max_age=100), self.layout)
+        return Ros2Connector(Ros2Options(domain=self.peer.domain, timeout=self.timeout_ms, max_age=100), self.layout)
 
     def generation(self, raw: bytes) -> int:
         counted = self._counted.decode(raw)

@@ -15,7 +15,7 @@ from shmio.layout.tags import place_tags
 from shmio.layout.values.codec import codec
 from shmio.model.statuses import GOOD
 from shmio.segment import EventKind, Write
-from shmio.testing.conformance import Rig, Run
+from shmio.testing.conformance import TIMEOUT_MS, Rig, Run
 from shmio.testing.proxy import FaultProxy
 from shmio.testing.table_conformance import TableConformance, Tags, connected, value_of
 from shmio.testing.write_conformance import SPARE, WriteConformance, Writer, WriteRig
@@ -46,6 +46,7 @@ class RosbridgeRig:
 
     def __init__(self, proxy: FaultProxy, *, changed: bool = False) -> None:
         self.proxy = proxy
+        self.timeout_ms = TIMEOUT_MS
         self.layout = layout(changed=changed)
         by_path = {register.path: register for register in self.layout.registers}
         self._counted = codec(by_path["counted"], "little")
@@ -58,7 +59,9 @@ class RosbridgeRig:
         return RosbridgeRig(self.proxy, changed=True)
 
     def connector(self) -> Connector:
-        return RosbridgeConnector(RosbridgeOptions(url=f"ws://{self.proxy.address}", timeout=200), self.layout)
+        return RosbridgeConnector(
+            RosbridgeOptions(url=f"ws://{self.proxy.address}", timeout=self.timeout_ms), self.layout
+        )
 
     def generation(self, raw: bytes) -> int:
         counted = self._counted.decode(raw)

@@ -19,7 +19,7 @@ from shmio.emulators.programs import Counter, generations
 from shmio.emulators.s7 import ServerOptions
 from shmio.layout.model import Layout, Register
 from shmio.segment import EventKind, Quality, Write
-from shmio.testing.conformance import Run
+from shmio.testing.conformance import TIMEOUT_MS, Run
 from shmio.testing.proxy import FaultProxy
 from shmio.testing.write_conformance import SPARE, WriteConformance, Writer
 
@@ -53,6 +53,7 @@ class S7Rig:
 
     def __init__(self, proxy: FaultProxy, plc: Emulator, size: int, *, tail: int = TAIL) -> None:
         self.proxy = proxy
+        self.timeout_ms = TIMEOUT_MS
         self.plc = plc
         self.layout = layout(size - TAIL + tail)
         self._size, self._tail = size, tail
@@ -63,7 +64,9 @@ class S7Rig:
 
     def connector(self) -> Connector:
         address = self.proxy.address
-        return S7Connector(S7Options(host=address.host, port=address.port, timeout=200, dbNumber=7), self.layout)
+        return S7Connector(
+            S7Options(host=address.host, port=address.port, timeout=self.timeout_ms, dbNumber=7), self.layout
+        )
 
     def changed(self) -> S7Rig:
         return S7Rig(self.proxy, self.plc, self._size, tail=0)

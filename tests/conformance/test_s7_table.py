@@ -17,7 +17,7 @@ from shmio.layout.model import Layout
 from shmio.layout.tags import place_tags
 from shmio.model.statuses import BAD_OUT_OF_RANGE, GOOD, StatusArea
 from shmio.segment import Quality, Write
-from shmio.testing.conformance import Run
+from shmio.testing.conformance import TIMEOUT_MS, Run
 from shmio.testing.proxy import FaultProxy
 from shmio.testing.table_conformance import TableConformance, Tags
 from shmio.testing.write_conformance import SPARE, WriteConformance
@@ -32,6 +32,7 @@ class TableRig:
 
     def __init__(self, proxy: FaultProxy, plc: Emulator, size: int, *, changed: bool = False) -> None:
         self.proxy, self.plc = proxy, plc
+        self.timeout_ms = TIMEOUT_MS
         self._size, self._changed = size, changed
         self._counted = counted = size - TAIL
         self._one_pdu = size <= 400
@@ -64,7 +65,7 @@ class TableRig:
 
     def connector(self) -> Connector:
         address = self.proxy.address
-        options = S7Options(host=address.host, port=address.port, timeout=200)
+        options = S7Options(host=address.host, port=address.port, timeout=self.timeout_ms)
         return S7Connector.for_layout(self.layout)(options, self.layout)
 
     def generation(self, raw: bytes) -> int:

@@ -11,7 +11,7 @@ from shmio.connectors.base import Connector
 from shmio.layout.model import Layout
 from shmio.layout.tags import place_tags
 from shmio.layout.values.codec import codec
-from shmio.testing.conformance import ConnectorConformance
+from shmio.testing.conformance import TIMEOUT_MS, ConnectorConformance
 from shmio.testing.proxy import FaultProxy
 from shmio_mtconnect.connector import MTConnectConnector, MTConnectOptions
 
@@ -23,6 +23,7 @@ class Rig:
 
     def __init__(self, proxy: FaultProxy) -> None:
         self.proxy = proxy
+        self.timeout_ms = TIMEOUT_MS
         tags: dict[str, object] = {
             "count": {"type": "UDINT", "address": "count"},
             "copy": {"type": "LREAL", "address": "VMC/copy"},
@@ -31,7 +32,9 @@ class Rig:
 
     def connector(self) -> Connector:
         """Return a connector to the agent."""
-        options = MTConnectOptions(url=f"http://{self.proxy.address}", timeout=200, interval=5, heartbeat=50)
+        options = MTConnectOptions(
+            url=f"http://{self.proxy.address}", timeout=self.timeout_ms, interval=5, heartbeat=50
+        )
         return MTConnectConnector(options, self.layout)
 
     def generation(self, raw: bytes) -> int:
