@@ -32,6 +32,7 @@ from tests.fmus import build
 
 DT_NS = 20_000_000
 OURS = "shmio, the runner alone"
+LABORATORY = "shmio, a laboratory: one process"
 FMPY_AND_CELL = "FMPy in a loop, with the runner of the A50 cell"
 OUTPUTS = {
     "tank2": ["level", "runs", "a/b caption", "phase", "calls"],
@@ -195,7 +196,7 @@ def main() -> None:
                 samples = interleave(
                     {
                         ours: local(running.segment.instance, duration_s),
-                        "shmio, a laboratory: one process": laboratory(config, duration_s),
+                        LABORATORY: laboratory(config, duration_s),
                         FMPY_AND_CELL: coupled_alone(file, duration_s, cell=True),
                         "FMPy in a loop, the FMUs only": coupled_alone(file, duration_s, cell=False),
                     },
@@ -203,6 +204,8 @@ def main() -> None:
                 )
             title = f"two coupled tanks of {work_us} us and the A50 cell"
             report(title, "steps/s", samples, ours, "more", FMPY_AND_CELL)
+            alike = {name: samples[name] for name in (LABORATORY, FMPY_AND_CELL)}
+            report(f"{title}, in one process", "steps/s", alike, LABORATORY, "more", FMPY_AND_CELL)
 
 
 if __name__ == "__main__":
