@@ -150,7 +150,7 @@ class Writer:
 
     def frames(self, channels: Channels, frames: Iterable[tuple[int, Frame]]) -> None:
         """Add frames, each with its log time."""
-        self._mcap.add_messages(channels.frames, map(_frame_message, frames))
+        self._mcap.add_messages(channels.frames, _messages(frames))
 
     def event(self, channels: Channels, event: Event, log_ns: int) -> None:
         """Add an event with the log time ``log_ns``."""
@@ -191,8 +191,10 @@ class Writer:
         self._output.flush()
 
 
-def _frame_message(entry: tuple[int, Frame]) -> Message:
-    log_ns, frame = entry
-    publish_ns = frame.source_ns if frame.source_ns > 0 else log_ns
-    sequence = frame.number & 0xFFFFFFFF
-    return log_ns, publish_ns, sequence, encode_frame_v2(frame, sequence, log_ns, publish_ns)
+def _messages(frames: Iterable[tuple[int, Frame]]) -> Iterator[Message]:
+    """Yield the messages of frames, which are given with their log times."""
+    for log_ns, frame in frames:
+        source_ns = frame.source_ns
+        publish_ns = source_ns if source_ns > 0 else log_ns
+        sequence = frame.number & 0xFFFFFFFF
+        yield log_ns, publish_ns, sequence, encode_frame_v2(frame, sequence, log_ns, publish_ns)

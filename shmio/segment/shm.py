@@ -34,7 +34,7 @@ class SharedObject:
         self.name = name
         self._path = f"{DIRECTORY}/{name}"
         self.writable = writable
-        self._private = private
+        self._private = private  # its file has only locks: the memory is that of the process
         self.inode = os.fstat(fd).st_ino
         self._fd = fd
         self._held: set[int] = set()
@@ -93,7 +93,9 @@ class SharedObject:
     def again(self) -> SharedObject:
         """Open a private object once more, with locks of its own."""
         fd = os.open(f"/proc/self/fd/{self._fd}", os.O_RDWR | os.O_CLOEXEC)
-        return SharedObject(self.name, fd, writable=True, private=True)
+        again = SharedObject(self.name, fd, writable=True, private=True)
+        again._map = self._map
+        return again
 
     def allocate(self, size: int) -> None:
         """Reserve memory for the first ``size`` bytes, so that no process gets SIGBUS later.
@@ -101,6 +103,9 @@ class SharedObject:
         Raises:
             SegmentError: There is no room in shared memory.
         """
+        if self._private:
+            self._map = _private_memory(self.name, size)
+            return
         try:
             os.posix_fallocate(self._fd, 0, size)
         except OSError as error:
@@ -116,6 +121,8 @@ class SharedObject:
     @property
     def size(self) -> int:
         """Present size of the object, in bytes."""
+        if self._private:
+            return 0 if self._map is None else len(self._map)
         return os.fstat(self._fd).st_size
 
     def map(self) -> mmap.mmap:
@@ -184,14 +191,30 @@ class SharedObject:
         if self._fd < 0:
             return
         if self._map is not None:
-            with suppress(BufferError):  # a view is still referenced; the mapping ends with that
-                self._map.close()
+            if not self._private:  # else other objects may use the mapping, which ends with the last of them
+                with suppress(BufferError):  # a view is still referenced; the mapping ends with that
+                    self._map.close()
             self._map = None
         # The mapping has a copy of the descriptor, which would keep the locks while a view is in use.
         unlock = struct.pack(_FLOCK, fcntl.F_UNLCK, os.SEEK_SET, 0, 0, 0)
         fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, unlock)
         os.close(self._fd)
         self._fd = -1
+
+
+def _private_memory(name: str, size: int) -> mmap.mmap:
+    """Return memory of this process, in huge pages if possible, because page faults cost more than most steps.
+
+    Raises:
+        SegmentError: There is not enough memory.
+    """
+    try:
+        memory = mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    except OSError as error:
+        raise SegmentError(f"cannot allocate {size / 1e6:.1f} MB for segment {name}: {error.strerror}") from None
+    with suppress(OSError):  # a kernel without huge pages
+        memory.madvise(mmap.MADV_HUGEPAGE)
+    return memory
 
 
 def unlink(name: str) -> None:

@@ -194,16 +194,20 @@ class McapWriter:
 
     def add_messages(self, channel: int, messages: Iterable[Message]) -> None:
         """Add messages of one channel."""
+        parts, index = self._parts, self._indexes.get(channel)
         for log_ns, publish_ns, sequence, data in messages:
-            size = _MESSAGE.size - HEAD.size + sum(map(len, data))
-            self._parts += _MESSAGE.pack(_MESSAGE_OPCODE, size, channel, sequence, log_ns, publish_ns), *data
-            index = self._indexes.get(channel)
+            size = _MESSAGE.size - HEAD.size
+            for part in data:
+                size += len(part)
+            parts.append(_MESSAGE.pack(_MESSAGE_OPCODE, size, channel, sequence, log_ns, publish_ns))
+            parts += data
             if index is None:
                 index = self._indexes[channel] = []
             index += log_ns, self._size
             self._size += HEAD.size + size
             if self._size > CHUNK_BYTES:
                 self._end_chunk()
+                parts, index = self._parts, None
 
     def flush(self) -> None:
         """End the present chunk, and write it to the output. A chunk without messages remains open."""
