@@ -368,18 +368,19 @@ class Group:
         given_bytes = [bytes(view) for view in self._views]
         if given_bytes == self._given_bytes:
             return 0
-        self._given_bytes = given_bytes
+        is_new = True
         if self.is_native:
             for part, data in zip(self._parts, given_bytes, strict=True):
                 part[:] = data
-            return self._set(*self.arguments)
-        given = [port.read() for port in self._ports]
-        if given == self._given:
-            return 0
-        self._given = given
-        flat = [one for value in given for one in _flat(value)] if self._arrays else given
-        self._values[:] = [one.encode() for one in flat] if self.is_text else flat
-        return self._set(*self.arguments)
+        else:
+            given = [port.read() for port in self._ports]
+            is_new = given != self._given
+            if is_new:
+                flat = [one for value in given for one in _flat(value)] if self._arrays else given
+                self._values[:] = [one.encode() for one in flat] if self.is_text else flat
+                self._given = given
+        self._given_bytes = given_bytes  # only now: bytes that are no valid text also fail in the next step
+        return self._set(*self.arguments) if is_new else 0
 
 
 class Outputs:

@@ -118,6 +118,20 @@ def test_texts_and_negative_zero_reach_the_fmu_and_come_back(run: Runner) -> Non
         assert str(value(runner, "small_out", image)) == str(small / 3)
 
 
+def test_bytes_that_are_no_text_fail_each_step_until_they_are_replaced(run: Runner) -> None:
+    """Otherwise, later steps would be good although the FMU has an older text than the register shows."""
+    runner = run("plant3")
+    at = find(runner.layout, "text").offset
+    for number, (data, shown) in enumerate([(b"\xfe\1a", "<a>"), (b"\xfe\xff", ""), (b"\xfe\1b", "<b>")]):
+        assert runner.write([Write(at, 0, data)]) == [""]
+        for step in (2 * number + 1, 2 * number + 2):
+            if shown:
+                assert value(runner, "text_out", runner.step(step * 20 * MS, 20 * MS)) == shown
+            else:
+                with pytest.raises(ModelError):
+                    runner.step(step * 20 * MS, 20 * MS)
+
+
 @pytest.mark.parametrize("dt_ms", [20, 10, 15.625, 7])
 def test_results_equal_those_of_fmpy_bit_for_bit(run: Runner, folder: Path, dt_ms: float) -> None:
     dt_ns = round(dt_ms * MS)
