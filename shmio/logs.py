@@ -206,7 +206,8 @@ class LogRateLimit(logging.Filter):
     """Limits the records of each kind, so that no client can fill the log. Any thread may use it.
 
     Records with the same unformatted text are of one kind. After more than ``MAX_LINES`` of them in
-    an interval, the next record that is written says how many were left out.
+    an interval, the next record that is written says how many were left out. If no other one comes,
+    that is the last of those left out: see :meth:`write_last`.
     """
 
     def __init__(self, clock_s: Callable[[], float] = time.monotonic, *, one_kind: bool = False) -> None:
@@ -219,6 +220,8 @@ class LogRateLimit(logging.Filter):
         self._one_kind = one_kind
         self._kinds: dict[str, tuple[float, int]] = {}
         """End of the present interval, and number of records in it, for each kind."""
+        self._last: dict[str, logging.LogRecord] = {}
+        """The last record of each kind, if it was left out. It may say what is the case since then."""
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return whether to write the record."""
@@ -227,11 +230,35 @@ class LogRateLimit(logging.Filter):
         until_s, count = self._kinds.get(kind, (0.0, 0))
         if now_s < until_s:
             self._kinds[kind] = until_s, count + 1
+            if count >= MAX_LINES:
+                self._last[kind] = record
             return count < MAX_LINES
         self._kinds[kind] = now_s + TURN_S, 1
+        self._last.pop(kind, None)
         if count > MAX_LINES:
             record.msg = f"{text} ({count - MAX_LINES} similar lines before this one were left out)"
         return True
+
+    def write_last(self, log: logging.Logger) -> None:
+        """Write the last record of each kind, if it was left out and its interval is over."""
+        for kind in list(self._last):
+            until_s, count = self._kinds[kind]
+            if self._clock_s() >= until_s and (record := self._last.pop(kind, None)) is not None:
+                self._kinds[kind] = until_s, count - 1
+                log.handle(record)  # through this filter, which begins the next interval
+
+
+_limits: Final[list[tuple[logging.Logger, LogRateLimit]]] = []
+"""The limits of :func:`rate_limited` that are in effect."""
+
+
+def write_left_out() -> None:
+    """Write the last line of each kind that :func:`rate_limited` has left out. Call this about once a second.
+
+    Otherwise, the log of a source whose quality has often changed would not end with its present quality.
+    """
+    for log, limit in _limits:
+        limit.write_last(log)
 
 
 @contextmanager
@@ -244,11 +271,13 @@ def rate_limited(*loggers: str) -> Iterator[None]:
         loggers: The names of the loggers.
 
     """
-    limits = {name: LogRateLimit(one_kind=not name.startswith("shmio.")) for name in loggers}
-    for name, limit in limits.items():
-        logging.getLogger(name).addFilter(limit)
+    limits = [(logging.getLogger(name), LogRateLimit(one_kind=not name.startswith("shmio."))) for name in loggers]
+    for log, limit in limits:
+        log.addFilter(limit)
+    _limits.extend(limits)
     try:
         yield
     finally:
-        for name, limit in limits.items():
-            logging.getLogger(name).removeFilter(limit)
+        _limits[:] = [one for one in _limits if one not in limits]
+        for log, limit in limits:
+            log.removeFilter(limit)

@@ -94,7 +94,10 @@ class Worker:
         note: str | None = None,
         activity: Activity | None = None,
     ) -> None:
-        """Send a heartbeat, and update the process table: values that are None stay unchanged."""
+        """Send a heartbeat, and update the process table: values that are None stay unchanged.
+
+        Also write the last log lines that a rate limit has left out.
+        """
         old = self._report
         self._report = Report(
             old.pid,
@@ -106,6 +109,7 @@ class Worker:
         if self._report != old:
             self.slot.report = self._report
         self.slot.beat()
+        logs.write_left_out()
 
     def report_readers(self, readers: Iterable[tuple[Block, int]]) -> None:
         """Report how far this process is behind with reading frames.

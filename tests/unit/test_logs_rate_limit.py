@@ -39,6 +39,38 @@ def test_lines_of_a_kind_are_rate_limited_and_the_rest_is_counted(caplog: pytest
         log.removeFilter(rate_limit)
 
 
+def test_the_last_line_of_a_kind_is_written_when_no_other_one_comes(caplog: pytest.LogCaptureFixture) -> None:
+    """As for a source whose quality often changes, and then stays bad."""
+    now_s = 100.0
+    log = logging.getLogger("test.rate_limit")
+    rate_limit = LogRateLimit(lambda: now_s)
+    log.addFilter(rate_limit)
+    try:
+        for number in range(MAX_LINES + 5):
+            log.warning("bad: %s", number)
+            caplog.clear()
+        rate_limit.write_last(log)
+        assert not caplog.records
+        now_s += TURN_S
+        for _ in range(2):
+            rate_limit.write_last(log)
+            assert [record.getMessage() for record in caplog.records] == [
+                f"bad: {MAX_LINES + 4} (4 similar lines before this one were left out)"
+            ]
+        for number in range(MAX_LINES):
+            log.warning("bad: %s", number)
+        assert len(caplog.records) == MAX_LINES, "it counts in its interval"
+        now_s += TURN_S
+        log.warning("bad: %s", "again")
+        assert caplog.messages[-1] == "bad: again (1 similar lines before this one were left out)"
+        caplog.clear()
+        now_s += TURN_S
+        rate_limit.write_last(log)
+        assert not caplog.records, "nothing was left out since"
+    finally:
+        log.removeFilter(rate_limit)
+
+
 def test_all_lines_of_another_library_are_of_one_kind(caplog: pytest.LogCaptureFixture) -> None:
     for name, written in (("library", MAX_LINES), ("shmio.test", 2 * MAX_LINES)):
         log = logging.getLogger(name)

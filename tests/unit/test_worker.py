@@ -17,8 +17,8 @@ from shmio.segment import Activity, ProcessSpec, Segment, State
 from shmio.testing.cell import until
 
 WORK = """
-import gc, os, signal, sys, threading
-from shmio import worker
+import gc, logging, os, signal, sys, threading
+from shmio import logs, worker
 from shmio.errors import ConfigError, ConnectorError
 
 def run(w):
@@ -42,6 +42,12 @@ def run(w):
         told.append(f"permitted: {reload.permitted(lambda: what == 'reload begun')}")
     if what == "collect":
         told.append(f"collects: {started}, then {gc.isenabled()}")
+    if what == "flood":
+        logs.TURN_S = 0.05
+        limited = logs.rate_limited("shmio.source")
+        limited.__enter__()
+        for number in range(1000):
+            logging.getLogger("shmio.source").warning("the quality is %s", number)
     while not w.stopping.wait(0.01):
         w.report((1, 2, 3), note=" ".join(["at work", *told]))
 
@@ -110,6 +116,11 @@ def test_it_takes_its_role_reports_sends_heartbeats_and_stops(segment: Segment, 
         assert worker.end() == (0, "")
     assert (slot.report.activity, slot.alive()) == (Activity.STOPPING, False)
     assert "stopped" in worker.log.read_text().splitlines()[-1]
+
+
+def test_the_last_line_that_a_rate_limit_has_left_out_is_written(segment: Segment, tmp_path: Path) -> None:
+    with Started(segment, tmp_path, "flood") as worker:
+        until(lambda: worker.log.exists() and "the quality is 999" in worker.log.read_text(), "the last line")
 
 
 def test_garbage_is_collected_once_the_start_is_over(segment: Segment, tmp_path: Path) -> None:
