@@ -56,7 +56,10 @@ _THERE: Final = "that cell's supervisor.toml, and reload it"
 _HERE: Final = "this cell's supervisor.toml, and reload it"
 """The same place in the audit log of this cell."""
 _MAX_NAMED_BYTES: Final = 4096
-"""Most bytes of a denied command whose registers are named, so that it costs little time."""
+"""Most bytes of a denied command whose registers are named, so that it costs little time.
+
+For the same reason, only the first items count, as many as the log names.
+"""
 _KINDS: Final = {
     "inject": CommandKind.INJECT,
     "shadow": CommandKind.SHADOW,
@@ -435,7 +438,7 @@ def _named(feed: Feed | None, request: CommandRequest) -> Mapping[str, Any]:
 
     The keys are always the same, so that the log merges the commands of a sender that tries all registers.
     """
-    items = request.writes if request.injection is None else request.injection.items
+    items = (request.writes if request.injection is None else request.injection.items)[:MAX_NAMED]
     if feed is None or not items or not request.layout or request.layout != feed.digest[: len(request.layout)]:
         return {}
     if sum(len(item.data) for item in items) > _MAX_NAMED_BYTES:

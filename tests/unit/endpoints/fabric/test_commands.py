@@ -6,7 +6,7 @@ import asyncio
 import json
 import socket
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterator, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,11 @@ from nats.errors import TimeoutError as NatsTimeoutError
 from shmio.audit import trail
 from shmio.audit.file import AuditSettings
 from shmio.config.model import FabricAllow, FabricRule
+from shmio.endpoints.fabric import commands as module
 from shmio.endpoints.fabric.uplink import Uplink
 from shmio.fabric.messages import CommandReply, CommandRequest, WriteItem, decode_reply, encode_command
+from shmio.layout.model import Layout
+from shmio.layout.values.write import Write, paths_of
 from shmio.segment import Segment
 from tests.nats_server import NatsServer
 from tests.unit.endpoints.fabric.harness import CELL, LAYOUT, TIMEOUT_S, in_loop, until, uplink
@@ -165,6 +168,28 @@ async def test_a_denied_cell_cannot_fill_the_audit_log_with_registers(
     entries = [json.loads(line) for line in file.read_text().splitlines()]
     assert sum(one["count"] for one in entries) == 52
     assert len(entries) < 25
+
+
+@in_loop
+async def test_a_denied_command_of_many_items_costs_little(
+    segment: Segment, server: NatsServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    described: list[int] = []
+
+    def counted(layout: Layout, writes: Sequence[Write], most: int | None = None) -> list[str]:
+        described.append(len(writes))
+        return paths_of(layout, writes, most)
+
+    monkeypatch.setattr(module, "paths_of", counted)
+    file = tmp_path / "audit.jsonl"
+    trail.open_trail(AuditSettings(str(file), 1 << 20, 2), segment.instance, "fabric")
+    try:
+        async with commander(segment, server.url) as client:
+            await client.write(*[(0, 0, b"\1")] * 4096, sender="plant2.line1.twin")
+    finally:
+        trail.close_trail()
+    assert described == [trail.MAX_NAMED]
+    assert json.loads(file.read_text())["what"]["paths"] == ["cell/count.%B3"]
 
 
 @in_loop
