@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import os
+import re
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -150,6 +152,24 @@ def test_an_object_is_current_until_its_name_is_removed(instance: str) -> None:
     unlink(name)
     shared.close()
     other.close()
+
+
+def test_a_private_object_takes_only_the_memory_that_is_used() -> None:
+    """Laboratories of many sources have many rings, and short runs use little of each."""
+    shared = SharedObject.private("private")
+    shared.allocate(64 << 20)
+    memory = shared.map()
+    for at in range(0, len(memory), 2 << 20):
+        memory[at] = 1
+    begin = ctypes.addressof(ctypes.c_char.from_buffer(memory))
+    found = 0
+    for line in Path("/proc/self/smaps").read_text().splitlines():
+        if span := re.match(r"([0-9a-f]+)-([0-9a-f]+) ", line):
+            inside = int(span[1], 16) <= begin < int(span[2], 16)
+        elif line.startswith("Rss:") and inside:
+            found = int(line.split()[1])
+    assert 0 < found < 8 << 10, f"{found} kB"
+    shared.close()
 
 
 def test_a_ring_without_a_readable_frame_is_reported_with_the_remedy(instance: str) -> None:
