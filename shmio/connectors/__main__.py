@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from shmio.connectors.fabric.loop import MirrorLoop
     from shmio.connectors.replay.loop import ReplayLoop
 
-LOGGERS: Final = ("shmio.source", "shmio.source.mqtt")
-"""Loggers whose lines a device can cause in great number. The rate of these lines is limited."""
+LOGGERS: Final = ("shmio.source", "shmio.source.mqtt", "shmio.fabric", "nats", "asyncio")
+"""Loggers whose lines a device or another cell can cause in great number. The rate of these lines is limited."""
 SWITCH_S = 0.0005  # with Python's default of 5 ms, other threads would delay the poll thread too long
 RELOAD_S = 120.0
 LAST_WORDS_S = 4.0  # less than the supervisor's grace period

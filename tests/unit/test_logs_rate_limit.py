@@ -83,12 +83,13 @@ def test_all_lines_of_another_library_are_of_one_kind(caplog: pytest.LogCaptureF
         assert not log.filters
 
 
+@pytest.mark.parametrize("logger", ["shmio.source", "shmio.source.mqtt", "shmio.fabric", "nats", "asyncio"])
 def test_a_device_cannot_fill_the_log_of_its_source(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, logger: str
 ) -> None:
     def flood(worker: Worker) -> NoReturn:
         for number in range(3 * MAX_LINES):
-            logging.getLogger("shmio.source").warning("malformed message %d", number)
+            logging.getLogger(logger).warning("malformed message %d", number)
         raise EOFError
 
     monkeypatch.setattr(source_process, "_loop_of", flood)
