@@ -301,6 +301,7 @@ class Group:
         self._is_boolean, self.is_text = type_ == "Boolean", type_ == "String"
         references = (ctypes.c_uint * len(variables))(*(one.reference for one in variables))
         self._ports = [ports[one.name] for one in variables]
+        self._names = [one.name for one in variables]
         self._arrays = any(one.shape for one in variables)
         self._shapes = [one.shape for one in variables]
         self._values = (c_type * sum(one.size for one in variables))()
@@ -364,7 +365,12 @@ class Group:
         return 0 if [port.read() for port in self._ports] == self._starts else self.set_changed()
 
     def set_changed(self) -> int:
-        """Give the FMU the values of all ports if any of them has changed since the last call. Return the status."""
+        """Give the FMU the values of all ports if any of them has changed since the last call. Return the status.
+
+        Raises:
+            ModelError: An input is no text that C can read.
+
+        """
         given_bytes = [bytes(view) for view in self._views]
         if given_bytes == self._given_bytes:
             return 0
@@ -376,11 +382,22 @@ class Group:
             given = [port.read() for port in self._ports]
             is_new = given != self._given
             if is_new:
-                flat = [one for value in given for one in _flat(value)] if self._arrays else given
-                self._values[:] = [one.encode() for one in flat] if self.is_text else flat
+                self._values[:] = self._flat(given)
                 self._given = given
         self._given_bytes = given_bytes  # only now: bytes that are no valid text also fail in the next step
         return self._set(*self.arguments) if is_new else 0
+
+    def _flat(self, given: list[Any]) -> list[Any]:
+        """Return the values of the ports as values for the array."""
+        if not self.is_text:
+            return [one for value in given for one in _flat(value)] if self._arrays else given
+        texts: list[bytes] = []
+        for name, value in zip(self._names, given, strict=True):
+            for text in _flat(value):
+                if text is None or "\0" in text:
+                    raise ModelError(f"{name} has bytes that are no text, or a text with a NUL character")
+                texts.append(text.encode())
+        return texts
 
 
 class Outputs:

@@ -122,13 +122,14 @@ def test_bytes_that_are_no_text_fail_each_step_until_they_are_replaced(run: Runn
     """Otherwise, later steps would be good although the FMU has an older text than the register shows."""
     runner = run("plant3")
     at = find(runner.layout, "text").offset
-    for number, (data, shown) in enumerate([(b"\xfe\1a", "<a>"), (b"\xfe\xff", ""), (b"\xfe\1b", "<b>")]):
+    texts = [(b"\xfe\1a", "<a>"), (b"\xfe\xff", ""), (b"\xfe\3a\0b", ""), (b"\xfe\1b", "<b>")]
+    for number, (data, shown) in enumerate(texts):
         assert runner.write([Write(at, 0, data)]) == [""]
         for step in (2 * number + 1, 2 * number + 2):
             if shown:
                 assert value(runner, "text_out", runner.step(step * 20 * MS, 20 * MS)) == shown
             else:
-                with pytest.raises(ModelError):
+                with pytest.raises(ModelError, match="text has bytes that are no text, or a text with a NUL"):
                     runner.step(step * 20 * MS, 20 * MS)
 
 
