@@ -232,7 +232,9 @@ class CellUnderTest:
         reports = Reports(argparse.Namespace(report=file, junit=None))
         judge = self._judged(shown, begin, reports)
         facts = [("instance", self._segment.instance), ("recording", str(self.folder / RECORDING))]
-        reports.write(judge, self._title, facts, f"pytest {self._title}", self._injections.spans)
+        problems = reports.write(judge, self._title, facts, f"pytest {self._title}", self._injections.spans)
+        for problem in problems.values():
+            raise RecordingError(problem)
 
     def _judged(self, expectations: Sequence[Expectation], begin: int, reports: Reports | None = None) -> Judge:
         blocks = self._segment.blocks

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import shlex
+import sys
 
 from shmio.campaigns.digests import of_campaign, of_file, of_layouts
 from shmio.cli.campaigns.reports import Reports
-from shmio.cli.campaigns.verdicts import tell
+from shmio.cli.campaigns.verdicts import UNDECIDED, tell
+from shmio.cli.common import say
 from shmio.cli.recordings.common import DamageReport, time_range
 from shmio.config.campaign import CampaignFile
 from shmio.errors import ConfigError
@@ -24,10 +26,11 @@ def judge(arguments: argparse.Namespace) -> int:
 
     """
     expectations = CampaignFile(arguments.campaign).expect  # its injections are not laid, so they may have ranges
+    reports = Reports(arguments)
+    reports.check()
     report = DamageReport()
     with report.open(arguments.files) as dump:
         begin, end = time_range(arguments, dump.begin_ns)
-        reports = Reports(arguments)
         try:
             found = recording_judge(dump, expectations, GoldenRecordings(arguments.campaign.parent))
             judge_recording(dump, found, begin, end, reports.collector(lambda: found))
@@ -43,5 +46,8 @@ def judge(arguments: argparse.Namespace) -> int:
     words = ["shmio-campaign", "judge", *map(str, arguments.files), "-f", str(arguments.campaign)]
     for option, text in (("--from", arguments.begin), ("--to", arguments.end)):
         words += [] if text is None else [option, text]
-    reports.write(found, f"Campaign {arguments.campaign.name}", facts, shlex.join(words), times.spans)
-    return tell(found, {"files": [str(file) for file in arguments.files]}, as_json=arguments.json)
+    status = tell(found, {"files": [str(file) for file in arguments.files]}, as_json=arguments.json)
+    problems = reports.write(found, f"Campaign {arguments.campaign.name}", facts, shlex.join(words), times.spans)
+    for option, problem in problems.items():
+        say(f"{option} {problem}", sys.stderr)
+    return status or (UNDECIDED if problems else 0)

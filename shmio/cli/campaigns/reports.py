@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import os
+import secrets
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from shmio.errors import RecordingError
+from shmio.config.folder import unwritable
+from shmio.errors import ConfigError
 from shmio.judging.judge import Judge
 from shmio.judging.report import Drawn, Report, Span, html, junit
 from shmio.judging.source import Rows, Signal
@@ -15,6 +19,29 @@ from shmio.judging.trace import Traces
 
 MAX_PLOTS: Final = 500
 """Maximum number of plots in a report; further plots are left out."""
+
+
+def check_place(option: str, file: Path | None) -> None:
+    """Check that the file of an option can be written, before the work whose result it gets.
+
+    Raises:
+        ConfigError: Its folder does not exist or cannot be written, or there is a folder in the file's place.
+
+    """
+    if file is None:
+        return
+    try:
+        if file.is_dir():
+            raise ConfigError(f"{option} {file}: this is a folder; name a file")
+        if file.exists() and not file.is_file():  # a device or a pipe
+            return
+        folder = file.resolve().parent
+        if not folder.is_dir():
+            raise ConfigError(f"{option} {file}: there is no folder {folder}; create it, or name another file")
+    except OSError as error:
+        raise ConfigError(f"{option} {file}: {error.strerror}; name another file") from None
+    if obstacle := unwritable(folder):
+        raise ConfigError(f"{option} {file}: {obstacle.reason}")
 
 
 class Reports:
@@ -25,6 +52,16 @@ class Reports:
         self._html: Path | None = arguments.report
         self._junit: Path | None = arguments.junit
         self._traces: Traces | None = None
+
+    def check(self) -> None:
+        """Check, before the run, that the files can be written.
+
+        Raises:
+            ConfigError: One of the files cannot be written.
+
+        """
+        check_place("--report", self._html)
+        check_place("--junit", self._junit)
 
     def collector(self, judge: Callable[[], Judge]) -> Callable[[Mapping[str, Rows]], None]:
         """Return a function that collects the signals' new values for the plots.
@@ -51,8 +88,8 @@ class Reports:
         facts: Sequence[tuple[str, str]],
         command: str,
         injections: Sequence[Span],
-    ) -> None:
-        """Write the reports that the command line asks for.
+    ) -> dict[str, str]:
+        """Write the reports that the command line asks for. A file that cannot be written does not stop the other.
 
         Args:
             judge: The judge, after the end of the run.
@@ -61,12 +98,12 @@ class Reports:
             command: The command line that repeats the run.
             injections: When injections were active.
 
-        Raises:
-            RecordingError: A file cannot be written.
+        Returns:
+            For each option whose file could not be written, the file and the reason.
 
         """
         if self._html is None and self._junit is None:
-            return
+            return {}
         verdicts = judge.verdicts
         drawn: list[list[Drawn]] = [[] for _ in verdicts]
         if self._traces is not None:
@@ -74,10 +111,12 @@ class Reports:
                 plot, limits = self._traces.plot(one), judge.limits(index, one)
                 drawn[index].append(Drawn(one, plot, judge.troubles(one.source), limits))
         report = Report(title, facts, command, judge.begin_ns, judge.end_ns or 1, verdicts, drawn, injections)
+        problems = {}
         if self._html is not None:
-            _write(self._html, html(report).encode("utf-8", "replace"))
+            problems["--report"] = _write(self._html, html(report).encode("utf-8", "replace"))
         if self._junit is not None:
-            _write(self._junit, junit(report))
+            problems["--junit"] = _write(self._junit, junit(report))
+        return {option: problem for option, problem in problems.items() if problem}
 
 
 def _plotted(judge: Judge) -> list[tuple[int, Signal]]:
@@ -85,8 +124,28 @@ def _plotted(judge: Judge) -> list[tuple[int, Signal]]:
     return [(index, one) for index in range(len(judge.verdicts)) for one in judge.read_by(index)][:MAX_PLOTS]
 
 
-def _write(file: Path, data: bytes) -> None:
+def _write(file: Path, data: bytes) -> str:
+    """Write a file; return why it cannot be written, or "". An older file is replaced only by a complete one."""
     try:
-        file.write_bytes(data)
+        if file.exists() and not file.is_file():  # a device or a pipe
+            file.write_bytes(data)
+        else:
+            _replace(file.resolve(), data)
     except OSError as error:
-        raise RecordingError(f"{file}: {error.strerror}") from None
+        return f"{file}: it cannot be written: {error.strerror}"
+    return ""
+
+
+def _replace(file: Path, data: bytes) -> None:
+    new = file.with_name(f".shmio-{secrets.token_hex(8)}")
+    descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+    try:
+        with os.fdopen(descriptor, "wb") as stream:
+            stream.write(data)
+            if file.exists():
+                os.fchmod(descriptor, file.stat().st_mode & 0o777)
+        new.replace(file)
+    except BaseException:
+        with suppress(OSError):
+            new.unlink()
+        raise

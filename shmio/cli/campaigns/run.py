@@ -16,8 +16,8 @@ from typing import Any, Final
 from shmio import control
 from shmio.campaigns.digests import of_campaign, of_configuration, of_layouts
 from shmio.campaigns.live import LiveRun, Plan
-from shmio.cli.campaigns.reports import Reports
-from shmio.cli.campaigns.verdicts import tell
+from shmio.cli.campaigns.reports import Reports, check_place
+from shmio.cli.campaigns.verdicts import UNDECIDED, tell
 from shmio.cli.common import say, stop_on_signals
 from shmio.cli.instance.control import stop
 from shmio.cli.instance.detach import start
@@ -35,7 +35,6 @@ from shmio.wording import EXISTS
 
 SEED_BITS: Final = 32
 WHERE_S: Final = 2.0
-UNDECIDED: Final = 3
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -56,6 +55,9 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigError(f"{arguments.campaign}: {error}") from None
     if arguments.record is not None and arguments.record.exists():
         raise ConfigError(f"--record {arguments.record}: {EXISTS}")
+    check_place("--record", arguments.record)
+    reports = Reports(arguments)
+    reports.check()
     seed = secrets.randbits(SEED_BITS) if arguments.seed is None else arguments.seed
     step_ms = arguments.step_ms or (None if arguments.real_time else campaign.step_ms)
     plan = Plan(
@@ -69,7 +71,6 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.record,
         arguments.start or campaign.start,
     )
-    reports = Reports(arguments)
     facts = [*of_campaign(arguments.campaign, campaign.expect), ("seed", str(seed))]
     with stop_on_signals() as over:
         try:
@@ -81,7 +82,6 @@ def run(arguments: argparse.Namespace) -> int:
     facts += [("instance", name), ("time", how), ("duration", f"{duration_s:g} s")]
     facts += [] if work.start is None else [("start", f"snapshot {work.start.name}, {work.start.time_ns / 1e9:g} s")]
     command = _command(arguments, seed, duration_s, work)
-    reports.write(work.judge, f"Campaign {arguments.campaign.name}", facts, command, work.injections.spans)
     found: dict[str, Any] = {"instance": name, "seed": seed, "virtual": work.virtual, "command": command}
     if arguments.record is not None and work.virtual:
         with open_dump(arguments.record) as dump:
@@ -89,6 +89,11 @@ def run(arguments: argparse.Namespace) -> int:
     status = tell(work.judge, found, as_json=arguments.json)
     if "contents_sha256" in found and not arguments.json:
         say(f"{arguments.record}: contents sha256 {found['contents_sha256']}", sys.stderr)
+    unwritten = reports.write(work.judge, f"Campaign {arguments.campaign.name}", facts, command, work.injections.spans)
+    for option, problem in unwritten.items():
+        say(f"{option} {problem}", sys.stderr)
+    if unwritten:
+        status = status or UNDECIDED
     if work.problem is not None:
         say(f"the run ended early: {work.problem}", sys.stderr)
         return status or UNDECIDED

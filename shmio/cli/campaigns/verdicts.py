@@ -12,7 +12,8 @@ from shmio.cli.common import say, say_json
 from shmio.judging.judge import Judge
 from shmio.judging.verdict import Outcome, Verdict, distance
 
-STATUSES: Final = {Outcome.PASSED: 0, Outcome.FAILED: 1, Outcome.INCONCLUSIVE: 3}
+UNDECIDED: Final = 3
+STATUSES: Final = {Outcome.PASSED: 0, Outcome.FAILED: 1, Outcome.INCONCLUSIVE: UNDECIDED}
 
 
 def exit_status(verdicts: Sequence[Verdict]) -> int:

@@ -1,0 +1,93 @@
+"""``shmio-campaign``: files of reports that cannot be written cost no verdict."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from shmio.cli.campaign import main
+from tests.unit.recording.build import build, image
+
+CAMPAIGN = '[[expect]]\nname = "low"\nalways = "speed < {limit}"\n'
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Make a folder with a recording and two campaigns, of which it meets one."""
+    monkeypatch.chdir(tmp_path)
+    with build(tmp_path / "run.mem") as work:
+        work.block("cell")
+        for number in range(1, 10):
+            work.frame(number, image(number, number, on=True))
+    (tmp_path / "good.toml").write_text(CAMPAIGN.format(limit=100))
+    (tmp_path / "bad.toml").write_text(CAMPAIGN.format(limit=5))
+    return tmp_path
+
+
+@pytest.fixture
+def full(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the disk fill when a report gets its name."""
+
+    def refuse(_self: Path, _target: Path) -> Path:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "replace", refuse)
+
+
+@pytest.mark.parametrize("option", ["--report", "--junit"])
+@pytest.mark.parametrize(
+    ("place", "error"),
+    [
+        ("none/out", "there is no folder {folder}/none; create it, or name another file"),
+        ("good.toml/out", "good.toml"),
+        (".", "this is a folder; name a file"),
+    ],
+)
+@pytest.mark.parametrize("words", [["judge", "run.mem", "-f"], ["run", "--for", "1", "--lab", "-c", "none.toml"]])
+def test_place_is_checked_before_the_run(
+    folder: Path, words: list[str], option: str, place: str, error: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*words, "bad.toml", option, place]) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.startswith(f"{option} {place}: ")
+    assert error.format(folder=folder) in told.err
+    assert told.err.count("\n") == 1
+
+
+@pytest.mark.usefixtures("full")
+@pytest.mark.parametrize(("campaign", "status"), [("good.toml", 3), ("bad.toml", 1)])
+def test_verdicts_are_printed_before_a_file_fails(
+    folder: Path, campaign: str, status: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "old.html").write_text("old")
+    before = {one.name for one in folder.iterdir()}
+    assert main(["judge", "run.mem", "-f", campaign, "--report", "old.html", "--junit", "o.xml"]) == status
+    told = capsys.readouterr()
+    assert "low" in told.out
+    assert told.err.splitlines() == [
+        "--report old.html: it cannot be written: No space left on device",
+        "--junit o.xml: it cannot be written: No space left on device",
+    ]
+    assert (folder / "old.html").read_text() == "old"
+    assert {one.name for one in folder.iterdir()} == before
+
+
+def test_a_file_that_fails_does_not_stop_the_other(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["judge", "run.mem", "-f", "bad.toml", "--report", "/dev/full", "--junit", "o.xml"]) == 1
+    assert capsys.readouterr().err == "--report /dev/full: it cannot be written: No space left on device\n"
+    assert b"<failure" in (folder / "o.xml").read_bytes()
+    assert not Path("/dev/full").is_file()
+
+
+def test_an_older_file_keeps_its_permissions_and_a_link_its_target(folder: Path) -> None:
+    (folder / "real.xml").write_text("old")
+    (folder / "real.xml").chmod(0o640)
+    (folder / "link.xml").symlink_to("real.xml")
+    assert main(["judge", "run.mem", "-f", "good.toml", "--junit", "link.xml"]) == 0
+    assert (folder / "link.xml").is_symlink()
+    assert (folder / "real.xml").read_text().startswith("<?xml")
+    assert (folder / "real.xml").stat().st_mode & 0o777 == 0o640
