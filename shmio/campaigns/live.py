@@ -116,11 +116,18 @@ class LiveRun:
         self.start: SnapshotInfo | None = None
         """The snapshot from which the run has started; None if it started in the present state."""
         self.problem: ShmioError | None = None
-        """The error that ended the run early; None if there was no such error."""
+        """The error that ended the run early, or with which its end failed; None if there was no such error."""
+        self.ended_early = False
+        """True if :attr:`problem` ended the run early."""
+        self.recorded = False
+        """True if the recording is complete."""
+        self._unrecorded: RecordingError | None = None
         self._blocks: dict[str, Block] = {source: blocks[source] for source in self.judge.sources}
 
     def run(self, over: threading.Event, begun: Callable[[], None] = lambda: None) -> None:
         """Run to the end, or until ``over`` is set; with :attr:`Plan.stop`, stop also at the first failure.
+
+        After the start, no error is raised: :attr:`problem` has it, and the judge judges what was seen until then.
 
         Args:
             over: Set this event to end the run.
@@ -130,9 +137,24 @@ class LiveRun:
             ConfigError: An injection is invalid, or the instance does not allow the plan's
                 ``step_s``, ``real_time`` or ``start``.
             CommandError: A source refused an injection.
-            RecordingError: The file of the recording cannot be created or completed.
+            RecordingError: The file of the recording cannot be created.
             SnapshotError: The snapshot cannot be restored.
         """
+        started = False
+
+        def start() -> None:
+            nonlocal started
+            started = True
+            begun()
+
+        try:
+            self._run(over, start)
+        except ShmioError as error:
+            if not started:
+                raise
+            self.problem = self.problem or error
+
+    def _run(self, over: threading.Event, begun: Callable[[], None]) -> None:
         plan = self._plan
         with ExitStack() as stack:
             cell = stack.enter_context(self._attach(self._segment))
@@ -170,10 +192,12 @@ class LiveRun:
                 turn = self._turns(tap, recorder)
                 for _ in self._steps(cell, over) if self.virtual else self._waits(tap, over):
                     next(turn)
+                    if recorder is not None:
+                        self._check_recording(recorder)
                     if plan.stop and self.judge.failed:
                         break
             except ShmioError as error:
-                self.problem = error
+                self.problem, self.ended_early = error, True
             next(turn)
             self._seen(self.judge.finish())
 
@@ -206,7 +230,23 @@ class LiveRun:
             recorder.end()  # not close(), which would read frames that are not judged
             closed = output.close(CLOSE_S)
         if not closed:
-            raise RecordingError(f"{file}: {output.problem or 'it is not complete yet'}")
+            raise RecordingError(f"--record {file}: {output.error or output.doubt or 'it is not complete yet'}")
+        self.recorded = self._unrecorded is None
+
+    def _record(self, recorder: Recorder, entries: Sequence[BlockEntry | InstanceEntry]) -> None:
+        """Record entries, unless the file was removed."""
+        if self._unrecorded is None:
+            try:
+                recorder.put(entries)
+            except RecordingError as error:
+                self._unrecorded = RecordingError(f"--record {error}")
+
+    def _check_recording(self, recorder: Recorder) -> None:
+        """Raise RecordingError if the last write failed, as on a full disk, or if the file was removed."""
+        if self._unrecorded is not None:
+            raise self._unrecorded
+        if error := recorder.output.error:
+            raise RecordingError(f"--record {recorder.output.path}: {error}")
 
     def _steps(self, cell: Attachment, over: threading.Event) -> Iterator[None]:
         """Step virtual time to the end of the run, and yield after each batch of steps."""
@@ -236,7 +276,7 @@ class LiveRun:
             while more:
                 entries, more = tap.take()
                 if recorder is not None:
-                    recorder.put(entries)
+                    self._record(recorder, entries)
                 self._judge(entries)
                 waiting += len(entries)
             if waiting >= enough:

@@ -184,12 +184,12 @@ class Laboratory:
             over: Set this event to end the run; None: the run cannot be ended early.
 
         Returns:
-            The run, with its verdicts.
+            The run, with its verdicts; :attr:`LiveRun.problem` has an error after its start.
 
         Raises:
             ConfigError: An expectation or an injection is invalid, or the plan's ``real_time`` is true.
             CommandError: A source refuses an injection.
-            RecordingError: The file of the recording cannot be created or completed.
+            RecordingError: The file of the recording cannot be created.
             SnapshotError: The snapshot cannot be restored.
 
         """

@@ -80,6 +80,7 @@ class Output:
         self.path = path
         self.error = ""
         """Reason why the last write failed; empty if it succeeded."""
+        self._remedy = ""
         self.doubt = ""
         """Reason why bytes of the file may be lost; empty if no fsync has failed.
 
@@ -147,7 +148,7 @@ class Output:
         """The present problem of the file or its disk, with the path; empty if there is none."""
         since_s = self._busy_since_s
         if self.error:
-            return f"{self.path}: {self.error}"
+            return f"{self.path}: {self.error}{self._remedy}"
         if self.doubt:
             return f"{self.path}: {self.doubt}"
         if since_s is not None and time.monotonic() - since_s > SLOW_S:
@@ -232,14 +233,14 @@ class Output:
             while at < len(piece):
                 at += os.pwrite(self._fd, view[at:], self.written + at)
         except OSError as error:
-            remedy = "; make room, and the recorder continues" if error.errno in FULL else ""
-            self.error = f"{error.strerror or error}{remedy}"
+            self._remedy = "; make room, and the recorder continues" if error.errno in FULL else ""
+            self.error = error.strerror or str(error)
             with suppress(OSError):
                 os.ftruncate(self._fd, self.written)
             return False
         finally:
             self._busy_since_s = None
-        self.error = ""
+        self.error = self._remedy = ""
         return True
 
     def _wait(self) -> bool:

@@ -8,7 +8,7 @@ import shlex
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -24,7 +24,7 @@ from shmio.cli.instance.detach import start
 from shmio.cli.target import Target, target
 from shmio.config.campaign import Campaign, load_campaign
 from shmio.config.declaration import with_seed
-from shmio.errors import ConfigError, ControlError, DeclarationError
+from shmio.errors import ConfigError, ControlError, DeclarationError, RecordingError
 from shmio.judging.expectation import check_texts
 from shmio.lab import Laboratory, prepare_laboratory
 from shmio.recorder.recorder import AttachedFiles, ConfigFiles, no_attachments
@@ -83,8 +83,8 @@ def run(arguments: argparse.Namespace) -> int:
     facts += [] if work.start is None else [("start", f"snapshot {work.start.name}, {work.start.time_ns / 1e9:g} s")]
     command = _command(arguments, seed, duration_s, work)
     found: dict[str, Any] = {"instance": name, "seed": seed, "virtual": work.virtual, "command": command}
-    if arguments.record is not None and work.virtual:
-        with open_dump(arguments.record) as dump:
+    if work.recorded and work.virtual:
+        with suppress(RecordingError), open_dump(arguments.record) as dump:  # it may have been removed
             found["contents_sha256"] = digest_of_contents(dump)
     status = tell(work.judge, found, as_json=arguments.json)
     if "contents_sha256" in found and not arguments.json:
@@ -95,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
     if unwritten:
         status = status or UNDECIDED
     if work.problem is not None:
-        say(f"the run ended early: {work.problem}", sys.stderr)
+        say(f"{'the run ended early: ' * work.ended_early}{work.problem}", sys.stderr)
         return status or UNDECIDED
     if over.is_set():
         say("the run ended early, by a signal", sys.stderr)

@@ -1,0 +1,100 @@
+"""``shmio-campaign run`` in a laboratory: recordings that fail, and the exit status."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shmio.cli.campaign import main
+
+CONFIG = """
+[instance]
+name = "run-test"
+
+[[source]]
+name = "lift"
+connector = "simulation"
+model = "run_lift:Lift"
+period_ms = 20
+"""
+MODEL = """
+from shmio.simulation import Model, Output
+
+class Lift(Model):
+    height = Output("LREAL")
+
+    def step(self, time_s, dt_s):
+        self.height += dt_s
+"""
+CAMPAIGN = 'duration_s = {duration_s}\n[[expect]]\nname = "low"\nalways = "lift/height < {limit}"\n'
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Make a folder with a configuration and two campaigns, of which it meets one."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run_lift.py").write_text(MODEL)
+    (tmp_path / "supervisor.toml").write_text(CONFIG)
+    (tmp_path / "good.toml").write_text(CAMPAIGN.format(limit=1e6, duration_s=1))
+    (tmp_path / "bad.toml").write_text(CAMPAIGN.format(limit=0.5, duration_s=1))
+    return tmp_path
+
+
+def lab(campaign: str, *options: str) -> int:
+    return main(["run", campaign, "-c", "supervisor.toml", "--lab", *options])
+
+
+@pytest.fixture
+def full(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let every disk be full for recordings."""
+
+    def refuse(*_: Any) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "pwrite", refuse)
+
+
+@pytest.mark.usefixtures("full")
+@pytest.mark.parametrize(("campaign", "status"), [("good.toml", 3), ("bad.toml", 1)])
+def test_a_full_disk_costs_the_recording_only(
+    folder: Path, campaign: str, status: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert lab(campaign, "--record", "a.mem", "--report", "r.html", "--junit", "r.xml", "--json") == status
+    told = capsys.readouterr()
+    found = json.loads(told.out)
+    assert [one["name"] for one in found["verdicts"]] == ["low"]
+    assert "contents_sha256" not in found
+    assert told.err.endswith("--record a.mem: No space left on device\n")
+    assert told.err.count("No space") == 1
+    assert (folder / "r.html").exists()
+    assert (folder / "r.xml").exists()
+
+
+@pytest.mark.usefixtures("full")
+def test_a_long_run_ends_early_when_the_disk_is_full(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "long.toml").write_text(CAMPAIGN.format(limit=0.5, duration_s=80_000))
+    assert lab("long.toml", "--record", "a.mem") == 1
+    told = capsys.readouterr()
+    assert "was false at 0.5" in told.out
+    assert told.err.endswith("the run ended early: --record a.mem: No space left on device\n")
+
+
+def test_a_removed_recording_ends_the_run(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def remove(_fd: int, data: memoryview, _at: int) -> int:
+        (folder / "a.mem").unlink(missing_ok=True)
+        return len(data)
+
+    monkeypatch.setattr("shmio.recorder.recorder.CHECK_S", 0.0)
+    monkeypatch.setattr(os, "pwrite", remove)
+    (folder / "long.toml").write_text(CAMPAIGN.format(limit=0.5, duration_s=80_000))
+    assert lab("long.toml", "--record", "a.mem") == 1
+    told = capsys.readouterr()
+    assert "was false at 0.5" in told.out
+    assert told.err.endswith("the run ended early: --record a.mem was removed while it was being written\n")
