@@ -22,6 +22,7 @@ from shmio.config.model import (
     Config,
     Declaration,
     Emulator,
+    Expectation,
     Fabric,
     FabricAllow,
     FabricHistory,
@@ -93,6 +94,7 @@ _TABLES: dict[str, type[Section]] = {
     "replay": Replay,
     "alert": Alert,
 }
+_CAMPAIGN_TABLES: Final[Mapping[str, type[Section]]] = {"expect": Expectation}
 _SEVERAL = {
     "source",
     "emulator",
@@ -515,7 +517,7 @@ def convert(tables: dict[str, Any], kind: type[_Table]) -> _Table:
         if unknown is None:
             raise ConfigError(explain(error, "", kind, tables)) from None
         table = re.sub(r"\[[^]]*\]", "", path)
-        known = kind if not table else _TABLES.get(table)
+        known = kind if not table else {**_TABLES, **_CAMPAIGN_TABLES}.get(table)
         raise ConfigError(
             _unknown(f"{path}.{unknown[1]}" if path else unknown[1], _known(known) if known else [])
         ) from None

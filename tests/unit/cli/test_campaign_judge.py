@@ -130,6 +130,13 @@ def test_wrong_recording_has_status_2(table: str, error: str, capsys: pytest.Cap
             "severity: unknown severity 'huge'; valid: info, warning",
         ),
         ('[[expect]]\nname = "e"\nnever = "on"\n' * 2, "expect[1].name: 'e' is already the name of expect[0]"),
+        (
+            '[[expect]]\nname = "e"\nsignal = "speed"\nmaxrate = 1\n',
+            "c.toml: expect[0].maxrate: unknown key; did you mean 'max_rate'? (expect \"e\")",
+        ),
+        ('[[expect]]\nnam = "e"\n', "c.toml: expect[0].nam: unknown key; did you mean 'name'?"),
+        ('[[expect]]\nname = "e"\nwhere = "x"\n', "where: unknown key; did you mean 'when'?"),
+        ('[[expect]]\nname = "e"\nzzz = "x"\n', "zzz: unknown key; valid: name, formula, when, within_s, then"),
         ('[expect]\nname = "e"\n', "expect: write [[expect]] with double brackets"),
         ("".join(f'[[expect]]\nname = "e{at}"\nnever = "on"\n' for at in range(257)), "at most 256 are allowed"),
     ],
