@@ -24,6 +24,10 @@ from shmio.errors import ConfigError
 SAMPLES: Final = 20
 """Number of random points at which a campaign with ranges is checked, besides the lowest, middle and highest."""
 _BARE: Final = re.compile(r"[A-Za-z0-9_-]+")
+_REMEDIES: Final = {
+    "injection": "write an [[injection]] table",
+    "expect": "write an [[expect]] table, or create the injections alone with shmio inject --file",
+}
 
 
 class Campaign(Section, omit_defaults=True):
@@ -256,7 +260,7 @@ def _parse(tables: dict[str, Any], needed: str) -> Campaign:
         )
     campaign = convert(tables, Campaign)
     if needed not in tables:
-        raise ConfigError(f"{needed}: this key is needed")
+        raise ConfigError(f"{needed}: this key is needed; {_REMEDIES[needed]}")
     check_declarations(campaign.injection)
     for fault in expectation_faults(campaign.expect):
         raise ConfigError(fault)

@@ -112,7 +112,7 @@ def test_wrong_recording_has_status_2(table: str, error: str, capsys: pytest.Cap
 @pytest.mark.parametrize(
     ("text", "error"),
     [
-        ("", "c.toml: expect: this key is needed"),
+        ("", "c.toml: expect: this key is needed; write an [[expect]] table, or create the injections alone with "),
         ("[[expect]]\n", "c.toml: expect[0].name: this key is needed"),
         ('[[expect]]\nname = "e"\n', "expect[0].formula: an expectation needs one of formula, then, never"),
         ('[[expect]]\nname = "e"\nnever = "speed >"\n', "c.toml: expect[0].never: at character 8: expected a register"),
