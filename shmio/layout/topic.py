@@ -231,6 +231,13 @@ def _with_source_in_errors(layout: Layout, topic: Topic, search: Callable[[Layou
             raise PathError(f"{topic.source}/{error}") from None
         if topic.named:
             raise
+        first, slash, _ = topic.path.partition("/")
+        if slash and layout.in_any_case(first) is None:
+            suggestion = did_you_mean(_near_topics(layout, topic.path, topic.source))
+            raise PathError(
+                f"no source {shorten(first)!r} and no register {shorten(topic.path)!r} in source {topic.source!r}"
+                f"{suggestion and f'; {suggestion}'}"
+            ) from None
         raise PathError(f"{error} (searched in source {topic.source!r}, because the path names no source)") from None
 
 
@@ -388,9 +395,10 @@ def _unknown(layout: Layout, path: str, source: str) -> str:
 
 
 def _near_topics(layout: Layout, path: str, source: str) -> list[str]:
-    """Return up to three topics that resemble a path, whose first segment may be a misspelt source."""
+    """Return up to three topics that resemble a path, whose first segment may be a misspelt or another source."""
     first, _, rest = path.partition("/")
-    like = near(layout, rest) if rest and similar_name(first, [source]) else []
+    below = rest.partition("/")[0]
+    like = near(layout, rest) if rest and (similar_name(first, [source]) or layout.in_any_case(below)) else []
     return [f"{source}/{one}" for one in like or near(layout, path)]
 
 

@@ -21,7 +21,7 @@ from shmio.fabric.place import Place, is_place, parse_place
 from shmio.layout.document import load_layout
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
-from shmio.layout.topic import find, parse_topic
+from shmio.layout.topic import find, look_up, parse_topic
 from shmio.layout.values.codec import codec
 from shmio.local.replays import date_ns
 from shmio.plan.layouts import LayoutFiles
@@ -362,7 +362,7 @@ def _check_connection(
         raise PathError(f"{text}: {unknown('source', topic.source, layouts)}")
     if topic.direction == "in":
         raise PathError(f"{text}: an input reads an output of a source; leave out /in")
-    register, own = find(layouts[topic.source], topic.path), find(layouts[source], path)
+    register, own = look_up(layouts[topic.source], topic), find(layouts[source], path)
     value = codec(register).decode(bytes(layouts[topic.source].size))
     try:
         codec(own).encode_into(value, initial_frame(layouts[source])[0])

@@ -120,9 +120,6 @@ def test_a_misspelt_source_is_corrected_in_the_whole_topic() -> None:
 @pytest.mark.parametrize(
     ("text", "suggested"),
     [
-        ("cel/Inputs/5", "'cell/Inputs/5'"),
-        ("Cell/inputs/5", "'cell/Inputs/5'"),
-        ("cel/Robot/Axs3", "'cell/Robot/Axs2' or 'cell/Robot/Axs1'"),
         ("cell/robot/axs2", "'cell/Robot/Axs2'"),
         ("robot/axs2", "'cell/Robot/Axs2'"),
     ],
@@ -131,6 +128,30 @@ def test_suggestions_are_whole_topics(layout: Layout, text: str, suggested: str)
     for search in (look_up, look_up_each):
         with pytest.raises(PathError, match=rf"DB1 has no such register; did you mean {suggested}\?"):
             search(layout, parse_topic(text, ["cell"], "cell"))
+
+
+@pytest.mark.parametrize(
+    ("text", "rest"),
+    [
+        ("cel/Inputs/5", "; did you mean 'cell/Inputs/5'?"),
+        ("Cell/inputs/5", "; did you mean 'cell/Inputs/5'?"),
+        ("cel/Robot/Axs3", "; did you mean 'cell/Robot/Axs2' or 'cell/Robot/Axs1'?"),
+        ("plc/robot/axs2", "; did you mean 'cell/Robot/Axs2'?"),
+        ("plc/Inputs/5..99", "; did you mean 'cell/Inputs'?"),
+        ("plc/x", ""),
+        ("plc/x/8.%X3", ""),
+    ],
+)
+def test_error_for_a_path_with_an_unknown_source_says_that_there_is_neither(
+    layout: Layout, text: str, rest: str
+) -> None:
+    for search in (look_up, look_up_each):
+        with pytest.raises(PathError) as caught:
+            search(layout, parse_topic(f"{text}/out", ["cell"], "cell"))
+        source = text.partition("/")[0]
+        expected = f"no source '{source}' and no register '{text}' in source 'cell'{rest}"
+        assert str(caught.value).startswith(expected)
+        assert rest or str(caught.value) == expected
 
 
 def test_error_for_a_path_without_a_source_names_the_searched_source(layout: Layout) -> None:

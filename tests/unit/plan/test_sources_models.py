@@ -216,7 +216,11 @@ def test_fault_of_a_remote_model_is_named_by_its_key(folder: Path, keys: str, me
             "source[0].connections.speed: gate/closed is BOOL, which does not fit an input of LREAL",
         ),
         ('model = "line:Belt"\nconnections = { speed = "panel/lamps" }', "BOOL[], which does not fit"),
-        ('model = "line:Belt"\nconnections = { speed = "panel/limits" }', "did you mean 'limit'"),
+        ('model = "line:Belt"\nconnections = { speed = "panel/limits" }', "did you mean 'panel/limit'"),
+        (
+            'model = "line:Belt"\nconnections = { speed = "plc/limit" }',
+            "source[0].connections.speed: no source 'plc' and no register 'plc/limit' in source 'belt'",
+        ),
         ('model = "line:Belt"\nconnections = { speed = "panel/limit/in" }', "leave out /in"),
         ('model = "line:Belt"\nconnections = { speed = "SIMLOG://step" }', "source[0].connections.speed: "),
     ],

@@ -133,7 +133,7 @@ def test_injected_registers_are_marked_and_have_their_originals(segment: Segment
         ((), Status.INVALID_ARGUMENT, "no pattern is given"),
         (("cell/nothing",), Status.NOT_FOUND, "no such register"),
         (("cell/x*",), Status.NOT_FOUND, "cell/x*: source 'cell' has no such register"),
-        (("other/x",), Status.NOT_FOUND, "no such register"),
+        (("other/x",), Status.NOT_FOUND, "no source 'other' and no register 'other/x' in source 'cell'"),
         (("cell/axis/position/in",), Status.NOT_FOUND, "leave out /in"),
         (("cell/inputs/0..2",), Status.NOT_FOUND, "outside"),
         (("cell/inputs/1..0",), Status.NOT_FOUND, "write the lower index first"),
