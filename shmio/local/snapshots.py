@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Final, Protocol
 
 from shmio import control
+from shmio.config.folder import unwritable
 from shmio.errors import ControlError, SnapshotError
 from shmio.local.snapshot_file import (
     SnapshotHead,
@@ -40,9 +41,6 @@ PATIENCE_S: Final = 30.0
 ASK_S: Final = 2.0
 _TURN_NS: Final = 100_000_000
 _PARTIAL: Final = "; --partial saves the rest"
-_UNKNOWN: Final = (
-    "it could not use the folder of snapshots; check whether the disk is full, and run shmio as the instance's user"
-)
 
 Refusals = dict[str, str]
 """For each process that has refused a request, by its name: the reason."""
@@ -112,9 +110,9 @@ class Snapshots:
         folder = self._folder()
         with self._time.still() as coordinator, work_folder(folder) as work:
             names, left_out = self._states.names()
-            _refuse_any({} if partial else left_out, "cannot be saved", _PARTIAL)
+            _refuse_any({} if partial else left_out, "cannot be saved", _PARTIAL if names else "")
             states, refusals = self._states.save(name, names, work)
-            _refuse_any({} if partial else refusals, "cannot be saved", _PARTIAL)
+            _refuse_any({} if partial else refusals, "cannot be saved", _PARTIAL if states else "")
             now = coordinator.read()
             head = SnapshotHead(
                 self._segment.instance, time.time(), now.step, now.done, now.time_ns, now.step_size_ns,
@@ -304,11 +302,20 @@ class ProcessStates:
 
 
 def _reason(file: Path) -> str:
-    """Return the reason that a process has written for its refusal."""
+    """Return the reason that a process has written for its refusal; if it could not write, why not."""
     try:
-        return read_bounded(file, MAX_PART_BYTES).decode(errors="replace") or _UNKNOWN
+        reason = read_bounded(file, MAX_PART_BYTES).decode(errors="replace")
     except OSError:
-        return _UNKNOWN
+        reason = ""
+    if reason:
+        return reason
+    folder = file.parent.parent
+    if obstacle := unwritable(folder):
+        return obstacle.reason
+    return (
+        f"it could not use the folder of snapshots, {folder}; "
+        "check whether the disk was full, and run shmio as the instance's user"
+    )
 
 
 def _check_alive(slots: list[ProcessSlot]) -> None:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from unittest.mock import MagicMock, Mock
 
 import pytest
 
+from shmio.config import folder
 from shmio.errors import SnapshotError
 from shmio.layout.model import Layout, Register
-from shmio.local.snapshots import ProcessStates
+from shmio.local import state_requests
+from shmio.local.snapshots import ProcessStates, Snapshots
 from shmio.local.state_requests import StateRequests
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Segment
 
@@ -100,4 +105,34 @@ def test_a_process_that_cannot_use_the_folder_refuses(
         assert "folder" in states.check("one", {"sim": b"old"}, work)["sim"]
         assert "folder" in states.restore("one", {"sim": b"old"}, work)["sim"]
         assert "folder" in states.save("one", ["sim"], work)[1]["sim"]
+        assert f"folder of snapshots, {tmp_path};" in states.save("one", ["sim"], work)[1]["sim"]
     assert keeper.state == b"new"
+
+
+def test_a_full_disk_is_the_reason_of_a_refusal(
+    segment: Segment, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    (tmp_path / WORK).mkdir()
+    monkeypatch.setattr(state_requests, "write_new", full)
+    monkeypatch.setattr(folder, "_write", full)
+    with serving(segment, monkeypatch, tmp_path, Keeper()) as states:
+        _, refusals = states.save("one", ["sim"], tmp_path / WORK)
+    expected = f"{tmp_path} cannot be written: the disk is full; make room, or choose another folder"
+    assert refusals == {"sim": expected}
+
+
+@pytest.mark.parametrize(
+    ("states", "end"), [({}, "cell: full"), ({"other": b"x"}, "cell: full; --partial saves the rest")]
+)
+def test_partial_is_offered_only_if_something_remains(
+    segment: Segment, tmp_path: Path, states: dict[str, bytes], end: str
+) -> None:
+    asked, still = Mock(), MagicMock()
+    asked.names.return_value = (["cell", *states], {})
+    asked.save.return_value = (states, {"cell": "full"})
+    with pytest.raises(SnapshotError) as caught:
+        Snapshots(segment, still, asked, lambda: tmp_path).save("one")
+    assert str(caught.value) == f"cannot be saved: {end}"
