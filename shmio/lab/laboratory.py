@@ -52,7 +52,7 @@ def prepare_laboratory(file: Path) -> Plan:
         LayoutError: A layout cannot be compiled.
 
     """
-    plan = prepare(file).plan
+    plan = prepare(file, writes_files=False).plan
     if not plan.blocks:
         raise ConfigError(f"{file}: the configuration has no [[source]]")
     for index, job in enumerate(job for job in plan.jobs if job.kind == "source"):

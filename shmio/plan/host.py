@@ -34,10 +34,13 @@ NO_SHELLS: Final = ("nologin", "false", "sync")
 MAX_NAMES: Final = 3
 
 
-def check_host(config: Config, catching: Callable[[], AbstractContextManager[None]]) -> list[str]:
+def check_host(
+    config: Config, catching: Callable[[], AbstractContextManager[None]], *, writes_files: bool = True
+) -> list[str]:
     """Check group, priorities, folders, libraries and other files, without creating any; return warnings.
 
-    ``catching`` returns a context manager that collects a ConfigError instead of raising it.
+    ``catching`` returns a context manager that collects a ConfigError instead of raising it. Without
+    ``writes_files``, the folders of the logs and the recordings are not checked.
     """
     with catching():
         _check_group(config.instance.group)
@@ -48,9 +51,10 @@ def check_host(config: Config, catching: Callable[[], AbstractContextManager[Non
         with catching():
             _check_priority(f"emulator[{index}]", emulator.realtime_priority)
     warnings: list[str] = []
-    with catching():
-        warnings += _check_folder("instance.log_dir", config.log_dir)
-    if config.recorder:
+    if writes_files:
+        with catching():
+            warnings += _check_folder("instance.log_dir", config.log_dir)
+    if writes_files and config.recorder:
         with catching():
             warnings += _check_folder("recorder.directory", config.path(config.recorder.directory))
     if config.grpc:

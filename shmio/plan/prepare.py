@@ -63,13 +63,16 @@ class Prepared:
     """Remarks for the user that are not about faults."""
 
 
-def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = None) -> Prepared:
+def prepare(
+    file: Path, mode: str = "live", keys: Mapping[str, Any] | None = None, *, writes_files: bool = True
+) -> Prepared:
     """Read a configuration, and check everything that can be checked without starting anything.
 
     Args:
         file: The configuration file.
         mode: ``live``, ``log`` or ``replay``.
         keys: Values by key that override those in the section ``[replay]``; None for none.
+        writes_files: Whether the instance writes logs and recordings, so that their folders must be writable.
 
     Raises:
         ConfigError: The configuration has faults.
@@ -92,7 +95,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
             faults.raise_any()
             faults.play([source.name for source in config.source])
         files = LayoutFiles(config)
-        notices += check_host(config, faults.catching)
+        notices += check_host(config, faults.catching, writes_files=writes_files)
         if not faults:
             with faults.catching():
                 check_listening(config)

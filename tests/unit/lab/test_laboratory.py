@@ -69,6 +69,11 @@ def prepare(tmp_path: Path) -> Callable[..., Plan]:
     return prepared
 
 
+def test_no_folder_of_logs_or_recordings_is_needed(prepare: Callable[..., Plan], tmp_path: Path) -> None:
+    (tmp_path / "logs").touch()  # in place of the folder
+    prepare(f'{SECTIONS}\n[recorder]\ndirectory = "logs"\n')
+
+
 def test_steps_writes_and_connections(prepare: Callable[..., Plan]) -> None:
     with Laboratory(prepare()) as lab, lab.attach() as cell:
         assert cell["lift/height"] == 0
