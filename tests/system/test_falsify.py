@@ -146,7 +146,7 @@ def test_a_search_goes_on_as_if_it_had_not_been_interrupted(
     (folder / "cut/case-001/campaign.toml").touch()
     (folder / "cut/trials.jsonl").write_bytes(b"".join(lines[:2]) + lines[2][:20])
     assert main([*words, "-o", "cut", "--resume"]) == 1
-    assert "1 trials and 0 cases exist already" in capsys.readouterr().err
+    assert "1 trial and 0 cases exist already" in capsys.readouterr().err
     assert trials(folder / "cut") == trials(folder / "whole")
     assert names(folder / "cut") == names(folder / "whole")
     assert main([*words, "-o", "cut", "--resume"]) == 1, "nothing is left to do"

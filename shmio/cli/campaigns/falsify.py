@@ -29,7 +29,7 @@ from shmio.lab import prepare_laboratory
 from shmio.local.snapshot_file import file_of
 from shmio.plan.processes import Plan
 from shmio.version import __version__
-from shmio.wording import printable
+from shmio.wording import counted, printable
 
 if TYPE_CHECKING:
     from shmio.fabric.connection import Access
@@ -167,10 +167,8 @@ class _Command:
         bundle = make_bundle(self._config, campaign, self._space.at({}), arguments.send)
         names = [*bundle.sizes]
         shown = ", ".join(names[:SHOWN_FILES]) + (f" and {len(names) - SHOWN_FILES} more" * (len(names) > SHOWN_FILES))
-        self._tell(
-            f"farm {access}: the workers get {len(names)} files of {bundle.root}, {sum(bundle.sizes.values())} bytes: "
-            f"{shown}"
-        )
+        files, size_bytes = counted(len(names), "file"), sum(bundle.sizes.values())
+        self._tell(f"farm {access}: the workers get {files} of {bundle.root}, {size_bytes} bytes: {shown}")
         environment, problem = environment_of(bundle)
         if problem:
             self._tell(f"farm: the models do not start from these files alone; is one missing (--send)? {problem}")
@@ -201,7 +199,8 @@ class _Command:
 
     def _resume(self, falsifier: Falsifier, trials: int) -> None:
         unshrunk, self._cases = falsifier.replay(self._journal.lines(), trials)
-        say(f"{self._output}: {self._tally.done} trials and {len(self._cases)} cases exist already", sys.stderr)
+        done = f"{counted(self._tally.done, 'trial')} and {counted(len(self._cases), 'case')}"
+        say(f"{self._output}: {done} exist already", sys.stderr)
         self._progress.begin(self._tally.done, self._tally.simulated_s)
         for line in unshrunk:
             if line.point is not None and line.result is not None:

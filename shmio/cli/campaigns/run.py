@@ -31,7 +31,7 @@ from shmio.recorder.recorder import AttachedFiles, ConfigFiles, no_attachments
 from shmio.recording.digest import digest_of_contents
 from shmio.recording.dump import open_dump
 from shmio.segment import Segment, running_instances
-from shmio.wording import EXISTS
+from shmio.wording import EXISTS, counted
 
 SEED_BITS: Final = 32
 WHERE_S: Final = 2.0
@@ -210,7 +210,8 @@ def _told(run: _Run, instance: str, work: LiveRun) -> None:
         say(f"{instance}: restored {work.start.name}, {work.start.time_ns / 1e9:g} s", sys.stderr)
         for process, why in work.start.left_out.items():
             say(f"  without {process}: {why}", sys.stderr)
-    say(f"{instance}: {len(campaign.injection)} injections, {len(campaign.expect)} expectations, {how}", sys.stderr)
+    injections, expectations = counted(len(campaign.injection), "injection"), counted(len(campaign.expect), "expectation")
+    say(f"{instance}: {injections}, {expectations}, {how}", sys.stderr)
     seed = next(
         (laid.seed for laid, one in zip(plan.injections, campaign.injection, strict=True) if one.seed is None), None
     )

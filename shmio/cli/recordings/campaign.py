@@ -12,7 +12,7 @@ from shmio.config.declaration import check_declarations
 from shmio.errors import ConfigError, RecordingError
 from shmio.recording.campaign import derive
 from shmio.recording.rewriting import new_file
-from shmio.wording import printable
+from shmio.wording import counted, printable
 
 
 def campaign(arguments: argparse.Namespace) -> int:
@@ -31,5 +31,6 @@ def campaign(arguments: argparse.Namespace) -> int:
         raise RecordingError(f"{dump.files[0]}: its injections cannot form a campaign: {error}") from None
     with new_file(arguments.output) as stream:
         stream.write(campaign_text(tables_of(Campaign(injection=list(declarations)))).encode())
-    say(f"{arguments.output}: {len(declarations)} injections; shmio inject --file {arguments.output} creates them")
+    creates = f"shmio inject --file {arguments.output} creates {'it' if len(declarations) == 1 else 'them'}"
+    say(f"{arguments.output}: {counted(len(declarations), 'injection')}; {creates}")
     return int(report.any)

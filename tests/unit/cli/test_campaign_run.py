@@ -49,6 +49,11 @@ def lab(campaign: str, *options: str) -> int:
     return main(["run", campaign, "-c", "supervisor.toml", "--lab", *options])
 
 
+def test_the_head_line_counts_in_singular_and_plural(capsys: pytest.CaptureFixture[str]) -> None:
+    assert lab("good.toml") == 0
+    assert "laboratory: 0 injections, 1 expectation, virtual time" in capsys.readouterr().err
+
+
 @pytest.fixture
 def full(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let every disk be full for recordings."""
