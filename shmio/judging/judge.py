@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from math import isfinite
 from typing import Final
 
 import numpy as np
@@ -211,7 +212,7 @@ class Judge:
         outer, formula = case.top_level, case.formula
         outcome, reason, moment_ns = Outcome.INCONCLUSIVE, "", None
         if case.failed:
-            outcome, reason, moment_ns = Outcome.FAILED, formula.failure, outer.decided_ns()
+            outcome, reason, moment_ns = Outcome.FAILED, formula.failure + _greatest_rate(case), outer.decided_ns()
         elif outer.low > 0 and not case.idle:
             outcome = Outcome.PASSED
         elif outer.low > 0:
@@ -245,6 +246,12 @@ class Judge:
             if unknown_ns + reach_ns < self.end_ns:
                 return f"a value was not a number at {unknown_ns / 1e9:.3f} s"
         return f"the run ended at {(self.end_ns - 1) / 1e9:.3f} s, before the expectation was decided"
+
+
+def _greatest_rate(case: _Case) -> str:
+    """Return the greatest rate in a failed expectation with ``max_rate``, as `` (up to 500)``; else an empty text."""
+    limit, margin = case.formula.expectation.max_rate, case.top_level.high
+    return "" if limit is None or not isfinite(margin) else f" (up to {limit - margin:g})"
 
 
 def _tubes(index: int, formula: Formula, network: Network, golden: Golden | None) -> list[tuple[TopLevel, Tube]]:

@@ -118,6 +118,11 @@ def test_verdicts(keys: Mapping[str, Any], outcome: Outcome, robustness: float |
     assert bool(found.around) == (outcome is FAILED)
 
 
+def test_failed_max_rate_has_the_greatest_rate() -> None:
+    found = verdict(trace([0, 1, 4, 8, 9]), signal="x", max_rate=1.5)
+    assert (found.reason, found.moment_ns) == ("x changed by more than 1.5 a second (up to 4)", 2 * S)
+
+
 def test_failure_has_the_values_around_it() -> None:
     found = verdict(UP, never="x > 2 and not on")
     assert found.around == {
