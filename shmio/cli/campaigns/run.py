@@ -24,7 +24,7 @@ from shmio.cli.instance.detach import start
 from shmio.cli.target import Target, target
 from shmio.config.campaign import Campaign, load_campaign
 from shmio.config.declaration import with_seed
-from shmio.errors import ConfigError, ControlError, DeclarationError, RecordingError
+from shmio.errors import ConfigError, ControlError, DeclarationError, NotRunningError, RecordingError
 from shmio.judging.expectation import check_texts
 from shmio.lab import Laboratory, prepare_laboratory
 from shmio.recorder.recorder import AttachedFiles, ConfigFiles, no_attachments
@@ -161,15 +161,13 @@ def _on_instance(run: _Run) -> tuple[str, LiveRun]:
             "parameters: an instance cannot change the parameters of its models; use --lab, "
             "or set them in supervisor.toml"
         )
-    with _instance(run.arguments) as wanted:
-        segment = wanted.open(writable=True)
-        with segment:
-            file = _configuration(segment)
-            attachments: AttachedFiles = no_attachments if file is None else ConfigFiles(file)
-            run.facts.extend([] if file is None else of_configuration(file))
-            run.facts.extend(of_layouts({source: block.layout for source, block in segment.blocks.items()}))
-            work = LiveRun(segment, run.plan, attachments, run.reports.collector(lambda: work.judge))
-            work.run(run.over, lambda: _told(run, wanted.name, work))
+    with _instance(run.arguments) as wanted, _opened(wanted, run.arguments) as segment:
+        file = _configuration(segment)
+        attachments: AttachedFiles = no_attachments if file is None else ConfigFiles(file)
+        run.facts.extend([] if file is None else of_configuration(file))
+        run.facts.extend(of_layouts({source: block.layout for source, block in segment.blocks.items()}))
+        work = LiveRun(segment, run.plan, attachments, run.reports.collector(lambda: work.judge))
+        work.run(run.over, lambda: _told(run, wanted.name, work))
     return wanted.name, work
 
 
@@ -193,6 +191,21 @@ def _instance(arguments: argparse.Namespace) -> Iterator[Target]:
             stop(segment)
 
 
+def _opened(wanted: Target, arguments: argparse.Namespace) -> Segment:
+    """Open the instance.
+
+    Raises:
+        NotRunningError: The instance does not run; the message says which option starts it.
+
+    """
+    try:
+        return wanted.open(writable=True)
+    except NotRunningError as error:
+        if wanted.file is None or arguments.config is not None:
+            raise
+        raise NotRunningError(f"{error}; or add -c {wanted.file}, with which the run starts and stops it") from None
+
+
 def _configuration(segment: Segment) -> Path | None:
     """Return the configuration file of an instance; None if its supervisor does not tell it."""
     try:
@@ -210,7 +223,8 @@ def _told(run: _Run, instance: str, work: LiveRun) -> None:
         say(f"{instance}: restored {work.start.name}, {work.start.time_ns / 1e9:g} s", sys.stderr)
         for process, why in work.start.left_out.items():
             say(f"  without {process}: {why}", sys.stderr)
-    injections, expectations = counted(len(campaign.injection), "injection"), counted(len(campaign.expect), "expectation")
+    injections = counted(len(campaign.injection), "injection")
+    expectations = counted(len(campaign.expect), "expectation")
     say(f"{instance}: {injections}, {expectations}, {how}", sys.stderr)
     seed = next(
         (laid.seed for laid, one in zip(plan.injections, campaign.injection, strict=True) if one.seed is None), None

@@ -54,6 +54,13 @@ def test_the_head_line_counts_in_singular_and_plural(capsys: pytest.CaptureFixtu
     assert "laboratory: 0 injections, 1 expectation, virtual time" in capsys.readouterr().err
 
 
+def test_without_an_instance_the_option_that_starts_one_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "good.toml"]) != 0
+    told = capsys.readouterr().err
+    assert "no instance 'run-test' is running" in told
+    assert told.endswith("; or add -c supervisor.toml, with which the run starts and stops it\n")
+
+
 @pytest.fixture
 def full(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let every disk be full for recordings."""
