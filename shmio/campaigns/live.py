@@ -122,6 +122,7 @@ class LiveRun:
         self.recorded = False
         """True if the recording is complete."""
         self._unrecorded: RecordingError | None = None
+        self._supervised = segment.supervised
         self._blocks: dict[str, Block] = {source: blocks[source] for source in self.judge.sources}
 
     def run(self, over: threading.Event, begun: Callable[[], None] = lambda: None) -> None:
@@ -248,6 +249,13 @@ class LiveRun:
         if error := recorder.output.error:
             raise RecordingError(f"--record {recorder.output.path}: {error}")
 
+    def _check_running(self) -> None:
+        """Raise NotRunningError if the instance has stopped, or if its supervisor has died."""
+        if not self._segment.shared.current():
+            raise NotRunningError(f"instance {self._segment.instance!r} has stopped")
+        if self._supervised and not self._segment.supervised:
+            raise NotRunningError(f"the supervisor of instance {self._segment.instance!r} has died")
+
     def _steps(self, cell: Attachment, over: threading.Event) -> Iterator[None]:
         """Step virtual time to the end of the run, and yield after each batch of steps."""
         left = ceil(self._plan.duration_s / self.step_s - 1e-9)
@@ -255,6 +263,7 @@ class LiveRun:
         most = STOP_STEPS if self._plan.stop else MAX_STEPS
         while left and not over.is_set():
             count = max(1, min(left, most, room))
+            self._check_running()
             cell.step(self.step_s, count)
             left -= count
             yield
@@ -263,8 +272,7 @@ class LiveRun:
         """Wait in real time until the end of the run, and yield after each pause."""
         until_s = time.monotonic() + self._plan.duration_s
         while (rest_s := until_s - time.monotonic()) > 0 and not over.wait(min(tap.pause_s, rest_s)):
-            if not self._segment.shared.current():
-                raise NotRunningError(f"instance {self._segment.instance!r} has stopped")
+            self._check_running()
             yield
 
     def _turns(self, tap: InstanceFollower, recorder: Recorder | None) -> Iterator[None]:

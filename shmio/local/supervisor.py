@@ -22,4 +22,9 @@ def ask_supervisor(segment: Segment, request: control.Request, timeout_s: float)
     try:
         return control.request(segment.header.control, request, timeout_s, lambda: supervisor_silence(segment))
     except UnreachableError as error:
-        raise ControlError(f"{error}; kill -TERM {segment.supervisor[0]} stops the instance") from None
+        remedy = (
+            f"kill -TERM {segment.supervisor[0]} stops the instance"
+            if segment.supervised
+            else f"the supervisor is dead; shmio-supervisor down --instance {segment.instance} stops what it left"
+        )
+        raise ControlError(f"{error}; {remedy}") from None

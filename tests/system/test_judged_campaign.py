@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from typing import Any
 
-from shmio.testing.cell import Cell
+import shmio
+from shmio.segment import Segment
+from shmio.testing.cell import BIN, Cell, kill
 
 CONFIG = """
 [instance]
@@ -171,3 +174,29 @@ def test_real_time_and_recording_agree_on_the_same_verdicts(make_cell: Callable[
     assert json.loads(cell.output("shmio-supervisor", "status", "--json"))["clock"]["mode"] == "wall", "released"
     assert cell.run("shmio-campaign", "run", "campaign.toml", "--record", "one.mem").returncode == 2
     cell.down()
+
+
+def test_a_run_judges_what_it_has_seen_when_the_supervisor_dies(make_cell: Callable[..., Cell]) -> None:
+    cell = prepared(make_cell, "wall")
+    (cell.folder / "low.toml").write_text('[[expect]]\nname = "low"\nnever = "slow/height >= 0"\n')
+    words = ("run", "low.toml", "-c", "supervisor.toml", "--real-time", "--for", "100")
+    with subprocess.Popen(
+        [BIN / "shmio-campaign", *words, "--report", "out.html", "--junit", "out.xml", "--record", "out.mem"],
+        cwd=cell.folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as run:  # fmt: skip
+        assert run.stderr is not None
+        assert "1 expectation," in run.stderr.readline()
+        with shmio.attach(cell.instance) as seen:
+            for _ in range(2):  # the run has begun, so it sees at least the second one
+                assert seen.wait("slow", timeout_s=60)
+        with Segment.open(cell.instance) as segment:
+            kill(segment.supervisor[0])
+        out, errors = run.communicate(timeout=120)
+    assert run.returncode == 1, errors
+    assert out.startswith("failed ")
+    assert f"the run ended early: the supervisor of instance '{cell.instance}' has died\n" in errors
+    assert "stopped slow, pid" in errors
+    assert "no instance" in cell.run("shmio", "list", "-c", "supervisor.toml").stderr
+    assert (cell.folder / "out.html").exists()
+    assert (cell.folder / "out.xml").exists()
+    assert cell.run("shmio-campaign", "judge", "out.mem", "-f", "low.toml").returncode == 1

@@ -19,12 +19,12 @@ from shmio.campaigns.live import LiveRun, Plan
 from shmio.cli.campaigns.reports import Reports, check_place
 from shmio.cli.campaigns.verdicts import UNDECIDED, tell
 from shmio.cli.common import say, stop_on_signals
-from shmio.cli.instance.control import stop
+from shmio.cli.instance.control import clear, stop
 from shmio.cli.instance.detach import start
 from shmio.cli.target import Target, target
 from shmio.config.campaign import Campaign, load_campaign
 from shmio.config.declaration import with_seed
-from shmio.errors import ConfigError, ControlError, DeclarationError, NotRunningError, RecordingError
+from shmio.errors import ConfigError, ControlError, NotRunningError, RecordingError, ShmioError
 from shmio.judging.expectation import check_texts
 from shmio.lab import Laboratory, prepare_laboratory
 from shmio.recorder.recorder import AttachedFiles, ConfigFiles, no_attachments
@@ -76,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
         try:
             execute = _in_laboratory if arguments.lab else _on_instance
             name, work = execute(_Run(arguments, campaign, plan, reports, facts, over))
-        except (ConfigError, DeclarationError) as error:
+        except ConfigError as error:
             raise ConfigError(f"{arguments.campaign}: {error}") from None
     how = f"virtual, steps of {work.step_s * 1000:g} ms" if work.virtual else "real"
     facts += [("instance", name), ("time", how), ("duration", f"{duration_s:g} s")]
@@ -180,15 +180,32 @@ def _instance(arguments: argparse.Namespace) -> Iterator[Target]:
 
     """
     wanted = target(arguments)
-    if arguments.config is None or wanted.name in running_instances():
+    name = wanted.name
+    if arguments.config is None or name in running_instances():
         yield wanted
+        with suppress(NotRunningError), wanted.open() as segment:
+            if not segment.supervised:
+                say(f"shmio-supervisor down --instance {name} stops what the dead supervisor left", sys.stderr)
         return
     _, started = start(arguments.config, "live")
     try:
         yield Target(started.instance, arguments.config)
     finally:
-        with Segment.open(started.instance) as segment:
-            stop(segment)
+        try:
+            _stop(name)
+        except ShmioError as error:  # the verdicts still count
+            say(f"instance {name} is not stopped: {error}", sys.stderr)
+
+
+def _stop(instance: str) -> None:
+    """Stop an instance, even if its supervisor is dead."""
+    with suppress(NotRunningError):  # somebody has stopped it
+        with Segment.open(instance) as segment:
+            if segment.supervised:
+                stop(segment)
+                return
+        for line in clear(instance):
+            say(line, sys.stderr)
 
 
 def _opened(wanted: Target, arguments: argparse.Namespace) -> Segment:

@@ -59,9 +59,19 @@ def down(arguments: argparse.Namespace) -> int:
                 f"{error}; if its supervisor is dead, `shmio-supervisor down --instance {name}` clears the instance"
             ) from None
     print(f"{name}: its supervisor is dead; clearing what it left")
-    for line in stale_segment.clear(name, forget_control=lambda path: _forget(path, name)):
+    for line in clear(name):
         print(line)
     return 0
+
+
+def clear(instance: str) -> list[str]:
+    """Stop the processes that a dead supervisor has left, and return a line for each action.
+
+    Raises:
+        SegmentError: A supervisor is alive, or a process does not end.
+
+    """
+    return stale_segment.clear(instance, forget_control=lambda path: _forget(path, instance))
 
 
 def _forget(path: str, name: str) -> None:
