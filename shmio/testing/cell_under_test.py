@@ -19,6 +19,7 @@ from shmio.cli.campaigns.reports import Reports
 from shmio.cli.campaigns.verdicts import lines
 from shmio.cli.instance.control import stop
 from shmio.cli.instance.detach import start
+from shmio.cli.instance.emulator import disturb
 from shmio.config import Expectation
 from shmio.config.campaign import Campaign as CampaignFile
 from shmio.config.campaign import parse_campaign
@@ -46,7 +47,6 @@ RECORDING: Final = "recording.mem"
 REPORT: Final = "report.html"
 MAX_PLOTS: Final = 32
 """Maximum number of registers that the report of a failed test plots besides those of expectations."""
-ANSWER_S: Final = 10.0
 
 
 class CellUnderTest:
@@ -139,8 +139,7 @@ class CellUnderTest:
             ControlError: There is no such emulator, or it cannot have faults.
 
         """
-        path = control.emulator_socket_path(self._segment.header.control, emulator)
-        control.request(path, control.Disturb(answers, delay_ms), ANSWER_S)
+        disturb(self._segment, emulator, answers, delay_ms)
 
     # -- time and expectations -------------------------------------------------------------------------------------
 

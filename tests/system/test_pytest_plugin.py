@@ -42,6 +42,17 @@ def test_unmarked(cell):
 def test_missing(cell):
     pass
 """
+MISSPELT = """
+import pytest
+
+@pytest.mark.shmio("logic.toml")
+def test_misspelt(cell):
+    try:
+        cell.disturb("plc", "hang")
+    except Exception as error:
+        print(error)
+    cell.expect(nevr="cell/Outputs/Locked")
+"""
 
 
 def blocks(page: str, kind: str) -> list[str]:
@@ -120,6 +131,13 @@ def test_a_failing_test_leaves_a_recording_and_plots(project: Path) -> None:
     assert "cell/Outputs/Openings" in pages[2]
     assert "kept" in recordings[0].parts
     assert (recordings[0].parent / "logs").is_dir()
+
+
+def test_misspelt_names_are_answered_as_by_the_commands(project: Path) -> None:
+    (project / "test_misspelt.py").write_text(MISSPELT)
+    output = run_pytest(project, "-n0", "test_misspelt.py")
+    assert "unknown emulator 'plc'; there are none" in output, output
+    assert "expect[0].nevr: unknown key; did you mean 'never'?" in output
 
 
 def test_other_tests_do_not_import_shmio(project: Path) -> None:
