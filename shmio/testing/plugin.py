@@ -6,8 +6,10 @@ pytest imports this module in each run, so it imports shmio only when a test use
 from __future__ import annotations
 
 import shutil
+import signal
+import threading
 from collections.abc import Generator, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,13 +49,26 @@ def cell(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     file = request.path.parent / marker.args[0]
     folder = tmp_path_factory.mktemp("cell")
     running = running_cell(file, folder, request.node.nodeid, real_time=bool(marker.kwargs.get("real_time")))
-    with ExitStack() as stack:
+    with _interrupted_by_sigterm(), ExitStack() as stack:
         try:
             cell = stack.enter_context(running)
         except ShmioError as error:
             raise pytest.fail.Exception(f"the instance of {file} does not start: {error}", pytrace=False) from None
         request.node.stash[_CELL] = cell
         yield cell
+
+
+@contextmanager
+def _interrupted_by_sigterm() -> Iterator[None]:
+    """Let SIGTERM interrupt the test as Ctrl-C does, so that pytest stops the instance; leave other handlers alone."""
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -53,6 +53,17 @@ def test_misspelt(cell):
         print(error)
     cell.expect(nevr="cell/Outputs/Locked")
 """
+TERMINATED = """
+import os
+import signal
+
+import pytest
+
+@pytest.mark.shmio("logic.toml")
+def test_terminated(cell):
+    os.kill(os.getpid(), signal.SIGTERM)
+    cell.run_for(0.1)
+"""
 
 
 def blocks(page: str, kind: str) -> list[str]:
@@ -138,6 +149,13 @@ def test_misspelt_names_are_answered_as_by_the_commands(project: Path) -> None:
     output = run_pytest(project, "-n0", "test_misspelt.py")
     assert "unknown emulator 'plc'; there are none" in output, output
     assert "expect[0].nevr: unknown key; did you mean 'never'?" in output
+
+
+def test_sigterm_stops_the_instance(project: Path) -> None:
+    before = ours()
+    (project / "test_terminated.py").write_text(TERMINATED)
+    assert "KeyboardInterrupt" in run_pytest(project, "-n0", "test_terminated.py")
+    assert ours() <= before
 
 
 def test_other_tests_do_not_import_shmio(project: Path) -> None:
