@@ -10,7 +10,7 @@ from shmio.campaigns.digests import of_campaign, of_file, of_layouts
 from shmio.cli.campaigns.reports import Reports
 from shmio.cli.campaigns.verdicts import UNDECIDED, tell
 from shmio.cli.common import say
-from shmio.cli.recordings.common import DamageReport, time_range
+from shmio.cli.recordings.common import DamageReport, not_closed, time_range
 from shmio.config.campaign import CampaignFile
 from shmio.errors import ConfigError
 from shmio.recording.injection_times import InjectionTimes
@@ -43,6 +43,10 @@ def judge(arguments: argparse.Namespace) -> int:
         facts = [*of_campaign(arguments.campaign, expectations)]
         facts += [("recording", f"{file}, sha256 {of_file(file)}") for file in arguments.files]
         facts += of_layouts({block.source: block.layout for block in dump.blocks})
+        upto = "" if found.end_ns is None else f"; judged up to {(found.end_ns - 1) / 1e9:.3f} s"
+        for reader in dump.readers:
+            if not reader.records.closed:
+                say(f"{reader.file}: {not_closed(reader.records.damage)}{upto}", sys.stderr)
     words = ["shmio-campaign", "judge", *map(str, arguments.files), "-f", str(arguments.campaign)]
     for option, text in (("--from", arguments.begin), ("--to", arguments.end)):
         words += [] if text is None else [option, text]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,21 @@ def test_verdicts_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert [pair["value"] for pair in second["around"]["cell/speed"]] == [9, 10, 11, 12, 13, 14]
     assert (third["outcome"], third["robustness"]) == ("passed", 1)
     assert (found["begin_s"], found["end_s"], found["files"]) == (0.02, 0.8, ["run.mem"])
+
+
+def test_a_recording_that_was_not_closed_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
+    campaign("never = 'speed > 10'")
+    assert main(["judge", "run.mem", "-f", "c.toml"]) == 1
+    whole = capsys.readouterr()
+    assert whole.err == ""
+    with Path("run.mem").open("r+b") as file:
+        file.truncate(file.seek(-30, os.SEEK_END))
+    assert main(["judge", "run.mem", "-f", "c.toml"]) == 1
+    cut = capsys.readouterr()
+    assert cut.out == whole.out
+    assert cut.err.startswith("run.mem: not closed (it ")
+    assert cut.err.endswith("or its recorder was killed; judged up to 0.800 s\n")
+    assert cut.err.count("\n") == 1
 
 
 def test_exit_status_and_text(capsys: pytest.CaptureFixture[str]) -> None:
