@@ -35,7 +35,8 @@ program calls shmio wrongly, Python's own errors are possible too, such as TypeE
 
 The command-line tools print the message of any of these errors and exit with status 1. The exception
 is ``shmio-campaign``, where 1 means that an expectation failed: it exits with 2 after ConfigError,
-LayoutError, PathError and ValueRangeError, and with 3 after any other error.
+LayoutError, MissingLibraryError, PathError, SnapshotError and ValueRangeError, and with 3 after any
+other error.
 """
 
 from __future__ import annotations

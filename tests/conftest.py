@@ -82,6 +82,8 @@ START_PROCESSES = (
     "tests/compatibility/test_segment.py",
     "tests/native/",
     "tests/system/",
+    "tests/unit/cli/test_campaign_run.py::test_a_fault_in_the_configuration",
+    "tests/unit/cli/test_campaign_run.py::test_a_log_folder",
     "tests/unit/cli/test_completion.py",
     "tests/unit/cli/test_schema.py::test_both_accept",
     "tests/unit/cli/test_schema.py::test_both_refuse_an_invalid_configuration",

@@ -24,11 +24,20 @@ from shmio.cli.common import (
     seed_number,
     verb_first,
 )
-from shmio.errors import ConfigError, LayoutError, PathError, ValueRangeError
+from shmio.errors import (
+    ConfigError,
+    LayoutError,
+    MissingLibraryError,
+    PathError,
+    SnapshotError,
+    ValueRangeError,
+)
 from shmio.version import __version__
 
 PROGRAM = "shmio-campaign"
 WRONG, UNDECIDED = 2, 3
+FAULTS = (ConfigError, LayoutError, MissingLibraryError, PathError, SnapshotError, ValueRangeError)
+"""The errors of the user's input and installation."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -42,8 +51,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _status_of(error: Exception) -> int:
-    """Return 2 if the campaign or the configuration is wrong; 3 if there is no verdict for another reason."""
-    return WRONG if isinstance(error, ConfigError | LayoutError | PathError | ValueRangeError) else UNDECIDED
+    """Return 2 if the user's input is wrong or a library is missing; 3 if there is no verdict for another reason."""
+    return WRONG if isinstance(error, FAULTS) else UNDECIDED
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -81,12 +81,14 @@ class Journal:
 
         Raises:
             ConfigError: There is a search already, there is none to go on with, it began in another
-                way, or another process has it open.
+                way, another process has it open, or the folder cannot be used.
             RecordingError: The file cannot be written.
 
         """
         self.file = folder / NAME
         try:
+            if folder.exists() and not folder.is_dir():
+                raise ConfigError(f"-o {folder}: this is a file; name a new or an empty folder")
             if resume and not self.file.exists():
                 raise ConfigError(f"--resume: {self.file} does not exist: there is no search to continue")
             folder.mkdir(parents=True, exist_ok=True)
@@ -94,7 +96,7 @@ class Journal:
                 raise ConfigError(f"-o {folder}: this folder has other files; give a new or an empty folder")
             self._fd = os.open(self.file, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
         except OSError as error:
-            raise RecordingError(f"{error.filename or self.file}: {error.strerror}") from None
+            raise ConfigError(f"-o {folder}: {error.filename or self.file}: {error.strerror}") from None
         try:
             self._lock()
             self._begin(beginning, resume=resume)

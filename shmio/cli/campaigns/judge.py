@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import errno
+import os
 import shlex
 import sys
 
@@ -12,7 +14,7 @@ from shmio.cli.campaigns.verdicts import UNDECIDED, tell
 from shmio.cli.common import say
 from shmio.cli.recordings.common import DamageReport, not_closed, time_range
 from shmio.config.campaign import CampaignFile
-from shmio.errors import ConfigError
+from shmio.errors import ConfigError, RecordingError
 from shmio.recording.injection_times import InjectionTimes
 from shmio.recording.judge import GoldenRecordings, judge_recording, recording_judge
 
@@ -21,16 +23,22 @@ def judge(arguments: argparse.Namespace) -> int:
     """Judge a recording, and print the verdicts.
 
     Raises:
-        ConfigError: The campaign is invalid.
+        ConfigError: The campaign or an option is invalid, or a file does not exist.
         RecordingError: A file is not a recording.
 
     """
     expectations = CampaignFile(arguments.campaign).expect  # its injections are not laid, so they may have ranges
     reports = Reports(arguments)
     reports.check()
+    for file in arguments.files:
+        if not file.exists():
+            raise ConfigError(f"{file}: {os.strerror(errno.ENOENT)}")
     report = DamageReport()
     with report.open(arguments.files) as dump:
-        begin, end = time_range(arguments, dump.begin_ns)
+        try:
+            begin, end = time_range(arguments, dump.begin_ns)
+        except RecordingError as error:  # wrong usage
+            raise ConfigError(str(error)) from None
         try:
             found = recording_judge(dump, expectations, GoldenRecordings(arguments.campaign.parent))
             judge_recording(dump, found, begin, end, reports.collector(lambda: found))

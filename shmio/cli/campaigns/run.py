@@ -49,10 +49,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.config is None and arguments.instance is None:
         arguments.config = configuration_of(arguments.campaign, campaign)
     duration_s = duration_of(arguments, campaign)
-    try:  # before an instance is started
+    with _faults_of(arguments.campaign):  # before an instance is started
         check_texts(campaign.expect)
-    except ConfigError as error:
-        raise ConfigError(f"{arguments.campaign}: {error}") from None
     if arguments.record is not None and arguments.record.exists():
         raise ConfigError(f"--record {arguments.record}: {EXISTS}")
     check_place("--record", arguments.record)
@@ -73,11 +71,8 @@ def run(arguments: argparse.Namespace) -> int:
     )
     facts = [*of_campaign(arguments.campaign, campaign.expect), ("seed", str(seed))]
     with stop_on_signals() as over:
-        try:
-            execute = _in_laboratory if arguments.lab else _on_instance
-            name, work = execute(_Run(arguments, campaign, plan, reports, facts, over))
-        except ConfigError as error:
-            raise ConfigError(f"{arguments.campaign}: {error}") from None
+        execute = _in_laboratory if arguments.lab else _on_instance
+        name, work = execute(_Run(arguments, campaign, plan, reports, facts, over))
     how = f"virtual, steps of {work.step_s * 1000:g} ms" if work.virtual else "real"
     facts += [("instance", name), ("time", how), ("duration", f"{duration_s:g} s")]
     facts += [] if work.start is None else [("start", f"snapshot {work.start.name}, {work.start.time_ns / 1e9:g} s")]
@@ -123,6 +118,15 @@ def duration_of(arguments: argparse.Namespace, campaign: Campaign) -> float:
     return duration_s
 
 
+@contextmanager
+def _faults_of(file: Path) -> Iterator[None]:
+    """Within a ``with`` block, prefix the message of a fault with the file that has it."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(f"{file}: {error}") from None
+
+
 @dataclass(frozen=True)
 class _Run:
     """A run of a campaign: what the user asked for, and where the results go.
@@ -141,12 +145,15 @@ class _Run:
 def _in_laboratory(run: _Run) -> tuple[str, LiveRun]:
     """Run the campaign in this process, without an instance. Return the instance's name and the run."""
     file: Path | None = run.arguments.config
+    named: Path = run.arguments.campaign
     if file is None:
-        raise ConfigError("--lab: name the configuration with -c FILE, or with the key config of the campaign")
+        raise ConfigError(f"{named}: name the configuration with -c FILE, or with the key config of the campaign")
     if run.arguments.real_time:
         raise ConfigError("--real-time: the time of a laboratory is always virtual")
     prepared = prepare_laboratory(file)
-    with Laboratory(prepared, run.campaign.parameters) as lab:
+    with _faults_of(named if run.campaign.parameters else file):
+        made = Laboratory(prepared, run.campaign.parameters)
+    with made as lab, _faults_of(named):
         work = lab.prepare(run.plan, run.reports.collector(lambda: work.judge))
         run.facts.extend(of_configuration(file))
         run.facts.extend(of_layouts({block.source: block.layout for block in prepared.blocks}))
@@ -158,10 +165,11 @@ def _on_instance(run: _Run) -> tuple[str, LiveRun]:
     """Run the campaign on an instance. Return the instance's name and the run."""
     if run.campaign.parameters:
         raise ConfigError(
-            "parameters: an instance cannot change the parameters of its models; use --lab, "
+            f"{run.arguments.campaign}: parameters: an instance cannot change the parameters of its models; use --lab, "
             "or set them in supervisor.toml"
         )
-    with _instance(run.arguments) as wanted, _opened(wanted, run.arguments) as segment:
+    named = run.arguments.campaign
+    with _instance(run.arguments) as wanted, _opened(wanted, run.arguments) as segment, _faults_of(named):
         file = _configuration(segment)
         attachments: AttachedFiles = no_attachments if file is None else ConfigFiles(file)
         run.facts.extend([] if file is None else of_configuration(file))
@@ -176,6 +184,7 @@ def _instance(arguments: argparse.Namespace) -> Iterator[Target]:
     """Yield the instance. With ``-c``, start it if it does not run, and then stop it at the end.
 
     Raises:
+        ConfigError: The configuration cannot be used.
         ControlError: The instance does not start.
 
     """

@@ -50,9 +50,13 @@ class Started(msgspec.Struct, tag=True):
 
 
 class Failed(msgspec.Struct, tag=True):
-    """Message of a detached supervisor: the instance cannot be started."""
+    """Message of a detached supervisor: the instance cannot be started.
+
+    ``faulty`` is True if the configuration is the reason.
+    """
 
     error: str
+    faulty: bool = False
 
 
 StartMessage = Configured | Started | Failed
@@ -85,7 +89,8 @@ def start(file: Path, mode: str, words: Sequence[str] = ()) -> tuple[str, Starte
         Path of the supervisor's log file, and the supervisor's message.
 
     Raises:
-        ControlError: The start failed.
+        ConfigError: The configuration cannot be used.
+        ControlError: The start failed for another reason.
 
     """
     command = (sys.executable, "-P", "-m", "shmio.cli.supervisor", "up")
@@ -154,7 +159,8 @@ def _await(fd: int) -> tuple[str, Started]:
     """Wait for the start; return the log file and the message.
 
     Raises:
-        ControlError: The start failed.
+        ConfigError: The configuration cannot be used.
+        ControlError: The start failed for another reason.
 
     """
     log_file = ""
@@ -164,7 +170,7 @@ def _await(fd: int) -> tuple[str, Started]:
             if isinstance(message, Started):
                 return log_file, message
             if isinstance(message, Failed):
-                raise ControlError(message.error)
+                raise ConfigError(message.error) if message.faulty else ControlError(message.error)
             log_file = message.log_file
             for warning in message.warnings:
                 say(warning, sys.stderr)

@@ -20,7 +20,7 @@ from shmio.cli.common import say
 from shmio.cli.instance.detach import Configured, Failed, Started, StartMessage, headline, replay_keys
 from shmio.cli.target import config_file
 from shmio.config import Address
-from shmio.errors import ShmioError
+from shmio.errors import ConfigError, LayoutError, ShmioError
 from shmio.libraries import skip_package_code
 from shmio.plan.prepare import Prepared, peer, prepare
 from shmio.plan.processes import BROKER, Job, Plan
@@ -113,7 +113,8 @@ def _detached(file: Path, mode: str, keys: Mapping[str, Any], report: int) -> in
             supervisor = Supervisor(plan, replan=_replan(plan, keys), on_state=on_state)
             supervisor.run()
     except ShmioError as error:
-        send(Failed("\n".join(map(printable, str(error).split("\n")))))
+        faulty = isinstance(error, ConfigError | LayoutError)
+        send(Failed("\n".join(map(printable, str(error).split("\n"))), faulty))
         return 1
     except OSError as error:
         send(Failed(printable(f"{error.filename}: {error.strerror}" if error.filename else str(error))))

@@ -168,5 +168,19 @@ def test_wrong_campaign_has_status_2(text: str, error: str, capsys: pytest.Captu
 def test_file_that_is_no_recording_has_status_3(capsys: pytest.CaptureFixture[str]) -> None:
     campaign("never = 'on'")
     assert main(["judge", "c.toml", "-f", "c.toml"]) == 3
-    assert main(["judge", "no.mem", "-f", "c.toml", "--json"]) == 3
-    assert "error" in json.loads(capsys.readouterr().out)
+    assert main(["judge", "c.toml", "-f", "c.toml", "--json"]) == 3
+    assert "error" in json.loads(capsys.readouterr().out.splitlines()[-1])
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        (["no.mem"], "no.mem: No such file or directory"),
+        (["run.mem", "--from", "yesterday"], "--from"),
+        (["run.mem", "--from", "3", "--to", "2"], "--to 2 is before --from 3"),
+    ],
+)
+def test_wrong_usage_has_status_2(words: list[str], error: str, capsys: pytest.CaptureFixture[str]) -> None:
+    campaign("never = 'on'")
+    assert main(["judge", *words, "-f", "c.toml", "--json"]) == 2
+    assert error in json.loads(capsys.readouterr().out)["error"]

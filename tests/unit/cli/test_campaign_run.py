@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,14 @@ class Lift(Model):
         self.height += dt_s
 """
 CAMPAIGN = 'duration_s = {duration_s}\n[[expect]]\nname = "low"\nalways = "lift/height < {limit}"\n'
+
+RANGE = """
+[[injection]]
+name = "late"
+target = "lift/height"
+operation = "set"
+value = { from = 0.0, to = 1.0 }
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -110,3 +119,59 @@ def test_a_removed_recording_ends_the_run(
     told = capsys.readouterr()
     assert "was false at 0.5" in told.out
     assert told.err.endswith("the run ended early: --record a.mem was removed while it was being written\n")
+
+
+@pytest.mark.parametrize("where", [["--lab"], []])
+@pytest.mark.parametrize(
+    ("config", "error"),
+    [
+        (None, "wrong.toml: No such file or directory"),
+        (CONFIG + "rate = 1\n", "unknown key"),
+        (CONFIG.replace("run_lift:Lift", "run_lift:Left"), "Left"),
+    ],
+)
+def test_a_fault_in_the_configuration_has_status_2_and_not_the_campaigns_name(
+    folder: Path, where: list[str], config: str | None, error: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    if config is not None:
+        (folder / "wrong.toml").write_text(config)
+    assert main(["run", "good.toml", "-c", "wrong.toml", *where]) == 2
+    told = capfd.readouterr().err
+    assert error in told
+    assert told.startswith("wrong.toml") or str(folder / "wrong.toml") in told
+    assert "good.toml" not in told
+
+
+def test_a_log_folder_that_cannot_be_used_has_status_2(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (folder / "wrong.toml").write_text(CONFIG.replace("[instance]", '[instance]\nlog_dir = "run_lift.py"'))
+    assert main(["run", "good.toml", "-c", "wrong.toml"]) == 2
+    assert "log_dir" in capfd.readouterr().err
+
+
+def test_a_fault_in_the_campaign_has_its_name(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "wrong.toml").write_text(CAMPAIGN.format(limit=1, duration_s=1).replace("height", "weight"))
+    assert lab("wrong.toml") == 2
+    assert capsys.readouterr().err.startswith("wrong.toml: expect[0].always: ")
+
+
+def test_an_unknown_snapshot_has_status_2(capsys: pytest.CaptureFixture[str]) -> None:
+    assert lab("good.toml", "--start", "wram") == 2
+    assert "unknown snapshot 'wram'" in capsys.readouterr().err
+
+
+def test_falsify_refuses_a_file_as_its_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = CAMPAIGN.format(limit=1, duration_s=1)
+    (folder / "ranges.toml").write_text(text + RANGE)
+    words = ["falsify", "ranges.toml", "-c", "supervisor.toml", "--search", "random", "-o", "good.toml"]
+    assert main(words) == 2
+    assert capsys.readouterr().err == "-o good.toml: this is a file; name a new or an empty folder\n"
+
+
+def test_a_missing_library_has_status_2(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    text = CAMPAIGN.format(limit=1, duration_s=1)
+    (folder / "ranges.toml").write_text(text + RANGE)
+    assert main(["falsify", "ranges.toml", "-c", "supervisor.toml"]) == 2
+    assert "shmio[falsify]" in capsys.readouterr().err
