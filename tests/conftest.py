@@ -50,6 +50,8 @@ ONE_AFTER_THE_OTHER = (
         "tests/system/test_docs.py",
         "tests/unit/cli/test_supervisor_cell.py::test_configuration_from_init_runs",
     ),
+    # its tests look whether an instance is left that was not there before
+    ("tests/system/test_pytest_plugin.py",),
     # all tests of such a module use one instance, browser or server, which takes seconds to start
     ("tests/compatibility/test_client.py",),
     ("tests/compatibility/test_segment.py",),
