@@ -59,7 +59,8 @@ def test_adding_and_removing_a_source_leaves_other_streams_alone(cell: Cell, stu
     next(stream)
     pids = {name: process["pid"] for name, process in cell.processes().items()}
     assert cell.run("shmio", "get", PATH).returncode == 0
-    assert "searched in source 'cell'" in cell.run("shmio", "get", "x/y").stderr
+    error = "no source 'x' and no register 'x/y' in source 'cell'\n"
+    assert cell.run("shmio", "get", "x/y").stderr == error
     add_second(cell)
     done = cell.supervisor("reload")
     assert (done.returncode, done.stderr) == (0, "")
