@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import os
-import secrets
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
 from shmio.config.folder import unwritable
 from shmio.errors import ConfigError
+from shmio.files import replace_file
 from shmio.judging.judge import Judge
 from shmio.judging.report import Drawn, Report, Span, html, junit
 from shmio.judging.source import Rows, Signal
@@ -130,22 +128,7 @@ def _write(file: Path, data: bytes) -> str:
         if file.exists() and not file.is_file():  # a device or a pipe
             file.write_bytes(data)
         else:
-            _replace(file.resolve(), data)
+            replace_file(file.resolve(), data, private=False)
     except OSError as error:
         return f"{file}: it cannot be written: {error.strerror}"
     return ""
-
-
-def _replace(file: Path, data: bytes) -> None:
-    new = file.with_name(f".shmio-{secrets.token_hex(8)}")
-    descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
-    try:
-        with os.fdopen(descriptor, "wb") as stream:
-            stream.write(data)
-            if file.exists():
-                os.fchmod(descriptor, file.stat().st_mode & 0o777)
-        new.replace(file)
-    except BaseException:
-        with suppress(OSError):
-            new.unlink()
-        raise

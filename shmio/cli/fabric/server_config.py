@@ -21,6 +21,7 @@ from shmio.errors import ConfigError
 from shmio.fabric.connection import INSTALL, public_key
 from shmio.fabric.names import CellName
 from shmio.fabric.server_config import ROUTE_PORTS, Kind, ServerSettings, User, server_configuration
+from shmio.files import replace_file
 from shmio.libraries import library
 from shmio.wording import plain_text, printable
 
@@ -44,11 +45,11 @@ def execute(options: argparse.Namespace) -> int:
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     made = [file for file in new if _make_seed(folder / file)]
     users = list(_users(folder))
-    _replace(folder / SETTINGS, msgspec.json.format(msgspec.json.encode(settings)).decode() + "\n")
+    replace_file(folder / SETTINGS, msgspec.json.format(msgspec.json.encode(settings)) + b"\n", private=True)
     written = []
     for index in range(len(settings.listen)):
         name = "nats-server.conf" if len(settings.listen) == 1 else f"nats-server-{index + 1}.conf"
-        _replace(folder / name, server_configuration(settings, index, users))
+        replace_file(folder / name, server_configuration(settings, index, users).encode(), private=True)
         written.append(folder / name)
     if options.json:
         seeds = [str(folder / file) for file in made]
@@ -158,19 +159,6 @@ def _key(file: Path) -> str:
     if file.stat().st_mode & 0o077:
         raise ConfigError(f"{file}: other users can read or change this seed; run chmod 600 {file}, or remove the file")
     return public_key(file.read_text(encoding="ascii", errors="replace").strip(), file)
-
-
-def _replace(file: Path, text: str) -> None:
-    """Write a file that only its owner can read. It replaces an older one at once."""
-    part = file.with_name(f".{file.name}.{os.getpid()}")
-    fd = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
-    try:
-        with open(fd, "w", encoding="utf-8") as stream:  # noqa: PTH123  a descriptor
-            stream.write(text)
-        part.replace(file)
-    except OSError:
-        part.unlink(missing_ok=True)
-        raise
 
 
 def _tls_options(tls: MqttTls | None) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import base64
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -15,6 +14,7 @@ from shmio.errors import ConfigError, RemoteError
 from shmio.fabric.connection import Access, call_once
 from shmio.fabric.names import CellName
 from shmio.fabric.registry import Registry
+from shmio.files import replace_file
 from shmio.layout.document import load_layout
 from shmio.layout.model import Layout
 from shmio.wording import unknown
@@ -139,9 +139,7 @@ def _keep(mirror: Mirror, offer: Offer, file: Path) -> None:
     stored = _Stored(str(mirror.cell), mirror.source, offer.period_ns, offer.stale_ns, text)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        part = file.with_suffix(".part")
-        part.write_bytes(msgspec.json.encode(stored))
-        os.replace(part, file)  # noqa: PTH105  atomic
+        replace_file(file, msgspec.json.encode(stored), private=False)
     except OSError:
         return  # only a start without a server would need it
 

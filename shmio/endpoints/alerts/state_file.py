@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
 import threading
 from collections.abc import Mapping
 from contextlib import suppress
@@ -19,6 +18,7 @@ import msgspec
 from shmio.config import Alert
 from shmio.endpoints.alerts.lifecycle import Progress
 from shmio.endpoints.alerts.notice import Notice
+from shmio.files import replace_file
 from shmio.segment import Segment
 
 FILE_NAME: Final = "alerts.json"
@@ -127,7 +127,7 @@ class StateWriter:
             if data is None:
                 return
             try:
-                _replace(self._file, data)
+                replace_file(self._file, data, private=True)
             except OSError as error:
                 problem = f"{self._file}: {error.strerror}; after a restart of this process, notices may come again"
                 if problem != self.problem:
@@ -135,15 +135,6 @@ class StateWriter:
                 self.problem = problem
             else:
                 self.problem = ""
-
-
-def _replace(file: Path, data: bytes) -> None:
-    """Replace a file at once: a reader sees the old or the new content. Only this user may read it."""
-    new = file.with_name(f".{file.name}.new")
-    descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-    with open(descriptor, "wb") as stream:  # noqa: PTH123  a descriptor
-        stream.write(data)
-    new.replace(file)
 
 
 def alert_states(folders: Mapping[str, str], segment: Segment) -> Mapping[str, AlertState]:
