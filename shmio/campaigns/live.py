@@ -251,8 +251,7 @@ class LiveRun:
 
     def _check_running(self) -> None:
         """Raise NotRunningError if the instance has stopped, or if its supervisor has died."""
-        if not self._segment.shared.current():
-            raise NotRunningError(f"instance {self._segment.instance!r} has stopped")
+        self._segment.require_running()
         if self._supervised and not self._segment.supervised:
             raise NotRunningError(f"the supervisor of instance {self._segment.instance!r} has died")
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from shmio.campaigns.digests import of_configuration, of_file, of_layouts
 from shmio.cli.campaigns.run import configuration_of, duration_of
+from shmio.cli.campaigns.verdicts import UNDECIDED
 from shmio.cli.common import say, say_json, stop_on_signals
 from shmio.config.campaign import Campaign, CampaignFile, campaign_of, read_settings
 from shmio.config.ranges import Point, Space
@@ -42,7 +43,7 @@ EACH_S: Final = 0.2
 """Interval in s at which the progress line on a terminal is updated."""
 LINES_S: Final = 10.0
 """Interval in s between two progress lines if standard error is not a terminal."""
-FAILED, UNDECIDED = 1, 3
+FAILED = 1
 
 
 def falsify(arguments: argparse.Namespace) -> int:
