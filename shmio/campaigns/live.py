@@ -32,14 +32,14 @@ from shmio.segment import Block, Event, Frame, Segment
 from shmio.segment.block import Layouts
 
 MAX_STEPS: Final = 256
-"""Maximum number of steps of virtual time after which their frames are read."""
+"""In virtual time, the frames of the steps are read after at most this many steps."""
 STOP_STEPS: Final = 64
 """As :data:`MAX_STEPS`, if the run stops at the first failure.
 
 The judge then also takes a turn after these steps, so it is the maximum number of steps after the failure.
 """
 TURN_FRAMES: Final = 1024
-"""Number of frames for which the judge takes a turn in virtual time, because a turn costs much, for any number."""
+"""In virtual time, the judge takes a turn when this many frames wait. A turn costs nearly the same for any number."""
 GOOD_S: Final = 10.0
 """Maximum time in s to wait at the start until all sources that the expectations read have good quality."""
 LOOK_S: Final = 0.02
@@ -275,7 +275,7 @@ class LiveRun:
             yield
 
     def _turns(self, tap: InstanceFollower, recorder: Recorder | None) -> Iterator[None]:
-        """In each iteration, record what is new; judge it as soon as it is enough for a turn."""
+        """In each iteration, record the new entries, and judge them if enough wait for a turn."""
         enough = TURN_FRAMES if self.virtual and not self._plan.stop else 1
         waiting = 0  # for the judge's next turn
         while True:

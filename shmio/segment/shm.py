@@ -203,7 +203,7 @@ class SharedObject:
 
 
 def _private_memory(name: str, size: int) -> mmap.mmap:
-    """Return memory of this process, which takes up room as it is used.
+    """Return private memory of this process. The kernel provides each page when it is first used.
 
     Raises:
         SegmentError: There is not enough memory.

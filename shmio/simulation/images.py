@@ -222,7 +222,7 @@ class RegisterPort:
         self._start, self._stop = register.offset, register.offset + register.size
         self._is_row = register.type == "BYTE" and len(register.dims) == 1
         self.is_native = register.element.base in NUMBERS and byte_order == sys.byteorder
-        """Whether C can read the register's bytes as numbers on this machine."""
+        """True if C on this machine can read the register's bytes as numbers."""
 
     def read(self) -> Any:
         """Return the value.
