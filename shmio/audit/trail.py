@@ -162,7 +162,7 @@ class _Waiting(NamedTuple):
     @property
     def kind(self) -> tuple[object, ...] | None:
         """Key that all repetitions of an action share; None if repetitions are not merged."""
-        if (self.action not in MERGED and self.outcome != "denied") or not isinstance(self.what, Mapping):
+        if (self.action not in MERGED and self.outcome != "denied") or callable(self.what):
             return None
         return self.acting.actor, self.acting.endpoint, self.action, self.outcome, self.reason, *self.what
 

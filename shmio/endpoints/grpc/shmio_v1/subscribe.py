@@ -375,11 +375,12 @@ class SubscribeCall:
         self._rotation += 1  # otherwise a block with long updates would starve the others
         most = len(parts) + BATCH_UPDATES
         while waiting and size < BATCH_BYTES and len(parts) < most:
-            update = waiting[0].next(now_s)
+            block = waiting.popleft()
+            update = block.next(now_s)
             if update is None:
-                waiting.popleft()
                 continue
-            waiting.rotate(-1)
+            if block.follower.behind:
+                waiting.append(block)
             self.updates += 1
             size += len(update)
             parts.append(field(UPDATES, update))

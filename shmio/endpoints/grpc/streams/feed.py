@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sized
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sized, ValuesView
 from typing import Final, NamedTuple, Protocol
 
 from shmio.endpoints.grpc.commands.command_client import CommandClient
@@ -455,6 +455,10 @@ class Feeds(Mapping[str, Feed]):
 
     def __len__(self) -> int:
         return len(self._feeds)
+
+    def values(self) -> ValuesView[Feed]:
+        """Return all feeds. Each step needs them; the method of Mapping would look up each by its name."""
+        return self._feeds.values()
 
     @property
     def messages(self) -> int:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
-from contextlib import asynccontextmanager, closing, suppress
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
+from contextlib import suppress
 from functools import partial
 from typing import Any, Final, TypeVar
 
@@ -47,7 +47,8 @@ class StepDriver:
         """
         until_ns = time.monotonic_ns() + BRIEF_NS
         cancelled = False
-        with closing(self._coordinator.stepping(dt_ns)) as stepping:
+        stepping = self._coordinator.stepping(dt_ns)
+        try:
             while not self._stopped:
                 try:
                     wait = next(stepping)
@@ -61,6 +62,8 @@ class StepDriver:
                         await self._wait(wait)
                     except asyncio.CancelledError:
                         cancelled = True
+        finally:
+            stepping.close()
         raise asyncio.CancelledError
 
     def stop(self) -> None:
@@ -374,20 +377,25 @@ class Stepper:
 
     async def _make(self, dt_ns: int | None) -> Step:
         """Make a step and deliver it."""
-        async with self._steering():
+
+        async def make() -> Step:
             step = await self._driver.step(dt_ns)
             await self.timeline.deliver(step)
             return step
 
+        return await self._steer(make)
+
     async def _change(self, call: Callable[[], None], *, end: bool = False) -> None:
         """Take control of time, and call a method of the coordinator that changes how time moves."""
-        async with self._steering():
+
+        async def change() -> None:
             call()
             self.timeline.ended = end
 
-    @asynccontextmanager
-    async def _steering(self) -> AsyncIterator[None]:
-        """Take control of time. Until the block ends, no other client of this endpoint can move time."""
+        await self._steer(change)
+
+    async def _steer(self, work: Callable[[], Awaitable[_Result]]) -> _Result:
+        """Take control of time, and do ``work``. Until it ends, no other client of this endpoint can move time."""
         async with self._lock:
             try:
                 if self._segment.outdated:
@@ -396,12 +404,12 @@ class Stepper:
                     self.timeline.update()  # another program may just have returned to real time
                     self._coordinator.take_over()
                     self._own(True)
+                    self.timeline.update()
                 await self.timeline.delivered()
                 self.timeline.steered = True
-                yield
+                return await work()
             finally:
-                self.timeline.steered = False
-                self.timeline.update()
+                self.timeline.end_steering()
                 self._set_rest()
 
     def _own(self, owns: bool) -> None:
@@ -431,8 +439,7 @@ class Stepper:
         if self._player.on:
             raise TimeError("time is playing; pause it first")
         check_virtual(self._segment.clock.read())
-        async with self._steering():
-            return await asyncio.to_thread(work, self._coordinator)
+        return await self._steer(partial(asyncio.to_thread, work, self._coordinator))
 
     # ---- playing ---------------------------------------------------------------------------------------------------
 
@@ -449,6 +456,7 @@ class Stepper:
         async with self._changing:
             await self._player.end()
             async with self._lock:
+                self.timeline.update()
                 await self.timeline.delivered()
                 self._coordinator.release()
                 self._own(False)

@@ -168,7 +168,7 @@ class Timeline:
         self.virtual_time = virtual_time
         """The state of virtual time, with the last delivered step."""
         self.steered = False
-        """True while this process moves time, and delivers its own steps."""
+        """True while this process moves time, until the delivery of its own step has begun."""
         self.ended = False
         """True after a client has called ``stop`` of SimServerAPI, until the next step."""
         self._clock = segment.clock
@@ -234,8 +234,7 @@ class Timeline:
         return self._status(self.update())
 
     async def delivered(self) -> None:
-        """Wait until no step is being delivered, and all steps of other programs have been."""
-        self.update()
+        """Wait until no step is being delivered, and all steps noticed meanwhile have been."""
         while self._delivery.busy:
             await self._delivery.over()
             self.update()
@@ -247,7 +246,14 @@ class Timeline:
         delivered.
         """
         self._delivery.begin(step, partial(self._mark, step))
+        self.steered = False
         await self._delivery.over()
+
+    def end_steering(self) -> None:
+        """Let :meth:`update` deliver steps again, and do so unless :meth:`deliver` has delivered the newest."""
+        if self.steered:
+            self.steered = False
+            self.update()
 
     def update(self) -> Clock:
         """Read the clock page, and react to its changes.
