@@ -17,7 +17,7 @@ from shmio.endpoints.grpc.encoding import field
 from shmio.endpoints.grpc.server.error_status import Context, refuse
 from shmio.endpoints.grpc.shmio_v1.declare import DeclareCall
 from shmio.endpoints.grpc.shmio_v1.selection import MAX_PATTERNS, Selections, SourceDirection
-from shmio.endpoints.grpc.shmio_v1.tables import VALUES, Array, StatusChanges, head, head_of, pack, pack_slots
+from shmio.endpoints.grpc.shmio_v1.tables import NO_STATUSES, VALUES, Array, head, head_of, pack, pack_slots
 from shmio.endpoints.grpc.shmio_v1.write import MAX_VALUES, decode_assignments, outcome, packed
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.endpoints.grpc.streams.outbox import SendQueue
@@ -391,7 +391,7 @@ class InjectCall(InjectionFollower):
             self._shown = frame
             return None
         before = self._shown_image if shown is not None and shown.source_ns else None
-        body, statuses = b"", StatusChanges(b"", codes=False)
+        body, statuses = b"", NO_STATUSES
         if frame.source_ns:
             columns = self._view.columns
             values = pack(columns.decode(image), None if before is None else columns.decode(before))

@@ -122,6 +122,7 @@ class LatestFrame:
         self._deadband = deadband
         self._last_s = -math.inf
         self._values: DecodedImage | None = None  # the receiver's values; kept only with a dead-band
+        self._with_statuses = view.block.statuses is not None
         self._sent: Frame | None = None  # frame of the last update; kept only if registers have statuses
 
     def next(self, now_s: float) -> bytes | None:
@@ -150,7 +151,7 @@ class LatestFrame:
         if shown is not None and not (update.changed or stale or was_stale or _state(frame) != _state(shown)):
             return None
         self._last_s = now_s
-        if self.view.block.statuses is not None:
+        if self._with_statuses:
             self._sent = frame
         return update.whole + stale
 
@@ -403,7 +404,8 @@ class SubscribeCall:
             self._wake_ups.join(updates.view.block, self._rings[place], patient=True)
 
     async def _wait(self) -> None:
-        due_s = min((updates.due_s for updates in self._blocks.values()), default=math.inf)
+        limited = self._blocks.values() if self._request.max_rate_hz else ()
+        due_s = min((updates.due_s for updates in limited), default=math.inf)
         if math.isinf(due_s):
             await self._wake.wait()
             return

@@ -411,6 +411,9 @@ class StatusChanges(NamedTuple):
     """True if a status code has changed; False if only source times have."""
 
 
+NO_STATUSES: Final = StatusChanges(b"", codes=False)
+
+
 class WriteUpdates:
     """Encodes the writes to a table's registers, once for all subscribers.
 
@@ -493,6 +496,7 @@ class Selection:
         self._updates: OrderedDict[tuple[int, int, int], UpdateMessage] = OrderedDict()
         self._injected_places: OrderedDict[int, Array] = OrderedDict()
         self._status_indices: Array | None = None
+        self._status_area = block.statuses
 
     @cached_property
     def writes(self) -> WriteUpdates:
@@ -537,7 +541,7 @@ class Selection:
         """
         if before is not None and not before.source_ns:
             before = None
-        if sent is None or self.block.statuses is None:
+        if sent is None or self._status_area is None:
             sent = before
         key = frame.number, before.number if before else 0, sent.number if sent else 0
         found = self._updates.get(key)
@@ -575,7 +579,7 @@ class Selection:
         sent: Frame | None,
         deadband: float = 0.0,
     ) -> UpdateMessage:
-        parts, statuses = [], StatusChanges(b"", codes=False)
+        parts, statuses = [], NO_STATUSES
         if frame.source_ns:
             if values := pack(new, old, deadband):
                 parts.append(field(VALUES, values))
@@ -591,9 +595,9 @@ class Selection:
 
     def statuses(self, frame: Frame, sent: Frame | None) -> StatusChanges:
         """Return the statuses of a frame that differ from those of the frame ``sent``; all if ``sent`` is None."""
-        area = self.block.statuses
+        area = self._status_area
         if area is None:
-            return StatusChanges(b"", codes=False)
+            return NO_STATUSES
         codes, times = self._status_columns(area, frame)
         differ = np.ones(len(codes), bool)
         places = np.arange(len(codes))
@@ -602,7 +606,7 @@ class Selection:
             differ = codes != old_codes
             places = np.flatnonzero(differ | (times != old_times))
         if not len(places):
-            return StatusChanges(b"", codes=False)
+            return NO_STATUSES
         columns = places.astype("<u4"), codes[places].astype("<u4"), times[places].astype("<i8")
         parts = b"".join(field(at, column.tobytes()) for at, column in enumerate(columns, 1))
         return StatusChanges(field(STATUSES, parts), codes=bool(differ.any()))

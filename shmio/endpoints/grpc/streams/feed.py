@@ -257,6 +257,8 @@ class Feed:
             self._shown = None
             return
         shown, self._shown = self._shown, DeliveredImage(*self._virtual_time.moment, frame.image, frame.raw)
+        if not self._channels:
+            return
         for channel in sorted(self._changes(shown, frame), key=lambda channel: channel.order):
             self._keep(channel.listeners, channel.encode(self._shown))
         self._settle()
