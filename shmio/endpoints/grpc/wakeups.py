@@ -14,7 +14,7 @@ log = logging.getLogger("shmio.grpc")
 
 Callback = Callable[[], object]
 
-PAUSE_S: Final = 0.005
+PAUSE_S: Final = 0.02
 """Length of a pause between wake-ups in which all listeners are patient, in s."""
 
 

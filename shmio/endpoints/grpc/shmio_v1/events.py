@@ -61,7 +61,7 @@ class EventLog:
         self.listeners: dict[Callback, None] = {}  # in the order in which they came
         self._entries: deque[tuple[int, int, bytes]] = deque()  # event's number, events missed until then, message
         self._size = 0
-        self._batches = BatchReader(block, wake_ups, self._read, patient=True)
+        self._batches = BatchReader(block, wake_ups, self._read)
 
     @property
     def end(self) -> int:
