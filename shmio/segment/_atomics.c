@@ -32,14 +32,15 @@ static void Ring_dealloc(Ring *self)
 
 static int Ring_init(Ring *self, PyObject *args, PyObject *kwargs)
 {
-    static char *names[] = {"buffer", "offset", "size", NULL};
+    static char *names[] = {"buffer", "offset", "size", "private", NULL};
     PyObject *object;
     Py_ssize_t offset, size;
+    int private = false;
     if (self->buffer.obj) {
         PyErr_SetString(PyExc_TypeError, "a Ring can be opened only once");
         return -1;
     }
-    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "Onn", names, &object, &offset, &size)) return -1;
+    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "Onn|p", names, &object, &offset, &size, &private)) return -1;
     if (PyObject_GetBuffer(object, &self->buffer, PyBUF_SIMPLE) < 0) return -1;
     if (offset < 0 || size < 0 || offset > self->buffer.len || size > self->buffer.len - offset) {
         PyErr_SetString(PyExc_ValueError, "ring lies outside the buffer");
@@ -50,6 +51,7 @@ static int Ring_init(Ring *self, PyObject *args, PyObject *kwargs)
         PyErr_SetString(PyExc_ValueError, wrong);
         return -1;
     }
+    self->ring.private = private && !self->buffer.readonly; /* its threads count themselves when they wait */
     self->scratch = malloc(align8(self->ring.frame_size));
     if (!self->scratch) {
         PyErr_NoMemory();
@@ -345,17 +347,17 @@ static PyObject *Ring_wake(Ring *self, PyObject *unused)
 {
     (void)unused;
     if (!Ring_writable(self)) return NULL;
-    doorbell_ring(&ring_head(&self->ring)->doorbell);
+    ring_wake(&self->ring);
     Py_RETURN_NONE;
 }
 
 /* Waits without the GIL, and returns the word's value. A signal also ends the wait; its Python handler
  * runs first. */
-static PyObject *wait_on(const a32 *word, unsigned int seen, long long timeout_ns)
+static PyObject *wait_on(const a32 *word, a32 *waiters, unsigned int seen, long long timeout_ns)
 {
     int error;
     Py_BEGIN_ALLOW_THREADS
-    error = doorbell_wait(word, seen, timeout_ns);
+    error = doorbell_wait(word, waiters, seen, timeout_ns);
     Py_END_ALLOW_THREADS
     if (error == EINTR && PyErr_CheckSignals() < 0) return NULL;
     if (error && error != EINTR && error != ETIMEDOUT) {
@@ -370,7 +372,8 @@ static PyObject *Ring_wait(Ring *self, PyObject *args)
     unsigned int seen;
     long long timeout_ns;
     if (!PyArg_ParseTuple(args, "IL", &seen, &timeout_ns)) return NULL;
-    return Ring_ready(self) ? wait_on(&ring_head(&self->ring)->doorbell, seen, timeout_ns) : NULL;
+    if (!Ring_ready(self)) return NULL;
+    return wait_on(&ring_head(&self->ring)->doorbell, ring_waiters(&self->ring), seen, timeout_ns);
 }
 
 /* Returns the relay in a buffer, which the caller must release; NULL with an exception. */
@@ -383,13 +386,13 @@ static relay *relay_in(PyObject *object, Py_buffer *buffer)
     return NULL;
 }
 
-static PyObject *relay_on(const a32 *word, PyObject *object, int descriptor, long long turn_ns)
+static PyObject *relay_on(const a32 *word, a32 *waiters, PyObject *object, int descriptor, long long turn_ns)
 {
     Py_buffer buffer;
     relay *shared = relay_in(object, &buffer);
     if (!shared) return NULL;
     Py_BEGIN_ALLOW_THREADS
-    relay_run(shared, word, descriptor, turn_ns);
+    relay_run(shared, word, waiters, descriptor, turn_ns);
     Py_END_ALLOW_THREADS
     PyBuffer_Release(&buffer);
     Py_RETURN_NONE;
@@ -401,7 +404,8 @@ static PyObject *Ring_relay(Ring *self, PyObject *args)
     int descriptor;
     long long turn_ns;
     if (!PyArg_ParseTuple(args, "OiL", &shared, &descriptor, &turn_ns)) return NULL;
-    return Ring_ready(self) ? relay_on(&ring_head(&self->ring)->doorbell, shared, descriptor, turn_ns) : NULL;
+    if (!Ring_ready(self)) return NULL;
+    return relay_on(&ring_head(&self->ring)->doorbell, ring_waiters(&self->ring), shared, descriptor, turn_ns);
 }
 
 static PyObject *Ring_get(Ring *self, void *field)
@@ -598,7 +602,7 @@ static PyObject *atomics_bell_wait(PyObject *module, PyObject *args)
     long long timeout_ns;
     if (!PyArg_ParseTuple(args, "y*nIL", &buffer, &offset, &seen, &timeout_ns)) return NULL;
     const a32 *at = (const a32 *)(void *)place(&buffer, offset, 4, 4);
-    PyObject *value = at ? wait_on(at, seen, timeout_ns) : NULL; /* the buffer stays exported */
+    PyObject *value = at ? wait_on(at, NULL, seen, timeout_ns) : NULL; /* the buffer stays exported */
     PyBuffer_Release(&buffer);
     return value;
 }
@@ -613,7 +617,7 @@ static PyObject *atomics_bell_relay(PyObject *module, PyObject *args)
     long long turn_ns;
     if (!PyArg_ParseTuple(args, "y*nOiL", &buffer, &offset, &shared, &descriptor, &turn_ns)) return NULL;
     const a32 *at = (const a32 *)(void *)place(&buffer, offset, 4, 4);
-    PyObject *result = at ? relay_on(at, shared, descriptor, turn_ns) : NULL; /* the buffer stays exported */
+    PyObject *result = at ? relay_on(at, NULL, shared, descriptor, turn_ns) : NULL; /* the buffer stays exported */
     PyBuffer_Release(&buffer);
     return result;
 }

@@ -93,7 +93,7 @@ static inline uint32_t frames_publish(const ring_view *ring, const uint8_t *data
         *last = at;
         *end = at += ENTRY_HEADER_SIZE + length;
     }
-    if (count) doorbell_ring(&ring_head(ring)->doorbell);
+    if (count) ring_wake(ring);
     return count;
 }
 

@@ -19,9 +19,9 @@ typedef struct {
 _Static_assert(sizeof(relay) == 16, "relay");
 
 /* Makes `descriptor` readable at the start, after each ring of the doorbell, and after `turn_ns` without a
- * ring. Until the loop has handled a wake-up, it gets no other, and the doorbell does not wake this thread.
+ * ring. `waiters` is that of doorbell_wait. Until the loop has handled a wake-up, it gets no other, and the doorbell does not wake this thread.
  * Returns after relay_stop. */
-static inline void relay_run(relay *shared, const a32 *word, int descriptor, int64_t turn_ns)
+static inline void relay_run(relay *shared, const a32 *word, a32 *waiters, int descriptor, int64_t turn_ns)
 {
     const uint64_t one = 1;
     atomic_store(&shared->word, word);
@@ -32,10 +32,10 @@ static inline void relay_run(relay *shared, const a32 *word, int descriptor, int
         if (atomic_compare_exchange_strong(&shared->state, &state, RELAY_NOTIFIED)) {
             if (write(descriptor, &one, sizeof one) < 0) return; /* cannot happen: the counter does not overflow */
         } else if (state == RELAY_NOTIFIED && atomic_compare_exchange_strong(&shared->state, &state, RELAY_WAITING)) {
-            doorbell_wait(&shared->state, RELAY_WAITING, -1);
+            doorbell_wait(&shared->state, NULL, RELAY_WAITING, -1);
         }
         if (atomic_load(&shared->state) == RELAY_STOPPED) return;
-        doorbell_wait(word, seen, turn_ns);
+        doorbell_wait(word, waiters, seen, turn_ns);
     }
 }
 

@@ -52,7 +52,9 @@ typedef struct {
     a64 head;     /* number of the last complete frame; 0: none yet */
     a32 doorbell; /* futex word: incremented after a frame, or after a run of frames */
     a32 incarnation;
-    uint64_t reserved2[6];
+    a32 waiters; /* in a private ring: number of threads that wait on the doorbell */
+    uint32_t reserved5;
+    uint64_t reserved2[5];
 } ring_header;
 _Static_assert(sizeof(ring_header) == RING_HEADER_SIZE, "ring header");
 
@@ -83,6 +85,7 @@ _Static_assert(sizeof(slot_info) == SLOT_HEADER_SIZE - 8, "slot info");
 typedef struct {
     uint8_t *base;
     uint32_t slot_count, slot_stride, frame_size, effective_offset;
+    bool private; /* only this process uses the ring, and its threads wait with doorbell_wait and ring_waiters */
 } ring_view;
 
 static inline uint64_t align8(uint64_t size) { return (size + 7u) & ~(uint64_t)7u; }
@@ -110,7 +113,7 @@ static inline const char *ring_open(ring_view *ring, uint8_t *base, uint64_t siz
     if (header.slot_stride < last + image || (header.effective_offset && header.effective_offset < RAW_OFFSET + image))
         return "images overlap or do not fit in a slot";
     if (RING_HEADER_SIZE + (uint64_t)header.slot_count * header.slot_stride > size) return "slots do not fit in the section";
-    *ring = (ring_view){base, header.slot_count, header.slot_stride, header.frame_size, header.effective_offset};
+    *ring = (ring_view){base, header.slot_count, header.slot_stride, header.frame_size, header.effective_offset, false};
     return NULL;
 }
 
@@ -146,23 +149,45 @@ static inline void words_load(uint8_t *data, const uint8_t *shared, size_t size)
     }
 }
 
+static inline void futex_wake(a32 *word) { syscall(SYS_futex, word, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0); }
+
 /* Wakes all threads that wait on this word. Readers with a read-only mapping cannot register, so the
  * system call is always made. */
 static inline void doorbell_ring(a32 *word)
 {
     /* Release: a thread that sees the new value sees everything that was written before it. */
     atomic_fetch_add_explicit(word, 1, memory_order_release);
-    syscall(SYS_futex, word, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0);
+    futex_wake(word);
 }
 
 /* Waits until the word differs from `seen`, or until the time-out (negative: none). Returns 0 or errno
- * (EINTR, ETIMEDOUT). */
-static inline int doorbell_wait(const a32 *word, uint32_t seen, int64_t timeout_ns)
+ * (EINTR, ETIMEDOUT). `waiters` counts this thread while it waits, unless it is NULL. */
+static inline int doorbell_wait(const a32 *word, a32 *waiters, uint32_t seen, int64_t timeout_ns)
 {
-    if (atomic_load_explicit(word, memory_order_acquire) != seen) return 0;
+    int error = 0;
     struct timespec limit = {timeout_ns / 1000000000, timeout_ns % 1000000000};
-    long result = syscall(SYS_futex, word, FUTEX_WAIT, seen, timeout_ns < 0 ? NULL : &limit, NULL, 0);
-    return result == 0 || errno == EAGAIN ? 0 : errno;
+    if (waiters) atomic_fetch_add_explicit(waiters, 1, memory_order_seq_cst);
+    /* seq_cst, as in ring_wake: either this thread sees the new value of the word, or ring_wake sees this thread. */
+    if (atomic_load_explicit(word, memory_order_seq_cst) == seen &&
+        syscall(SYS_futex, word, FUTEX_WAIT, seen, timeout_ns < 0 ? NULL : &limit, NULL, 0) != 0 && errno != EAGAIN)
+        error = errno;
+    if (waiters) atomic_fetch_add_explicit(waiters, (uint32_t)-1, memory_order_relaxed);
+    return error;
+}
+
+/* Returns what counts the threads that wait on a ring's doorbell; NULL if other processes may wait on it, too. */
+static inline a32 *ring_waiters(const ring_view *ring) { return ring->private ? &ring_head(ring)->waiters : NULL; }
+
+/* Wakes all readers. For a private ring, the system call is made only if a thread waits. */
+static inline void ring_wake(const ring_view *ring)
+{
+    ring_header *header = ring_head(ring);
+    if (!ring->private) {
+        doorbell_ring(&header->doorbell);
+        return;
+    }
+    atomic_fetch_add_explicit(&header->doorbell, 1, memory_order_seq_cst);
+    if (atomic_load_explicit(&header->waiters, memory_order_seq_cst)) futex_wake(&header->doorbell);
 }
 
 /* Writes a frame, and returns its number. It wakes no reader. Each ring has one writer. `effective` is NULL if
@@ -195,7 +220,7 @@ static inline uint64_t ring_publish(const ring_view *ring, slot_info info, const
                                     const uint8_t *effective)
 {
     uint64_t frame = ring_write(ring, info, reason, raw, effective);
-    doorbell_ring(&ring_head(ring)->doorbell);
+    ring_wake(ring);
     return frame;
 }
 

@@ -198,8 +198,8 @@ def read_block(
     try:
         at, size = part(SectionKind.SOURCE)
         attributes = _ATTRIBUTES.decode(bytes(memory[at : at + size]))
-        frames = _atomics.Ring(memory, *part(SectionKind.FRAMES))
-        events = _atomics.Ring(memory, *part(SectionKind.EVENTS))
+        frames = _atomics.Ring(memory, *part(SectionKind.FRAMES), private=shared.is_private)
+        events = _atomics.Ring(memory, *part(SectionKind.EVENTS), private=shared.is_private)
         queues = CommandQueues(memory, *part(SectionKind.COMMANDS))
         injections, size = part(SectionKind.INJECTIONS)
         declared, declared_size = part(SectionKind.DECLARED)

@@ -34,7 +34,8 @@ class SharedObject:
         self.name = name
         self._path = f"{DIRECTORY}/{name}"
         self.writable = writable
-        self._private = private  # its file has only locks: the memory is that of the process
+        self.is_private = private
+        """True if only this process can use the memory. The object's file then has only locks."""
         self.inode = os.fstat(fd).st_ino
         self._fd = fd
         self._held: set[int] = set()
@@ -103,7 +104,7 @@ class SharedObject:
         Raises:
             SegmentError: There is no room in shared memory.
         """
-        if self._private:
+        if self.is_private:
             self._map = _private_memory(self.name, size)
             return
         try:
@@ -121,7 +122,7 @@ class SharedObject:
     @property
     def size(self) -> int:
         """Present size of the object, in bytes."""
-        if self._private:
+        if self.is_private:
             return 0 if self._map is None else len(self._map)
         return os.fstat(self._fd).st_size
 
@@ -169,7 +170,7 @@ class SharedObject:
         Return False if the name was removed, or belongs to a new object. A private object, which has
         no name, is always current.
         """
-        if self._private:
+        if self.is_private:
             return True
         try:
             return os.fstat(self._fd).st_nlink > 0  # faster than the path, and each step of time asks
@@ -191,7 +192,7 @@ class SharedObject:
         if self._fd < 0:
             return
         if self._map is not None:
-            if not self._private:  # else other objects may use the mapping, which ends with the last of them
+            if not self.is_private:  # else other objects may use the mapping, which ends with the last of them
                 with suppress(BufferError):  # a view is still referenced; the mapping ends with that
                     self._map.close()
             self._map = None

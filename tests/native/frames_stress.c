@@ -90,7 +90,7 @@ int main(void)
             check_frames(&far, count, last);
             seen += count;
         } else if (head == last) {
-            doorbell_wait(bell, before, 1000000000);
+            doorbell_wait(bell, NULL, before, 1000000000);
         } else {
             uint64_t newest = atomic_load(&ring_head(&near)->head);
             check(newest > last + SLOTS - 1, "a frame was lost early");

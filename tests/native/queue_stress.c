@@ -37,7 +37,7 @@ static void *consume(void *unused)
             uint32_t seen = atomic_load_explicit(&bell, memory_order_acquire);
             result = queue_peek(queue, CAPACITY, &size);
             if (result != QUEUE_EMPTY) break;
-            doorbell_wait(&bell, seen, 1000000000);
+            doorbell_wait(&bell, NULL, seen, 1000000000);
         }
         bool right = result == QUEUE_RECORD && size == size_of(number);
         if (right) {

@@ -2,8 +2,8 @@
  *
  * The header itself is compiled here. Each of its accesses to shared memory and each of its system calls
  * is replaced by one that first lets another party continue. From each state, every party is tried next. A state
- * is identified by what each party has seen and by the shared data, so that each is explored once. Memory
- * is assumed to be sequentially consistent, and a futex may also wake without a reason, as after a signal.
+ * is identified by what each party has seen and by the shared data, so that each is explored once. The doorbell
+ * is that of a ring: first of one that other processes may use, then of a private one. Memory is assumed to be sequentially consistent, and a futex may also wake without a reason, as after a signal.
  * Exit status 0: no ring of the doorbell was lost, and a stopped thread ends. */
 #include <errno.h>
 #include <linux/futex.h>
@@ -76,7 +76,8 @@ static char stacks[PARTIES][1 << 16];
 
 /* Data that the parties share. */
 static relay shared;
-static a32 word;
+static ring_header header;
+static ring_view ring = {.base = (uint8_t *)&header};
 static uint32_t frames, looked_at, told;
 static bool stopping, stop_called;
 static int spurious;
@@ -136,7 +137,7 @@ static ssize_t model_write(int descriptor, const void *data, size_t size)
     return (ssize_t)size;
 }
 
-static void run_thread(void) { relay_run(&shared, &word, DESCRIPTOR, 1); }
+static void run_thread(void) { relay_run(&shared, &header.doorbell, ring_waiters(&ring), DESCRIPTOR, 1); }
 
 /* Handles each wake-up and looks. One more wake-up has no cause, as happens to event loops. */
 static void run_loop(void)
@@ -161,7 +162,7 @@ static void run_ringer(void)
     for (uint32_t i = 0; i < rings; i++) {
         turn();
         frames++;
-        doorbell_ring(&word);
+        ring_wake(&ring);
     }
 }
 
@@ -182,7 +183,7 @@ static void begin(bool with_stop)
 {
     void (*const functions[PARTIES])(void) = {run_thread, run_loop, run_ringer, run_stopper};
     memset(&shared, 0, sizeof shared);
-    word = frames = looked_at = told = 0;
+    header.doorbell = header.waiters = frames = looked_at = told = 0;
     stopping = with_stop, rings = with_stop ? 1 : 2, stop_called = false, spurious = 0;
     for (int i = 0; i < PARTIES; i++) {
         parties[i].begun = false, parties[i].seen = 0, parties[i].waits = NULL, parties[i].done = i == STOPPER && !with_stop;
@@ -217,7 +218,7 @@ static void go_on(int choice)
 
 static uint64_t digest(void)
 {
-    uint64_t all[3 * PARTIES + 6], hash = 14695981039346656037u;
+    uint64_t all[3 * PARTIES + 7], hash = 14695981039346656037u;
     int count = 0;
     for (int i = 0; i < PARTIES; i++) {
         all[count++] = parties[i].seen;
@@ -225,7 +226,8 @@ static uint64_t digest(void)
         all[count++] = parties[i].done;
     }
     all[count++] = shared.state;
-    all[count++] = word;
+    all[count++] = header.doorbell;
+    all[count++] = header.waiters;
     all[count++] = (uint64_t)frames << 32 | looked_at;
     all[count++] = (uint64_t)told << 32 | (unsigned)spurious;
     all[count++] = stop_called;
@@ -268,7 +270,7 @@ static const char *wrong_end(void)
     if (!stopping) return looked_at == rings ? NULL : "a ring was lost";
     if (parties[THREAD].done) return NULL;
     /* The thread was just about to wait for its turn_ns: whoever waits for its end stops it again. */
-    if (parties[THREAD].waits == &word)
+    if (parties[THREAD].waits == &header.doorbell)
         return shared.state == RELAY_STOPPED ? NULL : "a stopped thread keeps running";
     return "a stopped thread waits for the loop";
 }
@@ -298,13 +300,15 @@ static int explore(int depth)
 
 int main(void)
 {
-    for (int with_stop = 0; with_stop < 2; with_stop++) {
+    for (int mode = 0; mode < 4; mode++) {
+        bool with_stop = mode & 1;
+        ring.private = mode & 2;
         states = 0;
         memset(known, 0, sizeof known);
         begin(with_stop);
         is_new(digest());
         if (explore(0)) return 1;
-        printf("%s: %u states\n", with_stop ? "stopped" : "to the end", states);
+        printf("%s, %s: %u states\n", ring.private ? "private" : "shared", with_stop ? "stopped" : "to the end", states);
     }
     return 0;
 }

@@ -121,7 +121,7 @@ static void model_fence(memory_order order)
 
 static uint8_t memory[RING_HEADER_SIZE + SLOTS * (RAW_OFFSET + SIZE)] __attribute__((aligned(64)));
 static uint8_t cell[8 + 16] __attribute__((aligned(64)));
-static ring_view ring = {memory, SLOTS, RAW_OFFSET + SIZE, SIZE, 0};
+static ring_view ring = {memory, SLOTS, RAW_OFFSET + SIZE, SIZE, 0, false};
 
 static void check(bool right, const char *what)
 {

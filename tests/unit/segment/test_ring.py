@@ -208,13 +208,14 @@ def test_any_slots_with_a_valid_header_are_readable(data: bytes) -> None:
         ring.read(number)
 
 
-def test_a_waiter_is_woken_by_the_next_frame() -> None:
+@pytest.mark.parametrize("private", [False, True])
+def test_a_waiter_is_woken_by_the_next_frame(private: bool) -> None:
     memory = ring_memory()
-    ring = Ring(memory, 0, len(memory))
+    ring, reader = (Ring(memory, 0, len(memory), private=private) for _ in range(2))
     ring.begin()
     seen = ring.doorbell()
-    assert ring.wait(seen, 0) == seen  # no ring: it returns after the time-out
-    waiter = threading.Thread(target=ring.wait, args=(seen, -1))
+    assert reader.wait(seen, 0) == seen  # no ring: it returns after the time-out
+    waiter = threading.Thread(target=reader.wait, args=(seen, -1))
     waiter.start()
     publish(ring, bytes(20))
     waiter.join(10)
