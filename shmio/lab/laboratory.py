@@ -280,9 +280,11 @@ class _LabCoordinator(Coordinator):
                         lab.stepping = True
                         try:
                             begin_step(before, step, time_ns, dt_ns, done)
-                            problem = "; ".join(
-                                [f"{name}: {why}" for name, loop in loops if (why := loop.step(step, time_ns, dt_ns))]
-                            )
+                            problems = []
+                            for name, loop in loops:
+                                if why := loop.step(step, time_ns, dt_ns):
+                                    problems.append(f"{name}: {why}")
+                            problem = "; ".join(problems)
                         finally:
                             lab.stepping = False
                     done = done if problem else step

@@ -24,6 +24,7 @@ import struct
 import time
 from collections.abc import Callable
 from enum import IntEnum
+from functools import partial
 from typing import Final, NamedTuple
 
 from shmio.errors import SegmentError
@@ -112,7 +113,8 @@ class DoubleBuffer:
             complaint: Message of the error that :meth:`read` raises if both copies are corrupt.
         """
         self._memory = memory
-        self._copies = copies
+        self.write = partial(_atomics.cells_write, memory, copies)
+        """Writes the value to one copy, then to the other. Only the value's owner may call this."""
         self._attempts = copies * _ATTEMPTS
         self._complaint = complaint
 
@@ -123,10 +125,6 @@ class DoubleBuffer:
             if data is not None:
                 return data
         raise SegmentError(self._complaint)
-
-    def write(self, data: bytes) -> None:
-        """Write the value to one copy, then to the other. Only the value's owner may call this."""
-        _atomics.cells_write(self._memory, self._copies, data)
 
 
 class ClockPage:
@@ -238,8 +236,8 @@ class ClockPage:
             done: Number of the last step that is done.
         """
         flags = _STEPPING | _PLAYING if before.playing else _STEPPING
-        rest = before.step_size_ns, before.rate, before.owner, b""
-        self._state.write(_STATE.pack(before.mode, flags, step, time_ns, dt_ns, done, *rest))
+        mode, step_size_ns, rate, owner = before.mode, before.step_size_ns, before.rate, before.owner
+        self._state.write(_STATE.pack(mode, flags, step, time_ns, dt_ns, done, step_size_ns, rate, owner, b""))
 
     def end_step(self, before: Clock, step: int, time_ns: int, dt_ns: int, done: int, note: str) -> None:
         """Write that a step of virtual time has ended, and ring the page's doorbell.
