@@ -18,10 +18,10 @@ from shmio.cli.common import (
     complete,
     exit_on_signals,
     load,
-    milliseconds,
     run,
     seconds,
     seed_number,
+    step_ms,
     verb_first,
 )
 from shmio.errors import (
@@ -97,7 +97,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     live.add_argument(
         "--step-ms",
-        type=milliseconds,
+        type=step_ms,
         metavar="N",
         help="length of a step (default: step_ms of the file, or the shortest period)",
     )
@@ -149,7 +149,7 @@ def _falsify(verb: argparse.ArgumentParser) -> None:
     _settings(verb)
     verb.add_argument("--for", dest="for_s", type=seconds, metavar="S", help="duration (default: that of the file)")
     verb.add_argument(
-        "--step-ms", type=milliseconds, metavar="N", help="length of a step (default: that of the file, or the period)"
+        "--step-ms", type=step_ms, metavar="N", help="length of a step (default: that of the file, or the period)"
     )
     verb.add_argument(
         "--limit", type=seconds, default=60, metavar="S", help="maximum real time of a trial (default: 60 s)"

@@ -201,6 +201,19 @@ def milliseconds(text: str) -> float:
     return found
 
 
+def step_ms(text: str) -> float:
+    """Convert an argument that is the length of a step in ms. This is an argparse type."""
+    from shmio.model.clock import MAX_STEP_NS, MIN_STEP_NS, check_step  # noqa: PLC0415  only for commands that step
+
+    try:
+        found = float(text)
+        check_step(found * 1e6)
+    except ValueError:  # ValueRangeError is one
+        limits = f"from {MIN_STEP_NS / 1e6:g} to {MAX_STEP_NS // 10**6}"
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of ms {limits}") from None
+    return found
+
+
 _AGO: Final = re.compile(r"([0-9]{1,9}(?:\.[0-9]{1,6})?)([smhd])")
 _UNITS_S: Final = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
 

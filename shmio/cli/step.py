@@ -8,17 +8,17 @@ import sys
 
 import msgspec
 
-from shmio.cli.common import at_least, dumps, stop_on_signals
-from shmio.errors import CommandError, ValueRangeError
+from shmio.cli.common import at_least, dumps, step_ms, stop_on_signals
+from shmio.errors import CommandError
 from shmio.model.cell import Cell
-from shmio.model.clock import MAX_RATE, MAX_STEP_NS, MIN_STEP_NS, ClockMode, ClockStatus, check_step, clock_status
+from shmio.model.clock import MAX_RATE, ClockMode, ClockStatus, clock_status
 
 LOOK_S = 0.2
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``step``."""
-    parser.add_argument("--dt-ms", type=_dt_ms, metavar="N", help="length of a step (default: the step size, 50)")
+    parser.add_argument("--dt-ms", type=step_ms, metavar="N", help="length of a step (default: the step size, 50)")
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--count", type=at_least(1), default=1, metavar="N", help="number of steps (default: 1)")
     how.add_argument(
@@ -110,24 +110,10 @@ def _play(cell: Cell, rate: float, dt_s: float | None) -> None:
 
 
 def _rate(text: str) -> float:
-    value = _number(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
     if not 0 < value <= MAX_RATE:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0 and up to {MAX_RATE:g}")
     return value
-
-
-def _dt_ms(text: str) -> float:
-    value = _number(text)
-    try:
-        check_step(value * 1e6)
-    except ValueRangeError:
-        limits = f"from {MIN_STEP_NS / 1e6:g} to {MAX_STEP_NS // 10**6}"
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of ms {limits}") from None
-    return value
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan

@@ -16,7 +16,7 @@ from msgspec import Meta, field
 from shmio.config.declaration import check_declarations
 from shmio.config.expectation import expectation_faults
 from shmio.config.faults import named
-from shmio.config.model import Declaration, Expectation, Milliseconds, Section, Text
+from shmio.config.model import Declaration, Expectation, Section, Text
 from shmio.config.ranges import Choice, Point, Space, key_of
 from shmio.config.read import check_text, convert, read_tables
 from shmio.errors import ConfigError
@@ -47,7 +47,7 @@ class Campaign(Section, omit_defaults=True):
     config: Text | None = None
     start: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$")] | None = None
     duration_s: Annotated[float, Meta(gt=0, le=1e6)] | None = None
-    step_ms: Milliseconds | None = None
+    step_ms: Annotated[float, Meta(ge=0.001, le=3_600_000)] | None = None
     parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
     injection: list[Declaration] = field(default_factory=list)
     expect: list[Expectation] = field(default_factory=list)

@@ -159,6 +159,22 @@ def test_an_unknown_snapshot_has_status_2(capsys: pytest.CaptureFixture[str]) ->
     assert "unknown snapshot 'wram'" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("text", ["0", "0.0001", "3600001", "nan", "x"])
+@pytest.mark.parametrize("verb", ["run", "falsify"])
+def test_a_step_has_limits(verb: str, text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([verb, "good.toml", "-c", "supervisor.toml", "--step-ms", text])
+    assert stop.value.code == 2
+    assert f"argument --step-ms: '{text}' is not a number of ms from 0.001 to 3600000\n" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("step_ms", ["0.0001", "3600001.0"])
+def test_the_key_of_a_step_has_the_same_limits(folder: Path, step_ms: str, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "steps.toml").write_text(f"step_ms = {step_ms}\n{(folder / 'good.toml').read_text()}")
+    assert lab("steps.toml") == 2
+    assert "step_ms: expected a number" in capsys.readouterr().err
+
+
 def test_falsify_refuses_a_file_as_its_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = CAMPAIGN.format(limit=1, duration_s=1)
     (folder / "ranges.toml").write_text(text + RANGE)
