@@ -20,6 +20,7 @@ from shmio.recording.format.mcap_writer import IndexedChunk, Summary, message_in
 from shmio.recording.format.records import (
     BROKEN,
     CHUNK,
+    COMPRESSIONS,
     HEAD,
     INDEX,
     LOOK_BYTES,
@@ -57,8 +58,8 @@ def finalise(file: Path, beat: Callable[[], object] = lambda: None) -> bool:
         False if another process is still writing the file.
 
     Raises:
-        RecordingError: The file is not a recording, or is so damaged that only ``shmio-dump
-            recover`` can read it.
+        RecordingError: The file is not a recording, is so damaged that only ``shmio-dump recover`` can read
+            it, or ends with a chunk whose compression is unknown. The file is unchanged.
         OSError: The disk is full. The file is unchanged, except that its incomplete or damaged end is cut off.
     """
     with Reader(file, own=True, beat=beat) as reader:
@@ -204,8 +205,18 @@ class _RecordingEnd:
         chunk.counts[number] = size // _ENTRY_BYTES
 
     def _drop_damaged(self) -> None:
-        """Cut off the damaged chunks after the last intact record."""
+        """Cut off the damaged chunks after the last intact record.
+
+        Raises:
+            RecordingError: The compression of such a chunk is unknown, so the chunk may be intact.
+        """
         while self._chunks and self._chunks[-1][0].start > self._besides and not self._intact(self._chunks[-1][0]):
+            record, chunk = self._chunks[-1]
+            if chunk.index.compression not in COMPRESSIONS:
+                raise RecordingError(
+                    f"{self._reader.file}: the chunk at byte {record.start} has the compression "
+                    f"{chunk.index.compression[:20]!r}, which this version of shmio does not know"
+                )
             self.cut = self._chunks.pop()[0].start
             self.dropped += 1
 

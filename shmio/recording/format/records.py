@@ -47,6 +47,9 @@ MAX_CHUNK_BYTES: Final = 32 << 20
 A recorder ends a chunk as soon as it has 1 MiB; a message has at most 2 MiB.
 """
 
+COMPRESSIONS: Final = ("", "zstd")
+"""The compressions of chunks that can be read; "" is none."""
+
 HEAD: Final = struct.Struct("<BQ")  # of any record: opcode, size of its content
 CHUNK: Final = struct.Struct("<QQQI")  # start, end, uncompressed size, CRC; then the compression's name, size, data
 FOOTER: Final = struct.Struct("<QQI")  # start of the summary, start of its offsets, CRC of the summary up to here

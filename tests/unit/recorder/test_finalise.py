@@ -15,6 +15,7 @@ from shmio.errors import RecordingError
 from shmio.recorder.finalise import finalise
 from shmio.recorder.recorder import AttachedFile
 from shmio.recording.check import check
+from shmio.recording.format.records import HEAD
 from shmio.recording.reading.reader import Reader
 from shmio.segment import EventKind, Record, Segment
 from shmio.testing.cell import kill, until
@@ -140,6 +141,25 @@ def test_damaged_chunks_at_the_end_are_cut_off(
     with Reader(whole) as reader:
         assert check(reader).whole
     assert f"{whole} ended with {damaged} damaged chunk" in caplog.text
+
+
+@pytest.mark.parametrize("damaged", [0, 1])
+def test_a_chunk_of_unknown_compression_is_not_cut_off(whole: Path, damaged: int) -> None:
+    """Another program may have written it, such as one that compresses recordings again."""
+    content = whole.read_bytes()
+    chunks = records(whole, Opcode.CHUNK)
+    begin, end = chunks[-1 - damaged]
+    chunk = content[begin:end].replace(b"\x04\x00\x00\x00zstd", b"\x03\x00\x00\x00lz4", 1)
+    packed = chunk[:1] + (len(chunk) - HEAD.size).to_bytes(8, "little") + chunk[HEAD.size :]
+    strange = bytearray(content[:begin] + packed + content[end : chunks[-1][1]])
+    if damaged:
+        strange[-5] ^= 0xFF  # the last chunk, after that of unknown compression
+    whole.write_bytes(strange)
+    with pytest.raises(
+        RecordingError, match=f"the chunk at byte {begin} has the compression 'lz4', which this version"
+    ):
+        finalise(whole)
+    assert whole.read_bytes() == strange
 
 
 @pytest.mark.parametrize("what", ["chunk", "attachment"])
