@@ -220,6 +220,7 @@ class LiveRun:
             yield None
             return
         try:
+            file.parent.mkdir(parents=True, exist_ok=True)
             fd = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         except OSError as error:
             raise RecordingError(f"--record {file}: {error.strerror}") from None

@@ -23,7 +23,7 @@ def check_place(option: str, file: Path | None) -> None:
     """Check that the file of an option can be written, before the work whose result it gets.
 
     Raises:
-        ConfigError: Its folder does not exist or cannot be written, or there is a folder in the file's place.
+        ConfigError: Its folder cannot be written or created, or there is a folder in the file's place.
 
     """
     if file is None:
@@ -34,8 +34,6 @@ def check_place(option: str, file: Path | None) -> None:
         if file.exists() and not file.is_file():  # a device or a pipe
             return
         folder = file.resolve().parent
-        if not folder.is_dir():
-            raise ConfigError(f"{option} {file}: there is no folder {folder}; create it, or name another file")
     except OSError as error:
         raise ConfigError(f"{option} {file}: {error.strerror}; name another file") from None
     if obstacle := unwritable(folder):
@@ -123,8 +121,12 @@ def _plotted(judge: Judge) -> list[tuple[int, Signal]]:
 
 
 def _write(file: Path, data: bytes) -> str:
-    """Write a file; return why it cannot be written, or "". An older file is replaced only by a complete one."""
+    """Write a file, in a new folder if need be; return why it cannot be written, or "".
+
+    An older file is replaced only by a complete one.
+    """
     try:
+        file.resolve().parent.mkdir(parents=True, exist_ok=True)
         if file.exists() and not file.is_file():  # a device or a pipe
             file.write_bytes(data)
         else:

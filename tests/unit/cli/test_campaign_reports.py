@@ -41,8 +41,8 @@ def full(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("place", "error"),
     [
-        ("none/out", "there is no folder {folder}/none; create it, or name another file"),
-        ("good.toml/out", "good.toml"),
+        ("good.toml/out", "{folder}/good.toml is not a directory"),
+        ("/proc/none/out", "/proc/none cannot be created in /proc: "),
         (".", "this is a folder; name a file"),
     ],
 )
@@ -74,6 +74,13 @@ def test_verdicts_are_printed_before_a_file_fails(
     ]
     assert (folder / "old.html").read_text() == "old"
     assert {one.name for one in folder.iterdir()} == before
+
+
+def test_missing_folders_are_created(folder: Path) -> None:
+    places = ["--report", "a/b/out.html", "--junit", "c/out.xml"]
+    assert main(["judge", "run.mem", "-f", "good.toml", *places]) == 0
+    assert (folder / "a/b/out.html").exists()
+    assert (folder / "c/out.xml").exists()
 
 
 def test_a_file_that_fails_does_not_stop_the_other(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

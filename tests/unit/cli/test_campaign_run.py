@@ -70,6 +70,11 @@ def test_without_an_instance_the_option_that_starts_one_is_named(capsys: pytest.
     assert told.endswith("; or add -c supervisor.toml, with which the run starts and stops it\n")
 
 
+def test_the_folder_of_a_recording_is_created(folder: Path) -> None:
+    assert lab("good.toml", "--record", "new/folder/a.mem") == 0
+    assert (folder / "new/folder/a.mem").exists()
+
+
 @pytest.fixture
 def full(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let every disk be full for recordings."""
