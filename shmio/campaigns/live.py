@@ -221,7 +221,7 @@ class LiveRun:
             return
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
-            fd = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+            fd = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         except OSError as error:
             raise RecordingError(f"--record {file}: {error.strerror}") from None
         output = Output(file, fd, limit_bytes=BUFFER_BYTES)

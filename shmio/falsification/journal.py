@@ -94,7 +94,7 @@ class Journal:
             folder.mkdir(parents=True, exist_ok=True)
             if not self.file.exists() and any(folder.iterdir()):
                 raise ConfigError(f"-o {folder}: this folder has other files; give a new or an empty folder")
-            self._fd = os.open(self.file, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
+            self._fd = os.open(self.file, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o666)
         except OSError as error:
             raise ConfigError(f"-o {folder}: {error.filename or self.file}: {error.strerror}") from None
         try:

@@ -75,6 +75,16 @@ def test_the_folder_of_a_recording_is_created(folder: Path) -> None:
     assert (folder / "new/folder/a.mem").exists()
 
 
+@pytest.mark.parametrize("umask", [0o022, 0o077])
+def test_new_files_have_the_permissions_that_the_umask_allows(folder: Path, umask: int) -> None:
+    before = os.umask(umask)
+    try:
+        assert lab("good.toml", "--record", "a.mem", "--report", "r.html", "--junit", "r.xml") == 0
+    finally:
+        os.umask(before)
+    assert {(folder / name).stat().st_mode & 0o777 for name in ("a.mem", "r.html", "r.xml")} == {0o666 & ~umask}
+
+
 @pytest.fixture
 def full(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let every disk be full for recordings."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import resource
 from pathlib import Path
 
@@ -89,3 +90,13 @@ def test_damage_and_a_full_disk(tmp_path: Path) -> None:
     file.write_bytes(b"{}\n")
     with pytest.raises(ConfigError, match="not the file of a search"):
         Journal(tmp_path, BEGINNING, resume=True)
+
+
+@pytest.mark.parametrize("umask", [0o022, 0o077])
+def test_the_file_has_the_permissions_that_the_umask_allows(tmp_path: Path, umask: int) -> None:
+    before = os.umask(umask)
+    try:
+        written(tmp_path)
+    finally:
+        os.umask(before)
+    assert (tmp_path / NAME).stat().st_mode & 0o777 == 0o666 & ~umask
