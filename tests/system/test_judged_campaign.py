@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from typing import Any
 
 import shmio
-from shmio.segment import Segment
-from shmio.testing.cell import BIN, Cell, kill
+from shmio.segment import Segment, stale_segment
+from shmio.testing.cell import BIN, Cell, kill, until
 
 CONFIG = """
 [instance]
@@ -167,6 +168,8 @@ def test_real_time_and_recording_agree_on_the_same_verdicts(make_cell: Callable[
     live = judged(cell, "run", "campaign.toml", "--instance", cell.instance, "--real-time", "--record", "one.mem")
     assert not live["virtual"]
     same(live, judged(cell, "judge", "one.mem", "-f", "campaign.toml"))
+    told = cell.run("shmio-campaign", "run", "campaign.toml", "--for", "1").stderr
+    assert ", virtual time, steps of 20 ms; the instance was already running\n" in told
     status = cell.run("shmio-campaign", "run", "campaign.toml", "--for", "3", "--stop", "--json")
     stopped = json.loads(status.stdout)
     assert stopped["virtual"]
@@ -185,7 +188,9 @@ def test_a_run_judges_what_it_has_seen_when_the_supervisor_dies(make_cell: Calla
         cwd=cell.folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     ) as run:  # fmt: skip
         assert run.stderr is not None
-        assert "1 expectation," in run.stderr.readline()
+        head = run.stderr.readline()
+        assert "1 expectation," in head
+        assert head.endswith(", real time; the instance was started for this run\n")
         with shmio.attach(cell.instance) as seen:
             for _ in range(2):  # the run has begun, so it sees at least the second one
                 assert seen.wait("slow", timeout_s=60)
@@ -200,3 +205,37 @@ def test_a_run_judges_what_it_has_seen_when_the_supervisor_dies(make_cell: Calla
     assert (cell.folder / "out.html").exists()
     assert (cell.folder / "out.xml").exists()
     assert cell.run("shmio-campaign", "judge", "out.mem", "-f", "low.toml").returncode == 1
+
+
+HANGING = """
+from pathlib import Path
+
+from shmio.simulation import Model, Output
+
+class Ramp(Model):
+    height = Output("LREAL")
+
+    def start(self):
+        Path("hang").read_bytes()  # a FIFO
+
+    def step(self, time_s, dt_s):
+        pass
+"""
+
+
+def test_a_run_clears_the_instance_whose_supervisor_dies_while_it_starts(make_cell: Callable[..., Cell]) -> None:
+    cell = prepared(make_cell, "wall")
+    (cell.folder / "ramp.py").write_text(HANGING)
+    os.mkfifo(cell.folder / "hang")
+    with subprocess.Popen(
+        [BIN / "shmio-campaign", "run", "campaign.toml", "-c", "supervisor.toml"],
+        cwd=cell.folder, stderr=subprocess.PIPE, text=True,
+    ) as run:  # fmt: skip
+        until(lambda: run.poll() is not None or stale_segment.living(cell.instance), "a process of the instance runs")
+        with Segment.open(cell.instance) as segment:
+            kill(segment.supervisor[0])
+        errors = run.communicate(timeout=120)[1]
+    assert run.returncode == 3, errors
+    assert "the supervisor died while it started" in errors
+    assert ", which had lost its supervisor\nremoved the left-over segment" in errors
+    assert "no instance" in cell.run("shmio", "list", "-c", "supervisor.toml").stderr

@@ -169,19 +169,26 @@ def _on_instance(run: _Run) -> tuple[str, LiveRun]:
             "or set them in supervisor.toml"
         )
     named = run.arguments.campaign
-    with _instance(run.arguments) as wanted, _opened(wanted, run.arguments) as segment, _faults_of(named):
+    with (
+        _instance(run.arguments) as (wanted, started),
+        _opened(wanted, run.arguments) as segment,
+        _faults_of(named),
+    ):
+        note = "; the instance was started for this run" if started else "; the instance was already running"
         file = _configuration(segment)
         attachments: AttachedFiles = no_attachments if file is None else ConfigFiles(file)
         run.facts.extend([] if file is None else of_configuration(file))
         run.facts.extend(of_layouts({source: block.layout for source, block in segment.blocks.items()}))
         work = LiveRun(segment, run.plan, attachments, run.reports.collector(lambda: work.judge))
-        work.run(run.over, lambda: _told(run, wanted.name, work))
+        work.run(run.over, lambda: _told(run, wanted.name, work, note))
     return wanted.name, work
 
 
 @contextmanager
-def _instance(arguments: argparse.Namespace) -> Iterator[Target]:
-    """Yield the instance. With ``-c``, start it if it does not run, and then stop it at the end.
+def _instance(arguments: argparse.Namespace) -> Iterator[tuple[Target, bool]]:
+    """Yield the instance, and whether this run has started it. With ``-c``, start it if it does not run.
+
+    Stop it at the end if this run has started it, even if its supervisor has died meanwhile.
 
     Raises:
         ConfigError: The configuration cannot be used.
@@ -191,14 +198,19 @@ def _instance(arguments: argparse.Namespace) -> Iterator[Target]:
     wanted = target(arguments)
     name = wanted.name
     if arguments.config is None or name in running_instances():
-        yield wanted
+        yield wanted, False
         with suppress(NotRunningError), wanted.open() as segment:
             if not segment.supervised:
                 say(f"shmio-supervisor down --instance {name} stops what the dead supervisor left", sys.stderr)
         return
-    _, started = start(arguments.config, "live")
     try:
-        yield Target(started.instance, arguments.config)
+        start(arguments.config, "live")
+    except ControlError:
+        with suppress(ShmioError):  # the error of the start counts
+            _clear(name)
+        raise
+    try:
+        yield wanted, True
     finally:
         try:
             _stop(name)
@@ -208,13 +220,17 @@ def _instance(arguments: argparse.Namespace) -> Iterator[Target]:
 
 def _stop(instance: str) -> None:
     """Stop an instance, even if its supervisor is dead."""
-    with suppress(NotRunningError):  # somebody has stopped it
-        with Segment.open(instance) as segment:
-            if segment.supervised:
-                stop(segment)
-                return
-        for line in clear(instance):
-            say(line, sys.stderr)
+    with suppress(NotRunningError), Segment.open(instance) as segment:
+        if segment.supervised:
+            stop(segment)
+            return
+    _clear(instance)
+
+
+def _clear(instance: str) -> None:
+    """Stop the processes that a dead supervisor has left, and say so."""
+    for line in clear(instance):
+        say(line, sys.stderr)
 
 
 def _opened(wanted: Target, arguments: argparse.Namespace) -> Segment:
@@ -240,7 +256,7 @@ def _configuration(segment: Segment) -> Path | None:
         return None
 
 
-def _told(run: _Run, instance: str, work: LiveRun) -> None:
+def _told(run: _Run, instance: str, work: LiveRun, note: str = "") -> None:
     campaign, plan = run.campaign, run.plan
     if run.arguments.json:
         return
@@ -251,7 +267,7 @@ def _told(run: _Run, instance: str, work: LiveRun) -> None:
             say(f"  without {process}: {why}", sys.stderr)
     injections = counted(len(campaign.injection), "injection")
     expectations = counted(len(campaign.expect), "expectation")
-    say(f"{instance}: {injections}, {expectations}, {how}", sys.stderr)
+    say(f"{instance}: {injections}, {expectations}, {how}{note}", sys.stderr)
     seed = next(
         (laid.seed for laid, one in zip(plan.injections, campaign.injection, strict=True) if one.seed is None), None
     )
