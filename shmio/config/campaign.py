@@ -81,12 +81,12 @@ class CampaignFile:
             point: A value for each range, by the name of the range.
 
         Raises:
-            ConfigError: A name is unknown, a range has no value, or the values contradict each
-                other. The message names the file, the key and the remedy.
+            ConfigError: A name is unknown, a range has no value or not this one, or the values contradict
+                each other. The message names the file, the key and the remedy.
 
         """
         try:
-            self.space.check_names(point)
+            self.space.check(point)
             for one in self.space.dimensions:
                 if one.name not in point:
                     raise ConfigError(

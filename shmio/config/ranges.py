@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -67,6 +67,15 @@ class Range:
         value = min(max(value, self.low), self.high)
         return round(value) if self.whole else float(value)
 
+    def has(self, value: Any) -> bool:
+        """Return whether a value lies between the limits; it need not be one of the steps."""
+        return isinstance(value, int | float) and not isinstance(value, bool) and self.low <= value <= self.high
+
+    @property
+    def text(self) -> str:
+        """The limits for a message."""
+        return f"{self.low:g} to {self.high:g}"
+
     def nearest(self, value: float) -> float:
         """Return the value in the range that is nearest to a number."""
         value = min(max(value, self.low), self.high)
@@ -110,6 +119,15 @@ class Choice:
     def at(self, share: float) -> Any:
         """Return the value at a fraction ``share`` of the list: the first at 0, the last at 1."""
         return self.options[min(int(share * len(self.options)), len(self.options) - 1)]
+
+    def has(self, value: Any) -> bool:
+        """Return whether a value is one of the options."""
+        return any(one == value and isinstance(one, bool) == isinstance(value, bool) for one in self.options)
+
+    @property
+    def text(self) -> str:
+        """The options for a message."""
+        return ", ".join(map(brief, self.options))
 
     @property
     def simplest(self) -> Any:
@@ -159,17 +177,20 @@ class Space:
         """Return the point at the same fraction ``share``, from 0 to 1, of each dimension."""
         return {one.name: one.at(share) for one in self.dimensions}
 
-    def check_names(self, names: Iterable[str]) -> None:
-        """Check that each name is the name of a dimension.
+    def check(self, point: Point) -> None:
+        """Check that each name is the name of a dimension, which has the value.
 
         Raises:
-            ConfigError: A name is unknown.
+            ConfigError: A name is unknown, or its dimension does not have the value.
 
         """
-        known = [one.name for one in self.dimensions]
-        for name in names:
+        known = {one.name: one for one in self.dimensions}
+        for name, value in point.items():
             if name not in known:
                 raise ConfigError(unknown("range", name, known))
+            one = known[name]
+            if not one.has(value):
+                raise ConfigError(f"{key_of(one.place)}: {brief(value)} is not in the range {name}, {one.text}")
 
 
 def key_of(place: Sequence[str | int]) -> str:

@@ -71,7 +71,7 @@ def falsify(arguments: argparse.Namespace) -> int:
     read = CampaignFile(file)
     settings = read_settings(arguments.settings)
     try:
-        read.space.check_names(settings)
+        read.space.check(settings)
         tables = read.space.at(settings)
         check_space(Space(tables))
         check_texts(read.expect)

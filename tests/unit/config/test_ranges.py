@@ -137,6 +137,25 @@ def test_a_range_is_refused_where_nothing_searches_it(tmp_path: Path) -> None:
             read_settings([text])
 
 
+@pytest.mark.parametrize(
+    ("key", "good", "wrong", "limits"),
+    [
+        ("value = { from = 0, to = 5 }", ("0", "0.5", "5"), ("-0.1", "6", "nan", "true", '"3"', "[1]"), "0 to 5"),
+        ("value = { from = 0, to = 4, step = 2 }", ("1",), ("5",), "0 to 4"),
+        ('value = { choice = [1, "NaN"] }', ("1", '"NaN"'), ("true", "0", '"nan"'), "1, 'NaN'"),
+    ],
+)
+def test_a_value_that_is_not_in_the_range_is_refused(
+    tmp_path: Path, key: str, good: tuple[str, ...], wrong: tuple[str, ...], limits: str
+) -> None:
+    file = campaign(tmp_path, f"{key}\n").file
+    for text in good:
+        load_campaign(file, [f"late.value={text}"])
+    for text in wrong:
+        with pytest.raises(ConfigError, match=rf"injection\[0\]\.value: .* is not in the range late\.value, {limits} "):
+            load_campaign(file, [f"late.value={text}"])
+
+
 def test_parameters_of_models_are_not_for_a_running_instance(tmp_path: Path) -> None:
     found = campaign(tmp_path, "value = 1\n", HEAD + "[parameters.lift]\ntop = 1\n")
     with pytest.raises(ConfigError, match=r"parameters: .*--lab"):
