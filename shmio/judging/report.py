@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import msgspec
 import numpy as np
 
-from shmio.config import Expectation
+from shmio.config import Declaration, Expectation
 from shmio.judging.pieces import Piece, head
 from shmio.judging.source import Signal, Trouble
 from shmio.judging.trace import Plot, compressed
@@ -19,6 +19,7 @@ from shmio.judging.verdict import Outcome, Verdict, distance
 
 _Place = Callable[[float], float]
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM = 860, 130, 70, 20
+_SHOWN_SPANS: Final = 20
 _NO_XML: Final = dict.fromkeys(
     [*range(9), 11, 12, *range(14, 32), 0xFFFE, 0xFFFF, *range(0xD800, 0xE000)], "\N{REPLACEMENT CHARACTER}"
 )
@@ -70,6 +71,7 @@ class Report:
         verdicts: The verdicts.
         signals: For each verdict, the signals that its expectation reads.
         injections: When injections were active.
+        declared: The injections of the campaign, with their seeds.
     """
 
     title: str
@@ -80,12 +82,17 @@ class Report:
     verdicts: Sequence[Verdict]
     signals: Sequence[Sequence[Drawn]]
     injections: Sequence[Span] = field(default=())
+    declared: Sequence[Declaration] = field(default=())
 
 
 def describe(expectation: Expectation) -> str:
     """Return what is expected, as lines of the form ``key = value``."""
-    left_out = ("name", "severity", "text", "requirement")
-    keys = {key: value for key, value in msgspec.to_builtins(expectation).items() if key not in left_out}
+    return _keys(expectation, "name", "severity", "text", "requirement")
+
+
+def _keys(table: Declaration | Expectation, *left_out: str) -> str:
+    """Return the keys of a table that are not left out, as lines of the form ``key = value``."""
+    keys = {key: value for key, value in msgspec.to_builtins(table).items() if key not in left_out}
     return "\n".join(f"{key} = {msgspec.json.encode(value).decode()}" for key, value in keys.items())
 
 
@@ -116,9 +123,42 @@ def _page(report: Report) -> Iterator[str]:
             f"<td>{one.severity}<td>{escape(one.requirement)}<td>{escape(verdict.reason)}{_moment(verdict)}</tr>"
         )
     yield "</table>"
+    yield from _injections(report)
     for at, (verdict, signals) in enumerate(zip(report.verdicts, report.signals, strict=True)):
         yield from _section(report, at, verdict, signals)
     yield "</body></html>"
+
+
+def _injections(report: Report) -> Iterator[str]:
+    """Yield a table of the campaign's injections, and of others that were active."""
+    if not (report.declared or report.injections):
+        return
+    active: dict[str, list[Span]] = {}
+    for span in report.injections:
+        active.setdefault(span.name, []).append(span)
+    heads = ("injection", "target", "operation", "keys", "seed", "active")
+    yield f"<h2>Injections</h2>\n<table><tr>{''.join(f'<th>{head}' for head in heads)}</tr>"
+    for one in report.declared:
+        targets = [one.target] if isinstance(one.target, str) else one.target
+        target = "<br>".join(f"<code>{escape(target)}</code>" for target in targets)
+        keys = escape(_keys(one, "name", "target", "operation", "seed"))
+        yield (
+            f"<tr><td>{escape(one.name)}<td>{target}<td>{one.operation}<td><pre>{keys}</pre>"
+            f"<td>{'' if one.seed is None else one.seed}<td>{_active(active.pop(one.name, []))}</tr>"
+        )
+    for name, spans in active.items():
+        yield f"<tr><td>{escape(name)}<td>{escape(spans[0].source)}<td><td><td><td>{_active(spans)}</tr>"
+    yield "</table>"
+
+
+def _active(spans: Sequence[Span]) -> str:
+    """Return when an injection was active; at most ``_SHOWN_SPANS`` times."""
+    shown = [
+        f"{span.begin_ns / 1e9:.3f} s to {'the end' if span.end_ns is None else f'{span.end_ns / 1e9:.3f} s'}"
+        for span in spans[:_SHOWN_SPANS]
+    ]
+    more = [f"and {len(spans) - _SHOWN_SPANS} more times"] if len(spans) > _SHOWN_SPANS else []
+    return "<br>".join([*shown, *more]) or "never"
 
 
 def _section(report: Report, at: int, verdict: Verdict, signals: Sequence[Drawn]) -> Iterator[str]:

@@ -158,6 +158,7 @@ def test_virtual_time_and_recording_agree_and_repeat(make_cell: Callable[..., Ce
     assert page.count("<svg") == page.count("injection offset on cell") == 14, "a plot for each signal"
     assert "failed at 1.000 s" in page
     assert live["command"] in page
+    assert page.count("<td>3<td>") == 2, "the table of injections has the seed of both"
     suite = ET.parse(cell.folder / "out.xml").getroot()
     assert (suite.get("tests"), suite.get("failures"), suite.get("errors")) == ("10", "2", "2")
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
+from shmio.config import Declaration
 from shmio.config.folder import unwritable
 from shmio.errors import ConfigError
 from shmio.files import replace_file
@@ -84,6 +85,7 @@ class Reports:
         facts: Sequence[tuple[str, str]],
         command: str,
         injections: Sequence[Span],
+        declared: Sequence[Declaration] = (),
     ) -> dict[str, str]:
         """Write the reports that the command line asks for. A file that cannot be written does not stop the other.
 
@@ -93,6 +95,7 @@ class Reports:
             facts: Names and values to show, such as the seed and digests.
             command: The command line that repeats the run.
             injections: When injections were active.
+            declared: The injections of the campaign, with their seeds.
 
         Returns:
             For each option whose file could not be written, the file and the reason.
@@ -106,7 +109,7 @@ class Reports:
             for index, one in _plotted(judge):
                 plot, limits = self._traces.plot(one), judge.limits(index, one)
                 drawn[index].append(Drawn(one, plot, judge.troubles(one.source), limits))
-        report = Report(title, facts, command, judge.begin_ns, judge.end_ns or 1, verdicts, drawn, injections)
+        report = Report(title, facts, command, judge.begin_ns, judge.end_ns or 1, verdicts, drawn, injections, declared)
         problems = {}
         if self._html is not None:
             problems["--report"] = _write(self._html, html(report).encode("utf-8", "replace"))

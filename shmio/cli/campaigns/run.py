@@ -84,7 +84,8 @@ def run(arguments: argparse.Namespace) -> int:
     status = tell(work.judge, found, as_json=arguments.json)
     if "contents_sha256" in found and not arguments.json:
         say(f"{arguments.record}: contents sha256 {found['contents_sha256']}", sys.stderr)
-    unwritten = reports.write(work.judge, f"Campaign {arguments.campaign.name}", facts, command, work.injections.spans)
+    title = f"Campaign {arguments.campaign.name}"
+    unwritten = reports.write(work.judge, title, facts, command, work.injections.spans, plan.injections)
     for option, problem in unwritten.items():
         say(f"{option} {problem}", sys.stderr)
     if unwritten:

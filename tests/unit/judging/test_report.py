@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import xml.etree.ElementTree as ET
 from html.parser import HTMLParser
@@ -9,6 +10,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from shmio.config import Declaration
 from shmio.judging.report import Drawn, Report, Span, html, junit
 from shmio.judging.source import Rows
 from shmio.judging.trace import MAX_POINTS, Traces
@@ -33,6 +35,10 @@ def report() -> Report:
     return Report(
         f"Campaign {HOSTILE}", [("seed", "7"), (HOSTILE, HOSTILE)], f"shmio-campaign {HOSTILE}", 0, 5 * S + 1,
         found.verdicts, drawn, [Span(HOSTILE, "cell", S, 2 * S), Span("open", "cell", 3 * S, None)],
+        [
+            Declaration(HOSTILE, HOSTILE, "offset", value=HOSTILE.replace("\ud800", ""), when="on", seed=7),
+            Declaration("idle", ["cell/x", "cell/y"], "freeze"),
+        ],
     )  # fmt: skip
 
 
@@ -67,6 +73,22 @@ def test_page_is_self_contained_and_has_all(report: Report) -> None:
     assert all(path.startswith("M70.0 ") for path in paths)
     assert paths[0].count("H") == 6, "six steps"
     page.encode("utf-8", "replace")
+
+
+def test_injections_are_listed(report: Report) -> None:
+    page = html(report)
+    table = page.partition("<h2>Injections</h2>")[2].partition("</table>")[0]
+    first, second, third = re.findall(r"<tr><td>(.*)</tr>", table.replace("\n", " "), re.DOTALL)[0].split(
+        "</tr> <tr><td>"
+    )
+    assert "<td>offset<td>" in first
+    assert first.endswith("<td>7<td>1.000 s to 2.000 s")
+    assert "when = " in first
+    assert second == "idle<td><code>cell/x</code><br><code>cell/y</code><td>freeze<td><pre></pre><td><td>never"
+    assert third == "open<td>cell<td><td><td><td>3.000 s to the end", "an injection that the campaign does not have"
+    many = [Span("many", "cell", at * S, at * S + 1) for at in range(30)]
+    assert "<br>and 10 more times</tr>" in html(dataclasses.replace(report, injections=many, declared=()))
+    assert "Injections" not in html(dataclasses.replace(report, injections=(), declared=()))
 
 
 def test_junit(report: Report) -> None:
