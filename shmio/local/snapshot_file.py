@@ -33,6 +33,8 @@ VERSION: Final = 1
 MAX_FILE_BYTES: Final = 512 << 20
 MAX_HEAD_BYTES: Final = 1 << 20
 MAX_LISTED: Final = 10_000
+MAX_SUMMED_BYTES: Final = 64 << 20
+"""Total size of the files whose checksums a list checks, the newest first, so that it takes little time."""
 _MAGIC: Final = b"SHMIOSNP"
 _HEADER: Final = struct.Struct("<8sIIQ32s")
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")
@@ -160,7 +162,8 @@ def read_snapshot(file: Path) -> tuple[SnapshotInfo, SnapshotHead, dict[str, byt
 def list_snapshots(folder: Path) -> list[SnapshotInfo]:
     """Return the snapshots of a folder, the oldest first; at most ``MAX_LISTED``, those of the newest files.
 
-    If the description of a snapshot is damaged, the ``problem`` of its entry says so.
+    If a snapshot is damaged, the ``problem`` of its entry says so. The checksums are checked for the newest
+    files, up to ``MAX_SUMMED_BYTES`` in total; for the others, only the description and the size.
 
     Raises:
         SnapshotError: The folder cannot be read.
@@ -169,7 +172,12 @@ def list_snapshots(folder: Path) -> list[SnapshotInfo]:
         files = [file for file in folder.glob(f"*{SUFFIX}") if _NAME.fullmatch(file.stem)]
     except OSError as error:
         raise SnapshotError(f"{folder}: {error.strerror}") from None
-    return sorted(map(_listed, heapq.nlargest(MAX_LISTED, files, _changed_ns)), key=lambda one: (one.saved_s, one.name))
+    found, left = [], MAX_SUMMED_BYTES
+    for file in heapq.nlargest(MAX_LISTED, files, _changed_ns):
+        found.append(_listed(file, left))
+        with suppress(OSError):
+            left -= file.stat().st_size
+    return sorted(found, key=lambda one: (one.saved_s, one.name))
 
 
 def delete_snapshot(file: Path) -> None:
@@ -187,14 +195,18 @@ def _changed_ns(file: Path) -> int:
         return 0
 
 
-def _listed(file: Path) -> SnapshotInfo:
+def _listed(file: Path, summed_bytes: int) -> SnapshotInfo:
+    """Return the entry of a file in a list. Check its checksum if it has at most ``summed_bytes``."""
     try:
         with open_file(file) as stream:
-            head_size, body_size, _ = _sizes(file, stream.read(_HEADER.size))
-            head = _head(file, stream.read(head_size))
+            head_size, body_size, digest = _sizes(file, stream.read(_HEADER.size))
+            description = stream.read(head_size)
             size = os.fstat(stream.fileno()).st_size
-        if size != _HEADER.size + head_size + body_size:
-            raise SnapshotError(f"{file} is damaged: it has {size} bytes")
+            if size != _HEADER.size + head_size + body_size:
+                raise SnapshotError(f"{file} is damaged: it has {size} bytes")
+            if size <= summed_bytes and hashlib.sha256(description + stream.read(body_size)).digest() != digest:
+                raise SnapshotError(f"{file} is damaged: its checksum is wrong")
+        head = _head(file, description)
         return _info(file, head, size)
     except OSError as error:
         return SnapshotInfo(file.stem, problem=f"{file}: {error.strerror}")

@@ -84,6 +84,18 @@ def test_each_damaged_byte_is_noticed(tmp_path: Path) -> None:
     assert list_snapshots(tmp_path)[0].problem
 
 
+def test_a_list_checks_the_checksums_of_the_newest_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for number, name in enumerate(("old", "new")):
+        file = write(tmp_path, name=name)
+        content = file.read_bytes()
+        file.write_bytes(content[:-60] + b"\xff" + content[-59:])  # in a state
+        os.utime(file, (number, number))
+    damaged = [one.problem for one in list_snapshots(tmp_path)]
+    assert damaged == [f"{tmp_path / name}.snapshot is damaged: its checksum is wrong" for name in ("new", "old")]
+    monkeypatch.setattr(snapshot_file, "MAX_SUMMED_BYTES", len(content))
+    assert [(one.name, bool(one.problem)) for one in list_snapshots(tmp_path)] == [("new", True), ("old", False)]
+
+
 def test_a_valid_checksum_does_not_make_the_content_valid(tmp_path: Path) -> None:
     for head, body in ((b"{}", b"\x80"), (b"[" * 9999, b"\x80"), (b'{"instance":1}', b"\x80"), (None, b"\xc0")):
         data = msgspec.json.encode(HEAD) if head is None else head
