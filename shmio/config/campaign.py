@@ -6,20 +6,21 @@ import json
 import random
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import msgspec
 from msgspec import Meta, field
 
-from shmio.config.declaration import check_declarations
+from shmio.config.declaration import declaration_faults
 from shmio.config.expectation import expectation_faults
-from shmio.config.faults import named
+from shmio.config.faults import Faults
 from shmio.config.model import Declaration, Expectation, Section, Text
-from shmio.config.ranges import Choice, Point, Space, key_of
-from shmio.config.read import check_text, convert, read_tables
+from shmio.config.ranges import Choice, Dimension, Point, Space, key_of
+from shmio.config.read import Structure, check_text, convert, parse, read_text
 from shmio.errors import ConfigError
+from shmio.wording import near
 
 SAMPLES: Final = 20
 """Number of random points at which a campaign with ranges is checked, besides the lowest, middle and highest."""
@@ -28,6 +29,9 @@ _REMEDIES: Final = {
     "injection": "write an [[injection]] table",
     "expect": "write an [[expect]] table, or create the injections alone with shmio inject --file",
 }
+
+
+_TABLES: Final[Mapping[str, type[Section]]] = {"injection": Declaration, "expect": Expectation}
 
 
 class Campaign(Section, omit_defaults=True):
@@ -60,19 +64,30 @@ class CampaignFile:
         """Read a file with expectations.
 
         Raises:
-            ConfigError: The file is invalid, or has no expectation; the message names the file, the
-                key and the remedy.
+            ConfigError: The file is invalid, or has no expectation; the message has a line for each
+                fault, which names the file, its line, the key and the remedy.
 
         """
         self.file = file
-        self.tables = tables = read_tables(file)
-        try:
-            _check_brackets(tables)
-            check_text(tables, "")
-            self.space = Space(tables)
-            self._check()
-        except ConfigError as error:
-            raise ConfigError(f"{file}: {named(str(error), tables)}") from None
+        self._text = read_text(file)
+        self.tables = parse(file, self._text)
+        faults = self.faults()
+        with faults.catching():
+            self.space = Space(self.tables)
+        faults.raise_any()
+        self._check(faults)
+        faults.raise_any()
+
+    def faults(self) -> Faults:
+        """Return an empty collection for faults of this file."""
+        return Faults(self.file, self.tables, self._text)
+
+    def refuse(self, messages: Iterable[str]) -> None:
+        """Raise ConfigError if there are messages about this file, each of which begins with its key."""
+        faults = self.faults()
+        for message in messages:
+            faults.add(message)
+        faults.raise_any()
 
     def at(self, point: Point) -> Campaign:
         """Return the campaign at a point.
@@ -85,40 +100,46 @@ class CampaignFile:
                 each other. The message names the file, the key and the remedy.
 
         """
-        try:
+        faults = self.faults()
+        with faults.catching():
             self.space.check(point)
-            for one in self.space.dimensions:
-                if one.name not in point:
-                    raise ConfigError(
-                        f"{key_of(one.place)}: this is a range; search it with shmio-campaign falsify, or "
-                        f"choose a value with shmio-campaign run --set {one.name}=VALUE"
-                    )
+        for one in self.space.dimensions:
+            if one.name not in point:
+                faults.add(
+                    f"{key_of(one.place)}: this is a range; search it with shmio-campaign falsify, or "
+                    f"choose a value with shmio-campaign run --set {one.name}=VALUE"
+                )
+        faults.raise_any()
+        try:
             return _parse(self.space.at(point), "expect")
         except ConfigError as error:
-            raise ConfigError(f"{self.file}: {named(str(error), self.tables)}") from None
+            raise ConfigError(faults.located(str(error))) from None
 
     @property
     def expect(self) -> list[Expectation]:
         """The expectations, which never have ranges."""
         return _parse({"expect": self.tables["expect"]}, "expect").expect
 
-    def _check(self) -> None:
-        """Check each end of each range alone, and the whole at some points.
-
-        Raises:
-            ConfigError: A value of a range is invalid, or no point is valid.
-
-        """
+    def _check(self, faults: Faults) -> None:
+        """Check each end of each range alone, and the whole at some points: a fault is what no point avoids."""
         space, first = self.space, self.space.shares(0)
+        found = _sound(space.at(first), "expect", faults)
+        for fault in () if space.dimensions else _contradictions(found):
+            faults.add(fault)
+        if faults:
+            return
         for one in space.dimensions:
             for value in one.options if isinstance(one, Choice) else (one.low, one.high):
                 if one.place[0] == "injection":
-                    convert({"injection": space.at({**first, one.name: value})["injection"]}, Campaign)
+                    with faults.catching():
+                        convert({"injection": space.at({**first, one.name: value})["injection"]}, Campaign)
+        if faults or not space.dimensions:
+            return
         draw = random.Random(0)  # noqa: S311  not for a secret
         points = [space.shares(0.5), first, space.shares(1)]
         points += [{one.name: one.at(draw.random()) for one in space.dimensions} for _ in range(SAMPLES)]
         problem: ConfigError | None = None
-        for point in points if space.dimensions else points[:1]:
+        for point in points:
             try:
                 _parse(space.at(point), "expect")
             except ConfigError as error:
@@ -126,22 +147,7 @@ class CampaignFile:
             else:
                 return
         if problem is not None:
-            raise problem
-
-
-def load_campaign(file: Path, settings: Sequence[str] = ()) -> Campaign:
-    """Read a campaign file with expectations.
-
-    Args:
-        file: The file.
-        settings: Values for ranges, each as ``NAME=VALUE`` with the value in TOML.
-
-    Raises:
-        ConfigError: The file is invalid, has no expectation, or has a range without a value; the
-            message names the file, the key and the remedy.
-
-    """
-    return CampaignFile(file).at(read_settings(settings))
+            faults.add(str(problem))
 
 
 def read_settings(settings: Sequence[str]) -> dict[str, Any]:
@@ -173,11 +179,18 @@ def read_campaign(file: Path) -> list[Declaration]:
         ConfigError: The file is invalid; the message names the file, the key and the remedy.
 
     """
-    tables = read_tables(file)
-    try:
-        return parse_campaign(tables)
-    except ConfigError as error:
-        raise ConfigError(f"{file}: {named(str(error), tables)}") from None
+    text = read_text(file)
+    tables = parse(file, text)
+    faults = Faults(file, tables, text)
+    with faults.catching():
+        space = Space(tables)
+        for one in space.dimensions:
+            faults.add(_range_refused(one))
+        found = _sound(space.at(space.shares(0)), "injection", faults)
+        for fault in (*(() if space.dimensions else _contradictions(found)), *_parameters_refused(found)):
+            faults.add(fault)
+    faults.raise_any()
+    return found.injection
 
 
 def parse_campaign(tables: dict[str, Any]) -> list[Declaration]:
@@ -188,11 +201,15 @@ def parse_campaign(tables: dict[str, Any]) -> list[Declaration]:
 
     """
     found = _parse(tables, "injection")
-    if found.parameters:
-        raise ConfigError(
-            "parameters: a running instance cannot change the parameters of its models; use shmio-campaign run --lab"
-        )
+    for fault in _parameters_refused(found):
+        raise ConfigError(fault)
     return found.injection
+
+
+def _parameters_refused(campaign: Campaign) -> Iterator[str]:
+    """Yield a fault if a campaign has parameters."""
+    if campaign.parameters:
+        yield "parameters: a running instance cannot change the parameters of its models; use shmio-campaign run --lab"
 
 
 def campaign_of(tables: dict[str, Any]) -> Campaign:
@@ -251,17 +268,42 @@ def _check_brackets(tables: Mapping[str, Any]) -> None:
             raise ConfigError(f"{key}: write [[{key}]] with double brackets, because there can be several")
 
 
+def _sound(tables: dict[str, Any], needed: str, faults: Faults) -> Campaign:
+    """Return the campaign of a file without its faulty keys and tables, and add their faults."""
+    sound, faults.places = Structure(faults, Campaign, _TABLES, _TABLES).sections(tables)
+    if needed not in tables and not any(near(key, [needed]) for key in tables):  # a misspelled key is a fault already
+        faults.add(_missing(needed))
+    return convert(sound, Campaign)
+
+
 def _parse(tables: dict[str, Any], needed: str) -> Campaign:
+    """Return the campaign that tables describe.
+
+    Raises:
+        ConfigError: A table is invalid; the message describes the first fault, and begins with its key.
+
+    """
     _check_brackets(tables)
     check_text(tables, "")
     for one in Space(tables).dimensions:
-        raise ConfigError(
-            f"{key_of(one.place)}: this is a range, which only shmio-campaign falsify searches; write a value"
-        )
+        raise ConfigError(_range_refused(one))
     campaign = convert(tables, Campaign)
     if needed not in tables:
-        raise ConfigError(f"{needed}: this key is needed; {_REMEDIES[needed]}")
-    check_declarations(campaign.injection)
-    for fault in expectation_faults(campaign.expect):
+        raise ConfigError(_missing(needed))
+    for fault in _contradictions(campaign):
         raise ConfigError(fault)
     return campaign
+
+
+def _range_refused(one: Dimension) -> str:
+    return f"{key_of(one.place)}: this is a range, which only shmio-campaign falsify searches; write a value"
+
+
+def _missing(key: str) -> str:
+    return f"{key}: this key is needed; {_REMEDIES[key]}"
+
+
+def _contradictions(campaign: Campaign) -> Iterator[str]:
+    """Yield the faults of valid keys that do not go together."""
+    yield from declaration_faults(campaign.injection)
+    yield from expectation_faults(campaign.expect)

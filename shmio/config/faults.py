@@ -312,7 +312,8 @@ def named(message: str, tables: Mapping[str, Any]) -> str:
         name = tables[key[1]][int(key[2])]["name"]
     except (LookupError, TypeError):
         return message
-    return f'{message} ({key[1]} "{name}")' if isinstance(name, str) else message
+    suffix = f' ({key[1]} "{name}")'
+    return message + suffix if isinstance(name, str) and not message.endswith(suffix) else message
 
 
 def locate(message: str, file: str, lines: Lines) -> tuple[int, str]:
@@ -377,6 +378,11 @@ class Faults:
             return
         where, text, line = self._located(named(_PLACE.sub(self._place, message), self._tables))
         self._note(f"{where}: {text}", line)
+
+    def located(self, message: str) -> str:
+        """Return a message ``key: what is wrong`` with the file, the line and the name of the section."""
+        where, text, _ = self._located(named(message, self._tables))
+        return f"{where}: {text}"
 
     def _located(self, message: str) -> tuple[str, str, int]:
         """Return the file with the line of the key that a message begins with, the message, and its line in this file.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
@@ -161,6 +162,21 @@ def examine(file: Path, text: str | None = None) -> Examined:
         text = read_text(file, REMEDY)
     tables = parse(file, text)
     return _examine(tables, file.resolve().parent, Faults(file, tables, text))
+
+
+@contextmanager
+def located(file: Path) -> Iterator[None]:
+    """Within a ``with`` block, add the file and the line of the key to the message of a fault.
+
+    Raises:
+        ConfigError: There was a fault, whose message began with its key.
+
+    """
+    try:
+        yield
+    except ConfigError as error:
+        text = read_text(file)
+        raise ConfigError(Faults(file, parse(file, text), text).located(str(error))) from None
 
 
 def read_tables(file: Path) -> dict[str, Any]:
@@ -348,9 +364,9 @@ class Structure:
         self._whole, self._kinds, self._several = whole, kinds, several
 
     def sections(self, tables: dict[str, Any]) -> tuple[dict[str, Any], dict[str, list[int]]]:
-        """Return the sections without faults, and the indices that they have in the file if they may repeat.
+        """Return what has no faults, and the indices that sections have in the file if they may repeat.
 
-        Add the faults of the other sections to the faults of the file.
+        Add the faults of the other sections and keys to the faults of the file.
         """
         sound: dict[str, Any] = {}
         places: dict[str, list[int]] = {}
@@ -358,6 +374,9 @@ class Structure:
         for field in _fields(self._whole):
             if field.required and field.name not in tables and field.name not in hinted:
                 self._faults.add(f"{field.name}: this key is needed")
+            if field.name not in self._kinds and field.name in tables:
+                value = tables[field.name]
+                sound |= {field.name: value} if self._field(value, field.name, field.type) else {}
         for name in (one for one in self._kinds if "." not in one):
             if name not in tables:
                 continue

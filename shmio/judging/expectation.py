@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -74,12 +74,10 @@ def read_expectations(
     return found, registers
 
 
-def check_texts(expectations: Sequence[Expectation]) -> None:
+def faults_of_texts(expectations: Sequence[Expectation]) -> Iterator[str]:
     """Parse the formulas and conditions of expectations, without looking up their registers.
 
-    Raises:
-        ConfigError: One of them is invalid; the message starts as ``expect[0].formula: …``.
-
+    Yield a message for each fault; it starts as ``expect[0].formula: …``.
     """
     for index, expectation in enumerate(expectations):
         for key in ("formula", "when", "then", "never", "always", "stays", "signal"):
@@ -87,7 +85,7 @@ def check_texts(expectations: Sequence[Expectation]) -> None:
                 try:
                     _parsed(expectation, key)
                 except ConfigError as error:
-                    raise ConfigError(f'expect[{index}].{error} (expect "{expectation.name}")') from None
+                    yield f"expect[{index}].{error}"
 
 
 def _parsed(expectation: Expectation, key: str, *, momentary: bool = False) -> Tree:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from shmio.campaigns.live import LiveRun, Plan
-from shmio.config.campaign import load_campaign
+from shmio.config.campaign import CampaignFile
 from shmio.config.declaration import with_seed
 from shmio.lab import Laboratory, prepare_laboratory
 from shmio.recording.compare import Comparison, compare
@@ -131,7 +131,7 @@ never = "raw(panel/Speed) != 1.5"
 
 
 def in_laboratory(folder: Path, recording: Path, seed: int) -> LiveRun:
-    campaign = load_campaign(folder / "campaign.toml")
+    campaign = CampaignFile(folder / "campaign.toml").at({})
     assert campaign.duration_s is not None
     plan = Plan(
         [with_seed(one, seed) for one in campaign.injection], campaign.expect, campaign.duration_s, record=recording

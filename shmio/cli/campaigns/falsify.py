@@ -18,6 +18,7 @@ from shmio.cli.campaigns.verdicts import UNDECIDED
 from shmio.cli.common import say, say_json, stop_on_signals
 from shmio.config.campaign import Campaign, CampaignFile, campaign_of, read_settings
 from shmio.config.ranges import Point, Space
+from shmio.config.read import located
 from shmio.errors import ConfigError
 from shmio.falsification.cases import store, tables_for
 from shmio.falsification.falsify import Failure, Falsifier, check_space
@@ -25,7 +26,7 @@ from shmio.falsification.journal import Beginning, Journal, Line
 from shmio.falsification.pool import Pool
 from shmio.falsification.search import MAX_TRIALS, GridSearch, begin_search
 from shmio.falsification.trial import Result
-from shmio.judging.expectation import check_texts
+from shmio.judging.expectation import faults_of_texts
 from shmio.lab import prepare_laboratory
 from shmio.local.snapshot_file import file_of
 from shmio.plan.processes import Plan
@@ -70,15 +71,13 @@ def falsify(arguments: argparse.Namespace) -> int:
         access = farm_of(arguments)
     read = CampaignFile(file)
     settings = read_settings(arguments.settings)
-    try:
+    read.refuse(faults_of_texts(read.expect))
+    with located(file):
         read.space.check(settings)
         tables = read.space.at(settings)
         check_space(Space(tables))
-        check_texts(read.expect)
         known = {key: value for key, value in tables.items() if key not in ("injection", "parameters")}
         campaign = campaign_of(known)
-    except ConfigError as error:
-        raise ConfigError(f"{file}: {error}") from None
     config = arguments.config or configuration_of(file, campaign)
     if config is None:
         raise ConfigError(f"{file}: name the configuration with -c FILE, or with the key config of the campaign")

@@ -14,6 +14,7 @@ from shmio.cli.campaigns.verdicts import UNDECIDED, tell
 from shmio.cli.common import say
 from shmio.cli.recordings.common import DamageReport, not_closed, time_range
 from shmio.config.campaign import CampaignFile
+from shmio.config.read import located
 from shmio.errors import ConfigError, RecordingError
 from shmio.recording.injection_times import InjectionTimes
 from shmio.recording.judge import GoldenRecordings, judge_recording, recording_judge
@@ -39,11 +40,9 @@ def judge(arguments: argparse.Namespace) -> int:
             begin, end = time_range(arguments, dump.begin_ns)
         except RecordingError as error:  # wrong usage
             raise ConfigError(str(error)) from None
-        try:
+        with located(arguments.campaign):
             found = recording_judge(dump, expectations, GoldenRecordings(arguments.campaign.parent))
             judge_recording(dump, found, begin, end, reports.collector(lambda: found))
-        except ConfigError as error:
-            raise ConfigError(f"{arguments.campaign}: {error}") from None
         times = InjectionTimes()
         for _, block, event in dump.events(None, begin, end):
             if block is not None:

@@ -22,10 +22,11 @@ from shmio.cli.common import say, stop_on_signals
 from shmio.cli.instance.control import clear, stop
 from shmio.cli.instance.detach import start
 from shmio.cli.target import Target, target
-from shmio.config.campaign import Campaign, load_campaign
+from shmio.config.campaign import Campaign, CampaignFile, read_settings
 from shmio.config.declaration import with_seed
+from shmio.config.read import located
 from shmio.errors import ConfigError, ControlError, NotRunningError, RecordingError, ShmioError
-from shmio.judging.expectation import check_texts
+from shmio.judging.expectation import faults_of_texts
 from shmio.lab import Laboratory, prepare_laboratory
 from shmio.recorder.recorder import AttachedFiles, ConfigFiles, no_attachments
 from shmio.recording.digest import digest_of_contents
@@ -45,12 +46,12 @@ def run(arguments: argparse.Namespace) -> int:
         ShmioError: The instance does not start, does not run, or cannot be controlled.
 
     """
-    campaign = load_campaign(arguments.campaign, arguments.settings)
+    read = CampaignFile(arguments.campaign)
+    campaign = read.at(read_settings(arguments.settings))
     if arguments.config is None and arguments.instance is None:
         arguments.config = configuration_of(arguments.campaign, campaign)
     duration_s = duration_of(arguments, campaign)
-    with _faults_of(arguments.campaign):  # before an instance is started
-        check_texts(campaign.expect)
+    read.refuse(faults_of_texts(campaign.expect))  # before an instance is started
     if arguments.record is not None and arguments.record.exists():
         raise ConfigError(f"--record {arguments.record}: {EXISTS}")
     check_place("--record", arguments.record)
@@ -119,15 +120,6 @@ def duration_of(arguments: argparse.Namespace, campaign: Campaign) -> float:
     return duration_s
 
 
-@contextmanager
-def _faults_of(file: Path) -> Iterator[None]:
-    """Within a ``with`` block, prefix the message of a fault with the file that has it."""
-    try:
-        yield
-    except ConfigError as error:
-        raise ConfigError(f"{file}: {error}") from None
-
-
 @dataclass(frozen=True)
 class _Run:
     """A run of a campaign: what the user asked for, and where the results go.
@@ -152,9 +144,9 @@ def _in_laboratory(run: _Run) -> tuple[str, LiveRun]:
     if run.arguments.real_time:
         raise ConfigError("--real-time: the time of a laboratory is always virtual")
     prepared = prepare_laboratory(file)
-    with _faults_of(named if run.campaign.parameters else file):
+    with located(named if run.campaign.parameters else file):
         made = Laboratory(prepared, run.campaign.parameters)
-    with made as lab, _faults_of(named):
+    with made as lab, located(named):
         work = lab.prepare(run.plan, run.reports.collector(lambda: work.judge))
         run.facts.extend(of_configuration(file))
         run.facts.extend(of_layouts({block.source: block.layout for block in prepared.blocks}))
@@ -173,7 +165,7 @@ def _on_instance(run: _Run) -> tuple[str, LiveRun]:
     with (
         _instance(run.arguments) as (wanted, started),
         _opened(wanted, run.arguments) as segment,
-        _faults_of(named),
+        located(named),
     ):
         note = "; the instance was started for this run" if started else "; the instance was already running"
         file = _configuration(segment)

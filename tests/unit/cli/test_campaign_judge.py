@@ -129,9 +129,12 @@ def test_wrong_recording_has_status_2(table: str, error: str, capsys: pytest.Cap
     ("text", "error"),
     [
         ("", "c.toml: expect: this key is needed; write an [[expect]] table, or create the injections alone with "),
-        ("[[expect]]\n", "c.toml: expect[0].name: this key is needed"),
+        ("[[expect]]\n", "c.toml:1: expect[0].name: this key is needed"),
         ('[[expect]]\nname = "e"\n', "expect[0].formula: an expectation needs one of formula, then, never"),
-        ('[[expect]]\nname = "e"\nnever = "speed >"\n', "c.toml: expect[0].never: at character 8: expected a register"),
+        (
+            '[[expect]]\nname = "e"\nnever = "speed >"\n',
+            "c.toml:3: expect[0].never: at character 8: expected a register",
+        ),
         ('[[expect]]\nname = "e"\nnever = "no > 1"\n', "never: at character 1: no: DB1 has no such register"),
         ('[[expect]]\nname = "e"\nnever = "row > 1"\n', "row is an array, but a formula reads single values"),
         ('[[expect]]\nname = "e"\nnever = "on"\nfor_s = 1\n', "for_s: never takes no such key; the key is for stays"),
@@ -148,9 +151,9 @@ def test_wrong_recording_has_status_2(table: str, error: str, capsys: pytest.Cap
         ('[[expect]]\nname = "e"\nnever = "on"\n' * 2, "expect[1].name: 'e' is already the name of expect[0]"),
         (
             '[[expect]]\nname = "e"\nsignal = "speed"\nmaxrate = 1\n',
-            "c.toml: expect[0].maxrate: unknown key; did you mean 'max_rate'? (expect \"e\")",
+            "c.toml:4: expect[0].maxrate: unknown key; did you mean 'max_rate'? (expect \"e\")",
         ),
-        ('[[expect]]\nnam = "e"\n', "c.toml: expect[0].nam: unknown key; did you mean 'name'?"),
+        ('[[expect]]\nnam = "e"\n', "c.toml:2: expect[0].nam: unknown key; did you mean 'name'?"),
         ('[[expect]]\nname = "e"\nwhere = "x"\n', "where: unknown key; did you mean 'when'?"),
         ('[[expect]]\nname = "e"\nzzz = "x"\n', "zzz: unknown key; valid: name, formula, when, within_s, then"),
         ('[expect]\nname = "e"\n', "expect: write [[expect]] with double brackets"),

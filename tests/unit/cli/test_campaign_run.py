@@ -166,7 +166,7 @@ def test_a_log_folder_that_cannot_be_used_has_status_2(folder: Path, capfd: pyte
 def test_a_fault_in_the_campaign_has_its_name(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "wrong.toml").write_text(CAMPAIGN.format(limit=1, duration_s=1).replace("height", "weight"))
     assert lab("wrong.toml") == 2
-    assert capsys.readouterr().err.startswith("wrong.toml: expect[0].always: ")
+    assert capsys.readouterr().err.startswith("wrong.toml:4: expect[0].always: ")
 
 
 def test_an_unknown_snapshot_has_status_2(capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -10,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmio.config import Declaration, load
-from shmio.config.campaign import read_campaign
+from shmio.config.campaign import CampaignFile, read_campaign
 from shmio.config.declaration import KEYS, contradictions
 from shmio.errors import ConfigError
 
@@ -66,8 +68,45 @@ def test_configuration_may_declare_injections(tmp_path: Path) -> None:
 def test_errors_name_the_key(tmp_path: Path, old: str, new: str, message: str) -> None:
     with pytest.raises(ConfigError) as refused:
         campaign(tmp_path, GOOD.replace(old, new))
-    assert str(refused.value).startswith(f"{tmp_path / 'c.toml'}: {message}")
+    assert re.match(rf"{tmp_path / 'c.toml'}:[2-8]: {re.escape(message)}", str(refused.value))
     assert "\n" not in str(refused.value)
+
+
+FAULTY = """duration = 3
+step_ms = "fast"
+
+[[injection]]
+name = "drift"
+target = "cell/a"
+operation = "ofset"
+speed = 1
+
+[[injection]]
+name = "drift"
+target = "cell/a"
+operation = "offset"
+
+[[expect]]
+name = "low"
+stays = "cell/a"
+"""
+
+
+@pytest.mark.parametrize("read", [read_campaign, CampaignFile])
+def test_all_faults_are_shown_with_their_lines(tmp_path: Path, read: Callable[[Path], object]) -> None:
+    file = tmp_path / "c.toml"
+    file.write_text(FAULTY)
+    with pytest.raises(ConfigError) as refused:
+        read(file)
+    found = [line.removeprefix(f"{file}:") for line in str(refused.value).splitlines()]
+    assert [line.partition("; ")[0] for line in found] == [
+        "1: duration: unknown key",
+        "2: step_ms: expected a number, found 'fast'",
+        "7: injection[0].operation: unknown operation 'ofset'",
+        "8: injection[0].speed: unknown key",
+        "10: injection[1].value: this key is needed for operation 'offset' (injection \"drift\")",
+        '15: expect[0].for_s: this key is needed with stays (expect "low")',
+    ]
 
 
 def test_duplicate_name_is_refused(tmp_path: Path) -> None:

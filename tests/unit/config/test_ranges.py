@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
 from shmio.config.campaign import (
+    Campaign,
     CampaignFile,
     campaign_text,
-    load_campaign,
     parse_campaign,
     read_campaign,
     read_settings,
@@ -27,6 +28,10 @@ def campaign(tmp_path: Path, keys: str, head: str = HEAD) -> CampaignFile:
     file = tmp_path / "c.toml"
     file.write_text(head + INJECTION + keys)
     return CampaignFile(file)
+
+
+def load_campaign(file: Path, settings: Sequence[str] = ()) -> Campaign:
+    return CampaignFile(file).at(read_settings(settings))
 
 
 def test_a_point_makes_a_campaign_without_ranges(tmp_path: Path) -> None:
@@ -154,6 +159,17 @@ def test_a_value_that_is_not_in_the_range_is_refused(
     for text in wrong:
         with pytest.raises(ConfigError, match=rf"injection\[0\]\.value: .* is not in the range late\.value, {limits} "):
             load_campaign(file, [f"late.value={text}"])
+
+
+def test_faults_beside_a_range_have_their_own_lines(tmp_path: Path) -> None:
+    keys = 'valu = 1\n[[injection]]\nname = "b"\ntarget = "cell/a"\noperation = "offset"\n'
+    with pytest.raises(ConfigError) as refused:
+        campaign(tmp_path, f"{keys}value = {{ from = 0, to = 5 }}\nend_s = {{ from = -1, to = 5 }}\n")
+    found = str(refused.value).replace(str(tmp_path), "").splitlines()
+    assert [line.partition(";")[0] for line in found] == [
+        "/c.toml:9: injection[0].valu: unknown key",
+        '/c.toml:15: injection[1].end_s: expected a number >= 0.0, found -1.0 (injection "b")',
+    ]
 
 
 def test_parameters_of_models_are_not_for_a_running_instance(tmp_path: Path) -> None:
