@@ -45,6 +45,7 @@ def extension(name: str, *headers: str) -> Extension:
 setup(
     ext_modules=[
         extension("shmio.injection._numbers"),
+        extension("shmio.recording.format._frames"),
         extension("shmio.segment._atomics", "frames.h", "queue.h", "relay.h", "ring.h"),
     ],
     cmdclass={"bdist_wheel": AbiWheel},

@@ -30,7 +30,8 @@ from shmio.emulators.programs import A50
 from shmio.layout.model import Layout
 from shmio.recorder.file_output import Output, create
 from shmio.recorder.recorder import CHUNK_S
-from shmio.recording.format.encoding import FRAME, encode_frame, encode_frame_v2
+from shmio.recording.format import _frames
+from shmio.recording.format.encoding import FRAME, encode_frame
 from shmio.recording.writer import Writer
 from shmio.segment import Block, BlockSpec, BlockWriter, Frame, ProcessSpec, Provenance, Quality, Segment
 from shmio.segment.processes import Activity
@@ -172,7 +173,11 @@ def layouts() -> None:
         """
         header = frame.number & 0xFFFFFFFF, START_NS + frame.clock_ns, frame.source_ns
         frame = frame._replace(raw=bytes(map(frame.raw.__getitem__, order))) if sort else frame
-        data = b"".join(encode_frame_v2(frame, *header)) if once else encode_frame(frame)
+        if once:
+            parts: list[bytes] = []
+            _frames.add(parts, [], 1, [(START_NS + frame.clock_ns, frame)], 0, 0, 0)
+            return b"".join(parts)
+        data = encode_frame(frame)
         return struct.pack("<BQHIQQ", 5, 22 + len(data), 1, *header) + data
 
     plain = [message(frame) for frame in some]

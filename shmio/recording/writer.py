@@ -6,7 +6,7 @@ changes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -31,11 +31,10 @@ from shmio.recording.format.encoding import (
     ProcessChange,
     StepMark,
     encode_event,
-    encode_frame_v2,
     encode_json,
     encode_position,
 )
-from shmio.recording.format.mcap_writer import McapWriter, Message, Output
+from shmio.recording.format.mcap_writer import McapWriter, Output
 from shmio.recording.reading.part import DumpBlock
 from shmio.segment import Block, Event, Frame
 from shmio.version import __version__
@@ -148,9 +147,9 @@ class Writer:
         """Add a frame with the log time ``log_ns``."""
         self.frames(channels, [(log_ns, frame)])
 
-    def frames(self, channels: Channels, frames: Iterable[tuple[int, Frame]]) -> None:
+    def frames(self, channels: Channels, frames: list[tuple[int, Frame]]) -> None:
         """Add frames, each with its log time."""
-        self._mcap.add_messages(channels.frames, _messages(frames))
+        self._mcap.add_frames(channels.frames, frames)
 
     def event(self, channels: Channels, event: Event, log_ns: int) -> None:
         """Add an event with the log time ``log_ns``."""
@@ -189,12 +188,3 @@ class Writer:
         """Close the recording: write its index and footer."""
         self._mcap.finish()
         self._output.flush()
-
-
-def _messages(frames: Iterable[tuple[int, Frame]]) -> Iterator[Message]:
-    """Yield the messages of frames, which are given with their log times."""
-    for log_ns, frame in frames:
-        source_ns = frame.source_ns
-        publish_ns = source_ns if source_ns > 0 else log_ns
-        sequence = frame.number & 0xFFFFFFFF
-        yield log_ns, publish_ns, sequence, encode_frame_v2(frame, sequence, log_ns, publish_ns)

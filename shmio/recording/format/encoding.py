@@ -36,7 +36,10 @@ PROCESSES_TOPIC: Final = "processes"
 
 FRAME: Final = "shmio.frame.v1"
 FRAME_V2: Final = "shmio.frame.v2"
-"""Like FRAME, but five fields are differences from the message's header: see :func:`encode_frame_v2`."""
+"""Like FRAME, but five fields are differences from the message's header. ``_frames.c`` encodes it.
+
+The differences hardly change from frame to frame, so they compress well.
+"""
 EVENT: Final = "shmio.event.v1"
 PLAIN: Final = "json"
 GAP: Final = "gap"
@@ -48,7 +51,6 @@ In the file, all three have the encoding PLAIN; only their topics differ.
 """
 
 _FRAME: Final = struct.Struct("<QQqqqQIBBHHHII")
-_FRAME_V2: Final = struct.Struct("<QQQQQQIBBHHHII")  # the first five are differences
 _COUNTED: Final = struct.Struct("<QQQQQ")  # the first fields of a frame: number, cycle, publish, clock, source
 _EVENT: Final = struct.Struct("<QQQqqqQQIIIIIIHBBHH")
 _QUALITIES: Final = (*Quality, Quality.BAD)  # an unknown quality counts as bad
@@ -207,26 +209,8 @@ def decode_frame(data: bytes) -> Frame:
     )  # fmt: skip
 
 
-def encode_frame_v2(frame: Frame, sequence: int, log_ns: int, publish_ns: int) -> tuple[bytes, ...]:
-    """Encode a frame as FRAME_V2, and return the parts of the data: the images are not copied.
-
-    FRAME_V2 has, instead of the frame's numbers and times, their differences, modulo 2^64, from the
-    numbers and times in the message's header: ``sequence``, ``log_ns`` and ``publish_ns``. The
-    differences hardly change from frame to frame, so they compress well.
-    """
-    (number, cycle, published_ns, clock_ns, source_ns, incarnation, quality, provenance, event, delay_us, text, raw,
-     effective) = frame  # fmt: skip
-    reason = text.encode() if text else b""
-    head = _FRAME_V2.pack(
-        number - sequence & _MAX_U64, cycle - number & _MAX_U64, published_ns - clock_ns & _MAX_U64,
-        clock_ns - log_ns & _MAX_U64, source_ns - publish_ns & _MAX_U64, event, incarnation, quality, provenance,
-        0 if effective is None else _EFFECTIVE, len(reason), 0, len(raw), delay_us,
-    )  # fmt: skip
-    return head, reason, raw, effective or b""
-
-
 def restore(data: bytes, sequence: int, log_ns: int, publish_ns: int) -> bytes:
-    """Convert a frame from FRAME_V2 to FRAME; the opposite of :func:`encode_frame_v2`.
+    """Convert a frame from FRAME_V2 to FRAME.
 
     If the bytes are too short for a frame, return them unchanged.
     """

@@ -9,7 +9,7 @@ import struct
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 import zstandard
 from mcap.data_stream import RecordBuilder
@@ -31,7 +31,11 @@ from mcap.records import (
     SummaryOffset,
 )
 
+from shmio.recording.format import _frames
 from shmio.recording.format.records import FOOTER, HEAD, INDEX, MAGIC, U32
+
+if TYPE_CHECKING:
+    from shmio.segment import Frame
 
 CHUNK_BYTES: Final = 1 << 20
 """A chunk ends when it has more bytes than this."""
@@ -208,6 +212,15 @@ class McapWriter:
             if self._size > CHUNK_BYTES:
                 self._end_chunk()
                 parts, index = self._parts, None
+
+    def add_frames(self, channel: int, frames: list[tuple[int, Frame]]) -> None:
+        """Add frames, each with its log time, to a channel that has the encoding FRAME_V2."""
+        done = 0
+        while done < len(frames):
+            index = self._indexes.setdefault(channel, [])
+            done, self._size = _frames.add(self._parts, index, channel, frames, done, self._size, CHUNK_BYTES)
+            if self._size > CHUNK_BYTES:
+                self._end_chunk()
 
     def flush(self) -> None:
         """End the present chunk, and write it to the output. A chunk without messages remains open."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from mcap.reader import NonSeekingReader
 
 import shmio
 from shmio.recording.check import check
+from shmio.recording.format import _frames
 from shmio.recording.format.encoding import (
     EVENT,
     FRAME,
@@ -30,7 +32,6 @@ from shmio.recording.format.encoding import (
     decode_step,
     encode_event,
     encode_frame,
-    encode_frame_v2,
     encode_json,
     restore,
 )
@@ -138,7 +139,10 @@ def test_frames_of_the_second_version_are_encoded_to_the_same_bytes() -> None:
         assert times == (other.sequence, other.log_time, other.publish_time)
         if encoding == FRAME:
             frames += 1
-            assert (second, b"".join(encode_frame_v2(decode_frame(one.data), *times))) == (FRAME_V2, other.data)
+            parts: list[bytes] = []
+            _frames.add(parts, [], 1, [(one.log_time, decode_frame(one.data))], 0, 0, 0)
+            header = struct.pack("<BQHIQQ", 5, 22 + len(other.data), 1, *times)
+            assert (second, b"".join(parts)) == (FRAME_V2, header + other.data)
             assert restore(other.data, *times) == one.data
         else:
             assert (second, other.data) == (encoding, one.data)
