@@ -74,7 +74,7 @@ class Range:
     @property
     def text(self) -> str:
         """The limits for a message."""
-        return f"{self.low:g} to {self.high:g}"
+        return f"{self.low:.15g} to {self.high:.15g}"
 
     def nearest(self, value: float) -> float:
         """Return the value in the range that is nearest to a number."""
@@ -247,7 +247,7 @@ def _dimension(table: Mapping[str, Any], name: str, place: tuple[str | int, ...]
         return _choice(table, name, place)
     low, high = (_number(table, key) for key in ("from", "to"))
     if not low < high:
-        raise ConfigError(f".to: {high:g} is not above from, {low:g}; write a single value without a range")
+        raise ConfigError(f".to: {high:.15g} is not above from, {low:.15g}; write a single value without a range")
     log = table.get("log", False)
     if not isinstance(log, bool):
         raise ConfigError(f".log: expected true or false, found {brief(log)}")
@@ -256,13 +256,13 @@ def _dimension(table: Mapping[str, Any], name: str, place: tuple[str | int, ...]
     if step is not None and log:
         raise ConfigError(".log: a range cannot have both step and log = true; leave out one of them")
     if log and low <= 0:
-        raise ConfigError(f".from: {low:g} is not above 0, so it has no logarithm; leave out log, or begin above 0")
+        raise ConfigError(f".from: {low:.15g} is not above 0, so it has no logarithm; leave out log, or begin above 0")
     if step is not None and not 0 < step <= high - low:
-        raise ConfigError(f".step: {step:g} is not above 0 and at most {high - low:g}, the length of the range")
+        raise ConfigError(f".step: {step:.15g} is not above 0 and at most {high - low:.15g}, the length of the range")
     whole = whole_key or (step is not None and all(isinstance(one, int) for one in (low, high, step)))
     if whole and not all(float(one).is_integer() for one in (low, high, step or 1)):
         wrong = next(one for one in (low, high, step or 1) if not float(one).is_integer())
-        raise ConfigError(f".from: {place[2]} takes only whole numbers, but the range has {wrong:g}")
+        raise ConfigError(f".from: {place[2]} takes only whole numbers, but the range has {wrong:.15g}")
     if step is not None and (high - low) / step > 1e9:
         raise ConfigError(".step: the range has more than 1e9 values; leave out step")
     return Range(name, place, low, high, step, log, whole)

@@ -51,7 +51,11 @@ static int Ring_init(Ring *self, PyObject *args, PyObject *kwargs)
         PyErr_SetString(PyExc_ValueError, wrong);
         return -1;
     }
-    self->ring.private = private && !self->buffer.readonly; /* its threads count themselves when they wait */
+    if (private && self->buffer.readonly) {
+        PyErr_SetString(PyExc_ValueError, "threads that wait on a private ring write to it, so its buffer must be writable");
+        return -1;
+    }
+    self->ring.private = private;
     self->scratch = malloc(align8(self->ring.frame_size));
     if (!self->scratch) {
         PyErr_NoMemory();

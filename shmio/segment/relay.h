@@ -19,8 +19,8 @@ typedef struct {
 _Static_assert(sizeof(relay) == 16, "relay");
 
 /* Makes `descriptor` readable at the start, after each ring of the doorbell, and after `turn_ns` without a
- * ring. `waiters` is that of doorbell_wait. Until the loop has handled a wake-up, it gets no other, and the doorbell does not wake this thread.
- * Returns after relay_stop. */
+ * ring. `waiters` is that of doorbell_wait. Until the loop has handled a wake-up, it gets no other, and the
+ * doorbell does not wake this thread. Returns after relay_stop. */
 static inline void relay_run(relay *shared, const a32 *word, a32 *waiters, int descriptor, int64_t turn_ns)
 {
     const uint64_t one = 1;

@@ -3,7 +3,8 @@
  * The header itself is compiled here. Each of its accesses to shared memory and each of its system calls
  * is replaced by one that first lets another party continue. From each state, every party is tried next. A state
  * is identified by what each party has seen and by the shared data, so that each is explored once. The doorbell
- * is that of a ring: first of one that other processes may use, then of a private one. Memory is assumed to be sequentially consistent, and a futex may also wake without a reason, as after a signal.
+ * is that of a ring: first of one that other processes may use, then of a private one. Memory is assumed to be
+ * sequentially consistent, and a futex may also wake without a reason, as after a signal.
  * Exit status 0: no ring of the doorbell was lost, and a stopped thread ends. */
 #include <errno.h>
 #include <linux/futex.h>

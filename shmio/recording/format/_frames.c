@@ -97,26 +97,31 @@ static PyObject *frames_add(PyObject *module, PyObject *args)
         PyErr_SetString(PyExc_ValueError, "the first frame is before the list");
         return NULL;
     }
-    while (next < PyList_Size(frames) && size <= limit) {
+    const Py_ssize_t old_parts = PyList_Size(parts), old_index = PyList_Size(index);
+    while (next < PyList_Size(frames)) {
         PyObject *entry = PyList_GetItem(frames, next++);
         PyObject *frame = PyTuple_Check(entry) && PyTuple_Size(entry) == 2 ? PyTuple_GetItem(entry, 1) : NULL;
         if (!frame || !PyTuple_Check(frame) || PyTuple_Size(frame) != FIELDS) {
             PyErr_SetString(PyExc_TypeError, "pairs of a log time and a frame are needed");
-            return NULL;
+            break;
         }
         uint64_t log_ns = PyLong_AsUnsignedLongLong(PyTuple_GetItem(entry, 0));
-        if (PyErr_Occurred()) return NULL;
+        if (PyErr_Occurred()) break;
         Py_INCREF(entry); /* a conversion to a number may run Python code, which may change the list */
         uint64_t added = add_frame(parts, channel, log_ns, frame);
         Py_DECREF(entry);
-        if (!added || !append_number(index, log_ns) || !append_number(index, size)) return NULL;
+        if (!added || !append_number(index, log_ns) || !append_number(index, size)) break;
         size += added;
+        if (size > limit) break;
     }
-    return Py_BuildValue("nK", next, size);
+    if (!PyErr_Occurred()) return Py_BuildValue("nK", next, size);
+    PyList_SetSlice(parts, old_parts, PyList_Size(parts), NULL); /* so that the chunk stays as it was */
+    PyList_SetSlice(index, old_index, PyList_Size(index), NULL);
+    return NULL;
 }
 
 static PyMethodDef functions[] = {
-    {"add", frames_add, METH_VARARGS, "Add frames to a chunk until it is too large; return the next one and the size."},
+    {"add", frames_add, METH_VARARGS, "Add frames to a chunk, at least one, until it is too large; return the next one and the size."},
     {0},
 };
 

@@ -53,6 +53,7 @@ In the file, all three have the encoding PLAIN; only their topics differ.
 _FRAME: Final = struct.Struct("<QQqqqQIBBHHHII")
 _COUNTED: Final = struct.Struct("<QQQQQ")  # the first fields of a frame: number, cycle, publish, clock, source
 _EVENT: Final = struct.Struct("<QQQqqqQQIIIIIIHBBHH")
+_MAX_TEXT: Final = 0xFFFF // 3  # an invalid byte becomes a character of three bytes, and the text is encoded again
 _QUALITIES: Final = (*Quality, Quality.BAD)  # an unknown quality counts as bad
 _PROVENANCES: Final = tuple(Provenance)
 _MAX_U64: Final = (1 << 64) - 1
@@ -198,7 +199,7 @@ def decode_frame(data: bytes) -> Frame:
     quality, provenance, flags, reason_size, _, size, delay_us = rest
     raw_at = _FRAME.size + reason_size
     images = 2 if flags & _EFFECTIVE else 1
-    if len(data) != raw_at + images * size or provenance > Provenance.INJECTED:
+    if len(data) != raw_at + images * size or provenance > Provenance.INJECTED or reason_size > _MAX_TEXT:
         raise ValueError("a frame does not match its header")
     return Frame(
         number, cycle, publish_ns, clock_ns, source_ns, incarnation,
@@ -246,7 +247,7 @@ def decode_event(data: bytes) -> Event:
     )
     writer, item, items, offset, size, kind, quality, mask, data_size, text_size = rest
     text_at = _EVENT.size + data_size
-    if len(data) != text_at + text_size or data_size > EVENT_DATA_SIZE:
+    if len(data) != text_at + text_size or data_size > EVENT_DATA_SIZE or text_size > _MAX_TEXT:
         raise ValueError("an event does not match its header")
     known = Quality(quality) if quality <= Quality.GOOD else Quality.BAD
     return Event(

@@ -217,8 +217,9 @@ class McapWriter:
         """Add frames, each with its log time, to a channel that has the encoding FRAME_V2."""
         done = 0
         while done < len(frames):
-            index = self._indexes.setdefault(channel, [])
+            index = self._indexes.get(channel, [])
             done, self._size = _frames.add(self._parts, index, channel, frames, done, self._size, CHUNK_BYTES)
+            self._indexes[channel] = index
             if self._size > CHUNK_BYTES:
                 self._end_chunk()
 

@@ -185,6 +185,7 @@ class TimeCalls:
             )
         change = asyncio.Event()
         self._watchers.add(change)
+        self._stepper.timeline.follow(followed=True)
         try:
             while True:
                 change.clear()
@@ -192,6 +193,7 @@ class TimeCalls:
                 await change.wait()
         finally:
             self._watchers.discard(change)
+            self._stepper.timeline.follow(followed=bool(self._watchers))
 
     async def _do(self, work: Awaitable[object], context: Context) -> wire.Clock:
         try:

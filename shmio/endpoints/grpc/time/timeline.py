@@ -187,6 +187,7 @@ class Timeline:
         self._reported = self._status(state)[1:]
         self._delivered = state.done
         self._awaited = False  # whether steps wait for this process's delivery
+        self._followed = False  # whether a client waits for changes of time
         self._postponed = False  # whether update() has to be called when the present delivery ends
         open_streams.changed = self._attend
         virtual_time.update = self.update
@@ -227,6 +228,12 @@ class Timeline:
     def watch(self, watcher: Callable[[TimeStatus], None]) -> None:
         """Call ``watcher`` with the status of time, after each step and each other change."""
         self._watchers.append(watcher)
+
+    def follow(self, *, followed: bool) -> None:
+        """Set whether a client waits for changes of time. While one does, no change is noticed late."""
+        self._followed = followed
+        if followed and self._page is not None:
+            self._page.resume()
 
     @property
     def status(self) -> TimeStatus:
@@ -291,8 +298,8 @@ class Timeline:
             return False
         step = Step(state.done, state.present_ns, state.dt_ns)
         self._delivery.begin(step, partial(self._mark, step))
-        if self._page is not None and not self._awaited:
-            self._page.pause()  # no stream is open
+        if self._page is not None and not self._awaited and not self._followed:
+            self._page.pause()  # nobody waits
         return True
 
     def _begin(self, moment: Moment) -> None:

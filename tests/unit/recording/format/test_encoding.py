@@ -82,6 +82,21 @@ def test_a_contradictory_gap_is_refused(change: dict[str, object]) -> None:
         decode_gap(encode_json(Gap(**fields | change)))  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("size", [0xFFFF // 3, 0xFFFF // 3 + 1])
+def test_a_text_is_refused_if_it_could_not_be_encoded_again(size: int) -> None:
+    """Each invalid byte of a text becomes a character that has three bytes."""
+    text = "x" * size
+    frame = Frame(7, 3, 10, 20, 30, 1, Quality.GOOD, Provenance.LIVE, 0, 0, text, b"", None)
+    event = Event(7, 1, 3, 10, 20, 30, 40, 1, Quality.GOOD, 0, 0, 0, 0, 0, 0, 0, b"", text, 0)
+    for encode, decode, item in ((encode_frame, decode_frame, frame), (encode_event, decode_event, event)):
+        data = encode(item).replace(b"x", b"\xff")  # type: ignore[operator]
+        if size > 0xFFFF // 3:
+            with pytest.raises(ValueError, match="does not match its header"):
+                decode(data)
+        else:
+            assert len(encode(decode(data))) == len(data) + 2 * size  # type: ignore[operator]
+
+
 @given(st.binary(max_size=200))
 def test_any_bytes_are_decoded_or_refused(data: bytes) -> None:
     for decode in (decode_frame, decode_event, decode_gap):

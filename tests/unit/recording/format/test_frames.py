@@ -89,5 +89,7 @@ def test_the_writer_makes_the_same_file_of_frames_in_any_batches(monkeypatch: py
     ],
 )
 def test_what_is_no_frame_is_refused(entries: list[Any], first: int, error: type[Exception]) -> None:
+    parts, index = [b"before"], [0, 0]
     with pytest.raises(error):
-        _frames.add([], [], 1, entries, first, 0, 100)
+        _frames.add(parts, index, 1, [*[(1, ONE)] * (first + 1), *entries], first, 0, 1000)
+    assert (parts, index) == ([b"before"], [0, 0]), "the chunk is as before"

@@ -17,7 +17,11 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
 from shmio.recording.format import mcap_writer
+from shmio.recording.format.encoding import encode_frame
 from shmio.recording.format.mcap_writer import McapWriter, Message
+from shmio.segment import Frame
+from tests.unit.recording.format.test_encoding import differences
+from tests.unit.recording.format.test_frames import ONE, frames
 
 u64, u32, names = st.integers(0, 2**64 - 1), st.integers(0, 2**32 - 1), st.text(max_size=8)
 message = st.tuples(u64, u64, u32, st.lists(st.binary(max_size=30), max_size=3))
@@ -26,6 +30,7 @@ calls = st.lists(
         st.tuples(st.just("schema"), names, st.binary(max_size=20)),
         st.tuples(st.just("channel"), names, names, st.dictionaries(names, names, max_size=2)),
         st.tuples(st.just("messages"), st.integers(0, 3), st.lists(message, max_size=8)),
+        st.tuples(st.just("frames"), st.integers(0, 3), st.lists(st.tuples(u64, frames), max_size=4)),
         st.tuples(st.just("attachment"), u64, u64, names, st.binary(max_size=20)),
         st.tuples(st.just("metadata"), names, st.dictionaries(names, names, max_size=2)),
         st.tuples(st.just("flush")),
@@ -41,6 +46,12 @@ class LibraryWriter(Writer):
     def add_messages(self, channel: int, messages: Iterable[Message]) -> None:
         for log_ns, publish_ns, sequence, data in messages:
             self.add_message(channel, log_ns, b"".join(data), publish_ns, sequence)
+
+    def add_frames(self, channel: int, frames: Iterable[tuple[int, Frame]]) -> None:
+        for log_ns, frame in frames:
+            publish_ns, sequence = frame.source_ns if frame.source_ns > 0 else log_ns, frame.number % 2**32
+            data = differences(encode_frame(frame), sequence, log_ns, publish_ns)
+            self.add_message(channel, log_ns, data, publish_ns, sequence)
 
 
 def ours(made: list[Any]) -> bytes:
@@ -67,6 +78,8 @@ def play(writer: McapWriter | LibraryWriter, made: list[Any]) -> None:
                 channels.append(writer.register_channel(topic, encoding, 1, metadata))
             case "messages", (channel, messages):
                 writer.add_messages(channels[channel % len(channels)], messages)
+            case "frames", (channel, some):
+                writer.add_frames(channels[channel % len(channels)], some)
             case "attachment", (create_ns, log_ns, name, data):
                 writer.add_attachment(create_ns, log_ns, name, "text/plain", data)
             case "metadata", (name, metadata):
@@ -90,6 +103,7 @@ FULL = ("messages", 0, [(1, 1, 1, [bytes(CHUNK_BYTES - 100)])])
 @example([FULL, ("schema", "s", bytes(100)), FULL])
 @example([FULL, ("channel", "t", "e", {"k": "v" * 100}), FULL])
 @example([FULL, ("flush",), FULL, ("flush",)])
+@example([("schema", "s", bytes(2 * CHUNK_BYTES)), ("frames", 0, [(1, ONE), (2, ONE)])])
 def test_the_same_bytes_as_those_of_the_library(made: list[Any]) -> None:
     assert ours(made) == theirs(made)
 

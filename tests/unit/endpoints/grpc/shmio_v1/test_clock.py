@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import threading
+from contextlib import closing
 from typing import Any
 
 import grpc
 import pytest
 
 from shmio.client import connect_aio
+from shmio.endpoints.grpc import wakeups
 from shmio.endpoints.grpc.shmio_v1 import selection
 from shmio.errors import CommandError, ValueRangeError
+from shmio.local.time_control import Coordinator
+from shmio.segment import Segment
 from shmio.wire import shmio_v1_pb2 as wire
 from tests.unit.endpoints.grpc.shmio_v1.harness import stub, subscribe, values
 from tests.unit.endpoints.grpc.test_stepping import step as step_v1
@@ -76,6 +80,27 @@ def test_a_step_applies_the_writes_before_it(instance: str) -> None:
             assert status["clock"]["virtual"]
             with pytest.raises(ValueRangeError):
                 await cell.step(4000)
+
+    simulate(instance, test)
+
+
+def test_watch_clock_hears_at_once_of_the_steps_of_another_program(
+    instance: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While nobody waits for changes of time, the endpoint looks at the clock only from time to time."""
+    monkeypatch.setattr(wakeups, "PAUSE_S", 1000.0)
+
+    async def test(served: Endpoint, _: Models) -> None:
+        with Segment.open(instance, writable=True) as segment, closing(Coordinator(segment)) as coordinator:
+            await asyncio.to_thread(coordinator.step, MS)
+            await asyncio.to_thread(coordinator.step, MS)
+            watching = stub(served).WatchClock(wire.WatchClockRequest(), timeout=TIMEOUT_S)
+            assert (await next_message(watching)).step == 2
+            for number in (3, 4):
+                await asyncio.to_thread(coordinator.step, MS)
+                while (await next_message(watching)).step < number:
+                    pass
+            watching.cancel()
 
     simulate(instance, test)
 
