@@ -60,6 +60,7 @@ PRIVATE_NAMES: Final = (
     "_handle_publish",
     "_in_packet",
     "_last_mid",
+    "_reset_sockets",
     "_send_pingreq",
     "_sock_recv",
 )
@@ -141,6 +142,10 @@ class _Client(Client):
         taken = self._received[self._taken : self._taken + bufsize]
         self._taken += len(taken)
         return taken
+
+    def close_sockets(self) -> None:
+        """Close all sockets now, because an error's traceback may delay that this object is freed."""
+        self._reset_sockets()
 
     def turn(self, timeout_s: float) -> bool:
         """Wait for the socket, and handle all packets that are received at once.
@@ -383,7 +388,8 @@ class Link:
         _close_socket(client)
         if thread is not None:
             thread.join(CLOSE_S)
-        # Break the reference cycle with the client, which closes its sockets when it is freed.
+        client.close_sockets()
+        # Break the reference cycle with the client, so that it is freed soon.
         client.on_connect = client.on_disconnect = client.on_subscribe = client.on_publish = client.on_message = None
         client.on_pong = lambda: None
         self._client = None
