@@ -321,6 +321,7 @@ def test_page_returns_after_a_reload_that_restarts_its_server(cell: Cell, page: 
     page.get_by_role("button", name="Reload …").click()
     expect(page.get_by_role("dialog")).to_contain_text("connects again by itself")
     page.get_by_role("dialog").get_by_role("button", name="Reload", exact=True).click()
+    expect(page.locator(".plan")).to_contain_text("change nothing")  # a failure shows the supervisor's answer, too
     expect(page.locator(".plan .changes")).to_contain_text("change nothing")
     assert cell.processes()["web"]["pid"] != pid
 
