@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 def replace_file(file: Path, data: bytes, *, private: bool) -> None:
-    """Write a file. An older file stays as it was until the new one is complete.
+    """Write a file. Until all of it is written, readers see the older file.
 
     Args:
         file: The file. If it is a symbolic link, the link is replaced.

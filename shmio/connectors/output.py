@@ -215,8 +215,7 @@ class Output:
     def _publish(self, at: Stamp | None = None) -> None:
         if self._last is not None:
             last = self._last
-            seen = last.shown
-            effective = self.injections.effective(last.raw if seen is None else seen)
+            effective = self.injections.effective(last.base)
             self.writer.publish(
                 last.raw,
                 cycle=last.cycle,
@@ -224,7 +223,7 @@ class Output:
                 quality=last.quality,
                 provenance=last.provenance,
                 reason=last.reason,
-                effective=seen if effective is None else effective,
+                effective=last.shown if effective is None else effective,
                 asked_ns=last.asked_ns,
                 at=at,
             )

@@ -3,11 +3,10 @@
  * The header itself is compiled here. Each atomic access is replaced by one to a memory of messages: a
  * location keeps all values that it ever had, each with the view that a reader gains by reading it with
  * acquire. A load may return any value that is not older than those the reader has seen. This is C11 as
- * corrected by RC11 (Lahav et al., PLDI 2017), without seq_cst: so the waiters of a private ring, which need it,
- * are left out. On x86 most of it never happens, so no
- * test on such a machine finds an order that is too weak. The writer reads nothing that the reader writes;
- * therefore the writer runs first, and only the reader's choices are explored. Exit status 0: all
- * results are right. */
+ * corrected by RC11 (Lahav et al., PLDI 2017), without seq_cst. So this model leaves out the waiters of a
+ * private ring, which need it. On x86 most of it never happens, so no test on such a machine finds an order
+ * that is too weak. The writer reads nothing that the reader writes; therefore the writer runs first, and
+ * only the reader's choices are explored. Exit status 0: all results are right. */
 #include <setjmp.h>
 #include <stdatomic.h>
 #include <stdbool.h>

@@ -115,7 +115,7 @@ static PyObject *frames_add(PyObject *module, PyObject *args)
         if (size > limit) break;
     }
     if (!PyErr_Occurred()) return Py_BuildValue("nK", next, size);
-    PyList_SetSlice(parts, old_parts, PyList_Size(parts), NULL); /* so that the chunk stays as it was */
+    PyList_SetSlice(parts, old_parts, PyList_Size(parts), NULL); /* removes what this call has added */
     PyList_SetSlice(index, old_index, PyList_Size(index), NULL);
     return NULL;
 }

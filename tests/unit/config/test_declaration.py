@@ -68,7 +68,7 @@ def test_configuration_may_declare_injections(tmp_path: Path) -> None:
 def test_errors_name_the_key(tmp_path: Path, old: str, new: str, message: str) -> None:
     with pytest.raises(ConfigError) as refused:
         campaign(tmp_path, GOOD.replace(old, new))
-    assert re.match(rf"{tmp_path / 'c.toml'}:[2-8]: {re.escape(message)}", str(refused.value))
+    assert re.match(rf"{re.escape(str(tmp_path / 'c.toml'))}:[2-8]: {re.escape(message)}", str(refused.value))
     assert "\n" not in str(refused.value)
 
 
