@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
+from pathlib import Path
 from types import FrameType, MappingProxyType
 from typing import Any, Final, TextIO
 
@@ -77,11 +78,11 @@ def run(
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
-        _give_up_output()  # the reader has ended, as with `| head`
+        give_up_if_broken(sys.stdout)  # the reader has ended, as with `| head`
         return 141
     except OSError as error:
         _print_error(f"{error.filename or program}: {error.strerror}", as_json=as_json)
-        _give_up_output()
+        give_up_if_broken(sys.stdout)
         return status_of(error)
     return status
 
@@ -144,6 +145,9 @@ def say(line: str, stream: TextIO | None = None) -> None:
     """Print a line without delay. If the terminal is closed, do nothing."""
     with suppress(OSError):
         print(printable(line), file=stream or sys.stdout, flush=True)
+        return
+    if stream is sys.stderr:
+        give_up_if_broken(sys.stderr)  # Python would end with status 120
 
 
 def say_json(value: Any) -> None:
@@ -158,12 +162,20 @@ def _print_error(error: str, found: Mapping[str, object] = MappingProxyType({}),
         say_json({**found, "error": error})
 
 
-def _give_up_output() -> None:
-    """Discard the output, so that flushing it when the interpreter exits does not fail again."""
+def give_up_if_broken(stream: TextIO | None) -> str:
+    """Flush a stream. If that fails, discard its output from now on, and return why; else return "".
+
+    If it were not discarded, a later flush would fail again, and change the exit status.
+    """
+    if stream is None:
+        return ""
     try:
-        sys.stdout.flush()
-    except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        stream.flush()
+    except OSError as error:
+        with Path(os.devnull).open("wb") as null:
+            os.dup2(null.fileno(), stream.fileno())
+        return str(error.strerror)
+    return ""
 
 
 def at_least(least: int) -> Callable[[str], int]:

@@ -20,6 +20,7 @@ from shmio.judging.verdict import Outcome, Verdict, distance
 _Place = Callable[[float], float]
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM = 860, 130, 70, 20
 _SHOWN_SPANS: Final = 20
+_MOST: Final = float(np.finfo(np.float64).max)
 _NO_XML: Final = dict.fromkeys(
     [*range(9), 11, 12, *range(14, 32), 0xFFFE, 0xFFFF, *range(0xD800, 0xE000)], "\N{REPLACEMENT CHARACTER}"
 )
@@ -85,6 +86,11 @@ class Report:
     declared: Sequence[Declaration] = field(default=())
 
 
+def fault_of(error: Exception) -> str:
+    """Return an unexpected error as text."""
+    return f"{type(error).__name__}: {error}"
+
+
 def describe(expectation: Expectation) -> str:
     """Return what is expected, as lines of the form ``key = value``."""
     return _keys(expectation, "name", "severity", "text", "requirement")
@@ -99,12 +105,18 @@ def _keys(table: Declaration | Expectation, *left_out: str) -> str:
 # -- HTML --------------------------------------------------------------------------------------------------------------
 
 
-def html(report: Report) -> str:
-    """Return the report as an HTML page."""
-    return "\n".join(_page(report)) + "\n"
+def html(report: Report, warn: Callable[[str], None] = lambda _text: None) -> str:
+    """Return the report as an HTML page.
+
+    Args:
+        report: The report.
+        warn: Called with the name and the fault of each plot that cannot be drawn. The page then
+            has the fault in the plot's place.
+    """
+    return "\n".join(_page(report, warn)) + "\n"
 
 
-def _page(report: Report) -> Iterator[str]:
+def _page(report: Report, warn: Callable[[str], None]) -> Iterator[str]:
     yield f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(report.title)}</title>'
     yield "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'\">"
     yield f"<style>{_STYLE}</style></head><body>\n<h1>{escape(report.title)}</h1>"
@@ -125,7 +137,7 @@ def _page(report: Report) -> Iterator[str]:
     yield "</table>"
     yield from _injections(report)
     for at, (verdict, signals) in enumerate(zip(report.verdicts, report.signals, strict=True)):
-        yield from _section(report, at, verdict, signals)
+        yield from _section(report, at, verdict, signals, warn)
     yield "</body></html>"
 
 
@@ -161,7 +173,9 @@ def _active(spans: Sequence[Span]) -> str:
     return "<br>".join([*shown, *more]) or "never"
 
 
-def _section(report: Report, at: int, verdict: Verdict, signals: Sequence[Drawn]) -> Iterator[str]:
+def _section(
+    report: Report, at: int, verdict: Verdict, signals: Sequence[Drawn], warn: Callable[[str], None]
+) -> Iterator[str]:
     one = verdict.expectation
     requirement = f' <span class="dim">{escape(one.requirement)}</span>' if one.requirement else ""
     yield f'<h2 id="e{at}">{escape(one.name)}: {_outcome(verdict)}{requirement}</h2>'
@@ -171,7 +185,12 @@ def _section(report: Report, at: int, verdict: Verdict, signals: Sequence[Drawn]
     if verdict.reason:
         yield f"<p>{escape(verdict.reason)}{_moment(verdict)}</p>"
     for drawn in signals:
-        yield _svg(report, verdict, drawn)
+        try:
+            yield _svg(report, verdict, drawn)
+        except Exception as error:  # noqa: BLE001  a plot may cost no verdict
+            fault = f"the plot of {drawn.signal.name} cannot be drawn: {fault_of(error)}"
+            warn(fault)
+            yield f'<p class="dim">{escape(fault)}</p>'
     if verdict.around:
         yield "<table><tr><th>around the moment<th>time and value</tr>"
         for name, pairs in verdict.around.items():
@@ -209,15 +228,16 @@ def _svg(report: Report, verdict: Verdict, drawn: Drawn) -> str:
     lines += [(compressed(limit.time, limit.low, limit.high), "#2da44e") for limit in within]
     shown = np.concatenate([side[np.isfinite(side)] for line, _ in lines for side in (line.least, line.greatest)])
     least, greatest = (float(shown.min()), float(shown.max())) if len(shown) else (0.0, 1.0)
-    if least == greatest:
-        least, greatest = least - 0.5, greatest + 0.5
-    middle, half = least / 2 + greatest / 2, greatest / 2 - least / 2
+    if not greatest / 2 - least / 2:  # a constant, of any size
+        room = max(0.5, abs(least) / 1000)
+        least, greatest = max(least - room, -_MOST), min(greatest + room, _MOST)
+    half = greatest / 2 - least / 2  # the whole may exceed a float
 
     def x(time_ns: float) -> float:
         return _LEFT + (_WIDTH - _LEFT) * min(max((time_ns - begin) / (end - begin), 0.0), 1.0)
 
     def y(value: float) -> float:
-        return (_HEIGHT - _BOTTOM) / 2 - (value - middle) / half * ((_HEIGHT - _BOTTOM) / 2 - 6)
+        return _HEIGHT - _BOTTOM - 6 - (value / 2 - least / 2) / half * (_HEIGHT - _BOTTOM - 12)
 
     size = f'viewBox="0 0 {_WIDTH} {_HEIGHT}" width="{_WIDTH}" height="{_HEIGHT}"'
     parts = [f'<svg {size} role="img"><title>{escape(drawn.signal.name)}</title>']

@@ -28,6 +28,7 @@ from shmio.config.expectation import expectation_faults
 from shmio.config.read import convert
 from shmio.errors import ConfigError, NotRunningError, RecordingError, ShmioError
 from shmio.judging.judge import Judge
+from shmio.judging.report import fault_of
 from shmio.judging.verdict import Outcome
 from shmio.layout.model import NUMBERS
 from shmio.layout.values.codec import Value
@@ -210,17 +211,28 @@ class CellUnderTest:
     def keep(self) -> str:
         """End the recording, write a report with plots, and return a text with the paths of both."""
         found = []
-        try:
-            self._take()
-            self._recording.close()
-            found.append(f"recording: {self.folder / RECORDING}")
-            self._report(self.folder / REPORT)
-            found.append(f"plots:     {self.folder / REPORT}")
-        except ShmioError as error:
-            found.append(f"not complete: {error}")
+        for what, file, write in (
+            ("recording", RECORDING, self._close_recording),
+            ("plots", REPORT, self._report),
+        ):
+            path = self.folder / file
+            try:
+                warnings = write(path)
+            except Exception as error:  # noqa: BLE001  evidence may not change the test's result
+                warnings = [str(error) if isinstance(error, ShmioError) else fault_of(error)]
+            found += [f"not complete: {warning}" for warning in warnings]
+            if path.exists():
+                found.append(f"{f'{what}:':<10} {path}")
         return "\n".join([*found, f"logs:      {self.folder / LOGS}"])
 
-    def _report(self, file: Path) -> None:
+    def _close_recording(self, _file: Path) -> list[str]:
+        try:
+            self._take()
+        finally:
+            self._recording.close()
+        return []
+
+    def _report(self, file: Path) -> list[str]:
         shown, begin = ([self._unmet[0]], self._unmet[1]) if self._unmet is not None else ([], 0)
         for path in list(self._touched)[:MAX_PLOTS]:
             block, register = self.attachment.resolve(path)
@@ -231,9 +243,7 @@ class CellUnderTest:
         reports = Reports(argparse.Namespace(report=file, junit=None))
         judge = self._judged(shown, begin, reports)
         facts = [("instance", self._segment.instance), ("recording", str(self.folder / RECORDING))]
-        problems = reports.write(judge, self._title, facts, f"pytest {self._title}", self._injections.spans)
-        for problem in problems.values():
-            raise RecordingError(problem)
+        return reports.write(judge, self._title, facts, f"pytest {self._title}", self._injections.spans)
 
     def _judged(self, expectations: Sequence[Expectation], begin: int, reports: Reports | None = None) -> Judge:
         blocks = self._segment.blocks

@@ -11,7 +11,7 @@ import threading
 from collections.abc import Generator, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -82,15 +82,20 @@ def pytest_runtest_makereport(
     return report
 
 
-def _kept(item: pytest.Item, cell: Any) -> str:
-    text: str = cell.keep()
-    directory = item.config.getoption("--shmio-keep")
-    if directory is None:
-        return text
-    folder = directory / "".join(char if char.isalnum() or char in "._-" else "-" for char in item.nodeid)
-    shutil.rmtree(folder, ignore_errors=True)
-    shutil.copytree(cell.folder, folder, ignore=_links)
-    return text.replace(str(cell.folder), str(folder))
+def _kept(item: pytest.Item, cell: CellUnderTest) -> str:
+    """Return where the evidence is. Whatever goes wrong with it, the test's own result stays."""
+    text = ""
+    try:
+        text = cell.keep()
+        directory: Path | None = item.config.getoption("--shmio-keep")
+        if directory is None:
+            return text
+        folder = directory / "".join(char if char.isalnum() or char in "._-" else "-" for char in item.nodeid)
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(cell.folder, folder, ignore=_links)
+        return text.replace(str(cell.folder), str(folder))
+    except Exception as error:  # noqa: BLE001  an error in a hook ends the whole session
+        return f"{text}\nnot kept: {type(error).__name__}: {error}".lstrip()
 
 
 def _links(folder: str, names: list[str]) -> list[str]:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from shmio.campaigns.digests import of_configuration, of_file, of_layouts
+from shmio.cli.campaigns.reports import attempt
 from shmio.cli.campaigns.run import configuration_of, duration_of
 from shmio.cli.campaigns.verdicts import UNDECIDED
 from shmio.cli.common import say, say_json, stop_on_signals
@@ -221,7 +222,12 @@ class _Command:
             say(f"the ranges have only {size:.0f} points: --search grid tries each of them once", sys.stderr)
 
     def _on_trial(self, _point: Point, _result: Result, best: bool) -> None:
-        self._progress.at(self._falsifier, best=best, workers=self._workers)
+        fault = attempt(
+            lambda: self._progress.at(self._falsifier, best=best, workers=self._workers), "the progress is not shown"
+        )
+        if fault:
+            self._progress.stop()
+            say(fault, sys.stderr)
 
     def _on_failure(self, failure: Failure) -> None:
         """Store a shrunk case, unless it is stored already."""
@@ -342,6 +348,10 @@ class _Progress:
         with suppress(OSError):
             sys.stderr.write(f"\r{printable(text)}\x1b[K")
             sys.stderr.flush()
+
+    def stop(self) -> None:
+        """Show nothing from now on."""
+        self._silent = True
 
     def clear(self) -> None:
         """Remove the line from a terminal."""

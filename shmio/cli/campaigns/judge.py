@@ -10,7 +10,7 @@ import sys
 
 from shmio.campaigns.digests import of_campaign, of_file, of_layouts
 from shmio.cli.campaigns.reports import Reports
-from shmio.cli.campaigns.verdicts import UNDECIDED, tell
+from shmio.cli.campaigns.verdicts import tell
 from shmio.cli.common import say
 from shmio.cli.recordings.common import DamageReport, not_closed, time_range
 from shmio.config.campaign import CampaignFile
@@ -58,7 +58,6 @@ def judge(arguments: argparse.Namespace) -> int:
     for option, text in (("--from", arguments.begin), ("--to", arguments.end)):
         words += [] if text is None else [option, text]
     status = tell(found, {"files": [str(file) for file in arguments.files]}, as_json=arguments.json)
-    problems = reports.write(found, f"Campaign {arguments.campaign.name}", facts, shlex.join(words), times.spans)
-    for option, problem in problems.items():
-        say(f"{option} {problem}", sys.stderr)
-    return status or (UNDECIDED if problems else 0)
+    for warning in reports.write(found, f"Campaign {arguments.campaign.name}", facts, shlex.join(words), times.spans):
+        say(warning, sys.stderr)
+    return status

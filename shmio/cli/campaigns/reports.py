@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -12,7 +13,7 @@ from shmio.config.folder import unwritable
 from shmio.errors import ConfigError
 from shmio.files import replace_file
 from shmio.judging.judge import Judge
-from shmio.judging.report import Drawn, Report, Span, html, junit
+from shmio.judging.report import Drawn, Report, Span, fault_of, html, junit
 from shmio.judging.source import Rows, Signal
 from shmio.judging.trace import Traces
 
@@ -41,6 +42,15 @@ def check_place(option: str, file: Path | None) -> None:
         raise ConfigError(f"{option} {file}: {obstacle.reason}")
 
 
+def attempt(show: Callable[[], object], what: str) -> str:
+    """Call a function that only shows a verdict. Return why it failed, which must not cost the verdict, or ""."""
+    try:
+        show()
+    except Exception as error:  # noqa: BLE001  whatever is wrong with the display
+        return f"{what}: {fault_of(error)}"
+    return ""
+
+
 class Reports:
     """The reports that the command line asks for. They collect signals only if a report has plots."""
 
@@ -49,6 +59,7 @@ class Reports:
         self._html: Path | None = arguments.report
         self._junit: Path | None = arguments.junit
         self._traces: Traces | None = None
+        self._no_plots = ""
 
     def check(self) -> None:
         """Check, before the run, that the files can be written.
@@ -69,12 +80,16 @@ class Reports:
         if self._html is None:
             return lambda _rows: None
 
-        def seen(rows: Mapping[str, Rows]) -> None:
+        def collect(rows: Mapping[str, Rows]) -> None:
             if self._traces is None:
                 found = judge()
                 signals = {source: found.signals(source) for source in found.sources}
                 self._traces = Traces(signals, {one for _, one in _plotted(found)})
             self._traces.add(rows)
+
+        def seen(rows: Mapping[str, Rows]) -> None:
+            if not self._no_plots:
+                self._no_plots = attempt(lambda: collect(rows), "it has no plots")
 
         return seen
 
@@ -86,8 +101,8 @@ class Reports:
         command: str,
         injections: Sequence[Span],
         declared: Sequence[Declaration] = (),
-    ) -> dict[str, str]:
-        """Write the reports that the command line asks for. A file that cannot be written does not stop the other.
+    ) -> list[str]:
+        """Write the reports that the command line asks for, each on its own, whatever is wrong with another.
 
         Args:
             judge: The judge, after the end of the run.
@@ -98,24 +113,48 @@ class Reports:
             declared: The injections of the campaign, with their seeds.
 
         Returns:
-            For each option whose file could not be written, the file and the reason.
+            Warnings: what the reports lack, or why a file could not be written. They begin with the
+            option and the file.
 
         """
-        if self._html is None and self._junit is None:
-            return {}
-        verdicts = judge.verdicts
-        drawn: list[list[Drawn]] = [[] for _ in verdicts]
-        if self._traces is not None:
-            for index, one in _plotted(judge):
-                plot, limits = self._traces.plot(one), judge.limits(index, one)
-                drawn[index].append(Drawn(one, plot, judge.troubles(one.source), limits))
-        report = Report(title, facts, command, judge.begin_ns, judge.end_ns or 1, verdicts, drawn, injections, declared)
-        problems = {}
-        if self._html is not None:
-            problems["--report"] = _write(self._html, html(report).encode("utf-8", "replace"))
-        if self._junit is not None:
-            problems["--junit"] = _write(self._junit, junit(report))
-        return {option: problem for option, problem in problems.items() if problem}
+        warnings: list[str] = []
+        report = Report(
+            title, facts, command, judge.begin_ns, judge.end_ns or 1, judge.verdicts, [[] for _ in judge.verdicts],
+            injections, declared,
+        )  # fmt: skip
+
+        def write_html(file: Path) -> None:
+            def warn(text: str) -> None:
+                warnings.append(f"--report {file}: {text}")
+
+            drawn: list[list[Drawn]] = [[] for _ in report.verdicts]
+            fault = self._no_plots or attempt(lambda: self._draw(judge, drawn), "it has no plots")
+            if fault:
+                warn(fault)
+            page = html(replace(report, signals=drawn), warn)
+            _write(file, page.encode("utf-8", "replace"))
+
+        for option, file, write in (
+            ("--report", self._html, write_html),
+            ("--junit", self._junit, lambda file: _write(file, junit(report))),
+        ):
+            if file is None:
+                continue
+            try:
+                write(file)
+            except OSError as error:
+                warnings.append(f"{option} {file}: it cannot be written: {error.strerror}")
+            except Exception as error:  # noqa: BLE001  a report may cost no verdict
+                warnings.append(f"{option} {file}: it cannot be made: {fault_of(error)}")
+        return warnings
+
+    def _draw(self, judge: Judge, drawn: list[list[Drawn]]) -> None:
+        """Add the plots of the signals that each expectation reads."""
+        if self._traces is None:
+            return
+        for index, one in _plotted(judge):
+            plot, limits = self._traces.plot(one), judge.limits(index, one)
+            drawn[index].append(Drawn(one, plot, judge.troubles(one.source), limits))
 
 
 def _plotted(judge: Judge) -> list[tuple[int, Signal]]:
@@ -123,17 +162,10 @@ def _plotted(judge: Judge) -> list[tuple[int, Signal]]:
     return [(index, one) for index in range(len(judge.verdicts)) for one in judge.read_by(index)][:MAX_PLOTS]
 
 
-def _write(file: Path, data: bytes) -> str:
-    """Write a file, in a new folder if need be; return why it cannot be written, or "".
-
-    An older file is replaced only by a complete one.
-    """
-    try:
-        file.resolve().parent.mkdir(parents=True, exist_ok=True)
-        if file.exists() and not file.is_file():  # a device or a pipe
-            file.write_bytes(data)
-        else:
-            replace_file(file.resolve(), data, private=False)
-    except OSError as error:
-        return f"{file}: it cannot be written: {error.strerror}"
-    return ""
+def _write(file: Path, data: bytes) -> None:
+    """Write a file, in a new folder if need be. An older file is replaced only by a complete one."""
+    file.resolve().parent.mkdir(parents=True, exist_ok=True)
+    if file.exists() and not file.is_file():  # a device or a pipe
+        file.write_bytes(data)
+    else:
+        replace_file(file.resolve(), data, private=False)

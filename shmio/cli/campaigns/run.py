@@ -80,17 +80,15 @@ def run(arguments: argparse.Namespace) -> int:
     command = _command(arguments, seed, duration_s, work)
     found: dict[str, Any] = {"instance": name, "seed": seed, "virtual": work.virtual, "command": command}
     if work.recorded and work.virtual:
-        with suppress(RecordingError), open_dump(arguments.record) as dump:  # it may have been removed
+        # The recording may have been removed.
+        with suppress(RecordingError, OSError), open_dump(arguments.record) as dump:
             found["contents_sha256"] = digest_of_contents(dump)
     status = tell(work.judge, found, as_json=arguments.json)
     if "contents_sha256" in found and not arguments.json:
         say(f"{arguments.record}: contents sha256 {found['contents_sha256']}", sys.stderr)
     title = f"Campaign {arguments.campaign.name}"
-    unwritten = reports.write(work.judge, title, facts, command, work.injections.spans, plan.injections)
-    for option, problem in unwritten.items():
-        say(f"{option} {problem}", sys.stderr)
-    if unwritten:
-        status = status or UNDECIDED
+    for warning in reports.write(work.judge, title, facts, command, work.injections.spans, plan.injections):
+        say(warning, sys.stderr)
     if work.problem is not None:
         say(f"{'the run ended early: ' * work.ended_early}{work.problem}", sys.stderr)
         return status or UNDECIDED
@@ -207,7 +205,7 @@ def _instance(arguments: argparse.Namespace) -> Iterator[tuple[Target, bool]]:
     finally:
         try:
             _stop(name)
-        except ShmioError as error:  # the verdicts still count
+        except (ShmioError, OSError) as error:  # the verdicts still count
             say(f"instance {name} is not stopped: {error}", sys.stderr)
 
 

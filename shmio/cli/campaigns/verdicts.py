@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from math import isfinite
 from typing import Any, Final
 
 import msgspec
 
-from shmio.cli.common import say, say_json
+from shmio.cli.campaigns.reports import attempt
+from shmio.cli.common import give_up_if_broken, say, say_json
 from shmio.judging.judge import Judge
 from shmio.judging.verdict import Outcome, Verdict, distance
 
@@ -24,7 +26,7 @@ def exit_status(verdicts: Sequence[Verdict]) -> int:
 
 
 def tell(judge: Judge, found: dict[str, Any], *, as_json: bool) -> int:
-    """Print all verdicts, and return the exit status.
+    """Print all verdicts, and return the exit status, which does not depend on the terminal.
 
     Args:
         judge: The judge, after the end of the run.
@@ -32,21 +34,29 @@ def tell(judge: Judge, found: dict[str, Any], *, as_json: bool) -> int:
         as_json: Whether to print one JSON object instead of lines of text.
     """
     verdicts = judge.verdicts
-    if as_json:
-        begin, end = judge.begin_ns, judge.end_ns
-        times = {
-            "begin_s": None if begin is None else begin / 1e9,
-            "end_s": None if begin is None or end is None else (end - 1) / 1e9,
-        }
-        say_json({**found, **times, "verdicts": [as_table(verdict) for verdict in verdicts]})
-        return exit_status(verdicts)
+    fault = attempt(lambda: (_say_json if as_json else _say_lines)(judge, verdicts, found), "the verdicts")
+    fault = give_up_if_broken(sys.stdout) or fault
+    if fault:
+        say(f"standard output: {fault}", sys.stderr)
+    return exit_status(verdicts)
+
+
+def _say_json(judge: Judge, verdicts: Sequence[Verdict], found: dict[str, Any]) -> None:
+    begin, end = judge.begin_ns, judge.end_ns
+    times = {
+        "begin_s": None if begin is None else begin / 1e9,
+        "end_s": None if begin is None or end is None else (end - 1) / 1e9,
+    }
+    say_json({**found, **times, "verdicts": [as_table(verdict) for verdict in verdicts]})
+
+
+def _say_lines(_judge: Judge, verdicts: Sequence[Verdict], _found: dict[str, Any]) -> None:
     width = max((len(verdict.expectation.name) for verdict in verdicts), default=0)
     for verdict in verdicts:
         for line in lines(verdict, width):
             say(line)
     counts = [f"{sum(one.outcome is outcome for one in verdicts)} {outcome}" for outcome in Outcome]
     say(", ".join(counts))
-    return exit_status(verdicts)
 
 
 def as_table(verdict: Verdict) -> dict[str, Any]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -59,7 +61,7 @@ def test_place_is_checked_before_the_run(
 
 
 @pytest.mark.usefixtures("full")
-@pytest.mark.parametrize(("campaign", "status"), [("good.toml", 3), ("bad.toml", 1)])
+@pytest.mark.parametrize(("campaign", "status"), [("good.toml", 0), ("bad.toml", 1)])
 def test_verdicts_are_printed_before_a_file_fails(
     folder: Path, campaign: str, status: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -88,6 +90,50 @@ def test_a_file_that_fails_does_not_stop_the_other(folder: Path, capsys: pytest.
     assert capsys.readouterr().err == "--report /dev/full: it cannot be written: No space left on device\n"
     assert b"<failure" in (folder / "o.xml").read_bytes()
     assert not Path("/dev/full").is_file()
+
+
+@pytest.mark.parametrize(("campaign", "status"), [("good.toml", 0), ("bad.toml", 1)])
+@pytest.mark.parametrize(
+    ("broken", "warning"),
+    [
+        ("shmio.judging.report._svg", "--report o.html: the plot of cell/speed cannot be drawn"),
+        ("shmio.judging.report._page", "--report o.html: it cannot be made"),
+        ("shmio.judging.report._case", "--junit o.xml: it cannot be made"),
+        ("shmio.judging.trace.Traces.add", "--report o.html: it has no plots"),
+        ("shmio.judging.trace.Traces.plot", "--report o.html: it has no plots"),
+        ("shmio.cli.campaigns.verdicts.lines", "standard output: the verdicts"),
+    ],
+)
+def test_a_fault_of_a_display_is_a_warning(
+    folder: Path,
+    campaign: str,
+    status: int,
+    broken: str,
+    warning: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def divide(*_arguments: object, **_keywords: object) -> None:
+        raise ZeroDivisionError("float division by zero")
+
+    monkeypatch.setattr(broken, divide)
+    assert main(["judge", "run.mem", "-f", campaign, "--report", "o.html", "--junit", "o.xml"]) == status
+    assert capsys.readouterr().err == f"{warning}: ZeroDivisionError: float division by zero\n"
+    lost = "o.html" if "html: it cannot be made" in warning else "o.xml" if "xml" in warning else ""
+    assert {name: (folder / name).exists() for name in ("o.html", "o.xml")} == {
+        name: name != lost for name in ("o.html", "o.xml")
+    }
+
+
+@pytest.mark.parametrize(("campaign", "status"), [("good.toml", 0), ("bad.toml", 1)])
+def test_a_broken_output_changes_no_exit_status(folder: Path, campaign: str, status: int) -> None:
+    for out, err in (("/dev/full", "/dev/null"), ("/dev/null", "/dev/full"), ("/dev/full", "/dev/full")):
+        with Path(out).open("wb") as stdout, Path(err).open("wb") as stderr:
+            code = "import sys; from shmio.cli.entry import shmio_campaign; sys.exit(shmio_campaign())"
+            words = [sys.executable, "-c", code, "judge", "run.mem", "-f", campaign, "--junit", "o.xml"]
+            done = subprocess.run(words, stdout=stdout, stderr=stderr, cwd=folder, check=False)
+        assert done.returncode == status, (out, err)
+    assert (folder / "o.xml").exists()
 
 
 def test_an_older_file_keeps_its_permissions_and_a_link_its_target(folder: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -206,3 +207,15 @@ def test_a_missing_library_has_status_2(
     (folder / "ranges.toml").write_text(text + RANGE)
     assert main(["falsify", "ranges.toml", "-c", "supervisor.toml"]) == 2
     assert "shmio[falsify]" in capsys.readouterr().err
+
+
+def test_a_large_constant_costs_no_verdict(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    field = Path(__file__).parents[2] / "field/campaigns"
+    for name, other in (("supervisor.toml", "big_constant_supervisor.toml"), ("cm.py", "big_constant_model.py.txt")):
+        shutil.copy(field / other, tmp_path / name)
+    shutil.copy(field / "big_constant.toml", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    words = ["run", "big_constant.toml", "--lab", "--report", "o.html", "--junit", "o.xml"]
+    assert main(words) == 0
+    assert "1 passed" in Path("o.html").read_text()
+    assert b'failures="0" errors="0"' in Path("o.xml").read_bytes()

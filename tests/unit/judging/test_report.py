@@ -13,7 +13,7 @@ import pytest
 from shmio.config import Declaration
 from shmio.judging.report import Drawn, Report, Span, html, junit
 from shmio.judging.source import Rows
-from shmio.judging.trace import MAX_POINTS, Traces
+from shmio.judging.trace import MAX_POINTS, Plot, Traces
 from tests.unit.judging.test_judge import UP, S, expect
 from tests.unit.judging.traces import judge
 
@@ -127,3 +127,19 @@ def test_plots_of_long_signals_keep_extrema_within_a_limit() -> None:
     assert (np.diff(plot.time_ns) > 0).all()
     peak = int(plot.greatest.argmax())
     assert plot.time_ns[peak] <= 31_337 * S < plot.time_ns[peak + 1]
+
+
+@pytest.mark.parametrize(
+    ("least", "greatest"),
+    [(2.0**53, 2.0**53), (-(2.0**63), -(2.0**63)), (1.7e308, 1.7976931348623157e308), (-1.7976931348623157e308,) * 2,
+     (-1.7976931348623157e308, 1.7976931348623157e308), (5e-324, 5e-324), (0.0, 5e-324), (2.0**53, 2.0**53 + 2)],
+)  # fmt: skip
+def test_plots_of_extreme_values_lie_in_the_picture(report: Report, least: float, greatest: float) -> None:
+    signal = report.signals[0][0].signal
+    plot = Plot(np.array([0, S]), np.full(2, least), np.array([least, greatest]))
+    page = html(dataclasses.replace(report, signals=[[Drawn(signal, plot)], [], []]), pytest.fail)
+    (path,) = re.findall(r'<path d="([^"]*)" fill="none" stroke="#1f6feb"', page)
+    heights = [float(one) for one in re.findall(r"(?:V|M[0-9.]+ )(-?[0-9.]+)", path)]
+    assert heights
+    assert all(0 <= one <= 130 for one in heights), path
+    assert not re.search(r"\b(inf|nan)\b", page.partition("<svg")[2].partition("</svg>")[0])
