@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import datetime
+import json
 import re
 import shutil
 import subprocess
@@ -98,3 +100,40 @@ def test_only_a_tag_with_its_own_version_is_released(tree: Path) -> None:
     git(tree, "commit", "-qm", "z")
     git(tree, "tag", "-f", "v0.2.0")
     assert "complete section" in release(tree).stderr
+
+
+def test_each_package_must_have_been_built_lately_from_this_history(tree: Path) -> None:
+    (tree / "tests/compatibility/baselines/0.2.0").mkdir(parents=True)
+    (tree / "tests/compatibility/baselines/0.2.0/a").touch()
+    git(tree, "init", "-q")
+    assert release(tree, "--prepare", "0.2.0").returncode == 0
+    git(tree, "add", "-A")
+    git(tree, "commit", "-qm", "x")
+    today = f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d}"
+    file = tree / "packaging" / "builds.json"
+    scripts = {"wheel": "build-dist", "shmio-client": "build-dist", "deb": "build-deb", "image": "build-image"}
+
+    def head() -> str:
+        command = ["git", "rev-parse", "--short=12", "HEAD"]
+        return subprocess.run(command, cwd=tree, capture_output=True, text=True, check=True).stdout.strip()
+
+    def refusal(built: str, commit: str) -> str:
+        file.write_text(json.dumps({name: {"built": built, "commit": commit} for name in scripts if commit}))
+        git(tree, "add", "-A")
+        git(tree, "commit", "-qm", "y")
+        git(tree, "tag", "-f", "v0.2.0")
+        return release(tree).stderr
+
+    for why, built, commit in (
+        ("this package was never built", "", ""),
+        ("this package was last built", "2026-01-01", head()),
+        ("this package was last built from 0123456789ab, which is no part of this version", today, "0123456789ab"),
+    ):
+        said = refusal(built, commit)
+        for name, script in scripts.items():
+            assert f"{name}: {why}" in said
+            assert f"run scripts/{script}, and commit packaging/builds.json" in said
+    assert release(tree, "--record", *scripts).returncode == 0
+    assert json.loads(file.read_text()) == {name: {"built": today, "commit": head()} for name in scripts}
+    told = "".join(f"{name}: last built on {today} from {head()}\n" for name in scripts)
+    assert release(tree, "--builds").stdout == told
