@@ -26,6 +26,7 @@ _QUALITIES: Final = (Quality.GOOD, Quality.UNCERTAIN, Quality.BAD, Quality.BAD)
 GOOD: Final = 0x00000000
 UNCERTAIN: Final = 0x40000000
 UNCERTAIN_LAST_USABLE_VALUE: Final = 0x40900000
+BAD: Final = 0x80000000
 BAD_COMMUNICATION_ERROR: Final = 0x80050000
 BAD_RESOURCE_UNAVAILABLE: Final = 0x80040000
 BAD_TIMEOUT: Final = 0x800A0000
@@ -44,6 +45,14 @@ BAD_NOT_CONNECTED: Final = 0x808A0000
 BAD_DEVICE_FAILURE: Final = 0x808B0000
 BAD_NO_DATA: Final = 0x809B0000
 
+_FROM_OPC: Final = {  # by quality and sub-status, QQSSSS: OPC 10000-8, table A.61
+    0: BAD, 1: BAD_CONFIGURATION_ERROR, 2: BAD_NOT_CONNECTED, 3: BAD_DEVICE_FAILURE, 4: 0x808C0000, 5: 0x808D0000,
+    6: BAD_NO_COMMUNICATION, 7: 0x808D0000, 8: BAD_WAITING_FOR_INITIAL_DATA, 16: UNCERTAIN,
+    17: UNCERTAIN_LAST_USABLE_VALUE, 20: 0x40930000, 21: 0x40940000, 22: 0x40950000, 48: GOOD, 54: 0x00960000,
+}  # fmt: skip
+_OPC_QUALITIES: Final = range(256)
+_INFO_TYPE: Final = 0x0C00
+_INFO_BITS: Final = 0x03FF
 _NAMED: Final = 0xFFFF0000
 """The bits of a code that determine its name; the other half of the code has flags."""
 _NAMES: Final = {  # those codes of OPC 10000-6, annex A.2, that data sources use
@@ -220,7 +229,30 @@ class RegisterStatus(NamedTuple):
 def describe(code: int) -> str:
     """Return a status code as text: its name and number; if the name is unknown, only the number."""
     name = _NAMES.get(code & _NAMED)
+    if code & _NAMED == UNCERTAIN and code & _INFO_BITS and not code & _INFO_TYPE:
+        return f"{name} ({code & _INFO_BITS}, an unknown quality)"
     return f"{name} (0x{code:08X})" if name else f"status 0x{code:08X}"
+
+
+def from_opc_quality(quality: float) -> int | None:
+    """Return the status code for a quality of OPC DA, 0 to 255, whose bits are QQSSSSLL; None if it has no meaning."""
+    if quality not in _OPC_QUALITIES:
+        return None
+    number = int(quality) >> 2
+    return _FROM_OPC.get(number, _FROM_OPC.get(number & 0x30))
+
+
+def uncertain_quality(quality: object) -> int:
+    """Return the status code for a quality without a known meaning.
+
+    The code contains the number, from 1 to 1023, for :func:`describe`, in bits that OPC UA does not use in this case.
+    """
+    return UNCERTAIN | quality if isinstance(quality, int) and 0 < quality <= _INFO_BITS else UNCERTAIN
+
+
+def standard(code: int) -> int:
+    """Return a status code without the number that :func:`uncertain_quality` adds."""
+    return code if code & _INFO_TYPE else code & ~_INFO_BITS
 
 
 def worse(quality: Quality, reason: str, status: RegisterStatus) -> tuple[Quality, str]:

@@ -24,19 +24,19 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1cshmio/wire/sparkplug_b.proto\x12\x0fshmio.sparkplug\"d\n\rPropertyValue\x12\x0c\n\x04type\x18\x01 \x01(\r\x12\x0f\n\x07is_null\x18\x02 \x01(\x08\x12\x13\n\tint_value\x18\x03 \x01(\rH\x00\x12\x16\n\x0cstring_value\x18\x08 \x01(\tH\x00\x42\x07\n\x05value\"K\n\x0bPropertySet\x12\x0c\n\x04keys\x18\x01 \x03(\t\x12.\n\x06values\x18\x02 \x03(\x0b\x32\x1e.shmio.sparkplug.PropertyValue\"\xcf\x02\n\x06Metric\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\r\n\x05\x61lias\x18\x02 \x01(\x04\x12\x11\n\ttimestamp\x18\x03 \x01(\x04\x12\x10\n\x08\x64\x61tatype\x18\x04 \x01(\r\x12\x15\n\ris_historical\x18\x05 \x01(\x08\x12\x0f\n\x07is_null\x18\x07 \x01(\x08\x12\x30\n\nproperties\x18\t \x01(\x0b\x32\x1c.shmio.sparkplug.PropertySet\x12\x13\n\tint_value\x18\n \x01(\rH\x00\x12\x14\n\nlong_value\x18\x0b \x01(\x04H\x00\x12\x15\n\x0b\x66loat_value\x18\x0c \x01(\x02H\x00\x12\x16\n\x0c\x64ouble_value\x18\r \x01(\x01H\x00\x12\x17\n\rboolean_value\x18\x0e \x01(\x08H\x00\x12\x16\n\x0cstring_value\x18\x0f \x01(\tH\x00\x12\x15\n\x0b\x62ytes_value\x18\x10 \x01(\x0cH\x00\x42\x07\n\x05value\"S\n\x07Payload\x12\x11\n\ttimestamp\x18\x01 \x01(\x04\x12(\n\x07metrics\x18\x02 \x03(\x0b\x32\x17.shmio.sparkplug.Metric\x12\x0b\n\x03seq\x18\x03 \x01(\x04')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1cshmio/wire/sparkplug_b.proto\x12\x0fshmio.sparkplug\"\xc2\x01\n\rPropertyValue\x12\x0c\n\x04type\x18\x01 \x01(\r\x12\x0f\n\x07is_null\x18\x02 \x01(\x08\x12\x13\n\tint_value\x18\x03 \x01(\rH\x00\x12\x14\n\nlong_value\x18\x04 \x01(\x04H\x00\x12\x15\n\x0b\x66loat_value\x18\x05 \x01(\x02H\x00\x12\x16\n\x0c\x64ouble_value\x18\x06 \x01(\x01H\x00\x12\x17\n\rboolean_value\x18\x07 \x01(\x08H\x00\x12\x16\n\x0cstring_value\x18\x08 \x01(\tH\x00\x42\x07\n\x05value\"K\n\x0bPropertySet\x12\x0c\n\x04keys\x18\x01 \x03(\t\x12.\n\x06values\x18\x02 \x03(\x0b\x32\x1e.shmio.sparkplug.PropertyValue\"\xcf\x02\n\x06Metric\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\r\n\x05\x61lias\x18\x02 \x01(\x04\x12\x11\n\ttimestamp\x18\x03 \x01(\x04\x12\x10\n\x08\x64\x61tatype\x18\x04 \x01(\r\x12\x15\n\ris_historical\x18\x05 \x01(\x08\x12\x0f\n\x07is_null\x18\x07 \x01(\x08\x12\x30\n\nproperties\x18\t \x01(\x0b\x32\x1c.shmio.sparkplug.PropertySet\x12\x13\n\tint_value\x18\n \x01(\rH\x00\x12\x14\n\nlong_value\x18\x0b \x01(\x04H\x00\x12\x15\n\x0b\x66loat_value\x18\x0c \x01(\x02H\x00\x12\x16\n\x0c\x64ouble_value\x18\r \x01(\x01H\x00\x12\x17\n\rboolean_value\x18\x0e \x01(\x08H\x00\x12\x16\n\x0cstring_value\x18\x0f \x01(\tH\x00\x12\x15\n\x0b\x62ytes_value\x18\x10 \x01(\x0cH\x00\x42\x07\n\x05value\"S\n\x07Payload\x12\x11\n\ttimestamp\x18\x01 \x01(\x04\x12(\n\x07metrics\x18\x02 \x03(\x0b\x32\x17.shmio.sparkplug.Metric\x12\x0b\n\x03seq\x18\x03 \x01(\x04')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'shmio.wire.sparkplug_b_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_PROPERTYVALUE']._serialized_start=49
-  _globals['_PROPERTYVALUE']._serialized_end=149
-  _globals['_PROPERTYSET']._serialized_start=151
-  _globals['_PROPERTYSET']._serialized_end=226
-  _globals['_METRIC']._serialized_start=229
-  _globals['_METRIC']._serialized_end=564
-  _globals['_PAYLOAD']._serialized_start=566
-  _globals['_PAYLOAD']._serialized_end=649
+  _globals['_PROPERTYVALUE']._serialized_start=50
+  _globals['_PROPERTYVALUE']._serialized_end=244
+  _globals['_PROPERTYSET']._serialized_start=246
+  _globals['_PROPERTYSET']._serialized_end=321
+  _globals['_METRIC']._serialized_start=324
+  _globals['_METRIC']._serialized_end=659
+  _globals['_PAYLOAD']._serialized_start=661
+  _globals['_PAYLOAD']._serialized_end=744
 # @@protoc_insertion_point(module_scope)

@@ -18,7 +18,7 @@ from shmio.connectors.mqtt import address as addresses
 from shmio.connectors.mqtt import metric
 from shmio.connectors.mqtt.address import NAMESPACE, Metric, Place
 from shmio.connectors.mqtt.faults import ValueFaultError
-from shmio.connectors.mqtt.json_path import MAX_STEPS, Steps
+from shmio.connectors.mqtt.json_path import MAX_STEPS, Choice, Steps
 from shmio.connectors.mqtt.options import MqttOptions
 from shmio.connectors.mqtt.values import decode_json, is_number
 from shmio.wire import sparkplug_b_pb2 as wire
@@ -33,6 +33,8 @@ _KINDS: Final = {
     26: "USINT", 27: "UINT", 28: "UDINT", 29: "ULINT", 30: "REAL", 31: "LREAL", 32: "BOOL", 33: "STRING", 34: "ULINT",
 }  # fmt: skip
 _FIRST_ARRAY: Final = 22
+_NAMING: Final = ("id", "name")
+"""Members that name the objects of an array."""
 
 
 class Listener:
@@ -132,9 +134,24 @@ def _members(topic: str, names: tuple[str, ...], found: Any, steps: Steps, depth
     elif len(steps) >= min(depth, MAX_STEPS):
         yield Offer(names, refused=f"it is nested deeper than {len(steps)} levels")
     else:
-        inside: Iterable[tuple[str | int, Any]] = found.items() if isinstance(found, dict) else enumerate(found)
+        inside: Iterable[tuple[str | int | Choice, Any]] = (
+            found.items() if isinstance(found, dict) else _elements(found)
+        )
         for step, one in inside:
-            yield from _members(topic, (*names, str(step) or "_"), one, (*steps, step), depth)
+            name = step.text if isinstance(step, Choice) else str(step)
+            yield from _members(topic, (*names, name or "_"), one, (*steps, step), depth)
+
+
+def _elements(found: list[Any]) -> Iterable[tuple[int | Choice, Any]]:
+    """Return the elements of an array, by a member that names each of them; else by their indices.
+
+    An index may be another object in the next message, because some devices send only objects that have changed.
+    """
+    for key in _NAMING:
+        texts = [one[key] for one in found if isinstance(one, dict) and isinstance(one.get(key), str)]
+        if len({*texts}) == len(found):
+            return [(Choice(key, text), one) for text, one in zip(texts, found, strict=True)]
+    return enumerate(found)
 
 
 def _kind(found: Any) -> str:
@@ -222,7 +239,9 @@ def _address(source: Place | Metric) -> str:
     return f"{source.topic} ${''.join(map(_step, source.steps))}"
 
 
-def _step(step: str | int) -> str:
+def _step(step: str | int | Choice) -> str:
+    if isinstance(step, Choice):
+        return f"[{step.key}='{step.text}']"
     if isinstance(step, int):
         return f"[{step}]"
     if not set(step) & set(".[]'\" "):

@@ -9,7 +9,13 @@ from typing import Any, Final
 import numpy as np
 
 from shmio.connectors.mqtt.faults import ValueFaultError
-from shmio.model.statuses import BAD_DECODING_ERROR, BAD_NO_DATA, BAD_NOT_SUPPORTED
+from shmio.model.statuses import (
+    BAD_DECODING_ERROR,
+    BAD_NO_DATA,
+    BAD_NOT_SUPPORTED,
+    BAD_OUT_OF_RANGE,
+    BAD_TYPE_MISMATCH,
+)
 from shmio.wire import sparkplug_b_pb2 as wire
 
 BOOLEAN: Final = 11
@@ -42,10 +48,16 @@ def decode(metric: wire.Metric, datatype: int) -> Any:
     field = metric.WhichOneof("value")
     if metric.is_null or field is None:
         raise ValueFaultError(BAD_NO_DATA, "the metric is null")
+    if metric.datatype not in (0, datatype):
+        raise ValueFaultError(
+            BAD_TYPE_MISMATCH, f"the metric has data type {metric.datatype}, but its birth has {datatype}"
+        )
     found = getattr(metric, field)
     if datatype in _SIGNED or datatype in _UNSIGNED:
         if isinstance(found, int) and not isinstance(found, bool):
-            return _signed(found, _SIGNED[datatype], field) if datatype in _SIGNED else found
+            number = _signed(found, _SIGNED[datatype], field) if datatype in _SIGNED else found
+            _check_range(number, datatype)
+            return number
     elif datatype in (_FLOAT, _DOUBLE):
         if isinstance(found, float):
             return found
@@ -75,6 +87,19 @@ def _signed(found: int, bits: int, field: str) -> int:
     if found >> (wide - 1):
         return found - (1 << wide)
     return found - (1 << bits) if found >> (bits - 1) == 1 else found
+
+
+def _range(datatype: int) -> tuple[int, int]:
+    """Return the least and the greatest number of a data type of whole numbers."""
+    if datatype in _SIGNED:
+        return -(1 << _SIGNED[datatype] - 1), (1 << _SIGNED[datatype] - 1) - 1
+    return 0, (1 << _UNSIGNED[datatype]) - 1
+
+
+def _check_range(number: int, datatype: int) -> None:
+    least, most = _range(datatype)
+    if not least <= number <= most:
+        raise ValueFaultError(BAD_OUT_OF_RANGE, f"{number} does not fit the metric's data type {datatype}")
 
 
 def _decode_array(data: bytes, datatype: int) -> list[Any]:
@@ -134,15 +159,14 @@ def encode(metric: wire.Metric, datatype: int, value: Any, field: str | None) ->
 
 
 def _encode_whole(metric: wire.Metric, datatype: int, value: Any, field: str | None) -> None:
-    bits, signed = (_SIGNED[datatype], True) if datatype in _SIGNED else (_UNSIGNED[datatype], False)
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     if not isinstance(value, int) or isinstance(value, bool):
         raise ValueError(f"the metric is a whole number (data type {datatype}), but the written value is {value!r}")
-    least, most = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
+    least, most = _range(datatype)
     if not least <= value <= most:
         raise ValueError(f"{value} does not fit the metric, whose range is from {least} to {most}")
-    if bits == 64 or field == "long_value":
+    if 64 in (_SIGNED.get(datatype), _UNSIGNED.get(datatype)) or field == "long_value":
         metric.long_value = value & ((1 << 64) - 1)
     else:
         metric.int_value = value & ((1 << 32) - 1)

@@ -26,9 +26,13 @@ from shmio.model.statuses import (
     BAD_NOT_FOUND,
     BAD_WAITING_FOR_INITIAL_DATA,
     GOOD,
+    UNCERTAIN,
     UNCERTAIN_LAST_USABLE_VALUE,
+    from_opc_quality,
+    uncertain_quality,
 )
 from shmio.wire import sparkplug_b_pb2 as wire
+from shmio.wording import brief
 
 REBIRTH: Final = "Node Control/Rebirth"
 MAX_METRICS: Final = 100_000
@@ -41,8 +45,7 @@ CALM_NS: Final = 120_000_000_000
 """The waiting times start again with the shortest if shmio has not asked the node for this time in ns."""
 KINDS: Final = ("NBIRTH", "NDATA", "NDEATH", "DBIRTH", "DDATA", "DDEATH")
 _SEQUENCE: Final = 256
-_BAD: Final = 0x80000000
-_QUALITIES: Final = {0: _BAD, 500: UNCERTAIN_LAST_USABLE_VALUE}
+_STALE: Final = 500
 _MAX_MS: Final = ((1 << 63) - 1) // 1_000_000
 
 log = logging.getLogger("shmio.source.mqtt")
@@ -141,13 +144,20 @@ class Device(Origin):
         self.end(died=False)
         self.born, self._birth_order = True, order
 
-    def take(self, known: _Known, one: wire.Metric, message: Message, sent_ms: int) -> None:
+    def take(self, known: _Known, one: wire.Metric, message: Message, sent_ms: int | None) -> None:
         """Store the value of a metric, which a message has reported, for the metric's registers."""
         at_ms = one.timestamp if one.HasField("timestamp") else sent_ms
-        source_ns = at_ms * 1_000_000 if 0 < at_ms <= _MAX_MS else message.utc_ns
+        source_ns, doubt = message.utc_ns, ""
+        if at_ms is not None and 0 < at_ms <= _MAX_MS:
+            source_ns = at_ms * 1_000_000
+        elif at_ms is not None:
+            doubt = f"its time {at_ms} cannot be read"
         found: Found | ValueFaultError
         try:
-            found = Found(metric.decode(one, known.datatype), source_ns, _quality(one))
+            code, reason = _quality(one)
+            if doubt and code == GOOD:
+                code, reason = UNCERTAIN, doubt
+            found = Found(metric.decode(one, known.datatype), source_ns, code, reason=reason)
         except ValueFaultError as error:
             error.source_ns = source_ns
             found = error
@@ -181,8 +191,12 @@ class Node:
     def __init__(self, group: str, name: str) -> None:
         self._group, self._name = group, name
         self.devices: dict[str, Device] = {}
-        self._aliases: dict[int, tuple[Device, _Known] | None] = {}
-        """Metrics by their aliases; None for a metric that no register has."""
+        self._aliases: dict[str, dict[int, _Known | None]] = {}
+        """The metrics of each device by their aliases; None for a metric that no register has."""
+        self._alias_owners: dict[int, str] = {}
+        """The device that announced an alias last."""
+        self._shares_aliases = False
+        """True if the log says that two devices have announced the same alias."""
         self._asks = 0
         self._asked_ns = -CALM_NS
         self.reset()
@@ -217,7 +231,7 @@ class Node:
         self._born, self._ask = False, True
         self._session: int | None = None
         self._next: int | None = None
-        self._aliases.clear()
+        self._forget_aliases()
         for device in self.devices.values():
             device.reset()
 
@@ -234,10 +248,12 @@ class Node:
                 device.inherit(before)
             else:
                 device.missed = self._born
-        for alias, found in other._aliases.items():
-            now = self.devices.get(found[0].name) if found is not None else None
-            wanted = found is not None and now is not None and found[1].name in now.wanted
-            self._aliases[alias] = (now, found[1]) if wanted and now is not None and found is not None else None
+        self._alias_owners, self._shares_aliases = {**other._alias_owners}, other._shares_aliases
+        for name, aliases in other._aliases.items():
+            wanted = self.devices[name].wanted if name in self.devices else {}
+            self._aliases[name] = {
+                alias: known if known is not None and known.name in wanted else None for alias, known in aliases.items()
+            }
         self._ask = self._ask or any(device.missed for device in self.devices.values())
 
     # -- messages ------------------------------------------------------------------------------------------------------
@@ -258,6 +274,10 @@ class Node:
                 one.message = message
             self._device_message(kind, device, payload, message)
 
+    def _forget_aliases(self) -> None:
+        self._aliases.clear()
+        self._alias_owners.clear()
+
     def _payload(self, message: Message) -> wire.Payload | None:
         try:
             payload = wire.Payload.FromString(message.payload)
@@ -266,14 +286,15 @@ class Node:
         return payload if len(payload.metrics) <= MAX_METRICS else None
 
     def _birth(self, payload: wire.Payload, message: Message) -> None:
-        self._aliases.clear()
+        self._forget_aliases()
         for one in self.devices.values():
             one.end(died=False)
             one.message = message
         self._session = _session(payload)
         self._next = (payload.seq + 1) % _SEQUENCE if payload.HasField("seq") else None
         self._born, self._ask = True, False
-        self._begin(self.device(""), payload, message)
+        self.device("")
+        self._begin("", payload, message)
 
     def _death(self, payload: wire.Payload) -> None:
         session = _session(payload)
@@ -296,7 +317,7 @@ class Node:
     def _device_message(self, kind: str, name: str, payload: wire.Payload, message: Message) -> None:
         device = self.devices.get(name)
         if kind == "DBIRTH":
-            self._begin(device, payload, message)
+            self._begin(name, payload, message)
         elif kind == "DDEATH":
             if device is not None:
                 device.end(died=True)
@@ -305,47 +326,60 @@ class Node:
         elif device is not None and not device.born:
             self._lose(f"{device} sends data without a birth")
         else:
-            self._data(device, payload, message)
+            self._data(name, payload, message)
 
-    def _begin(self, device: Device | None, payload: wire.Payload, message: Message) -> None:
-        """Process the metrics of a birth.
-
-        ``device`` is None if no register belongs to the device.
-        """
+    def _begin(self, name: str, payload: wire.Payload, message: Message) -> None:
+        """Process the metrics of the birth of a device, or of the node itself if ``name`` is empty."""
+        device = self.devices.get(name)
+        for before in self._aliases.pop(name, ()):
+            if self._alias_owners.get(before) == name:
+                del self._alias_owners[before]
+        aliases: dict[int, _Known | None] = {}
         if device is not None:
-            self._aliases = {
-                alias: known for alias, known in self._aliases.items() if known is None or known[0] is not device
-            }
             device.begin(message.order)
         for one in payload.metrics:
             alias = one.alias if one.HasField("alias") else None
             wanted = device is not None and one.name in device.wanted
             known = _Known(one.name, alias, one.datatype, one.WhichOneof("value"))
             if alias is not None:
-                self._aliases[alias] = (device, known) if wanted and device is not None else None
+                aliases[alias] = known if wanted else None
+                self._check_alias(alias, name)
             if wanted and device is not None:
                 device.metrics[one.name] = known
-                device.take(known, one, message, payload.timestamp)
-        if len(self._aliases) > MAX_ALIASES:
+                device.take(known, one, message, _sent_ms(payload))
+        if aliases:
+            self._aliases[name] = aliases
+        if sum(map(len, self._aliases.values())) > MAX_ALIASES:
             self._lose(f"it has more than {MAX_ALIASES} metrics")
-            self._aliases.clear()
+            self._forget_aliases()
 
-    def _data(self, device: Device | None, payload: wire.Payload, message: Message) -> None:
+    def _check_alias(self, alias: int, name: str) -> None:
+        """Log that another device of the node has announced the same alias, which breaks the standard."""
+        other = self._alias_owners.setdefault(alias, name)
+        if other != name and not self._shares_aliases:
+            log.warning(
+                "%s: the births of %s and of %s have the same alias %d, which breaks the standard; shmio takes the "
+                "device from the topic", self, _owner(other), _owner(name), alias,
+            )  # fmt: skip
+            self._shares_aliases = True
+
+    def _data(self, name: str, payload: wire.Payload, message: Message) -> None:
+        device, aliases = self.devices.get(name), self._aliases.get(name, {})
         for one in payload.metrics:
             if one.is_historical:
                 continue
             if one.name:
                 known = device.metrics.get(one.name) if device is not None else None
-                if device is not None and known is not None:
-                    device.take(known, one, message, payload.timestamp)
             elif not one.HasField("alias"):
                 self._lose("a metric has neither a name nor an alias")
                 return
-            elif one.alias not in self._aliases:
-                self._lose(f"no birth has the alias {one.alias}")
+            elif one.alias not in aliases:
+                self._lose(f"no birth of {_owner(name)} has the alias {one.alias}")
                 return
-            elif (found := self._aliases[one.alias]) is not None:
-                found[0].take(found[1], one, message, payload.timestamp)
+            else:
+                known = aliases[one.alias]
+            if device is not None and known is not None:
+                device.take(known, one, message, _sent_ms(payload))
 
     def _lose(self, why: str) -> None:
         """Discard all values of the node until its next birth, and note that shmio must ask for this birth."""
@@ -444,9 +478,29 @@ def _session(payload: wire.Payload) -> int | None:
     return None
 
 
-def _quality(one: wire.Metric) -> int:
-    """Return the status that a metric states in its property Quality (6.4.8.1)."""
+def _owner(device: str) -> str:
+    return repr(device) if device else "the node"
+
+
+def _sent_ms(payload: wire.Payload) -> int | None:
+    return payload.timestamp if payload.HasField("timestamp") else None
+
+
+def _quality(one: wire.Metric) -> tuple[int, str]:
+    """Return the status that a metric states in its property Quality, and what the status does not say.
+
+    The specification has 0, 192 and 500 (6.4.8.1). Gateways send other numbers of OPC, too.
+    """
     for key, value in zip(one.properties.keys, one.properties.values, strict=False):
         if key == "Quality":
-            return _QUALITIES.get(value.int_value, GOOD)
-    return GOOD
+            field = value.WhichOneof("value")
+            found: Any = None if field is None or value.is_null else getattr(value, field)
+            if found is not None and field in ("int_value", "long_value"):
+                bits = 32 if field == "int_value" else 64
+                found -= (found >> bits - 1) << bits
+            if isinstance(found, int | float) and not isinstance(found, bool):
+                code = UNCERTAIN_LAST_USABLE_VALUE if found == _STALE else from_opc_quality(found)
+                if code is not None:
+                    return code, ""
+            return uncertain_quality(found), f"its quality is {brief(found)}, which has no meaning that shmio knows"
+    return GOOD, ""

@@ -14,7 +14,7 @@ from shmio.connectors.mqtt.faults import ValueFaultError
 from shmio.connectors.mqtt.json_path import Steps
 from shmio.connectors.mqtt.options import MqttOptions
 from shmio.connectors.mqtt.sparkplug import Device, Host
-from shmio.connectors.mqtt.topic import Message, Origin, Topic
+from shmio.connectors.mqtt.topic import Found, Message, Origin, Topic
 from shmio.connectors.mqtt.values import ValueConverter, decode_json
 from shmio.connectors.mqtt.watch import Watch
 from shmio.connectors.register_image import RegisterImage, no_status_area
@@ -156,7 +156,7 @@ class Store:
             return self.host.origin(source, index)
         new = Topic(source.topic, self._time, self._options.max_payload_bytes)
         topic = self._topics.setdefault(source.topic, new)
-        topic.places[index] = source.steps
+        topic.place(index, source.steps)
         return topic
 
     def describe(self) -> str:
@@ -181,7 +181,7 @@ class Store:
                     watch.take(message)
                 self._all_changed = True
             if (found := self._topics.get(topic)) is not None:
-                found.message = message
+                found.take(message)
                 for group in self._of_origin[id(found)]:
                     self._changed_groups[group] = None
             elif topic.startswith(_SPARKPLUG):
@@ -266,17 +266,17 @@ class Store:
             if origin.order_of(index) <= since:
                 continue
             try:
-                value, source_ns, code = self._find(index, origin)
+                value, found = self._find(index, origin)
             except ValueFaultError as error:
                 image.fail(index, error.code, error.source_ns)
                 self._note(index, error.code, str(error))
             else:
-                fault = image.put(index, value, source_ns, code or state)
-                if fault or self._codes[index] != GOOD:
-                    self._note(index, BAD_OUT_OF_RANGE if fault else GOOD, fault)
+                fault = image.put(index, value, found.source_ns, found.code or state)
+                if fault or found.reason or self._codes[index] != GOOD:
+                    self._note(index, BAD_OUT_OF_RANGE if fault else found.code, fault or found.reason)
 
-    def _find(self, index: int, origin: Origin) -> tuple[Value, int, int]:
-        """Return the value of a register, its source time in ns and its status.
+    def _find(self, index: int, origin: Origin) -> tuple[Value, Found]:
+        """Return the value of a register, and where it was found.
 
         Raises:
             ValueFaultError: The register has no usable value.
@@ -289,11 +289,11 @@ class Store:
         except ValueFaultError as error:
             error.source_ns = found.source_ns
             raise
-        return value, found.source_ns, found.code
+        return value, found
 
     def _note(self, index: int, code: int, reason: str) -> None:
         """Log a fault of a register's value when the fault begins."""
-        if code != self._codes[index] and code != GOOD:
+        if code != self._codes[index] and reason:
             log.warning("%s: %s", self.layout.registers[index].path, reason)
         self._codes[index] = code
 

@@ -3,21 +3,34 @@
 from __future__ import annotations
 
 import datetime
+import logging
+import re
 from abc import ABC, abstractmethod
-from contextlib import suppress
 from typing import Any, Final
 
 import msgspec
 
 from shmio.connectors.mqtt import json_path
 from shmio.connectors.mqtt.faults import ValueFaultError
-from shmio.connectors.mqtt.json_path import Steps
+from shmio.connectors.mqtt.json_path import AbsentError, Choice, Document, Steps
 from shmio.connectors.mqtt.values import decode_json
-from shmio.model.statuses import BAD_OUT_OF_RANGE, BAD_USER_ACCESS_DENIED, GOOD
+from shmio.model.statuses import (
+    BAD_OUT_OF_RANGE,
+    BAD_USER_ACCESS_DENIED,
+    BAD_WAITING_FOR_INITIAL_DATA,
+    GOOD,
+    UNCERTAIN,
+)
+from shmio.wording import brief
 
 _MAX_NS: Final = (1 << 63) - 1
 _UNITS: Final = ((1e11, 10**9), (1e14, 10**6), (1e17, 10**3))
 """Pairs (limit, unit in ns): a time below the limit is in this unit (s, ms or µs). A larger time is in ns."""
+_EPOCH: Final = re.compile(r"[0-9]{1,20}(?:\.[0-9]{1,20})?")
+_DATE_DIGITS: Final = 8
+"""Number of digits of a date such as 20240229, which is no time since 1970."""
+
+log = logging.getLogger("shmio.source.mqtt")
 
 
 class Message(msgspec.Struct, frozen=True, gc=False):
@@ -39,6 +52,8 @@ class Found(msgspec.Struct, frozen=True):
     code: int = GOOD
     text: bool = False
     """True if ``value`` is the whole payload, as text."""
+    reason: str = ""
+    """What the code does not say, for the log."""
 
 
 class Origin(ABC):
@@ -102,8 +117,20 @@ class Topic(Origin):
         self._seen: bytes | None = None
         """The payload of the last message on the connection before; None if there was none."""
         self._time, self._max_bytes = time, max_bytes
-        self._document: Any = None
+        self._document: Document | ValueFaultError | None = None
         self._decoded: Message | None = None
+        self._choosing: list[int] = []
+        """The registers whose path selects an object by a member. Not every message contains this object."""
+        self._chosen: dict[int, tuple[Found | ValueFaultError, int]] = {}
+        """What the last message with the object of such a register contains for it, and the message's ``order``."""
+        self._timeless = False
+        """True if the log says that a message has no readable time."""
+
+    def place(self, index: int, steps: Steps | None) -> None:
+        """Give a register its place in the messages."""
+        self.places[index] = steps
+        if any(isinstance(step, Choice) for step in steps or ()):
+            self._choosing.append(index)
 
     @property
     def fault(self) -> int:
@@ -116,14 +143,39 @@ class Topic(Origin):
         message = self.message
         return self.unretained and message is not None and message.retained and message.payload != self._seen
 
-    def order_of(self, index: int) -> int:  # noqa: ARG002  each message is for all registers
-        """Return the ``order`` of the newest message, which has values for all registers."""
+    def take(self, message: Message) -> None:
+        """Store a message. One that does not contain a selected object leaves the object's registers as they are."""
+        self.message = message
+        for index in self._choosing:
+            try:
+                found: Found | ValueFaultError = self._found(index, message)
+            except AbsentError:
+                continue
+            except ValueFaultError as error:
+                found = error
+            self._chosen[index] = found, message.order
+
+    def order_of(self, index: int) -> int:
+        """Return the ``order`` of the newest message with a value for a register."""
+        if index in self._chosen:
+            return self._chosen[index][1]
         return self.message.order if self.message is not None else 0
 
     def find(self, index: int) -> Found:
         """Return what the newest message contains for a register."""
         message = self.message
         assert message is not None  # noqa: S101 - Group.state has checked this
+        if index not in self._choosing:
+            return self._found(index, message)
+        found, _ = self._chosen.get(index, (None, 0))
+        if found is None:
+            choice = next(step for step in self.places[index] or () if isinstance(step, Choice))
+            raise ValueFaultError(BAD_WAITING_FOR_INITIAL_DATA, f"no message has contained an object {choice} yet")
+        if isinstance(found, ValueFaultError):
+            raise found
+        return found
+
+    def _found(self, index: int, message: Message) -> Found:
         if len(message.payload) > self._max_bytes:
             raise ValueFaultError(
                 BAD_OUT_OF_RANGE, f"a payload of {len(message.payload)} bytes is larger than max_payload_bytes"
@@ -132,43 +184,62 @@ class Topic(Origin):
         if steps is None:
             return Found(message.payload, message.utc_ns, text=True)
         document = self._json(message)
-        return Found(json_path.extract(document, steps), self._source_ns(document) or message.utc_ns)
+        found = json_path.extract(document, steps)
+        source_ns = None if self._time is None else self._source_ns(document, self._time)
+        return Found(found, source_ns or message.utc_ns, UNCERTAIN if source_ns == 0 else GOOD)
 
-    def _json(self, message: Message) -> Any:
+    def _json(self, message: Message) -> Document:
         if self._decoded is not message:
             try:
-                self._document = decode_json(message.payload)
+                self._document = Document(decode_json(message.payload))
             except ValueFaultError as error:
                 self._document = error
             self._decoded = message
         if isinstance(self._document, ValueFaultError):
             raise self._document
+        assert self._document is not None  # noqa: S101 - for the type checker
         return self._document
 
-    def _source_ns(self, document: Any) -> int:
-        if self._time is not None:
-            with suppress(ValueFaultError):
-                return time_ns(json_path.extract(document, self._time))
-        return 0
+    def _source_ns(self, document: Document, path: Steps) -> int | None:
+        """Return the time in a document; 0 if it cannot be read, None if there is none. The log says so once."""
+        at_ns = None
+        try:
+            found = json_path.extract(document, path)
+            if at_ns := time_ns(found):
+                return at_ns
+            reason = f"its time {brief(found)} cannot be read, so its values are uncertain"
+        except ValueFaultError as error:
+            reason = f"it has no time ({error})"
+        if not self._timeless:
+            log.warning("%s: %s; shmio uses the time of receipt", self.name, reason)
+            self._timeless = True
+        return at_ns
 
     def reset(self) -> None:
         """Forget the newest message, except its payload."""
         if self.message is not None:
             self._seen = self.message.payload
         self.message = self._document = self._decoded = None
-        self.refused = False
+        self._chosen.clear()
+        self.refused = self._timeless = False
 
     def inherit(self, other: Topic) -> None:
         """Take over the message of ``other``, the same topic in the layout before a reload."""
         self.message, self.refused = other.message, other.refused
         self.unretained, self._seen = other.unretained, other._seen
+        known = {other.places[index]: found for index, found in other._chosen.items()}
+        if self.message is not None:
+            self.take(self.message)
+        self._chosen |= {index: known[self.places[index]] for index in self._choosing if self.places[index] in known}
 
 
 def time_ns(found: Any) -> int:
     """Return a time in JSON as ns since 1970; 0 if the value is not a time.
 
-    A time is a number of s, ms, µs or ns, or text in ISO 8601.
+    A time is a number of s, ms, µs or ns, also as text, or text in ISO 8601.
     """
+    if isinstance(found, str) and len(found) != _DATE_DIGITS and _EPOCH.fullmatch(found):
+        found = float(found) if "." in found else int(found)
     if isinstance(found, str):
         try:
             at = datetime.datetime.fromisoformat(found[:64])

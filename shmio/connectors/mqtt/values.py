@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, Final
 
 import msgspec
 
 from shmio.connectors.mqtt.faults import ValueFaultError
+from shmio.errors import ValueRangeError
 from shmio.layout import model
 from shmio.layout.model import Register
-from shmio.layout.values.codec import Scalar, Value, flatten, nest
+from shmio.layout.values.codec import Scalar, Value, flatten, nest, unfold
 from shmio.model.statuses import (
     BAD_DECODING_ERROR,
     BAD_INDEX_RANGE_NO_DATA,
@@ -96,12 +97,11 @@ class ValueConverter:
             raise ValueFaultError(BAD_NO_DATA, "the value is null")
         if not isinstance(found, list):
             raise ValueFaultError(BAD_TYPE_MISMATCH, f"found {_show(found)}, expected an array")
-        flat = list(_flat(found, len(register.dims)))
-        if len(flat) != register.count:
-            raise ValueFaultError(
-                BAD_INDEX_RANGE_NO_DATA, f"the array has {len(flat)} elements, but the register has {register.count}"
-            )
-        return nest([self._element(one) for one in flat], register.shape)
+        try:
+            elements = unfold(found, register.shape)
+        except ValueRangeError as error:
+            raise ValueFaultError(BAD_INDEX_RANGE_NO_DATA, str(error)) from None
+        return nest([self._element(one) for one in elements], register.shape)
 
     def _element(self, found: Any) -> Scalar:
         if found is None:
@@ -225,15 +225,6 @@ def _parse_number(text: str) -> int | float:
     if found is None:
         raise ValueFaultError(BAD_DECODING_ERROR, f"{_show(text)} is not a number")
     return found
-
-
-def _flat(found: Any, depth: int) -> Iterator[Any]:
-    """Yield the elements of nested lists, down to ``depth`` levels."""
-    for one in found:
-        if depth > 1 and isinstance(one, list):
-            yield from _flat(one, depth - 1)
-        else:
-            yield one
 
 
 def _show(found: Any) -> str:

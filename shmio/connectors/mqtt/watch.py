@@ -84,7 +84,7 @@ class Watch:
     def _text(self, payload: bytes) -> str:
         if self.place.steps is None or len(payload) > MAX_TEXT:
             return payload[:MAX_TEXT].decode(errors="replace")
-        found = json_path.extract(decode_json(payload), self.place.steps)
+        found = json_path.extract(json_path.Document(decode_json(payload)), self.place.steps)
         return str(found).lower() if isinstance(found, bool) else str(found)
 
     def fault(self, message: Message | None) -> int:

@@ -12,7 +12,7 @@ from shmio.connectors.ros.messages import FLOATS, INTEGERS
 from shmio.errors import ValueRangeError
 from shmio.layout import model
 from shmio.layout.model import Register
-from shmio.layout.values.codec import Scalar, Value, flatten, nest
+from shmio.layout.values.codec import Scalar, Value, flatten, nest, unfold
 from shmio.model.statuses import BAD_INDEX_RANGE_NO_DATA, BAD_TYPE_MISMATCH
 
 _REALS: Final = frozenset({"REAL", "LREAL"})
@@ -69,12 +69,11 @@ class ValueConverter:
             return self._element(found)
         if not isinstance(found, list):
             raise FieldError(BAD_TYPE_MISMATCH, f"found {type(found).__name__}, expected a sequence")
-        if len(found) != register.count:
-            raise FieldError(
-                BAD_INDEX_RANGE_NO_DATA,
-                f"the sequence has {len(found)} elements, but the register has {register.count}",
-            )
-        return nest([self._element(one) for one in found], register.shape)
+        try:
+            elements = unfold(found, register.shape)
+        except ValueRangeError as error:
+            raise FieldError(BAD_INDEX_RANGE_NO_DATA, str(error)) from None
+        return nest([self._element(one) for one in elements], register.shape)
 
     def _element(self, found: Any) -> Scalar:
         base = self._base

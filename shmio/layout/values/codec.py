@@ -27,6 +27,7 @@ Formats: Siemens, "STEP 7 Professional", chapter "Data types".
 
 from __future__ import annotations
 
+import math
 import operator
 import struct
 import sys
@@ -218,6 +219,19 @@ def flatten(value: object, shape: tuple[int, ...], name: str) -> Iterator[object
         raise ValueRangeError(f"{name}: expected a list of {shape[0]} elements, found {found}")
     for item in value:
         yield from flatten(item, shape[1:], name)
+
+
+def unfold(found: list[Any], shape: tuple[int, ...]) -> list[Any]:
+    """Return the elements of a device's array, which is flat, or nested with exactly the lengths ``shape``.
+
+    Raises:
+        ValueRangeError: The array has another shape.
+    """
+    if len(shape) > 1 and any(isinstance(one, list) for one in found):
+        return list(flatten(found, shape, "the array has another shape"))
+    if len(found) != math.prod(shape):
+        raise ValueRangeError(f"the array has {len(found)} elements, but the register has {math.prod(shape)}")
+    return found
 
 
 # -- single elements -----------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import pytest
 
 from shmio.connectors.mqtt.address import Address, Metric, Place, parse
 from shmio.connectors.mqtt.connector import MqttConnector
-from shmio.connectors.mqtt.json_path import assign
+from shmio.connectors.mqtt.json_path import Choice, assign
 from shmio.connectors.mqtt.options import MqttOptions
 from shmio.errors import ConfigError
 from tests.unit.connectors.source import layout_of
@@ -23,6 +23,11 @@ from tests.unit.connectors.source import layout_of
         ("a $", Address(Place("a", ()), None)),
         ("a b $.c d.e[3].f", Address(Place("a b", ("c d", "e", 3, "f")), None)),
         ("a $['x.y'][\"it's\"]", Address(Place("a", ("x.y", "it's")), None)),
+        (
+            "a $.values[id=Line 1.Axis.Pos].v",
+            Address(Place("a", ("values", Choice("id", "Line 1.Axis.Pos"), "v")), None),
+        ),
+        ("a $[id='x]y'].v", Address(Place("a", (Choice("id", "x]y"), "v")), None)),
         ("$SYS/broker/uptime", Address(Place("$SYS/broker/uptime", None), None)),
         ("costs $5", Address(Place("costs $5", None), None)),
         ("a -> a/set", Address(Place("a", None), Place("a/set", None))),
@@ -39,7 +44,9 @@ def test_addresses(text: str, address: Address) -> None:
     ("text", "words"),
     [
         ("", "missing"), ("a/+/b", "one topic"), ("#", "one topic"), ("a $.", "from character 2"),
-        ("a $.b[x]", "from character 4"), ("a $.b..c", "from character 4"), ("a $" + ".b" * 17, "16 steps"),
+        ("a $.b[x]", "from character 4"), ("a $.b..c", "from character 4"),
+        ("a $[id=x]", "append a member"), ("a $[id=].v", "from character 2"),
+         ("a $" + ".b" * 17, "16 steps"),
         ("a\0b", "control"), ("a" * 1001, "1000"), ("$share/g/a", "shared"), ("spBv1.0/G/DDATA/N/D", "sparkplug GROUP"),
         ("sparkplug G/N", "metric NAME"), ("sparkplug G metric a", "GROUP"), ("sparkplug G/N/D/E metric a", "GROUP/"),
         ("sparkplug G/+ metric a", "without +"), ("sparkplug G//D metric a", "GROUP"), ("a -> ", "missing"),
@@ -55,6 +62,10 @@ def test_values_are_set_in_json() -> None:
     assert assign(None, ("a", 0, "b"), 1) == {"a": [{"b": 1}]}
     assert assign({"a": [{"b": 1, "c": 2}], "d": 3}, ("a", 0, "b"), 5) == {"a": [{"b": 5, "c": 2}], "d": 3}
     assert assign({"a": 1}, (), 5) == 5
+    assert assign(None, (Choice("id", "x"), "v"), 1) == [{"id": "x", "v": 1}]
+    assert assign([{"id": "y", "v": 1}, {"id": "x"}], (Choice("id", "x"), "v"), 2) == [
+        {"id": "y", "v": 1}, {"id": "x", "v": 2},
+    ]  # fmt: skip
     for wrong in (("a", 1), ("a", "b")):
         with pytest.raises(ValueError, match=r"element|object"):
             assign({"a": [] if wrong[1] == 1 else 5}, wrong, 1)

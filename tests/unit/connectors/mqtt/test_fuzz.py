@@ -221,6 +221,15 @@ def test_browsing_leaves_out_metrics_whose_names_are_not_utf_8() -> None:
     _browse([("spBv1.0/G/NBIRTH/N", birth.replace(b"m0", b"m\xff"))])
 
 
+def test_browsing_selects_named_objects() -> None:
+    listener = Listener(MqttOptions(url="mqtt://127.0.0.1"), Wanted())
+    objects = [{"id": "Line.a", "v": 1}, {"id": "Line.b", "v": 2}]
+    listener.take("kep", json.dumps({"values": objects, "others": [{"id": "x"}, {"v": 3}]}).encode(), retained=True)
+    assert [one.columns["address"] for one in listener.found().offers if one.type == "LREAL"] == [
+        "kep $.values[id='Line.a'].v", "kep $.values[id='Line.b'].v", "kep $.others[1].v",
+    ]  # fmt: skip
+
+
 PAYLOADS = st.builds(
     lambda seq, metrics: wire.Payload(seq=seq, metrics=metrics, timestamp=seq).SerializeToString(),
     st.integers(0, 3),
