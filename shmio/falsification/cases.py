@@ -106,7 +106,17 @@ def store(
 
 
 def _run(file: Path, limit_s: float, *options: str | Path) -> dict[str, Any]:
-    command = [sys.executable, "-m", "shmio.cli.campaign", "run", str(file), "--lab", "--json", *map(str, options)]
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "shmio.cli.campaign",
+        "run",
+        str(file),
+        "--lab",
+        "--json",
+        *map(str, options),
+    ]
     try:
         done = subprocess.run(
             command, capture_output=True, text=True, timeout=limit_s + START_S, check=False, process_group=0

@@ -147,7 +147,7 @@ class Pool:
                 self._end(one)
 
     def _start(self) -> _Process:
-        command = [sys.executable, "-m", "shmio.falsification.worker", str(os.getpid()), str(self._config)]
+        command = [sys.executable, "-P", "-m", "shmio.falsification.worker", str(os.getpid()), str(self._config)]
         popen = subprocess.Popen(
             [*command, str(self._folder)],
             cwd=self._home,

@@ -35,6 +35,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Final
@@ -56,6 +57,8 @@ _TOKEN: Final = re.compile(
     |(?P<sign><=|>=|==|!=|<>|[-+*/()<>=\[\],]))""",
     re.VERBOSE,
 )
+_NO_NUMBER: Final = re.compile(r"(?P<number>[0-9][0-9_.]*)(?P<unit>[\w.#]*)")
+_UNITS_S: Final = {"s": 1.0, "ms": 0.001, "us": 1e-6, "min": 60.0, "m": 60.0, "h": 3600.0}
 COMPARISONS: Final = ("==", "=", "!=", "<>", "<", "<=", ">", ">=")
 _FUNCTIONS: Final = frozenset({"abs", "rising", "falling", "changed"})
 _OF_FORMULAS: Final = frozenset({"rise", "fall", "rate", "quality", "age", "raw"})
@@ -130,6 +133,15 @@ def parse_formula(text: str) -> Tree:
     return _Parser(text, "formula", _FORMULA_KEYWORDS).whole()
 
 
+def _without_unit(wrong: re.Match[str]) -> str:
+    """Return what to write instead of a word that begins with a digit, such as ``500ms``."""
+    factor = _UNITS_S.get(wrong["unit"])
+    with suppress(ValueError):
+        if factor is not None:
+            return f"; times are in s, without a unit: write {float(wrong['number']) * factor:.12g}"
+    return "; put a path that begins with a digit in quotes"
+
+
 class _Parser:
     """A recursive-descent parser with a method for each rule of the grammar."""
 
@@ -163,6 +175,8 @@ class _Parser:
         match = _TOKEN.match(self._text, self._at)
         self._start += len(rest) - len(rest.lstrip())
         if match is None:
+            if wrong := _NO_NUMBER.match(self._text, self._start):
+                raise ConfigError(f"at character {self._start + 1}: {wrong[0]!r} is not a number{_without_unit(wrong)}")
             self._word = self._text[self._start]
             raise self._expected("a register, a number or an operator")
         self._kind, self._at = str(match.lastgroup), match.end()
@@ -246,7 +260,8 @@ class _Parser:
             raise ConfigError(f"at character {self._start + 1}: a bound is at most {MAX_BOUND_S} s")
         self._advance()
         if not self._is(end):
-            raise self._expected(repr(end))
+            unit = "; a bound is a time in s, without a unit" if self._word in _UNITS_S else ""
+            raise ConfigError(f"{self._expected(repr(end))}{unit}")
         self._advance()
         return round(seconds * 1_000_000_000)
 
@@ -295,8 +310,12 @@ class _Parser:
             self._advance()
             return self._counted(Constant(number))
         if self._kind in ("word", "quoted"):
-            path = word[1:-1] if self._kind == "quoted" else word
+            path, plain = (word[1:-1], False) if self._kind == "quoted" else (word, True)
             self._advance()
+            if plain and word.endswith("/"):
+                raise ConfigError(f"at character {at + len(word)}: put a blank before the '/' of a division")
+            if plain and word.lower() in _FORMULA_KEYWORDS and self._is("[", "("):
+                raise ConfigError(f"at character {at + 1}: a {self._what} has no {word!r}; only expectations have it")
             return self._counted(Reference(path, at + 1))
         raise self._expected("a register or a number")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, NamedTuple, Protocol
@@ -174,12 +175,29 @@ def number_register(path: str, layouts: Mapping[str, Layout]) -> tuple[str, Regi
         ConfigError: The register is an array, or its value is neither a number nor a BOOL.
 
     """
-    source, register = single(path, layouts)
+    try:
+        source, register = single(path, layouts)
+    except PathError as error:
+        raise PathError(f"{error}{_division(path, layouts)}") from None
     if register.dims:
         raise ConfigError(f"{path} is an array, but a condition reads single values; name one of its elements")
     if register.type != "BOOL" and not scalar_codec(register.element).plain:
         raise ConfigError(f"{path}: {register.type} is neither a number nor a BOOL")
     return source, register
+
+
+def _division(path: str, layouts: Mapping[str, Layout]) -> str:
+    """Return a remedy if a path begins with the path of a number, as in ``cell/speed/4``; else an empty text."""
+    head = path
+    while "/" in head:
+        head, _, _ = head.rpartition("/")
+        with suppress(PathError, ConfigError):
+            register = single(head, layouts)[1]
+            if not register.dims and scalar_codec(register.element).plain:
+                return (
+                    f"; {head} is a number: put blanks around the '/' of a division: {head} / {path[len(head) + 1 :]}"
+                )
+    return ""
 
 
 def _window(declaration: Declaration) -> Window:

@@ -312,7 +312,7 @@ def describe(
     from shmio.connectors.models.simulation import Answer, Request  # noqa: PLC0415  loads numpy
 
     request = Request(options, None if layout is None else layout.to_json().decode())
-    command = [sys.executable, "-m", "shmio.connectors.models.simulation"]
+    command = [sys.executable, "-P", "-m", "shmio.connectors.models.simulation"]
     try:
         done = subprocess.run(
             command, input=msgspec.json.encode(request), capture_output=True, timeout=PATIENCE_S, check=False

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import inspect
 import sys
 from pathlib import Path
 from types import ModuleType
-from typing import Any, TypeGuard
+from typing import Any, Final, TypeGuard
 
 from shmio.errors import ConfigError
 from shmio.simulation import fmu
@@ -15,13 +16,18 @@ from shmio.simulation.model import Model, explain
 from shmio.wording import unknown
 
 
+_OWN: Final = "_beside_configuration"
+"""Suffix of the names of modules in the folder that have the names of installed ones."""
+
+
 def load(text: str, folder: str | Path | None = None) -> type[Model]:
     """Import a model's class, or make one of an FMU.
 
     Args:
         text: ``package.module:Class``, or the path of an FMU, which ends in ``.fmu``.
-        folder: A folder to search for FMUs, and for modules that are not installed, such as the
-            configuration's folder; None: no folder.
+        folder: A folder to search for FMUs and modules first, such as the configuration's folder;
+            None: no folder. A file in it precedes an installed module of the same name, also one of
+            Python itself, but not shmio.
 
     Raises:
         ConfigError: The text is malformed, the module or class does not exist, its import fails, or
@@ -54,13 +60,58 @@ def _is_model(value: object) -> TypeGuard[type[Model]]:
 
 def _module(name: str, folder: str | Path | None) -> ModuleType:
     if folder is not None and str(folder) not in sys.path:
-        sys.path.append(str(folder))  # last, so that no file in the folder hides an installed module
+        sys.path.append(str(folder))  # last, so that no file in the folder hides a module that others import
+    own = None if folder is None else _beside(name, Path(folder))
+    imported = name
     try:
-        return importlib.import_module(name)
+        if own is not None and not _is_imported_as(name.partition(".")[0], own):
+            imported = _import_file(name, own)
+        return importlib.import_module(imported)
     except ModuleNotFoundError as error:
-        if error.name is not None and f"{name}.".startswith(f"{error.name}."):
+        if error.name is not None and f"{imported}.".startswith(f"{error.name}."):
             where = "installed" if folder is None else f"installed or in {folder}"
-            raise ConfigError(f"there is no module {error.name} that is {where}") from None
-        raise ConfigError(f"{name} cannot be imported: {explain(error, name)}") from error
+            raise ConfigError(f"there is no module {error.name.replace(_OWN, '')} that is {where}") from None
+        raise ConfigError(f"{name} cannot be imported: {explain(error, imported)}") from error
     except (Exception, SystemExit) as error:
-        raise ConfigError(f"{name} cannot be imported: {explain(error, name)}") from error
+        raise ConfigError(f"{name} cannot be imported: {explain(error, imported)}") from error
+
+
+def _beside(name: str, folder: Path) -> Path | None:
+    """Return the file in the folder that has a module or its package; None if the module comes from elsewhere."""
+    first = name.partition(".")[0]
+    if first == "shmio":
+        return None  # shmio's own models, such as shmio.simulation.loopback:Loopback
+    files = (folder / f"{first}.py", folder / first / "__init__.py")
+    return next((file.resolve() for file in files if file.is_file()), None)
+
+
+def _is_imported_as(first: str, file: Path) -> bool:
+    """Return whether ``import first`` gives the module of this file."""
+    try:
+        spec = importlib.util.find_spec(first)
+    except ValueError:  # a module without a spec, such as __main__
+        return False
+    return spec is not None and spec.origin is not None and Path(spec.origin).resolve() == file
+
+
+def _import_file(name: str, file: Path) -> str:
+    """Import the module or package in a file under a name that no installed module has, and return that name.
+
+    The installed module of the same name stays what others import.
+    """
+    first, dot, rest = name.partition(".")
+    own = f"{first}{_OWN}"
+    if getattr(sys.modules.get(own), "__file__", None) != str(file):
+        package = [str(file.parent)] if file.name == "__init__.py" else None
+        spec = importlib.util.spec_from_file_location(own, file, submodule_search_locations=package)
+        if spec is None or spec.loader is None:
+            raise ImportError(f"{file} is not a Python module")
+        for old in [one for one in sys.modules if one == own or one.startswith(f"{own}.")]:
+            del sys.modules[old]  # of another folder
+        module = sys.modules[own] = importlib.util.module_from_spec(spec)
+        try:
+            spec.loader.exec_module(module)
+        except BaseException:
+            del sys.modules[own]
+            raise
+    return f"{own}{dot}{rest}"

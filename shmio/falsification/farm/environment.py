@@ -64,7 +64,7 @@ def environment_of(bundle: Bundle) -> Survey:
 
 def _load(config: Path) -> Survey:
     """Load the models of a configuration in a process of their own."""
-    command = [sys.executable, "-m", "shmio.falsification.farm.environment", str(config)]
+    command = [sys.executable, "-P", "-m", "shmio.falsification.farm.environment", str(config)]
     try:
         done = subprocess.run(command, cwd=config.parent, capture_output=True, timeout=START_S, check=False)
     except subprocess.TimeoutExpired:

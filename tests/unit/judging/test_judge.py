@@ -391,6 +391,23 @@ def test_what_is_hidden_may_only_widen_the_robustness(seed: int) -> None:
         ({"formula": "always rise(once x > 1)"}, "formula: at character 8: rise( ) compares a frame with the one"),
         ({"formula": "always[2, 1] x"}, "formula: at character 8: the first bound is above the second one"),
         ({"formula": "always[0, 1e9] x"}, "formula: at character 11: a bound is at most 1000000 s"),
+        (
+            {"formula": "always[0,2s] x"},
+            "at character 10: '2s' is not a number; times are in s, without a unit: write 2",
+        ),
+        (
+            {"formula": "always[0, 500ms] x"},
+            "at character 11: '500ms' is not a number; times are in s, without a unit: write 0.5",
+        ),
+        (
+            {"formula": "always[0 min, 1] x"},
+            "at character 10: expected ',', found 'min'; a bound is a time in s, without",
+        ),
+        ({"formula": "always(x/4 > 1)"}, "x is a number: put blanks around the '/' of a division: x / 4"),
+        (
+            {"formula": "always(cell/x/4/2 > 1)"},
+            "cell/x is a number: put blanks around the '/' of a division: cell/x / 4/2",
+        ),
         ({"formula": "always[0 1] x"}, "at character 10: expected ',', found '1'"),
         ({"formula": "always quality(x + 1) = good"}, "at character 8: quality( ) takes one register"),
         ({"formula": "always q > 1"}, "expect[0].formula: at character 8: q: DB1 has no such register"),

@@ -42,10 +42,40 @@ def test_a_model_of_the_folder_is_found(folder: Path) -> None:
     assert load("plant_belt:Belt", folder).__name__ == "Belt"
 
 
-def test_an_installed_module_comes_first(folder: Path) -> None:
-    (folder / "json.py").write_text(BELT)
-    with pytest.raises(ConfigError, match="unknown class 'Belt' of json"):
-        load("json:Belt", folder)
+@pytest.mark.parametrize("name", ["trace", "json", "signal", "numpy", "time", "msgspec", "errors"])
+def test_a_file_beside_the_configuration_precedes_an_installed_module(folder: Path, name: str) -> None:
+    before = sys.modules.get(name)
+    (folder / f"{name}.py").write_text(BELT)
+    model = load(f"{name}:Belt", folder)
+    assert model.__name__ == "Belt"
+    assert model.code_files()[0] == folder / f"{name}.py"
+    assert load(f"{name}:Belt", folder) is model, "it is imported once"
+    assert sys.modules.get(name) in (before, sys.modules[model.__module__]), "others import the installed module"
+    with pytest.raises(ConfigError, match=f"unknown class 'Blet' of {name}; did you mean 'Belt'?"):
+        load(f"{name}:Blet", folder)
+
+
+def test_a_package_beside_the_configuration_precedes_an_installed_one(folder: Path) -> None:
+    (folder / "json").mkdir()
+    (folder / "json/__init__.py").write_text("")
+    (folder / "json/parts.py").write_text("from shmio.simulation import Output\nREAL = Output('LREAL')\n")
+    (folder / "json/belt.py").write_text(f"from .parts import REAL\n{BELT}")
+    assert load("json.belt:Belt", folder).__name__ == "Belt"
+    with pytest.raises(ConfigError, match=r"there is no module json\.decoder that is installed or in"):
+        load("json.decoder:JSONDecoder", folder)
+
+
+def test_a_file_with_the_name_of_shmio_does_not_hide_shmio(folder: Path) -> None:
+    (folder / "shmio.py").write_text("raise RuntimeError")
+    assert load("shmio.simulation.loopback:Loopback", folder) is Loopback
+
+
+def test_modules_of_two_folders_are_not_mixed_up(folder: Path) -> None:
+    for name, text in (("one", BELT), ("two", BELT.replace("Belt", "Lift"))):
+        (folder / name).mkdir()
+        (folder / name / "plant_x.py").write_text(text)
+    assert load("plant_x:Belt", folder / "one").__name__ == "Belt"
+    assert load("plant_x:Lift", folder / "two").__name__ == "Lift"
 
 
 @pytest.mark.parametrize(
