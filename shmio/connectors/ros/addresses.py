@@ -9,12 +9,14 @@ without brackets at the end of FIELD is a whole array.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Sequence
 from operator import itemgetter
 from typing import Any, Final, NamedTuple
 
-from shmio.connectors.ros.messages import DEFINITIONS, PRIMITIVES, TYPE, plain
+from shmio.connectors.ros.messages import DEFINITIONS, PRIMITIVES, TYPE, from_json, plain
+from shmio.layout.values.codec import nest
 from shmio.model.statuses import BAD_INDEX_RANGE_NO_DATA, BAD_NOT_FOUND, BAD_TYPE_MISMATCH
 
 MAX_STEPS: Final = 8
@@ -161,6 +163,7 @@ def extract(message: Any, address: Address) -> Any:
         found = found[name]
         if place is None and key is None:
             continue
+        found = from_json(found, "uint8[]")  # a type that shmio does not know
         if not isinstance(found, list):
             raise FieldError(BAD_TYPE_MISMATCH, f"{address.text}: {name!r} is not a sequence")
         index = place if place is not None else place_of(scopes, step, address)
@@ -169,7 +172,44 @@ def extract(message: Any, address: Address) -> Any:
                 BAD_INDEX_RANGE_NO_DATA, f"{address.text}: the array {name!r} has only {len(found)} elements"
             )
         found = found[index]
-    return found
+    return _folded(found, scopes[-1], address) if step.whole else found
+
+
+def _folded(found: Any, scope: Any, address: Address) -> Any:
+    """Return a sequence as nested lists if the message that contains it states their sizes, as a MultiArray does.
+
+    Raises:
+        FieldError: The sequence does not have the sizes.
+
+    """
+    layout = scope.get("layout") if isinstance(scope, dict) else None
+    dims = layout.get("dim") if isinstance(layout, dict) else None
+    if not isinstance(layout, dict) or not isinstance(dims, list):
+        return found
+    found = from_json(found, "uint8[]")
+    if not isinstance(found, list):
+        return found
+    offset = layout.get("data_offset", 0)
+    pairs: list[tuple[Any, Any]] = [
+        (one.get("size"), one.get("stride")) if isinstance(one, dict) else (None, None) for one in dims
+    ]
+    wrong = FieldError(BAD_INDEX_RANGE_NO_DATA, f"{address.text}: its layout does not fit its {len(found)} elements")
+    if any(type(one) is not int or one < 0 for one in (offset, *(one for pair in pairs for one in pair))):
+        raise wrong
+    sizes = tuple(size for size, _ in pairs)
+    counts = [math.prod(sizes[at:]) for at in range(len(sizes))]
+    if len(sizes) > MAX_STEPS or offset > len(found) or (counts and counts[0] > len(found)):
+        raise wrong
+    if not sizes or not counts[0]:
+        return found[offset:] if not sizes else []
+    # The stride of a dimension is the distance between two indices of the dimension before; many publishers leave it 0.
+    steps = [*(stride or count for (_, stride), count in zip(pairs[1:], counts[1:], strict=True)), 1]
+    places = [offset]
+    for size, step in zip(sizes, steps, strict=True):
+        places = [place + at * step for place in places for at in range(size)]
+    if places[-1] >= len(found) or (steps[:-1] == counts[1:] and places[-1] != len(found) - 1):
+        raise wrong
+    return nest([found[place] for place in places], sizes)
 
 
 def getter(address: Address) -> Callable[[Any], Any]:
@@ -187,7 +227,7 @@ def getter(address: Address) -> Callable[[Any], Any]:
                 scope = scope[one]
             found = scope[name]
             if place is None and key is None:
-                return found
+                return _folded(found, scope, address) if "layout" in scope else found
             if type(found) is list and place is not None:
                 return found[place]
             if type(found) is list and key is not None and type(scope[key[0]]) is list:

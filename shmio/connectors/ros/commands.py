@@ -176,6 +176,8 @@ def _message(topics: Topics, draft: Publication, base: Any) -> Any:
         try:
             for index, value in fields.items():
                 _assign(message, kind, topics.addresses[index], value, grow=False)
+            for index in fields:  # its layout, which no register has, may state other sizes
+                topics.converters[index].value(extract(message, topics.addresses[index]))
             return message
         except FieldError as error:
             if missing:

@@ -104,7 +104,7 @@ class RosbridgeConnector(Connector):
             while waiting and time.monotonic() < end_s:
                 link.check()
                 for name, received in link.newest().items():
-                    seen[name].message = from_json(decode(received.json), plain(seen[name].type))
+                    seen[name].message = from_json(decode(received.text), plain(seen[name].type))
                     waiting.discard(name)
                 link.wait_any(min(end_s, time.monotonic() + timeout_s / 4))
         finally:
@@ -191,7 +191,7 @@ class RosbridgeConnector(Connector):
 
     def _pull(self, link: Link) -> None:
         for name, received in link.newest().items():
-            message = from_json(decode(received.json), plain(self._topics.by_name[name].type))
+            message = from_json(decode(received.text), plain(self._topics.by_name[name].type))
             self._topics.take(name, message, received.monotonic_ns, received.utc_ns)
 
     def close(self) -> None:

@@ -21,6 +21,7 @@ from shmio.model.statuses import (
     BAD_TIMEOUT,
     BAD_WAITING_FOR_INITIAL_DATA,
     GOOD,
+    UNCERTAIN,
 )
 
 MAX_REPORTED: Final = 20
@@ -213,24 +214,34 @@ class Topics:
         topic.shown = GOOD
         source_ns = self._source_ns(topic)
         message = topic.message
+        code = GOOD
+        if self._stamps and stamp_ns(message) is None:
+            code = UNCERTAIN
+            self.report(
+                topic.registers[0], f"the stamp in a message of {topic.name} is no time; its values are uncertain"
+            )
         for row in topic.rows:
             try:
-                if image.put_batch(row.batch, row.get(message), source_ns):
+                if code == GOOD and image.put_batch(row.batch, row.get(message), source_ns):
                     continue
             except (TypeError, LookupError, ValueError):  # the message lacks something
                 pass
-            self._put_each(image, row.indices, message, source_ns)
-        self._put_each(image, topic.single, message, source_ns)
+            self._put_each(image, row.indices, message, source_ns, code)
+        self._put_each(image, topic.single, message, source_ns, code)
 
-    def _put_each(self, image: RegisterImage, indices: Iterable[int], message: Any, source_ns: int) -> None:
+    def _put_each(self, image: RegisterImage, indices: Iterable[int], message: Any, source_ns: int, code: int) -> None:
         for index in indices:
+            fault = ""
             try:
-                image.put(index, self.converters[index].value(self._getters[index](message)), source_ns)
+                fault = image.put(index, self.converters[index].value(self._getters[index](message)), source_ns, code)
             except FieldError as error:
                 image.fail(index, error.code, source_ns)
-                self.report(index, str(error))
-            except (ValueRangeError, OverflowError):
+                fault = str(error)
+            except (ValueRangeError, OverflowError) as error:
                 image.fail(index, BAD_OUT_OF_RANGE, source_ns)
+                fault = str(error)
+            if fault:
+                self.report(index, fault)
 
     def _source_ns(self, topic: Topic) -> int:
         return (stamp_ns(topic.message) if self._stamps else 0) or topic.utc_ns
@@ -250,13 +261,13 @@ class Topics:
         return (topic.name for topic in self.by_name.values() if not topic.received_ns)
 
 
-def stamp_ns(message: Any) -> int:
-    """Return the time stamp in a message's header, ns since 1970; 0 if it has none."""
+def stamp_ns(message: Any) -> int | None:
+    """Return the time stamp in a message's header, ns since 1970; 0 if it has none, None if it is no time."""
     header = message.get("header") if isinstance(message, dict) else None
     stamp = header.get("stamp") if isinstance(header, dict) else None
     if not isinstance(stamp, dict):
         return 0
     sec, nanosec = stamp.get("sec", stamp.get("secs")), stamp.get("nanosec", stamp.get("nsecs"))
     if type(sec) is not int or type(nanosec) is not int or not (0 <= sec < MAX_SEC and 0 <= nanosec < 10**9):
-        return 0
+        return None
     return sec * 10**9 + nanosec

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from shmio.connectors.ros.addresses import FieldError
-from shmio.connectors.ros.messages import FLOATS, INTEGERS
+from shmio.connectors.ros.messages import FLOATS, INTEGERS, from_json
 from shmio.errors import ValueRangeError
 from shmio.layout import model
 from shmio.layout.model import Register
@@ -67,6 +67,8 @@ class ValueConverter:
         register = self._register
         if not register.dims:
             return self._element(found)
+        if self.kind is None and self._base in model.INTEGERS:
+            found = from_json(found, "uint8[]")
         if not isinstance(found, list):
             raise FieldError(BAD_TYPE_MISMATCH, f"found {type(found).__name__}, expected a sequence")
         try:

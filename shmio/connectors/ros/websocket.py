@@ -8,7 +8,10 @@ from __future__ import annotations
 import contextlib
 import functools
 import itertools
+import json
 import logging
+import math
+import re
 import socket
 import struct
 import threading
@@ -37,7 +40,7 @@ log = logging.getLogger("shmio.source")
 class Received(NamedTuple):
     """The newest message of a topic as JSON, with the time of its receipt."""
 
-    json: msgspec.Raw
+    text: msgspec.Raw
     monotonic_ns: int
     utc_ns: int
 
@@ -59,6 +62,9 @@ class _Envelope(msgspec.Struct):
 
 
 _envelope = msgspec.json.Decoder(_Envelope)
+_TOPIC: Final = re.compile(rb'"op"\s*:\s*"publish".{0,1000}?"topic"\s*:\s*("(?:[^"\\]|\\.){1,256}")', re.DOTALL)
+_UNREADABLE: Final = (ValueError, RecursionError)
+"""What decoders raise for text that is not JSON."""
 
 
 class Link:
@@ -271,10 +277,9 @@ class Link:
             self._condition.notify_all()
 
     def _take(self, text: bytes) -> None:
-        try:
-            envelope = _envelope.decode(text)
-        except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
-            raise ConnectorError("sent a message that is not of the rosbridge protocol") from None
+        envelope = _read(text)
+        if envelope is None:
+            raise ConnectorError("sent a message that is not of the rosbridge protocol")
         self.heard_ns = time.monotonic_ns()
         if envelope.op == "publish":
             self._take_message(envelope)
@@ -287,13 +292,13 @@ class Link:
                     self._condition.notify_all()
 
     def _take_message(self, envelope: _Envelope) -> None:
-        json = envelope.msg.copy()
+        text = envelope.msg.copy()
         with self._condition:
             if envelope.topic not in self._topics:
                 return
-            self._newest[envelope.topic] = Received(json, self.heard_ns, time.time_ns())
+            self._newest[envelope.topic] = Received(text, self.heard_ns, time.time_ns())
             if self._expected is not None and self._expected[0] == envelope.topic:
-                message = decode(json)
+                message = decode(text)
                 if message is not None and _contains(message, self._expected[2]):
                     self._outcome, self._expected = "", None
             self._condition.notify_all()
@@ -314,12 +319,40 @@ class Link:
             log.warning("%s reports: %s", self._peer, text)
 
 
-def decode(json: msgspec.Raw) -> Any:
-    """Return the document in a JSON message; None if it is not valid JSON."""
-    try:
-        return msgspec.json.decode(json)
-    except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
-        return None
+def decode(text: msgspec.Raw) -> Any:
+    """Return the document in a JSON message, which may also contain NaN and Infinity; None if it is not valid JSON."""
+    with contextlib.suppress(*_UNREADABLE):
+        return msgspec.json.decode(text)
+    with contextlib.suppress(*_UNREADABLE):
+        return json.loads(bytes(text), parse_float=_number)
+    return None
+
+
+def _read(text: bytes) -> _Envelope | None:
+    """Return the operation in a text; None if it has none.
+
+    rosbridge_suite writes NaN and Infinity, which JSON does not have. A text that cannot be read, but names its
+    topic, is a message of this topic that cannot be read.
+    """
+    with contextlib.suppress(*_UNREADABLE):
+        return _envelope.decode(text)
+    with contextlib.suppress(*_UNREADABLE):
+        fields = json.loads(text, parse_float=_number)
+        if isinstance(fields, dict):
+            for name in {"msg", "values"} & fields.keys():
+                fields[name] = msgspec.Raw(json.dumps(fields[name]).encode())
+            return msgspec.convert(fields, _Envelope)
+    with contextlib.suppress(*_UNREADABLE):
+        if found := _TOPIC.search(text):
+            return _Envelope("publish", json.loads(found[1]))
+    return None
+
+
+def _number(text: str) -> float:
+    number = float(text)
+    if math.isinf(number):
+        raise ValueError("larger than all numbers")
+    return number
 
 
 def _contains(found: Any, expected: Any) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator
 from typing import Any
@@ -117,15 +118,43 @@ def test_values_that_do_not_fit_their_register(bridge: Bridge) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["", "{", "[]", "null", '{"op": 5}', '{"op": "publish", "topic": 5}', "[" * 100_000, '{"op":"publish","msg":NaN}',
-     '{"op": "status", "msg": ' + "[" * 50_000,
-     '{"op": "publish", "topic": "/joint_states", "msg": ' + "[" * 5000 + "]" * 5000 + "}"],
+    ["", "{", "[]", "null", '{"op": 5}', '{"op": "publish", "topic": 5}', "[" * 100_000,
+     '{"op": "status", "msg": ' + "[" * 50_000],
 )  # fmt: skip
 def test_what_is_not_of_the_protocol_ends_the_connection(bridge: Bridge, text: str) -> None:
     with connected(bridge.url, JOINTS) as source:
         bridge.ask("raw", text)
         with pytest.raises(ConnectorError, match="rosbridge protocol"):
             source.until(lambda: False)
+
+
+def test_a_message_that_cannot_be_read_is_bad_alone(bridge: Bridge) -> None:
+    tags = JOINTS | {"other": ("DINT", "/other std_msgs/Int32 data")}
+    head = '{"op": "publish", "topic": "/joint_states", "msg": '
+    with connected(bridge.url, tags) as source:
+        bridge.ask("publish", "/other", {"data": 7})
+        for message in (
+            '{"position": [', '{"position": [1.0], "name": ["j1"]', "[" * 5000 + "]" * 5000 + "}", '{"x": 1e999}}',
+            "{}}}", "nan}",
+        ):  # fmt: skip
+            bridge.ask("publish", "/joint_states", joint_state(["j1"], [1.0]))
+            source.until(lambda: source.code("j1") == 0 == source.code("other"))
+            bridge.ask("raw", head + message)
+            source.until(lambda: source.code("j1") == statuses.BAD_DECODING_ERROR)
+            assert source.code("other") == 0, message
+
+
+def test_numbers_that_json_does_not_have(bridge: Bridge) -> None:
+    """rosbridge_suite writes them for floats, as Python's json does."""
+    tags = JOINTS | {"count": ("DINT", "/other any_msgs/Thing count"), "text": ("STRING[9]", "/other any_msgs/Thing s")}
+    with connected(bridge.url, tags) as source:
+        bridge.ask("raw", json.dumps({"op": "publish", "topic": "/joint_states", "msg": {
+            "name": ["j1", "j2"], "position": [-math.inf, math.nan], "velocity": [1.0, 2.0, math.inf],
+        }}))  # fmt: skip
+        bridge.ask("raw", '{"op": "publish", "topic": "/other", "msg": {"count": NaN, "s": "NaN, é"}}')
+        source.until(lambda: source.code("j1") == 0 == source.code("text"))
+        assert (source.value("j1"), str(source.value("j2")), source.value("third")) == (-math.inf, "nan", math.inf)
+        assert (source.value("text"), source.code("count")) == ("NaN, é", statuses.BAD_TYPE_MISMATCH)
 
 
 def test_topics_that_nobody_asked_for_are_ignored(bridge: Bridge) -> None:
