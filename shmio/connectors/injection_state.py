@@ -64,7 +64,7 @@ def _save_declared(layer: DeclaredLayer) -> DeclaredState:
     now = layer.activation
     return DeclaredState(
         msgspec.json.encode(layer.program.declaration), layer.seed, now.state, now.runs, now.cycle, now.time_ns,
-        now.met, dict(layer.memory.seen), layer.writes, [(*one.write, one.cycle, one.time_ns) for one in layer.held],
+        now.met, layer.memory.to_save(), layer.writes, [(*one.write, one.cycle, one.time_ns) for one in layer.held],
         [(one.role, one.cycle, one.time_ns, one.image) for one in layer.operation.save()],
     )  # fmt: skip
 

@@ -1,7 +1,7 @@
 /* Numbers in the images of a block: reads them, changes them, and evaluates conditions over them.
  *
  * Limited API: one build serves CPython 3.11 and later. Conditions compute with Python's own numbers, so they
- * mean the same as in Python.
+ * mean the same as in Python; but where Python would round a large integer to a float, they compute exactly (exact.py).
  */
 #include <Python.h>
 #include <math.h>
@@ -346,9 +346,36 @@ static PyObject *apply_unary(int code, PyObject *seen, PyObject *place, PyObject
     return truth < 0 ? NULL : PyBool_FromLong(truth);
 }
 
+#define LARGE (INT64_C(1) << 50) /* as in exact.py */
+
+static bool is_large(PyObject *integer)
+{
+    int overflow;
+    long long value = PyLong_AsLongLongAndOverflow(integer, &overflow);
+    return overflow || value >= LARGE || value <= -LARGE;
+}
+
+/* Returns whether Python's own arithmetic could round an integer of more than 50 bits. */
+static bool needs_exact(int code, PyObject *left, PyObject *right)
+{
+    bool first = PyLong_Check(left), second = PyLong_Check(right);
+    if (first && second) return code == DIV && (is_large(left) || is_large(right));
+    if ((!first && !PyFloat_Check(left)) || (!second && !PyFloat_Check(right))) return true; /* a fraction */
+    return (first && is_large(left)) || (second && is_large(right));
+}
+
+static PyObject *calculate_exactly(int code, PyObject *left, PyObject *right)
+{
+    PyObject *module = PyImport_ImportModule("shmio.injection.exact");
+    PyObject *result = module ? PyObject_CallMethod(module, "calculate", "iOO", code - ADD, left, right) : NULL;
+    Py_XDECREF(module);
+    return result;
+}
+
 static PyObject *apply_binary(int code, PyObject *left, PyObject *right)
 {
     static const int compared[] = {Py_LT, Py_LE, Py_EQ, Py_NE, Py_GT, Py_GE};
+    if (code >= ADD && needs_exact(code, left, right)) return calculate_exactly(code, left, right);
     switch (code) {
     case ADD: return PyNumber_Add(left, right);
     case SUB: return PyNumber_Subtract(left, right);

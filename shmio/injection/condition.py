@@ -10,6 +10,7 @@ from typing import Final, NamedTuple
 from shmio.injection import _numbers
 from shmio.injection.language import Constant, Number, Operation, Reference, Tree, nodes, parse_condition
 
+_SAVED_BITS: Final = 64
 _PUSH: Final = 0
 _LOAD: Final = 1
 _CODES: Final = {
@@ -33,7 +34,18 @@ class Memory:
     """
 
     seen: dict[int, Number] = field(default_factory=dict)
-    """The last argument of each edge function, by the index of the edge function in the expression."""
+    """The last argument of each edge function, by the index of the edge function in the expression.
+
+    An argument that is calculated from large integers may also be a fraction.
+    """
+
+    def to_save(self) -> dict[int, Number]:
+        """Return the arguments that a snapshot can hold; the others begin anew."""
+        return {
+            place: value
+            for place, value in self.seen.items()
+            if isinstance(value, float) or (isinstance(value, int) and value.bit_length() < _SAVED_BITS)
+        }
 
 
 class Expression(NamedTuple):

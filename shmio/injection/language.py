@@ -37,6 +37,7 @@ import re
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
+from fractions import Fraction
 from functools import lru_cache
 from typing import Final
 
@@ -57,6 +58,8 @@ _TOKEN: Final = re.compile(
     |(?P<sign><=|>=|==|!=|<>|[-+*/()<>=\[\],]))""",
     re.VERBOSE,
 )
+_EXACT_BITS: Final = 128
+"""A whole number of at most this many bits is exact, even if it is written like 9.3e18."""
 _NO_NUMBER: Final = re.compile(r"(?P<number>[0-9][0-9_.]*)(?P<unit>[\w.#]*)")
 _UNITS_S: Final = {"s": 1.0, "ms": 0.001, "us": 1e-6, "min": 60.0, "m": 60.0, "h": 3600.0}
 COMPARISONS: Final = ("==", "=", "!=", "<>", "<", "<=", ">", ">=")
@@ -336,4 +339,8 @@ class _Parser:
             if not rest:
                 raise self._expected("digits after the '#'")
             return int(rest, int(base))
-        return float(digits) if set(digits) & set(".eE") else int(digits)
+        if not set(digits) & set(".eE"):
+            return int(digits)
+        exact = Fraction(digits)
+        whole = exact.denominator == 1 and exact.numerator.bit_length() <= _EXACT_BITS
+        return exact.numerator if whole and exact >= 1 << 53 else float(digits)

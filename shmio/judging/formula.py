@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
+from fractions import Fraction
 from functools import lru_cache, partial
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from shmio.errors import ConfigError, PathError
+from shmio.injection.exact import Exact, is_exact
 from shmio.injection.language import TEMPORAL, Constant, Operation, Reference, Tree, nodes
 from shmio.injection.program import number_register
 from shmio.judging.operators import (
     COMPARISONS,
     NUMBERS,
+    OF_INTEGERS,
     Arithmetic,
     Constantly,
     Difference,
@@ -242,14 +245,14 @@ class Network:
         function = from_bool if self._boolean(tree) else from_number
         return self._shared(("truth", number), lambda: Truth(function, (number,)))
 
-    def number(self, tree: Tree) -> Node | float:
+    def number(self, tree: Tree) -> Node | Exact:
         """Return the node for the number that a tree computes, or the number itself if it is constant.
 
         A truth counts as 1 or 0.
         """
         match tree:
             case Constant(value):
-                return float(value)
+                return value if is_exact(value) else float(value)
             case Reference():
                 return self._input_of(self._registers.signal(tree))
             case Operation(name, (Reference() as reference,)) if name in ASPECTS:
@@ -265,10 +268,24 @@ class Network:
             case _:
                 operands = [self.number(operand) for operand in tree.operands]
                 function = NUMBERS[tree.name]
+                exactly = OF_INTEGERS.get(tree.name) if self._whole(tree) else None
                 if not any(isinstance(operand, Node) for operand in operands):
-                    with np.errstate(all="ignore"):
-                        return float(function(*map(np.float64, operands)))  # type: ignore[arg-type]
-                return self._shared((tree.name, *operands), lambda: Arithmetic(function, operands))
+                    return _constant(exactly or function, operands)  # type: ignore[arg-type]
+                return self._shared((tree.name, *operands), lambda: Arithmetic(function, operands, exactly))
+
+    def _whole(self, tree: Tree) -> bool:
+        """Return whether the numbers of a tree are integers."""
+        match tree:
+            case Constant(value):
+                return not isinstance(value, float)
+            case Reference():
+                return self._registers.found[self._registers.signal(tree)].element.base not in ("REAL", "LREAL")
+            case Operation("raw", (operand,)):
+                return self._whole(operand)
+            case Operation("rate" | "age" | "/"):
+                return False
+            case _:
+                return tree.name in _TRUTH | {"quality"} or all(map(self._whole, tree.operands))
 
     def _boolean(self, tree: Tree) -> bool:
         match tree:
@@ -339,6 +356,13 @@ class Network:
             node = make()  # before it is stored, so that its operands come first
             self._nodes[key] = node
         return self._nodes[key]
+
+
+def _constant(function: Callable[..., Any], operands: Sequence[Exact]) -> Exact:
+    """Return the number that a function computes from constants; see :data:`shmio.injection.exact.Exact`."""
+    with np.errstate(all="ignore"):
+        found = function(*(one if is_exact(one) else np.float64(one) for one in operands))
+    return found if isinstance(found, (int, Fraction)) else float(found)
 
 
 def _extremum(name: str) -> np.ufunc:

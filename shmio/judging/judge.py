@@ -244,7 +244,9 @@ class Judge:
                 first = min(troubles)
                 return f"{first.reason} from {first.begin_ns / 1e9:.3f} s to {first.end_ns / 1e9:.3f} s"
             if unknown_ns + reach_ns < self.end_ns:
-                return f"a value was not a number at {unknown_ns / 1e9:.3f} s"
+                wide = any(self._sources[name].wide for name in names)
+                what = "not a number, or too large to be compared exactly," if wide else "not a number"
+                return f"a value was {what} at {unknown_ns / 1e9:.3f} s"
         return f"the run ended at {(self.end_ns - 1) / 1e9:.3f} s, before the expectation was decided"
 
 

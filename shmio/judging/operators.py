@@ -9,10 +9,24 @@ delivers thousands.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Final
+from fractions import Fraction
+from typing import Any, Final
 
 import numpy as np
 
+from shmio.injection.exact import (
+    ADD,
+    DIVIDE,
+    EXACTLY,
+    MODULO,
+    MULTIPLY,
+    SUBTRACT,
+    WHOLE,
+    Exact,
+    bounds,
+    floats,
+    is_exact,
+)
 from shmio.judging.pieces import FAR_NS, NOTHING, TINY, Alignment, Piece, Times, Values, cut, join
 
 Numeric = Callable[..., Values]
@@ -59,11 +73,19 @@ class _Pointwise(Node):
 
 
 class Arithmetic(_Pointwise):
-    """A number that is computed from other numbers; NaN if one of them is unknown."""
+    """A number that is computed from other numbers; NaN if one of them is unknown.
 
-    def __init__(self, function: Numeric, operands: Sequence[Node | float]) -> None:
+    Args:
+        function: Computes the number.
+        operands: The other numbers.
+        exactly: Computes the number from integers without rounding it. It takes the place of
+            ``function`` if a result is beyond 2**53. None if a result may be rounded.
+    """
+
+    def __init__(self, function: Numeric, operands: Sequence[Node | Exact], exactly: Numeric | None = None) -> None:
         super().__init__([operand for operand in operands if isinstance(operand, Node)])
         self._function = function
+        self._exactly = exactly
         self._constants = [None if isinstance(operand, Node) else operand for operand in operands]
 
     def combine(self, pieces: list[Piece]) -> Piece:
@@ -72,6 +94,8 @@ class Arithmetic(_Pointwise):
         arguments = [next(values).low if constant is None else constant for constant in self._constants]
         with np.errstate(all="ignore"):
             found = self._function(*arguments)
+            if self._exactly is not None and found.dtype != object and (np.abs(found) >= WHOLE).any():
+                found = self._exactly(*arguments)
         return Piece(pieces[0].time, found, found, pieces[0].end)
 
 
@@ -184,7 +208,7 @@ class Moment(Node):
         if not len(time):
             self.out = NOTHING
             return
-        _, operand, upper, _ = self._operand.out
+        operand, upper = floats(self._operand.out.low), floats(self._operand.out.high)
         after = time + 1
         room = np.append(after[:-1] < time[1:], after[-1] < end)
         open_ = np.isnan(operand) | ((operand < 0) & (upper > 0))
@@ -207,7 +231,7 @@ class Difference(Node):
     def __init__(self, operand: Node, *, per_second: bool) -> None:
         self._operand = operand
         self._per_second = per_second
-        self._before: tuple[int, float] | None = None
+        self._before: tuple[int, Any] | None = None
 
     def turn(self) -> None:
         """Subtract the previous value from each value."""
@@ -215,21 +239,22 @@ class Difference(Node):
         if not len(time):
             self.out = NOTHING
             return
-        time_ns, value = self._before or (int(time[0]) - 1, float(values[0]))
+        time_ns, value = self._before or (int(time[0]) - 1, values[0])
         with np.errstate(all="ignore"):
-            found = values - _shifted(values, value)
+            found = floats(_difference(values, _shifted(values, value)))
             if self._per_second:
                 passed = np.empty(len(time))
                 passed[0], passed[1:] = time[0] - time_ns, np.diff(time)
-                found /= passed / 1e9
+                found = found / (passed / 1e9)
         if self._before is None:
             found[0] = 0.0
-        self._before = int(time[-1]), float(values[-1])
+        self._before = int(time[-1]), values[-1]
         self.out = Piece(time, found, found, end)
 
 
-def _shifted(values: Values, before: float) -> Values:
-    shifted = np.empty_like(values)
+def _shifted(values: Values, before: Any) -> Values:
+    kind = object if isinstance(before, (int, Fraction)) else values.dtype
+    shifted = np.empty(len(values), kind)
     shifted[0], shifted[1:] = before, values[:-1]
     return shifted
 
@@ -460,13 +485,23 @@ class Tube(Node):
         operand: The number.
         lower: The lower limit. Its times count from the start of the judged time.
         upper: The upper limit. Its times count in the same way.
+        base: What was subtracted from the limits, so that large integers are exact.
     """
 
-    def __init__(self, operand: Node, lower: Piece, upper: Piece) -> None:
+    def __init__(self, operand: Node, lower: Piece, upper: Piece, base: Exact = 0) -> None:
         self._operand = operand
-        self.limits = lower, upper
-        """The limits; once the judged time has begun, with times of the instance's clock."""
+        self._base = base
+        self._limits = lower, upper
         self._begun = False
+
+    @property
+    def limits(self) -> tuple[Piece, Piece]:
+        """The limits; once the judged time has begun, with times of the instance's clock."""
+        lower, upper = (
+            limit._replace(low=limit.low + float(self._base), high=limit.high + float(self._base))
+            for limit in self._limits
+        )
+        return lower, upper
 
     def turn(self) -> None:
         """Compare the number with the limits at each moment."""
@@ -477,24 +512,27 @@ class Tube(Node):
         if not self._begun:
             self._begun = True
             begin = int(piece.time[0])
-            self.limits = tuple(limit._replace(time=limit.time + begin) for limit in self.limits)  # type: ignore[assignment]
+            self._limits = tuple(limit._replace(time=limit.time + begin) for limit in self._limits)  # type: ignore[assignment]
         inner = [
             limit.time[limit.time.searchsorted(piece.time[0], "right") : limit.time.searchsorted(piece.end)]
-            for limit in self.limits
+            for limit in self._limits
         ]
         time = np.unique(np.concatenate((piece.time, *inner)))
-        value = piece.low[piece.time.searchsorted(time, "right") - 1]
-        below, above = (limit.time.searchsorted(time, "right") - 1 for limit in self.limits)
-        lower, upper = self.limits
-        low = _loose(np.minimum(value - lower.high[below], upper.low[above] - value))
-        high = _loose(np.minimum(value - lower.low[below], upper.high[above] - value))
-        unknown = np.isnan(value)
+        values = piece.low[piece.time.searchsorted(time, "right") - 1]
+        least, greatest = bounds(EXACTLY[SUBTRACT](values, self._base) if self._base else values)
+        below, above = (limit.time.searchsorted(time, "right") - 1 for limit in self._limits)
+        lower, upper = self._limits
+        low = _loose(np.minimum(least - lower.high[below], upper.low[above] - greatest))
+        high = _loose(np.minimum(greatest - lower.low[below], upper.high[above] - least))
+        unknown = np.isnan(least)
         low[unknown], high[unknown] = -np.inf, np.inf
         self.out = Piece(time, low, high, piece.end)
 
 
-def tube(golden: Piece, tolerance: float, tolerance_ns: int) -> tuple[Piece, Piece]:
-    """Return the lower and the upper limit of the band around a signal.
+def tube(golden: Piece, tolerance: float, tolerance_ns: int) -> tuple[Piece, Piece, Exact]:
+    """Return the lower and the upper limit of the band around a signal, less a base, and this base.
+
+    The base is 0, or the signal's largest value if the signal has integers that floats cannot represent.
 
     Before its start, the signal counts as having its first value; after its end, its last value.
 
@@ -503,20 +541,30 @@ def tube(golden: Piece, tolerance: float, tolerance_ns: int) -> tuple[Piece, Pie
         tolerance: Tolerance of the value.
         tolerance_ns: Tolerance in time, in both directions.
     """
-    unknown = np.isnan(golden.low)
+    unknown = np.isnan(floats(golden.low))
+    base: Exact = 0
+    if is_exact(golden.low):
+        base = max(golden.low[~unknown].tolist(), key=abs)
+    low, high = bounds(EXACTLY[SUBTRACT](golden.low, base) if base else golden.low)
     time = golden.time.copy()
     time[-1] += tolerance_ns
     values = Input()
-    values.out = Piece(
-        time, low=np.where(unknown, -np.inf, golden.low), high=np.where(unknown, np.inf, golden.low), end=golden.end
-    )
+    values.out = Piece(time, low=np.where(unknown, -np.inf, low), high=np.where(unknown, np.inf, high), end=golden.end)
     limits = []
     for function, more in ((np.minimum, -tolerance), (np.maximum, tolerance)):
         window = Window(function, values, -tolerance_ns, tolerance_ns)
         window.turn()
         found = window.out
-        limits.append(Piece(found.time, found.low + more, found.high + more, found.end))
-    return limits[0], limits[1]
+        limits.append(Piece(found.time, _sum(found.low, more, -np.inf), _sum(found.high, more, np.inf), found.end))
+    return limits[0], limits[1], base
+
+
+def _sum(values: Values, more: float, towards: float) -> Values:
+    """Return sums; a sum of large numbers, which floats cannot represent, is rounded in a direction."""
+    found = values + more
+    with np.errstate(invalid="ignore"):  # infinity less infinity
+        lost = (np.abs(found) >= WHOLE) & np.isfinite(found) & (found - values != more)
+    return np.where(lost, np.nextafter(found, towards), found)
 
 
 # -- functions of numbers ----------------------------------------------------------------------------------------------
@@ -532,13 +580,30 @@ def _loose(distance: Values) -> Values:
     return np.where(distance == 0, TINY, distance)
 
 
+def _binary(operation: int, function: Numeric) -> Numeric:
+    """Return a function that computes exactly if an operand is exact; see :mod:`shmio.injection.exact`."""
+
+    def compute(left: Values, right: Values) -> Values:
+        return (EXACTLY[operation] if is_exact(left) or is_exact(right) else function)(left, right)
+
+    return compute
+
+
+_difference: Final = _binary(SUBTRACT, np.subtract)
+
+
+def _distance(left: Values, right: Values) -> Values:
+    """Return how far numbers are from others; only an equal number has the distance 0."""
+    return floats(_difference(left, right))
+
+
 COMPARISONS: Final[dict[str, Numeric]] = {
-    "==": lambda left, right: _loose(-np.abs(np.subtract(left, right))),
-    "!=": lambda left, right: _strict(np.abs(np.subtract(left, right))),
-    "<": lambda left, right: _strict(np.subtract(right, left)),
-    "<=": lambda left, right: _loose(np.subtract(right, left)),
-    ">": lambda left, right: _strict(np.subtract(left, right)),
-    ">=": lambda left, right: _loose(np.subtract(left, right)),
+    "==": lambda left, right: _loose(-np.abs(_distance(left, right))),
+    "!=": lambda left, right: _strict(np.abs(_distance(left, right))),
+    "<": lambda left, right: _strict(_distance(right, left)),
+    "<=": lambda left, right: _loose(_distance(right, left)),
+    ">": lambda left, right: _strict(_distance(left, right)),
+    ">=": lambda left, right: _loose(_distance(left, right)),
 }
 
 
@@ -547,14 +612,20 @@ def _quotient(left: Values, right: Values) -> Values:
 
 
 NUMBERS: Final[dict[str, Numeric]] = {
-    "+": np.add,
-    "-": np.subtract,
-    "*": np.multiply,
-    "/": _quotient,
-    "mod": np.mod,
+    "+": _binary(ADD, np.add),
+    "-": _difference,
+    "*": _binary(MULTIPLY, np.multiply),
+    "/": _binary(DIVIDE, _quotient),
+    "mod": _binary(MODULO, np.mod),
     "neg": np.negative,
     "abs": np.abs,
 }
+OF_INTEGERS: Final[dict[str, Numeric]] = {
+    "+": EXACTLY[ADD],
+    "-": EXACTLY[SUBTRACT],
+    "*": EXACTLY[MULTIPLY],
+}
+"""The functions of integers whose results are integers, which may be larger than the operands."""
 
 
 def from_bool(values: Values) -> Values:
@@ -564,4 +635,4 @@ def from_bool(values: Values) -> Values:
 
 def from_number(values: Values) -> Values:
     """Return the truths of numbers: a number is true if it is not 0."""
-    return _strict(np.abs(values))
+    return _strict(np.abs(floats(values)))

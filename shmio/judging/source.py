@@ -9,9 +9,11 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from shmio.injection.exact import integers, split
 from shmio.judging.operators import Input
 from shmio.judging.pieces import FAR_NS, NO_TIMES, NOTHING, Piece, Times, Values
 from shmio.layout.model import Layout, Register
+from shmio.layout.values.codec import scalar_codec
 from shmio.layout.values.frame_codec import FrameCodec
 from shmio.model.statuses import status_registers
 
@@ -90,8 +92,11 @@ class Rows(NamedTuple):
 class _Decoder:
     """Decodes those registers of a block that formulas read."""
 
-    def __init__(self, layout: Layout, registers: Mapping[str, Register], signals: Sequence[Signal]) -> None:
+    def __init__(
+        self, layout: Layout, registers: Mapping[str, Register], signals: Sequence[Signal], wide: Sequence[int]
+    ) -> None:
         self.layout = layout
+        self._wide = wide
         self._signals = signals
         self._registers = registers
         self._statuses: dict[str, str] = {}
@@ -104,14 +109,18 @@ class _Decoder:
         self._codec = FrameCodec(Layout("", None, layout.size, False, tuple(unique.values()), layout.byte_order))
 
     def decode(self, frames: Frames) -> Values:
-        """Return the values of the signals, of shape (signals, n). Ages are those at publication."""
+        """Return the values of the signals, of shape (signals, n). Ages are those at publication.
+
+        Further rows have what the values of wide signals lack to be exact.
+        """
         decoded = {"value": self._codec.decode(frames.images)}
         decoded["raw"] = decoded["value"]
         if frames.raws is not None and any(signal.aspect == "raw" for signal in self._signals):
             decoded["raw"] = self._codec.decode(frames.raws)
-        found = np.empty((len(self._signals), len(frames.number)))
+        found = np.zeros((len(self._signals) + len(self._wide), len(frames.number)))
+        rests = dict(zip(self._wide, found[len(self._signals) :], strict=True))
         bad = frames.quality == 0
-        for row, signal in zip(found, self._signals, strict=True):
+        for index, (row, signal) in enumerate(zip(found, self._signals, strict=False)):
             if signal.aspect == "age":
                 row[:] = frames.delay_us / 1e6
                 continue
@@ -128,9 +137,23 @@ class _Decoder:
                     np.minimum(row, np.where(code < _UNCERTAIN, 2, np.where(code < _BAD, 1, 0)), out=row)
                 continue
             column = columns[register.path]
-            row[:] = np.where(np.isnat(column), np.nan, column.astype(np.int64)) if column.dtype.kind == "m" else column
+            if _is_wide(register):
+                row[:], rest = split(column.astype(np.int64) if column.dtype.kind == "m" else column)
+                if index in rests:
+                    rests[index][:] = rest
+                else:  # a reload has changed the type
+                    row[rest != 0] = np.nan
+            elif column.dtype.kind == "m":
+                row[:] = np.where(np.isnat(column), np.nan, column.astype(np.int64))
+            else:
+                row[:] = column
             row[bad if code is None else bad | (code >= _BAD)] = np.nan
         return found
+
+
+def _is_wide(register: Register) -> bool:
+    """Return whether a register is a 64-bit integer, which a float may not represent."""
+    return register.type != "BOOL" and scalar_codec(register.element).plain in ("q", "Q")
 
 
 class _Waiting(NamedTuple):
@@ -174,6 +197,9 @@ class Source:
         self.rows = _no_rows(len(signals))
         """The values that the last turn made known."""
         self._decoder: _Decoder | None = None
+        self.wide = False
+        """True if a signal has been a 64-bit integer, which a float may not represent."""
+        self._wide: tuple[int, ...] = ()  # signals that have a further row, with what a float lacks
         self._stale_ns = FAR_NS
         self._number: int | None = None
         self._left_out = False
@@ -197,7 +223,16 @@ class Source:
                 unknown.
             stale_ns: Age in ns from which a frame is stale.
         """
-        self._decoder = _Decoder(layout, registers, self.signals)
+        self.wide = self.wide or any(map(_is_wide, registers.values()))
+        if self._decoder is None:
+            self._wide = tuple(
+                index
+                for index, signal in enumerate(self.signals)
+                if signal.aspect in ("value", "raw") and signal.path in registers and _is_wide(registers[signal.path])
+            )
+            more = np.zeros(len(self._wide), bool)
+            self._ages, self._qualities = np.append(self._ages, more), np.append(self._qualities, more)
+        self._decoder = _Decoder(layout, registers, self.signals, self._wide)
         self._stale_ns = stale_ns
         self._number = None
 
@@ -228,8 +263,13 @@ class Source:
         if len(rows.time) and not self._begun:
             rows = _from(rows, origin_ns)
             self._begun = len(rows.time) > 0
-        self.rows = rows if end_ns is None else Rows(rows.time[:-1], rows.values[:, :-1], end_ns)
-        for node, values in zip(self.inputs, rows.values, strict=True):
+        count = len(rows.time) if end_ns is None else len(rows.time) - 1
+        shown = rows.values[: len(self.signals), :count]
+        self.rows = Rows(rows.time[:count], shown, rows.end if end_ns is None else end_ns)
+        for index, node in enumerate(self.inputs):
+            values = rows.values[index]
+            if index in self._wide:
+                values = integers(values, rows.values[len(self.inputs) + self._wide.index(index)])
             node.out = Piece(rows.time, values, values, rows.end) if len(rows.time) else NOTHING
 
     def _known(self, end_ns: int | None) -> Rows:
@@ -241,7 +281,7 @@ class Source:
             self._waiting = []
         held = self._held
         if held is None or (end_ns is None and len(held.time) < 2):
-            return _no_rows(len(self.signals))
+            return _no_rows(len(self._ages))
         if end_ns is None:
             time, following, values = held.time[:-1], held.time[1:], held.values[:, :-1]
             self._held = held.last
@@ -286,7 +326,7 @@ class Source:
 
     def _unknown(self, count: int) -> Values:
         """Return unknown values: NaN, and bad quality."""
-        found = np.full((len(self.signals), count), np.nan)
+        found = np.full((len(self._ages), count), np.nan)
         found[self._qualities] = 0
         return found
 

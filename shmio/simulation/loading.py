@@ -15,7 +15,6 @@ from shmio.simulation import fmu
 from shmio.simulation.model import Model, explain
 from shmio.wording import unknown
 
-
 _OWN: Final = "_beside_configuration"
 """Suffix of the names of modules in the folder that have the names of installed ones."""
 
