@@ -7,6 +7,7 @@
     │   └── DeclarationError     a declared injection is wrong; also a subclass of ValueRangeError
     ├── LayoutError        a layout source is wrong; ``diagnostics`` has file, line and column
     ├── ValueRangeError    a value does not fit its register's type
+    │   └── CharacterError       the register's encoding lacks a character of the text
     ├── PathError          no such source or register
     ├── ConflictError      a name is in use for something else
     ├── WrongInstanceError the running instance of this name has another configuration file
@@ -88,6 +89,23 @@ class LayoutError(ShmioError):
 
 class ValueRangeError(ShmioError, ValueError):
     """A value does not fit the type of its register."""
+
+
+class CharacterError(ValueRangeError):
+    """The encoding of a register lacks a character of a text.
+
+    Attributes:
+        character: The character.
+        place: Its place in the text; the first character has place 1.
+
+    """
+
+    def __init__(self, message: str, character: str = "", place: int = 0) -> None:
+        super().__init__(message)
+        self.character, self.place = character, place
+
+    def __reduce__(self) -> tuple[type[CharacterError], tuple[str, str, int]]:
+        return type(self), (str(self), self.character, self.place)
 
 
 class DeclarationError(ConfigError, ValueRangeError):

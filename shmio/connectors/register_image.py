@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from shmio.errors import ConnectorError, ValueRangeError
+from shmio.errors import CharacterError, ConnectorError, ValueRangeError
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
 from shmio.layout.values.codec import Value, codec, scalar_codec
@@ -19,6 +19,7 @@ from shmio.model.statuses import (
     BAD_WAITING_FOR_INITIAL_DATA,
     GOOD,
     StatusArea,
+    character_missing,
 )
 
 
@@ -121,6 +122,8 @@ class RegisterImage:
         fault = ""
         try:
             self._codecs[index].encode_into(value, self._image)
+        except CharacterError as error:
+            code, fault = character_missing(error.place, error.character), str(error)
         except ValueRangeError as error:
             code, fault = BAD_OUT_OF_RANGE, str(error)
         if code == GOOD and index not in self._not_good:  # the usual case

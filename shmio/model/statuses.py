@@ -4,12 +4,13 @@ An image of a layout with :attr:`Layout.status_offset` ends in this area, so tha
 and replays carry it like all other bytes. It has two arrays in the order of the layout's registers,
 in the byte order of the layout:
 
-- the OPC UA status codes (u32, OPC 10000-4, section 7.39), padded to 8 bytes;
+- the OPC UA status codes (u32, OPC 10000-4, section 7.39), or those of :class:`Finding`, padded to 8 bytes;
 - the source times (i64, ns since 1970 UTC; 0: unknown, so that the time of the frame applies).
 """
 
 from __future__ import annotations
 
+import enum
 import struct
 from bisect import bisect_right
 from collections.abc import Iterable
@@ -51,8 +52,60 @@ _FROM_OPC: Final = {  # by quality and sub-status, QQSSSS: OPC 10000-8, table A.
     17: UNCERTAIN_LAST_USABLE_VALUE, 20: 0x40930000, 21: 0x40940000, 22: 0x40950000, 48: GOOD, 54: 0x00960000,
 }  # fmt: skip
 _OPC_QUALITIES: Final = range(256)
-_INFO_TYPE: Final = 0x0C00
-_INFO_BITS: Final = 0x03FF
+
+
+class Finding(enum.IntEnum):
+    """What a source itself found wrong with a register's value, as a status code with room for a detail.
+
+    The number is the highest byte of the code: the severity, bit 28, which OPC UA reserves, and a
+    number. The other three bytes have the detail.
+    """
+
+    CHARACTER = 0x91
+    """The register's encoding lacks a character of the text: its place (1 byte), its UTF-16 unit (2 bytes)."""
+    UNKNOWN_QUALITY = 0x51
+    """The device states a quality that has no meaning: the number, at most 0xFFFFFF."""
+    UNREADABLE_TIME = 0x52
+    """The device states a time that cannot be read, so the time of the receipt stands for it."""
+
+    def code(self, detail: int = 0) -> int:
+        """Return a status code with this finding and its detail, as far as three bytes can hold it."""
+        return self << 24 | min(max(detail, 0), 0xFFFFFF)
+
+
+UNREADABLE_TIME: Final = Finding.UNREADABLE_TIME.code()
+_STANDARD: Final = {
+    Finding.CHARACTER: BAD_OUT_OF_RANGE,
+    Finding.UNKNOWN_QUALITY: UNCERTAIN,
+    Finding.UNREADABLE_TIME: UNCERTAIN,
+}
+
+
+def character_missing(place: int, character: str) -> int:
+    """Return the code for a text with a character that the register's encoding lacks; ``place`` counts from 1."""
+    unit = min(ord(character), 0xFFFF)  # U+FFFF is no character: it stands for those beyond
+    return Finding.CHARACTER.code(min(place, 0xFF) << 16 | unit)
+
+
+def standard(code: int) -> int:
+    """Return the status code of the OPC UA standard for a code, which may be a finding of the source itself."""
+    return _STANDARD[Finding(code >> 24)] if code >> 24 in _STANDARD else code
+
+
+def _found(code: int) -> str:
+    """Return the reason for a finding of the source; empty if the code is a standard one."""
+    detail = code & 0xFFFFFF
+    match code >> 24:
+        case Finding.CHARACTER:
+            character = "a character" if detail & 0xFFFF == 0xFFFF else repr(chr(detail & 0xFFFF))
+            return f"the register's encoding cannot hold {character}, which is character {detail >> 16} of the text"
+        case Finding.UNKNOWN_QUALITY:
+            return f"the device states the quality {detail}, which has no meaning"
+        case Finding.UNREADABLE_TIME:
+            return "the device states a time that cannot be read, so the value has the time of its receipt"
+    return ""
+
+
 _NAMED: Final = 0xFFFF0000
 """The bits of a code that determine its name; the other half of the code has flags."""
 _NAMES: Final = {  # those codes of OPC 10000-6, annex A.2, that data sources use
@@ -223,14 +276,14 @@ class RegisterStatus(NamedTuple):
         """Reason why the quality is not good; empty if it is good."""
         if self.waits:
             return f"no data yet ({_NAMES[BAD_WAITING_FOR_INITIAL_DATA]})"
-        return "" if self.quality is Quality.GOOD else f"the device reports {describe(self.code)}"
+        if self.quality is Quality.GOOD:
+            return ""
+        return _found(self.code) or f"the device reports {describe(self.code)}"
 
 
 def describe(code: int) -> str:
     """Return a status code as text: its name and number; if the name is unknown, only the number."""
-    name = _NAMES.get(code & _NAMED)
-    if code & _NAMED == UNCERTAIN and code & _INFO_BITS and not code & _INFO_TYPE:
-        return f"{name} ({code & _INFO_BITS}, an unknown quality)"
+    name = _NAMES.get(standard(code) & _NAMED)
     return f"{name} (0x{code:08X})" if name else f"status 0x{code:08X}"
 
 
@@ -242,17 +295,9 @@ def from_opc_quality(quality: float) -> int | None:
     return _FROM_OPC.get(number, _FROM_OPC.get(number & 0x30))
 
 
-def uncertain_quality(quality: object) -> int:
-    """Return the status code for a quality without a known meaning.
-
-    The code contains the number, from 1 to 1023, for :func:`describe`, in bits that OPC UA does not use in this case.
-    """
-    return UNCERTAIN | quality if isinstance(quality, int) and 0 < quality <= _INFO_BITS else UNCERTAIN
-
-
-def standard(code: int) -> int:
-    """Return a status code without the number that :func:`uncertain_quality` adds."""
-    return code if code & _INFO_TYPE else code & ~_INFO_BITS
+def unknown_quality(quality: object) -> int:
+    """Return the status code for a quality without a known meaning; it has the number, unless that is below 0."""
+    return Finding.UNKNOWN_QUALITY.code(quality) if isinstance(quality, int) and quality >= 0 else UNCERTAIN
 
 
 def worse(quality: Quality, reason: str, status: RegisterStatus) -> tuple[Quality, str]:

@@ -26,10 +26,10 @@ from shmio.model.statuses import (
     BAD_NOT_FOUND,
     BAD_WAITING_FOR_INITIAL_DATA,
     GOOD,
-    UNCERTAIN,
     UNCERTAIN_LAST_USABLE_VALUE,
+    UNREADABLE_TIME,
     from_opc_quality,
-    uncertain_quality,
+    unknown_quality,
 )
 from shmio.wire import sparkplug_b_pb2 as wire
 from shmio.wording import brief
@@ -156,7 +156,7 @@ class Device(Origin):
         try:
             code, reason = _quality(one)
             if doubt and code == GOOD:
-                code, reason = UNCERTAIN, doubt
+                code, reason = UNREADABLE_TIME, doubt
             found = Found(metric.decode(one, known.datatype), source_ns, code, reason=reason)
         except ValueFaultError as error:
             error.source_ns = source_ns
@@ -502,5 +502,5 @@ def _quality(one: wire.Metric) -> tuple[int, str]:
                 code = UNCERTAIN_LAST_USABLE_VALUE if found == _STALE else from_opc_quality(found)
                 if code is not None:
                     return code, ""
-            return uncertain_quality(found), f"its quality is {brief(found)}, which has no meaning that shmio knows"
+            return unknown_quality(found), f"its quality is {brief(found)}, which has no meaning that shmio knows"
     return GOOD, ""

@@ -19,7 +19,7 @@ from shmio.model.statuses import (
     BAD_USER_ACCESS_DENIED,
     BAD_WAITING_FOR_INITIAL_DATA,
     GOOD,
-    UNCERTAIN,
+    UNREADABLE_TIME,
 )
 from shmio.wording import brief
 
@@ -186,7 +186,7 @@ class Topic(Origin):
         document = self._json(message)
         found = json_path.extract(document, steps)
         source_ns = None if self._time is None else self._source_ns(document, self._time)
-        return Found(found, source_ns or message.utc_ns, UNCERTAIN if source_ns == 0 else GOOD)
+        return Found(found, source_ns or message.utc_ns, UNREADABLE_TIME if source_ns == 0 else GOOD)
 
     def _json(self, message: Message) -> Document:
         if self._decoded is not message:

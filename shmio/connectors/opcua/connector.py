@@ -7,6 +7,7 @@ import concurrent.futures
 import importlib.util
 import itertools
 import logging
+import math
 import threading
 import time
 from bisect import bisect_left, bisect_right
@@ -27,11 +28,11 @@ from shmio.connectors.opcua.structures import AbsentError, ChangedValue, find, r
 from shmio.connectors.opcua.values import MismatchError, ValueConverter
 from shmio.connectors.register_image import RegisterImage, no_status_area
 from shmio.connectors.request_count import CycleRequests, Requests
-from shmio.errors import ConfigError, ConnectorError, ValueRangeError
+from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.addresses import siemens
 from shmio.layout.addresses.opcua import Address, Member, parse_member
 from shmio.layout.model import Layout, Register, bit_positions
-from shmio.layout.values.codec import codec
+from shmio.layout.values.codec import codec, flatten
 from shmio.layout.values.write import Write, apply, bits_of
 from shmio.model.statuses import (
     BAD_DECODING_ERROR,
@@ -343,12 +344,16 @@ class OpcUaConnector(Connector):
 
     def _put(self, image: RegisterImage, index: int, sample: Sample) -> None:
         try:
-            image.put(index, self._converters[index].value(sample), sample.source_ns, sample.code)
+            fault = image.put(index, self._converters[index].value(sample), sample.source_ns, sample.code)
         except MismatchError as error:
             image.fail(index, BAD_TYPE_MISMATCH, sample.source_ns)
             self._report(index, f"{error}; correct the register's type in the layout")
-        except (ValueRangeError, ValueError, OverflowError):
+            return
+        except (ValueError, OverflowError) as error:
             image.fail(index, BAD_OUT_OF_RANGE, sample.source_ns)
+            fault = str(error)
+        if fault:
+            self._report(index, f"the register cannot hold the server's value: {fault}")
 
     def _report(self, index: int, what: str) -> None:
         """Log a fault of a register, once per connection. After ``MAX_REPORTED`` faults, log no more of them."""
@@ -484,6 +489,14 @@ class OpcUaConnector(Connector):
         values = [*now.value[: one.first], *part.value, *now.value[end:]]
         changed.set(member, now._replace(value=values))
 
+    @staticmethod
+    def _node_write(number: int, item: Item, elements: str | None, sample: Sample) -> _NodeWrite:
+        """Return a write to a node. Raise ValueError if its value cannot be encoded."""
+        from shmio.connectors.opcua.session import check_encoding  # noqa: PLC0415  a library that only sources need
+
+        check_encoding(sample)
+        return _NodeWrite(number, item, elements, sample)
+
     def _path(self, step: _NodeWrite) -> str:
         """Return the path of the register that a step writes."""
         return self._layout.registers[self._nodes[step.item.index].registers[0]].path
@@ -512,18 +525,20 @@ class OpcUaConnector(Connector):
                     if item.is_structure:
                         yield _MemberWrite(number, index, value)
                     else:
-                        yield _NodeWrite(number, item, None, converter.sample(value, like))
+                        yield self._node_write(number, item, None, converter.sample(value, like))
                     continue
-                first, count = _elements(register, share)
-                flat: Any = value
+                elements = _elements(register, share)
+                flat = list(flatten(value, register.shape, register.path))
+                values = [flat[place] for place in elements]
                 if item.is_structure:
-                    yield _MemberWrite(number, index, flat[first : first + count], first, count)
+                    first = _consecutive(elements)
+                    yield _MemberWrite(number, index, values, first, len(values))
                     continue
-                sample = converter.elements(flat[first : first + count], like)
+                text, dims = _index_range(converter.shape(like), elements)
+                sample = converter.elements(values, like)._replace(dims=dims)
+                yield self._node_write(number, item, text, sample)
             except ValueError as error:
                 raise ValueError(f"{register.path}: {error}") from None
-            last = first + count - 1
-            yield _NodeWrite(number, item, f"{first}:{last}" if last > first else str(first), sample)
         if not found:
             raise ValueError("no register of the layout covers the written bytes")
 
@@ -602,16 +617,14 @@ def _overlapping(layout: Layout, write: Write) -> range:
     return range(first, bisect_left(registers, stop, key=lambda register: register.offset))
 
 
-def _elements(register: Register, share: bytes) -> tuple[int, int]:
-    """Return the first and the number of the elements whose bits are set in ``share``.
+def _elements(register: Register, share: bytes) -> list[int]:
+    """Return the places, in the flat array, of the elements whose bits are set in ``share``.
 
     Raises:
-        ValueError: The bits are not those of consecutive whole elements.
+        ValueError: The bits are not those of whole elements.
     """
     if not register.dims:
         raise ValueError("OPC UA cannot write a part of a value; write the whole register")
-    if len(register.dims) > 1:
-        raise ValueError("elements of an array with several dimensions cannot be written; write the whole array")
     chosen: list[int] = []
     whole = True
     if register.type == "BOOL":
@@ -623,9 +636,39 @@ def _elements(register: Register, share: bytes) -> tuple[int, int]:
             if any(part):
                 chosen.append(place)
                 whole = whole and part == b"\xff" * len(part)
-    if not whole or not chosen or chosen[-1] - chosen[0] + 1 != len(chosen):
+    if not whole or not chosen:
         raise ValueError("OPC UA cannot write a part of an element; write the whole element")
-    return chosen[0], len(chosen)
+    return chosen
+
+
+def _consecutive(elements: Sequence[int]) -> int:
+    """Return the first of consecutive elements. Raise ValueError if there are others between them."""
+    if elements[-1] - elements[0] + 1 != len(elements):
+        raise ValueError("elements that do not follow each other cannot be written; write the whole array")
+    return elements[0]
+
+
+def _index_range(shape: Sequence[int], elements: Sequence[int]) -> tuple[str, tuple[int, ...]]:
+    """Return the index range of elements of an array (OPC 10000-4, section 7.27), and its sizes.
+
+    Raises:
+        ValueError: They are not all elements of a range.
+
+    """
+    spans = [(min(places), max(places)) for places in zip(*(_place(shape, one) for one in elements), strict=True)]
+    sizes = tuple(last - first + 1 for first, last in spans)
+    if math.prod(sizes) != len(elements):
+        raise ValueError("OPC UA writes elements that form a range alone; write the whole array")
+    return ",".join(f"{first}:{last}" if last > first else f"{first}" for first, last in spans), sizes
+
+
+def _place(shape: Sequence[int], element: int) -> tuple[int, ...]:
+    """Return the indices, from 0, of an element whose place in the flat array is given."""
+    indices = []
+    for size in reversed(shape):
+        element, index = divmod(element, size)
+        indices.append(index)
+    return (*reversed(indices),)
 
 
 def _batches(steps: Sequence[_NodeWrite | _StructureWrite], most: int) -> Iterator[list[_NodeWrite] | _StructureWrite]:
@@ -929,7 +972,7 @@ class _Link(threading.Thread):
     async def has_ranges(self, step: _NodeWrite) -> bool:
         """Return whether the server supports the index range of a write."""
         assert step.elements is not None  # noqa: S101 - for the type checker
-        return await self.sessions[step.item.session].has_ranges(step.item, step.elements, len(step.sample.value))
+        return await self.sessions[step.item.session].has_ranges(step.item, step.elements, step.sample.dims)
 
     async def read_back(self, items: Sequence[Item]) -> None:
         """Read nodes that were just written."""

@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
+import dataclasses
+import enum
 import re
+import typing
 import uuid
 from base64 import b64decode
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from typing import Any, Final, Protocol
 
 from asyncua import ua
 
 from shmio.connectors.opcua import decode
 from shmio.connectors.opcua.decode import Extension, MalformedError, NodeKey, Reader, Sample, node_key
-from shmio.connectors.opcua.structures import NULL, Definition, Field, Structure, complete, read_definition
+from shmio.connectors.opcua.structures import (
+    NULL,
+    DefinedField,
+    Definition,
+    Field,
+    Structure,
+    complete,
+    read_definition,
+)
 
 MAX_TYPES: Final = 1000
 """Maximum number of data types whose definitions a source reads."""
@@ -66,7 +78,9 @@ class DataTypes:
         unknown = sorted(encodings - by_encoding.keys(), key=repr)
         if unknown:  # values of subtypes, or definitions without their encodings
             found = await self._session.origins([_node(key) for key in unknown], ua.NodeId(_HAS_ENCODING))
-            origins = {key: _key_of(node) for key, node in zip(unknown, found, strict=True) if node is not None}
+            pairs = zip(unknown, found, strict=True)
+            given = {key: _standard_origin(key) if node is None else _key_of(node) for key, node in pairs}
+            origins = {key: origin for key, origin in given.items() if origin is not None}
             await self._define({*origins.values()})
             by_encoding |= {key: origin for key, origin in origins.items() if origin in self._definitions}
         await self._name()
@@ -89,6 +103,7 @@ class DataTypes:
                     definition = read_definition(sample)
                 except MalformedError:  # only the members of this structure cannot be read
                     definition = None
+                definition = definition or standard_definition(key)
                 if definition is None:
                     others.append(key)
                     continue
@@ -154,6 +169,53 @@ class DataTypes:
 
     def _open(self, key: NodeKey) -> Structure:
         return self._built.setdefault(key, Structure(self._names.get(key) or str(key[2])[:100]))
+
+
+@cache
+def standard_definition(key: NodeKey) -> Definition | None:
+    """Return the definition of a structure of the standard, which few servers define; None if it is none.
+
+    The library has a class for each of them (OPC 10000-5).
+    """
+    of_type = _standard_classes().get(key)
+    if of_type is None:
+        return None
+    try:
+        hints = typing.get_type_hints(of_type, {"ua": ua})
+    except (AttributeError, NameError):  # the library's own annotation is wrong
+        return None
+    fields = []
+    for name in (one.name for one in dataclasses.fields(of_type)):
+        inner, rank = hints[name], -1
+        if typing.get_origin(inner) is list:
+            (inner,), rank = typing.get_args(inner), 1
+        data_type = _data_type(inner)
+        if data_type is None:
+            return None
+        fields.append(DefinedField(name, data_type, rank, optional=False))
+    return Definition(_key_of(ua.typeid_by_extension_objects[of_type]), 0, tuple(fields))
+
+
+def _standard_origin(encoding: NodeKey) -> NodeKey | None:
+    """Return the data type of the standard with this encoding; None if there is none."""
+    of_type = ua.extension_objects_by_typeid.get(_node(encoding))
+    return None if of_type is None else _key_of(of_type.data_type)
+
+
+@cache
+def _standard_classes() -> dict[NodeKey, Any]:
+    return {_key_of(one.data_type): one for one in ua.typeid_by_extension_objects if not one.data_type.NamespaceIndex}
+
+
+def _data_type(of_type: Any) -> NodeKey | None:
+    """Return the data type for which the library uses a class; None if it is unknown."""
+    if not isinstance(of_type, type):
+        return None
+    if of_type.__name__ in ua.VariantType.__members__:
+        return 2, 0, ua.VariantType[of_type.__name__].value
+    if issubclass(of_type, enum.Enum) and not issubclass(of_type, enum.Flag):
+        return 2, 0, decode.INT32
+    return _key_of(of_type.data_type) if hasattr(of_type, "data_type") else None
 
 
 def encodings_of(sample: Sample) -> Iterable[NodeKey]:

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
 from shmio.errors import ConnectorError
+from shmio.model.statuses import BAD_DECODING_ERROR
 
 BOOLEAN, SBYTE, BYTE, INT16, UINT16, INT32, UINT32, INT64, UINT64, FLOAT, DOUBLE, STRING, DATE_TIME, GUID = range(1, 15)
 BYTE_STRING, XML, NODE_ID, EXPANDED_NODE_ID, STATUS_CODE, QUALIFIED_NAME, LOCALIZED_TEXT, EXTENSION = range(15, 23)
@@ -32,7 +33,10 @@ _FIXED: Final = {
 _STRUCTS: Final = {kind: struct.Struct(f"<{code}") for kind, code in _FIXED.items()}
 _INT, _UINT, _TIME, _WORD = struct.Struct("<i"), struct.Struct("<I"), struct.Struct("<q"), struct.Struct("<H")
 _EPOCH: Final = 116_444_736_000_000_000  # 1970 in units of 100 ns since 1601
-_LAST_TICK: Final = _EPOCH + (1 << 63) // 100
+_LAST_TICK: Final = 2_650_467_743_990_000_000
+"""9999-12-31T23:59:59: the standard represents later times by the greatest number (OPC 10000-6, section 5.2.2.5)."""
+_LAST_STAMP_NS: Final = (1 << 63) - 1
+"""The last timestamp, in 2262, that the status of a register can hold."""
 _MAX_DEPTH: Final = 8
 _SERVICE_FAULT, _READ_RESPONSE, _PUBLISH_RESPONSE = 397, 634, 829
 _DATA_CHANGE, _STATUS_CHANGE = 811, 820
@@ -311,10 +315,13 @@ class Reader:
             server_ns = self.time()
         if mask & 0x20:
             self.skip(2)
-        return Sample(kind, value, dims, code, max(source_ns, 0) or max(server_ns, 0))
+        return sample(kind, value, dims, code, _stamp(source_ns) or _stamp(server_ns))
 
     def variant(self, depth: int) -> tuple[int, Any, tuple[int, ...] | None]:
-        """Read a variant; return the number of its built-in type, its value and its dimensions."""
+        """Read a variant; return the number of its built-in type, its value and its dimensions.
+
+        The dimensions may not fit the number of elements: :func:`sample` makes a bad value of that.
+        """
         mask = self.u8()
         kind = mask & 0x3F
         if not mask & 0x80:
@@ -323,15 +330,8 @@ class Reader:
             raise MalformedError
         values = self.elements(kind, self.count(size_of(kind)), depth)
         dims: tuple[int, ...] = (len(values),)
-        if mask & 0x40:
-            given = struct.unpack(f"<{count}i", self.take(4 * count)) if (count := self.count(4)) else ()
-            product = 1
-            for size in given:
-                product *= max(size, 0)
-                if product > len(values):
-                    raise MalformedError
-            if given and product == len(values):
-                dims = given
+        if mask & 0x40 and (count := self.count(4)):
+            dims = struct.unpack(f"<{count}i", self.take(4 * count))
         return kind, values, dims
 
     def value(self, kind: int, depth: int) -> Any:
@@ -382,6 +382,31 @@ class Reader:
         raise MalformedError
 
 
+def sample(kind: int, value: Any, dims: tuple[int, ...] | None, code: int = 0, source_ns: int = 0) -> Sample:
+    """Return a sample; it is bad, without a value, if its dimensions do not fit the number of its elements.
+
+    OPC 10000-6, section 5.2.2.16 makes such a value a decoding error. Its length is known all the
+    same, so that the rest of the message can be read.
+    """
+    if dims is not None and not _fit(dims, len(value)):
+        return Sample(0, None, None, code if code >> 30 == 2 else BAD_DECODING_ERROR, source_ns)
+    return Sample(kind, value, dims, code, source_ns)
+
+
+def _fit(dims: tuple[int, ...], count: int) -> bool:
+    product = int(min(dims) > 0)
+    for size in dims:
+        product *= size
+        if product > count:
+            return False
+    return product == count
+
+
+def _stamp(ns: int) -> int:
+    """Return a timestamp, or 0 if a status cannot hold it."""
+    return ns if 0 < ns <= _LAST_STAMP_NS else 0
+
+
 def encoded(kind: int, value: Any) -> bytes:
     """Encode a value of a built-in type, as :meth:`Reader.value` returns it.
 
@@ -390,10 +415,15 @@ def encoded(kind: int, value: Any) -> bytes:
 
     """
     if kind in _STRUCTS:
-        return _STRUCTS[kind].pack(value)
+        try:
+            return _STRUCTS[kind].pack(value)
+        except (struct.error, OverflowError):
+            raise ValueError(f"{value} does not fit a {NAMES[kind]}") from None
     if kind == DATE_TIME:
         return _TIME.pack(value // 100 + _EPOCH)
-    if kind in (STRING, LOCALIZED_TEXT, BYTE_STRING):
+    if kind == GUID:
+        return uuid.UUID(value).bytes_le
+    if kind in (STRING, XML, LOCALIZED_TEXT, BYTE_STRING):
         data = value if kind == BYTE_STRING else value.encode()
         return (b"\2" if kind == LOCALIZED_TEXT else b"") + _INT.pack(len(data)) + data
     raise ValueError(f"a {NAMES[kind]} in a structure cannot be written")

@@ -14,6 +14,7 @@ import math
 import socket
 import struct
 import time
+import uuid
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -565,8 +566,8 @@ class Session:
         (found,) = await self._samples([item.node])
         return found
 
-    async def has_ranges(self, item: Item, elements: str, count: int) -> bool:
-        """Return whether the server can read single elements of an array.
+    async def has_ranges(self, item: Item, elements: str, dims: tuple[int, ...] | None) -> bool:
+        """Return whether the server can read single elements of an array: an array of these dimensions.
 
         A server that does not know index ranges may ignore them, and replace the whole array.
         """
@@ -574,7 +575,7 @@ class Session:
         asked = ua.ReadValueId(item.node, ua.AttributeIds.Value, elements)
         request.Parameters = ua.ReadParameters(0, ua.TimestampsToReturn.Neither, [asked])
         (found,) = decode.read_response(await self._answer(request))
-        return found.code >> 30 == 0 and found.dims == (count,)
+        return found.code >> 30 == 0 and found.dims == dims
 
     async def write(self, values: Sequence[tuple[Item, str | None, Sample]]) -> list[int]:
         """Write whole values, or elements of arrays; return the status code of each write.
@@ -1011,13 +1012,31 @@ def _asked_too_much(code: int) -> bool:
     return code & 0xFFFF0000 in (0x80100000, 0x80080000, 0x80B80000, 0x80B90000)
 
 
+_WRAPPED: Final = {
+    ua.VariantType.LocalizedText: ua.LocalizedText,
+    ua.VariantType.StatusCode: ua.StatusCode,
+    ua.VariantType.Guid: uuid.UUID,
+    ua.VariantType.XmlElement: ua.XmlElement,
+}
+"""The classes of values that the library does not encode as Python's own."""
+
+
+def check_encoding(sample: Sample) -> None:
+    """Raise ValueError if the library cannot encode a value, so that its request is never sent."""
+    try:
+        ua_binary.variant_to_binary(_variant(sample))
+    except Exception as error:
+        name = decode.NAMES[sample.kind] if sample.kind < len(decode.NAMES) else f"type {sample.kind}"
+        raise ValueError(f"shmio cannot encode the value as a {name}: {str(error)[:200]}") from error
+
+
 def _variant(sample: Sample) -> Any:
     """Convert a sample to a variant of the library."""
     kind = ua.VariantType(sample.kind)
 
     def there(value: Any) -> Any:
-        if kind == ua.VariantType.LocalizedText:
-            return ua.LocalizedText(value)
+        if kind in _WRAPPED:
+            return _WRAPPED[kind](value)
         if kind == ua.VariantType.DateTime:
             return ua.datetime.fromtimestamp(0, ua.timezone.utc) + ua.timedelta(microseconds=value // 1000)
         if isinstance(value, decode.Extension):

@@ -201,7 +201,7 @@ class _Reading(Reader):
             if inner is not None:
                 return self.members(inner, depth + 1)
             if kind == ua.VARIANT:
-                return Sample(*self.variant(depth), 0, 0)
+                return ua.sample(*self.variant(depth))
             return (
                 self.data_value(depth) if kind == ua.DATA_VALUE else Sample(kind, self.value(kind, depth), None, 0, 0)
             )

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Iterator
+import uuid
+from collections.abc import Callable
 from typing import Any, Final
 
 from shmio.connectors.opcua import decode as ua
@@ -18,7 +19,7 @@ from shmio.connectors.opcua.decode import Extension, Sample
 from shmio.errors import ValueRangeError
 from shmio.layout.model import INTEGERS, Register
 from shmio.layout.values import calendar
-from shmio.layout.values.codec import Scalar, Value, flatten, nest, scalar_codec
+from shmio.layout.values.codec import REAL_MAX, Scalar, Value, flatten, nest, scalar_codec
 
 _INTEGERS: Final = {ua.SBYTE: 8, ua.BYTE: 8, ua.INT16: 16, ua.UINT16: 16, ua.INT32: 32, ua.UINT32: 32, ua.INT64: 64,
                     ua.UINT64: 64, ua.STATUS_CODE: 32}  # fmt: skip
@@ -142,8 +143,8 @@ class ValueConverter:
         return None
 
     def _moment(self, ns: int) -> str:
-        if ns < 0 or ns > calendar.LAST_NS:
-            raise ValueRangeError(f"{self._base}: the time is before 1970 or after 2262")
+        if ns < 0:
+            raise ValueRangeError(f"{self._base}: the time is before 1970")
         if self._base == "DATE":
             return calendar.format_day(ns // calendar.NS_PER_DAY)
         return calendar.format_moment(ns, 3 if self._base == "DATE_AND_TIME" else 9)
@@ -178,7 +179,12 @@ class ValueConverter:
         if kind == ua.BYTE_STRING and self._base in _CHARACTERS:
             return Sample(kind, b"".join(self._encoded(one) for one in flat), None, 0, 0)
         there = [self._there(one, kind, like) for one in flat]
-        return Sample(kind, there if register.dims else there[0], register.shape if register.dims else None, 0, 0)
+        return Sample(kind, there if register.dims else there[0], self.shape(like) if register.dims else None, 0, 0)
+
+    def shape(self, like: Sample | None) -> tuple[int, ...]:
+        """Return the sizes of the node's dimensions: some servers have one dimension for all elements."""
+        known = like.dims if like is not None else None
+        return known if known is not None and len(known) == 1 else self._register.shape
 
     def elements(self, values: list[Any], like: Sample | None) -> Sample:
         """Convert consecutive elements of an array to the node's type. Raise ValueError if this is impossible."""
@@ -209,12 +215,25 @@ class ValueConverter:
             if ns % 1000:
                 raise ValueError(f"{value} is too precise; only whole microseconds can be written")
             return ns
-        if kind in (ua.STRING, ua.LOCALIZED_TEXT) and isinstance(value, str):
+        if kind in (ua.STRING, ua.LOCALIZED_TEXT, ua.XML) and isinstance(value, str):
             return value
+        if kind == ua.GUID and isinstance(value, str):
+            return _guid(value)
         if kind not in _NUMBERS or not isinstance(value, int | float) or isinstance(value, bool):
             raise ValueError(f"a {self._register.type} cannot be written to a node of type {ua.NAMES[kind]}")
         number = value if scale is None else (value - scale[1]) / scale[0]
-        return float(number) if kind in _FLOATS else _whole(number, kind)
+        if kind in _FLOATS:
+            if kind == ua.FLOAT and math.isfinite(number) and abs(number) > REAL_MAX:
+                raise ValueError(f"{number} does not fit the node's {ua.NAMES[kind]}")
+            return float(number)
+        return _whole(number, kind)
+
+
+def _guid(text: str) -> str:
+    try:
+        return str(uuid.UUID(text))
+    except ValueError:
+        raise ValueError(f"{text!r} is not a Guid, which has 32 hexadecimal digits") from None
 
 
 def _same(value: Any) -> Scalar:
@@ -242,9 +261,3 @@ def _named(sample: Sample) -> str:
 
 def _type(register: Register) -> str:
     return register.type + (f"[{','.join(map(str, register.shape))}]" if register.dims else "")
-
-
-def bits_of_elements(register: Register) -> Iterator[tuple[int, int]]:
-    """Yield (first byte, number of bytes) of each element of an array; its type must not be BOOL."""
-    for place in range(register.count):
-        yield register.offset + place * register.element.stride, register.element.size

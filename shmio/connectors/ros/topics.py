@@ -21,7 +21,7 @@ from shmio.model.statuses import (
     BAD_TIMEOUT,
     BAD_WAITING_FOR_INITIAL_DATA,
     GOOD,
-    UNCERTAIN,
+    UNREADABLE_TIME,
 )
 
 MAX_REPORTED: Final = 20
@@ -216,7 +216,7 @@ class Topics:
         message = topic.message
         code = GOOD
         if self._stamps and stamp_ns(message) is None:
-            code = UNCERTAIN
+            code = UNREADABLE_TIME
             self.report(
                 topic.registers[0], f"the stamp in a message of {topic.name} is no time; its values are uncertain"
             )

@@ -15,8 +15,10 @@ NS_PER_DAY = 86_400 * NS_PER_SECOND
 EPOCH = date(1970, 1, 1).toordinal()
 DATE_EPOCH_DAYS = date(1990, 1, 1).toordinal() - EPOCH
 
-# The last moment of LDT and DTL: 2262-04-11T23:47:16.854775807, as nanoseconds in 63 bits.
+# The last moment of LDT: 2262-04-11T23:47:16.854775807, as nanoseconds in 63 bits.
 LAST_NS = (1 << 63) - 1
+# The last moment of DTL: its year has 16 bits, and ISO 8601 ends with 9999.
+LAST_DTL_NS = (date(9999, 12, 31).toordinal() - EPOCH + 1) * NS_PER_DAY - 1
 FIRST_DT_NS = DATE_EPOCH_DAYS * NS_PER_DAY
 LAST_DT_NS = (date(2090, 1, 1).toordinal() - EPOCH) * NS_PER_DAY - NS_PER_MS
 

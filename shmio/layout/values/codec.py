@@ -36,7 +36,7 @@ from contextlib import suppress
 from functools import lru_cache
 from typing import Any, Protocol
 
-from shmio.errors import ValueRangeError
+from shmio.errors import CharacterError, ValueRangeError
 from shmio.layout.model import ByteOrder, ElementType, Register, bit_positions
 from shmio.layout.values import calendar
 from shmio.wording import brief
@@ -415,12 +415,11 @@ def _moment_codec(base: str, order: str) -> _Moment:
         return _Moment(base, bounds, calendar.NS_PER_DAY, _date_to_ns(days), _date_from_ns(days))
     if base == "DATE_AND_TIME":
         return _Moment(base, (calendar.FIRST_DT_NS, calendar.LAST_DT_NS), calendar.NS_PER_MS, _dt_to_ns, _dt_from_ns)
-    since_1970 = (0, calendar.LAST_NS)
     if base == "LDT":
         ns = struct.Struct(order + "q")
-        return _Moment(base, since_1970, 1, lambda data, at: int(ns.unpack_from(data, at)[0]), ns.pack)
+        return _Moment(base, (0, calendar.LAST_NS), 1, lambda data, at: int(ns.unpack_from(data, at)[0]), ns.pack)
     fields = struct.Struct(order + "HBBBBBBI")
-    return _Moment(base, since_1970, 1, _dtl_to_ns(fields), _dtl_from_ns(fields))
+    return _Moment(base, (0, calendar.LAST_DTL_NS), 1, _dtl_to_ns(fields), _dtl_from_ns(fields))
 
 
 class _Moment:
@@ -584,14 +583,21 @@ def _encode_text(value: object, encoding: str, name: str) -> bytes:
     """Encode a text.
 
     Raises:
-        ValueRangeError: The value is not a text, or has a character that the encoding lacks.
+        ValueRangeError: The value is not a text.
+        CharacterError: The encoding lacks a character of the text.
+
     """
     if not isinstance(value, str):
         raise ValueRangeError(f"{name}: expected text, found {brief(value)}")
     try:
         return value.encode(encoding)
     except UnicodeEncodeError as error:
-        raise ValueRangeError(f"{name}: cannot hold the character {value[error.start]!r}") from None
+        character, place = value[error.start], error.start + 1
+        raise CharacterError(
+            f"{name}: the register's encoding ({encoding}) cannot hold {character!r}, character {place} of the text",
+            character,
+            place,
+        ) from None
 
 
 def out_of_range(value: object, name: str, least: object, most: object) -> ValueRangeError:

@@ -14,7 +14,8 @@ POINTER, ANY                  ``V6``, ``V10``
 ============================  ==========================================================================
 
 Values have native byte order. The field of an array register has the array's shape. Bytes that are
-not a valid value of their type become NaT or empty text.
+not a valid value of their type become NaT or empty text, and so does a DTL after 2262, where ``M8[ns]``
+ends.
 """
 
 from __future__ import annotations

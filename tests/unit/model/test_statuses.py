@@ -9,11 +9,16 @@ from shmio.layout.model import Layout
 from shmio.layout.topic import find
 from shmio.model.statuses import (
     BAD_NODE_ID_UNKNOWN,
+    BAD_OUT_OF_RANGE,
     GOOD,
+    UNCERTAIN,
     UNCERTAIN_LAST_USABLE_VALUE,
+    Finding,
     RegisterStatus,
     StatusArea,
+    character_missing,
     describe,
+    standard,
     status_area,
 )
 from shmio.model.values import Quality
@@ -72,3 +77,20 @@ def test_codes_have_names() -> None:
 def test_a_layout_without_a_status_area_has_none(layout: Layout) -> None:
     assert status_area(PLAIN) is None
     assert status_area(layout) is status_area(layout) is not None
+
+
+def test_findings_of_a_source_have_a_severity_a_reason_and_a_standard_code() -> None:
+    for code, quality, reason, expected in (
+        (character_missing(3, "✓"), Quality.BAD,
+         "the register's encoding cannot hold '✓', which is character 3 of the text", BAD_OUT_OF_RANGE),
+        (character_missing(300, "\U0001f600"), Quality.BAD,
+         "the register's encoding cannot hold a character, which is character 255 of the text", BAD_OUT_OF_RANGE),
+        (Finding.UNKNOWN_QUALITY.code(512), Quality.UNCERTAIN,
+         "the device states the quality 512, which has no meaning", UNCERTAIN),
+        (Finding.UNREADABLE_TIME.code(), Quality.UNCERTAIN,
+         "the device states a time that cannot be read, so the value has the time of its receipt", UNCERTAIN),
+    ):  # fmt: skip
+        status = RegisterStatus(code, 0)
+        assert (status.quality, status.reason, standard(code)) == (quality, reason, expected)
+    for code in (0, BAD_OUT_OF_RANGE, 0x80340400, 0xC0000000):
+        assert standard(code) == code

@@ -163,7 +163,7 @@ def test_source_times(plant: Plant) -> None:
         for wrong in ("yesterday", -5, 1e300, None, True):
             plant.device.publish("plant/state", {"at": wrong, "axes": [{"pos": 1}, {"pos": 1}]})
             source.until(lambda: abs(source.source_ns("x") - time.time_ns()) < 60e9)
-            assert source.code("x") == statuses.UNCERTAIN
+            assert source.code("x") == statuses.UNREADABLE_TIME
             plant.device.publish("plant/state", {"at": 5, "axes": [{"pos": 1}, {"pos": 1}]})
             source.until(lambda: source.source_ns("x") == 5 * 10**9)
 

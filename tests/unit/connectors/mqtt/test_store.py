@@ -19,11 +19,10 @@ from shmio.model.statuses import (
     BAD_TYPE_MISMATCH,
     BAD_WAITING_FOR_INITIAL_DATA,
     GOOD,
-    UNCERTAIN,
+    UNREADABLE_TIME,
     RegisterStatus,
     StatusArea,
     describe,
-    standard,
 )
 from shmio.wire import sparkplug_b_pb2 as wire
 from tests.unit.connectors.source import layout_of
@@ -85,7 +84,7 @@ def test_times(caplog: pytest.LogCaptureFixture) -> None:
     for wrong in wrongs:
         broker.publish("t", {"at": wrong, "x": 1})
         code, at_ns = broker.status("x")
-        assert code == UNCERTAIN, wrong
+        assert code == UNREADABLE_TIME, wrong
         assert abs(at_ns - time.time_ns()) < 60e9, wrong
     broker.publish("t", {"x": 1})
     assert broker.status("x").code == GOOD  # it does not state a time
@@ -156,14 +155,15 @@ def test_qualities() -> None:
         (0, "Bad "), (4, "BadConfigurationError "), (8, "BadNotConnected "), (12, "BadDeviceFailure "),
         (16, "BadSensorFailure "), (20, "BadOutOfService "), (24, "BadNoCommunication "), (28, "BadOutOfService "),
         (32, "BadWaitingForInitialData "), (63, "Bad "), (500, "UncertainLastUsableValue "),
-        (512, "Uncertain (512"), (128, "Uncertain (128"), (191, "Uncertain (191"), (256, "Uncertain (256"),
+        (512, "Uncertain "), (128, "Uncertain "), (191, "Uncertain "), (256, "Uncertain "),
         (-1, "Uncertain "), (70_000, "Uncertain "), ("192", "Uncertain "), (192.5, "Uncertain "),
     ):  # fmt: skip
         broker.sparkplug("NBIRTH/N", metric(3, 1, "m", quality=quality))
         status = broker.status("m")
         assert describe(status.code).startswith(found), quality
         assert broker.value("m") == 3
-        assert "(0x" in describe(standard(status.code))
+        assert ("which has no meaning" in status.reason) == (quality in (512, 128, 191, 256, 70_000)), quality
+        assert ("the quality 512," in status.reason) == (quality == 512)
 
 
 def test_an_unknown_quality_is_logged_with_its_number(caplog: pytest.LogCaptureFixture) -> None:
@@ -171,7 +171,9 @@ def test_an_unknown_quality_is_logged_with_its_number(caplog: pytest.LogCaptureF
     for quality in (70_000, 70_000, "good"):
         broker.sparkplug("NBIRTH/N", metric(3, 1, "m", quality=quality))
         broker.store.image(0)
-    assert [record.getMessage().split(",")[0] for record in caplog.records] == ["m: its quality is 70000"]
+    assert [record.getMessage().split(",")[0] for record in caplog.records] == [
+        "m: its quality is 70000", "m: its quality is 'good'"
+    ]  # fmt: skip
 
 
 def test_metrics_that_contradict_their_birth_or_have_no_time() -> None:
@@ -180,8 +182,8 @@ def test_metrics_that_contradict_their_birth_or_have_no_time() -> None:
         (metric(1, 1), GOOD), (metric(1.0, 1, datatype=10), BAD_TYPE_MISMATCH),
         (wire.Metric(alias=1, int_value=40_000), GOOD), (wire.Metric(alias=1, int_value=100_000), BAD_OUT_OF_RANGE),
         (wire.Metric(alias=1, int_value=0xFFFF_FFFF), GOOD),
-        (wire.Metric(alias=1, int_value=5, timestamp=0), UNCERTAIN),
-        (wire.Metric(alias=1, int_value=5, timestamp=1 << 63), UNCERTAIN),
+        (wire.Metric(alias=1, int_value=5, timestamp=0), UNREADABLE_TIME),
+        (wire.Metric(alias=1, int_value=5, timestamp=1 << 63), UNREADABLE_TIME),
     ):  # fmt: skip
         broker.sparkplug("NBIRTH/N", metric(0, 1, "m"))
         broker.sparkplug("NDATA/N", given)

@@ -11,6 +11,7 @@ from typing import Any
 from shmio.connectors.opcua.connector import OpcUaConnector
 from shmio.connectors.opcua.options import OpcUaOptions
 from shmio.layout.tags import place_tags
+from shmio.layout.topic import find
 from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.write import encode
 from shmio.model.statuses import RegisterStatus, StatusArea
@@ -71,7 +72,7 @@ class Source:
         return write(self.connector, writes)
 
     def write(self, path: str, value: Value) -> str:
-        register = self.layout.registers[self.layout.by_path[path]]
+        register = find(self.layout, path)
         outcomes = write(self.connector, encode(register, value, self.layout.byte_order))
         return "; ".join(outcomes)
 

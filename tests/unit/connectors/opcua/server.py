@@ -278,17 +278,20 @@ def _structure(data_type: str, value: Any) -> Any:
 
 
 def _variant(kind: str, value: Any) -> ua.Variant:
-    variant = ua.VariantType[kind]
+    standard = kind in ("Range", "EUInformation", "AxisInformation")
+    variant = ua.VariantType["ExtensionObject" if standard else kind]
     if kind == "ExtensionObject":
         value = ua.ExtensionObject(ua.NodeId("encoding", 2), bytes.fromhex(value))
     if kind == "ByteString":
         value = bytes.fromhex(value)
-    if kind == "LocalizedText":
-        value = ua.LocalizedText(value)
+    if kind in ("LocalizedText", "StatusCode", "XmlElement"):
+        value = getattr(ua, kind)(value)
     if kind == "DateTime":
         value = ua.datetime.fromisoformat(value)
     if kind == "Guid":
         value = ua.uuid.UUID(value)
+    if standard:
+        value = _structure(kind, value)
     return ua.Variant(value, variant, is_array=isinstance(value, list))
 
 

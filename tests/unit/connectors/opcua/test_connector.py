@@ -28,6 +28,9 @@ NODES: dict[str, tuple[str, Any]] = {
     "moment": ("DateTime", "2024-02-29T12:34:56+00:00"),
     "late": ("Double", 1e300),
     "array": ("Int16", [1, 2, 3]),
+    "code": ("StatusCode", 0),
+    "markup": ("XmlElement", "<x/>"),
+    "single": ("Float", 0.5),
 }
 TAGS: dict[str, Any] = {
     "text": "STRING[20]",
@@ -39,6 +42,9 @@ TAGS: dict[str, Any] = {
     "moment": "DATE_AND_TIME",
     "late": "REAL",
     "array": "ARRAY[0..2] OF DINT",
+    "code": "DWORD",
+    "markup": "STRING[20]",
+    "single": "LREAL",
 }
 
 
@@ -61,6 +67,9 @@ def test_values_of_many_types(device: Device, mode: str) -> None:
             "raw": 10.5,
             "moment": "2024-02-29T12:34:56.000",
             "array": [1, 2, 3],
+            "code": 0,
+            "markup": "<x/>",
+            "single": 0.5,
         }
         codes = {path: source.status(path, image).code for path in TAGS}
         assert codes == dict.fromkeys(TAGS, GOOD) | {"late": BAD_OUT_OF_RANGE}
@@ -70,7 +79,8 @@ def test_values_of_many_types(device: Device, mode: str) -> None:
 def test_each_type_is_written(device: Device, mode: str) -> None:
     new: dict[str, Value] = {
         "text": "closed", "mode": 200, "dtl": "1999-12-31T23:59:59.000000001", "bytes": [1, 2, 3], "raw": 0.5,
-        "moment": "2001-01-01T01:02:03.000", "array": [-1, 0, 40],
+        "moment": "2001-01-01T01:02:03.000", "array": [-1, 0, 40], "guid": "00000000-0000-0000-0000-0000000000ff",
+        "code": 0x80340000, "markup": "<y/>", "single": -1.5,
     }  # fmt: skip
     try:
         with connected(device.url, TAGS, mode=mode) as source:
@@ -79,12 +89,41 @@ def test_each_type_is_written(device: Device, mode: str) -> None:
             image = source.connector.read()
             assert {path: source.value(path, image) for path in new} == new
             assert device.ask("get", "raw") == 25
+            assert "1e+300 does not fit the node's Float" in source.write("single", 1e300)
             assert "Int16" in source.write("array", [1, 2, 40_000])
-            assert "Guid" in source.write("guid", "x")
+            assert "'x' is not a Guid" in source.write("guid", "x")
             assert device.ask("get", "array") == [-1, 0, 40]
     finally:
         for name, (kind, value) in NODES.items():
             device.ask("set", name, kind, value)
+
+
+def test_a_value_that_the_library_cannot_encode_is_refused_by_name(
+    device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fault of ours: it is not the server's, and costs no connection."""
+    with connected(device.url, {"mode": "INT", "array": "ARRAY[0..2] OF INT"}) as source:
+        monkeypatch.setattr("shmio.connectors.opcua.values._whole", lambda number, _kind: object())
+        assert source.write("mode", 5).startswith("mode: shmio cannot encode the value as a Int32: ")
+        assert source.write("array/1", 5).startswith("array: shmio cannot encode the value as a Int16: ")
+        monkeypatch.undo()
+        assert source.write("mode", 3) == ""
+
+
+def test_a_text_that_the_registers_encoding_cannot_hold_says_so(
+    device: Device, caplog: pytest.LogCaptureFixture
+) -> None:
+    device.ask("set", "text", "LocalizedText", "ok ✓")
+    try:
+        with connected(device.url, {"text": "STRING[20]", "mode": "INT"}) as source:
+            assert source.status("text").reason == (
+                "the register's encoding cannot hold '✓', which is character 4 of the text"
+            )
+            assert source.status("mode").code == GOOD
+        (said,) = [record.getMessage() for record in caplog.records]
+        assert said.startswith("text: the register cannot hold the server's value: STRING[20]: the register's encoding")
+    finally:
+        device.ask("set", "text", "LocalizedText", "open")
 
 
 @MODES

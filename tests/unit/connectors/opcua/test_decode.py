@@ -18,6 +18,13 @@ from hypothesis import strategies as st
 
 from shmio.connectors.opcua import decode
 from shmio.connectors.opcua.decode import Extension, FaultError, MalformedError, Sample
+from shmio.connectors.opcua.values import ValueConverter
+from shmio.connectors.register_image import RegisterImage
+from shmio.errors import ValueRangeError
+from shmio.layout.tags import place_tags
+from shmio.layout.values import calendar
+from shmio.layout.values.codec import codec
+from shmio.model.statuses import BAD_DECODING_ERROR, BAD_OUT_OF_RANGE, StatusArea
 
 NOON = datetime(2024, 2, 29, 12, 34, 56, 789012, UTC)
 NOON_NS = 1_709_210_096_789_012_000
@@ -137,7 +144,7 @@ HEADER = read()[:-8]
         struct.pack("<BBi", 1, 0x80 | 1, 0x7FFFFFFF),
         struct.pack("<BBi", 1, 0x80 | 12, 0x7FFFFFFF),
         struct.pack("<BBi", 1, 12, 0x7FFFFFFF),
-        struct.pack("<BBiBiii", 1, 0x80 | 0x40 | 3, 1, 0, 2, 0x7FFFFFFF, 0x7FFFFFFF),
+        struct.pack("<BBiBi", 1, 0x80 | 0x40 | 3, 1, 0, 0x7FFFFFFF),
         b"\1" + b"\x18" * 5000 + b"\1\1",
         b"\1\x17" * 5000 + b"\1\1",
         b"\1\x3f",
@@ -153,3 +160,49 @@ def test_what_asks_for_too_much_is_malformed_at_once(value: bytes) -> None:
     finally:
         tracemalloc.stop()
     assert time.monotonic() - begun < 5
+
+
+def test_a_value_whose_dimensions_do_not_fit_is_bad_alone() -> None:
+    """OPC 10000-6, section 5.2.2.16: inconsistent dimensions are a decoding error."""
+    good = b"\1\6\x2a\0\0\0"
+    huge = struct.pack("<iii", 2, 0x7FFFFFFF, 0x7FFFFFFF)
+    for dims in (
+        bytes.fromhex("02000000 02000000 02000000"), bytes.fromhex("02000000 01000000 02000000"),
+        bytes.fromhex("01000000 02000000"), struct.pack("<iii", 2, 3, 0), struct.pack("<iii", 2, -1, -3), huge,
+        struct.pack("<iiii", 3, 3, 0x7FFFFFFF, 0x7FFFFFFF),
+    ):  # fmt: skip
+        wrong = bytes.fromhex("01 c1 03000000 00 01 00") + dims
+        bad, fine = decode.read_response(HEADER + struct.pack("<i", 2) + wrong + good)
+        assert (bad.kind, bad.value, bad.code) == (0, None, BAD_DECODING_ERROR)
+        assert (fine.value, fine.code) == (42, 0)
+    for dims, sizes in (
+        (struct.pack("<i", 0), (3,)), (struct.pack("<ii", 1, 3), (3,)), (struct.pack("<iii", 2, 1, 3), (1, 3)),
+    ):  # fmt: skip
+        (found,) = decode.read_response(HEADER + struct.pack("<i", 1) + bytes.fromhex("01 c1 03000000 00 01 00") + dims)
+        assert (found.dims, found.value, found.code) == (sizes, [False, True, False], 0)
+
+
+TICKS = {  # 100 ns since 1601, computed with GNU date: the usual "no end", and what the standard sends for later times
+    2_650_467_743_990_000_000: "9999-12-31T23:59:59.000000000",
+    2_650_467_744_000_000_000 - 1: "9999-12-31T23:59:59.000000000",
+    (1 << 63) - 1: "9999-12-31T23:59:59.000000000",
+    208_678_456_368_547_758: "2262-04-11T23:47:16.854775800",
+    208_678_456_368_547_759: "2262-04-11T23:47:16.854775900",
+}
+
+
+def test_times_after_2262_are_no_earlier_times() -> None:
+    layout = place_tags("device", {n: {"type": n, "address": "i=1"} for n in ("DTL", "LDT")}).with_statuses()
+    for ticks, text in TICKS.items():
+        answer = HEADER + struct.pack("<iBBqqq", 1, 0x0D, decode.DATE_TIME, ticks, ticks, 116_444_736_000_000_010)
+        (sample,) = decode.read_response(answer)
+        assert calendar.format_moment(sample.value, 9) == text
+        image = RegisterImage(layout)
+        for index, register in enumerate(layout.registers):
+            with contextlib.suppress(ValueRangeError):
+                image.put(index, ValueConverter(register).value(sample), 0)
+        dtl, ldt = (StatusArea(layout).get(bytes(image), index) for index in range(2))
+        assert (codec(layout.registers[0], layout.byte_order).decode(bytes(image)), dtl.code) == (text, 0)
+        assert ldt.code == (0 if text < "2262-04-11T23:47:16.8547758070" else BAD_OUT_OF_RANGE)
+        # A status cannot hold such a timestamp, so the server's applies.
+        assert sample.source_ns == (sample.value if text < "2262-04-11T23:47:16.8547758070" else 1000)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,8 +17,9 @@ from shmio.layout.addresses.opcua import NodeAddress
 from shmio.layout.addresses.siemens import NAMESPACE, node_address
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.model import Layout
+from shmio.layout.topic import find
 from shmio.layout.values.codec import Value, codec
-from shmio.layout.values.write import encode
+from shmio.layout.values.write import Write, encode
 from shmio.model.statuses import GOOD, status_area
 from shmio.testing.write_conformance import write
 from tests.unit.connectors.opcua.node_server import NodeServer
@@ -45,6 +47,7 @@ VERSION : 0.1
          "Set point" : Real;
          Limits : Array[0..1] of Int;
       END_STRUCT;
+      Grid : Array[0..1, 1..3] of Int;
    END_STRUCT;
 BEGIN
 END_DATA_BLOCK
@@ -67,6 +70,7 @@ MIXED_NODES: list[tuple[str, str, str, Any, Value]] = [  # path, node, its type,
     ("Axes/0/Limits", '"Press line"."Axes"[0]."Limits"', "Int16", [-5, 5], [-5, 5]),
     ("Axes/1/Set point", '"Press line"."Axes"[1]."Set point"', "Float", 2.5, 2.5),
     ("Axes/1/Limits", '"Press line"."Axes"[1]."Limits"', "Int16", [-6, 6], [-6, 6]),
+    ("Grid", '"Press line"."Grid"', "Int16", [[1, 2, 3], [4, 5, 6]], [[1, 2, 3], [4, 5, 6]]),
 ]
 
 
@@ -194,6 +198,29 @@ def test_an_element_is_written_alone(server: NodeServer) -> None:
             assert found[place] == value
             assert found[:13] == [number % 241 for number in range(13)]
             assert write(connector, encode(layout.element(outputs, (place,)), place % 241)) == [""]
+    finally:
+        connector.close()
+
+
+def test_elements_of_an_array_with_two_dimensions_are_written_alone(server: NodeServer) -> None:
+    layout = compiled("press.db", MIXED.encode())
+    grid = find(layout, "Grid")
+    connector = connected(server, layout)
+
+    def written(bits: Write) -> tuple[list[str], Value]:
+        outcomes = write(connector, [bits])
+        return outcomes, values(layout, connector.read())["Grid"]
+
+    try:
+        (one,) = encode(find(layout, "Grid/1/2"), 50)
+        assert written(one) == ([""], [[1, 2, 3], [4, 50, 6]])
+        assert written(Write(grid.offset + 2, 0, struct.pack(">2h", 7, 8))) == ([""], [[1, 7, 8], [4, 50, 6]])
+        assert written(Write(grid.offset + 6, 0, struct.pack(">3h", 9, 10, 11))) == ([""], [[1, 7, 8], [9, 10, 11]])
+        (outcome,), after = written(Write(grid.offset + 4, 0, bytes(4)))  # the end of a row, and the start of the next
+        assert "form a range" in outcome
+        assert after == [[1, 7, 8], [9, 10, 11]]
+        (all_of_them,) = encode(grid, [[1, 2, 3], [4, 5, 6]])
+        assert written(all_of_them) == ([""], [[1, 2, 3], [4, 5, 6]])
     finally:
         connector.close()
 

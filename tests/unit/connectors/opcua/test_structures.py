@@ -102,6 +102,38 @@ def test_arrays_of_structures(server: Device) -> None:
         assert source.status("z").code == BAD_NO_DATA
 
 
+STANDARD: dict[str, tuple[str, Any]] = {
+    "limits": ("Range", {"Low": -1.5, "High": 20.0}),
+    "unit": ("EUInformation", {"NamespaceUri": "urn:u", "UnitId": 4408652}),
+    "axis": ("AxisInformation", {"EURange": ["Range", {"Low": 0.0, "High": 7.0}], "AxisSteps": [1.0, 2.0]}),
+}
+
+
+def test_structures_of_the_standard_need_no_definition(server: Device) -> None:
+    """The server, like most, has no DataTypeDefinition for them: OPC 10000-8, sections 5.6.2 and 5.6.3."""
+    for name, (kind, value) in STANDARD.items():
+        server.ask("add", name, kind, value)
+    tags = {
+        "low": {"type": "LREAL", "address": "ns=2;s=limits#Low"},
+        "high": {"type": "REAL", "address": "ns=2;s=limits#High"},
+        "unit id": {"type": "DINT", "address": "ns=2;s=unit#UnitId"},
+        "uri": {"type": "STRING[20]", "address": "ns=2;s=unit#NamespaceUri"},
+        "most": {"type": "LREAL", "address": "ns=2;s=axis#EURange.High"},
+        "step": {"type": "LREAL", "address": "ns=2;s=axis#AxisSteps[1]"},
+    }
+    with connected(server.url, tags) as source:
+        assert {path: source.value(path) for path in tags} == {
+            "low": -1.5, "high": 20.0, "unit id": 4408652, "uri": "urn:u", "most": 7.0, "step": 2.0,
+        }  # fmt: skip
+        assert source.write("high", 25.0) == ""
+        assert (source.value("low"), source.value("high")) == (-1.5, 25.0)
+    found = OpcUaConnector.browse(OpcUaOptions(url=server.url), Wanted(("Device/limits/*", "Device/axis/**")))
+    assert {one.names[-1]: one.type for one in found.offers} == {
+        "Low": "LREAL", "High": "LREAL", "NamespaceUri": "STRING", "UnitId": "DINT", "DisplayName": "STRING",
+        "Description": "STRING", "Title": "STRING", "AxisScaleType": "DINT", "AxisSteps": "ARRAY[0..1] OF LREAL",
+    }  # fmt: skip
+
+
 def test_another_definition_makes_members_bad_by_name(server: Device, caplog: pytest.LogCaptureFixture) -> None:
     tags = {
         "gone": {"type": "INT", "address": "ns=2;s=pump#Axis.Speed"},

@@ -18,7 +18,7 @@ from shmio.model.statuses import (
     BAD_OUT_OF_RANGE,
     BAD_TYPE_MISMATCH,
     GOOD,
-    UNCERTAIN,
+    UNREADABLE_TIME,
     RegisterStatus,
     StatusArea,
 )
@@ -114,8 +114,8 @@ def test_a_stamp_that_is_no_time_is_uncertain(caplog: pytest.LogCaptureFixture) 
     twist = {"linear": {"x": 1.0, "y": 2.0, "z": 3.0}}
     for stamp, code, source_ns in (
         ({"sec": 7, "nanosec": 1}, GOOD, 7_000_000_001), ({"secs": 7, "nsecs": 1}, GOOD, 7_000_000_001),
-        ({"sec": 0, "nanosec": 0}, GOOD, 5), ({"sec": -1, "nanosec": 0}, UNCERTAIN, 5),
-        ({"sec": 1, "nanosec": 10**9}, UNCERTAIN, 5), ({"sec": "7"}, UNCERTAIN, 5),
+        ({"sec": 0, "nanosec": 0}, GOOD, 5), ({"sec": -1, "nanosec": 0}, UNREADABLE_TIME, 5),
+        ({"sec": 1, "nanosec": 10**9}, UNREADABLE_TIME, 5), ({"sec": "7"}, UNREADABLE_TIME, 5),
     ):  # fmt: skip
         robot.publish("/s", {"header": {"stamp": stamp}, "twist": twist})
         assert [robot.status(name) for name in "xyz"] == [(code, source_ns)] * 3, stamp

@@ -54,6 +54,15 @@ async function main() {
     const dataType = DataType[type];
     const array = Array.isArray(value) && type !== 'Int64'; // one is [high, low]
     const held = type === 'DateTime' ? new Date(value) : value;
+    if (array && Array.isArray(value[0])) {
+      const dimensions = [value.length, value[0].length];
+      names.addVariable({
+        componentOf: device, browseName: id, nodeId: `s=${id}`, dataType, valueRank: 2, arrayDimensions: dimensions,
+        accessLevel: 'CurrentRead | CurrentWrite',
+        value: { dataType, arrayType: VariantArrayType.Matrix, dimensions, value: value.flat() },
+      });
+      continue;
+    }
     const variant = { dataType, arrayType: array ? VariantArrayType.Array : VariantArrayType.Scalar, value: held };
     names.addVariable({
       componentOf: device, browseName: id, nodeId: `s=${id}`, dataType,

@@ -86,6 +86,7 @@ VECTORS: list[tuple[str, Value, str]] = [
     ("LDT", "2262-04-11T23:47:16.854775807", "7fffffffffffffff"),
     ("DTL", "2024-02-29T12:34:56.123456789", "07e8021d050c2238075bcd15"),  # a Thursday
     ("DTL", "1970-01-01T00:00:00.000000000", "07b201010500000000000000"),
+    ("DTL", "9999-12-31T23:59:59.999999999", "270f0c1f06173b3b3b9ac9ff"),  # a Friday, the usual "no end"
     ("POINTER", "0000840000c8", "0000840000c8"),
     ("ANY", "10020001000084000000", "10020001000084000000"),
 ]
@@ -130,7 +131,7 @@ def test_little_endian() -> None:
         ("DTL", "07e8021e050c2238075bcd15"),  # 30 February
         ("DTL", "07e8021d05182238075bcd15"),
         ("DTL", "07e8021d050c22383b9aca00"),
-        ("DTL", "08d6040c0500000000000000"),  # a day after the last
+        ("DTL", "271001010700000000000000"),  # the year 10000
         ("DTL", "07b10c1f050c2238075bcd15"),  # 1969
     ],
 )
@@ -169,7 +170,7 @@ REFUSED: list[tuple[str, object]] = [
     *(("DATE", v) for v in ("1989-12-31", "2169-06-07", "2024-02-30", "2024-02-29T01:00:00", 5, "", "x")),
     *(("DATE_AND_TIME", v) for v in ("1989-12-31T23:59:59", "2090-01-01", "2024-01-01T00:00:00.0001")),
     *(("LDT", v) for v in ("1969-12-31", "2262-04-11T23:47:16.854775808", "2024-01-01T24:00:00", 0)),
-    *(("DTL", v) for v in ("1969-12-31", "2262-04-12", "2024-01-01T00:00:00.1234567890")),
+    *(("DTL", v) for v in ("1969-12-31", "10000-01-01", "2024-01-01T00:00:00.1234567890")),
     *(("POINTER", v) for v in ("00", "zz" * 6, 0, "00" * 7)),
 ]
 
@@ -264,7 +265,7 @@ VALUES: dict[str, st.SearchStrategy[Any]] = {
         lambda moment: moment.isoformat(timespec="milliseconds")
     ),
     "LDT": moments,
-    "DTL": moments,
+    "DTL": moments | st.sampled_from(["2262-04-12T00:00:00.000000000", "9999-12-31T23:59:59.999999999"]),
     "POINTER": st.binary(min_size=6, max_size=6).map(bytes.hex),
     "ANY": st.binary(min_size=10, max_size=10).map(bytes.hex),
 }

@@ -37,6 +37,10 @@ CODEC = FrameCodec(LAYOUT)
 MS, NS = np.timedelta64(1, "ms"), np.timedelta64(1, "ns")
 
 
+LAST_MOMENT = "2262-04-11T23:47:16.854775807"
+"""The last moment of datetime64[ns]."""
+
+
 def expected(value: Any, register: Register) -> Any:
     """Return what the vectorised codec must give for a value of the scalar codec."""
     if isinstance(value, list):
@@ -49,7 +53,7 @@ def expected(value: Any, register: Register) -> Any:
     if base in ("LTIME", "LTOD"):
         return np.timedelta64("NaT", "ns") if value is None or value == -(1 << 63) else value * NS
     if base in ("DATE", "DATE_AND_TIME", "LDT", "DTL"):
-        return np.datetime64("NaT", "ns") if value is None else np.datetime64(value)
+        return np.datetime64("NaT", "ns") if value is None or value > LAST_MOMENT else np.datetime64(value)
     return bytes.fromhex(value) if base in ("POINTER", "ANY") else value
 
 
