@@ -120,6 +120,71 @@ def test_user_writes_a_register_and_overrides_it(cell: Cell, page: Any) -> None:
     expect(row.locator(".origin")).to_have_text("live")
 
 
+def test_marked_register_is_the_one_that_is_written(cell: Cell, page: Any) -> None:
+    """By keyboard, as on the panel of a cell: what is marked is what Write and Override change, and nothing else is."""
+    open_tab(page, "Registers")
+    table, form = page.get_by_role("treegrid", name="Registers"), page.get_by_role("form", name="Register")
+    marked, named = page.locator(".tree-row[aria-selected=true]"), form.locator("strong")
+    field, write = page.get_by_label("New value"), page.get_by_role("button", name="Write")
+    search = page.get_by_label("Search")
+
+    def marks(path: str) -> None:
+        expect(marked).to_have_attribute("data-path", path)
+        expect(named).to_have_text(path)
+
+    page.locator('.tree-row[data-path="cell/Outputs"]').click()
+    marks("cell/Outputs")
+    elements = page.locator('.tree-row[data-path^="cell/Outputs/"]')
+    expect(elements.first).to_be_visible()
+    table.evaluate("(rows) => rows.scrollTo(0, 26 * 510)")
+    first, second, third = (f"cell/Outputs/{n}" for n in (510, 511, 512))
+    row = page.locator(f'.tree-row[data-path="{first}"]')
+    expect(row).to_be_visible()
+    expect(named).to_have_text("cell/Outputs")  # its mark is out of view
+    field.fill("111")  # half typed, and never written
+    row.click()
+    marks(first)
+    expect(field).to_have_value("")
+    field.fill("112")
+    table.press("ArrowDown")
+    marks(second)
+    expect(field).to_have_value("")
+    field.fill("7")
+    field.press("Enter")
+    expect(form.locator("output")).to_have_text("written")
+    until(lambda: reading(cell, second) == (7, "live"), "the marked element in the PLC's memory")
+    assert (reading(cell, first)[0], reading(cell, third)[0]) == (0, 0)
+
+    field.fill("9")
+    page.locator(f'.tree-row[data-path="{third}"]').click()
+    marks(third)
+    expect(field).to_have_value("")
+    table.press("ArrowUp")
+    marks(second)
+    field.fill("12")
+    page.get_by_role("button", name="Override").press("Enter")
+    expect(marked.locator(".origin")).to_have_text("injected")
+    until(lambda: reading(cell, second) == (12, "injected"), "the override of the marked element")
+    assert reading(cell, third) == (0, "live")
+    expect(field).to_have_value("12")
+    cell.output("shmio-supervisor", "restart", "web")  # also ends the page's override
+    expect(marked.locator(".origin")).to_have_text("live")
+    marks(second)
+    expect(field).to_have_value("12")
+
+    search.fill("Robot_800/Axs1_Pos")
+    expect(page.get_by_text("1 row", exact=True)).to_be_visible()
+    expect(write).to_have_count(0)  # nothing is marked any more, so nothing can be written
+    table.press("ArrowDown")
+    marks(AXIS)
+    expect(write).to_be_disabled()
+    search.fill("")
+    expect(page.locator('.tree-row[data-path="cell"]')).to_be_visible()
+    table.press("ArrowUp")
+    expect(write).to_have_count(0)
+    expect(marked).to_have_attribute("data-path", "cell")
+
+
 def test_user_sees_active_alerts(cell: Cell, page: Any) -> None:
     alerts = page.get_by_role("table", name="alerts")
     expect(page.get_by_role("button", name="Restart cell")).to_be_visible()

@@ -114,11 +114,25 @@ def _indices(dims: tuple[tuple[int, int], ...]) -> Iterator[tuple[int, ...]]:
             yield (index, *rest)
 
 
-def window(visible: Iterator[Row], first: int, count: int, most: int) -> tuple[list[Row], int]:
-    """Return ``count`` rows, beginning with number ``first``, and the number of all rows.
+class Window(NamedTuple):
+    """The rows that a page shows, the number of all rows, and the row that the user has marked."""
+
+    rows: list[Row]
+    total: int
+    marked: Row | None
+
+
+def window(visible: Iterator[Row], first: int, count: int, most: int, marked: str = "") -> Window:
+    """Return ``count`` rows, beginning with number ``first``, and the row whose path is ``marked``, if it is visible.
 
     Rows are counted only up to ``most``.
     """
-    skipped = sum(1 for _ in islice(visible, first))
-    chosen = list(islice(visible, count))
-    return chosen, skipped + len(chosen) + sum(1 for _ in islice(visible, max(0, most - skipped - len(chosen))))
+    shown: list[Row] = []
+    total, found = 0, None
+    for row in islice(visible, max(most, first + count)):
+        if first <= total < first + count:
+            shown.append(row)
+        if row.path == marked:
+            found = row
+        total += 1
+    return Window(shown, total, found)

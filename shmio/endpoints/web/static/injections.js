@@ -40,7 +40,10 @@ export class InjectionsTab {
     this.lift = element("button", { type: "button", class: "danger", disabled: !injects, title: why, click: () => this.liftAll() }, "Lift all injections");
     this.text = element("textarea", { rows: 10, spellcheck: "false", "aria-label": "Campaign", maxlength: 60_000 });
     this.text.value = sessionStorage.getItem(KEY) ?? EXAMPLE;
-    this.text.addEventListener("input", () => sessionStorage.setItem(KEY, this.text.value));
+    this.text.addEventListener("input", () => {
+      sessionStorage.setItem(KEY, this.text.value);
+      replace(this.result); // it was about another text
+    });
     this.keep = element("input", { type: "checkbox" });
     this.result = element("output", { class: "preview" });
     this.file = element("input", { type: "file", accept: ".toml", "aria-label": "Campaign file", change: () => this.load() });
@@ -153,8 +156,9 @@ export class InjectionsTab {
   }
 
   async check() {
-    const found = await this.act("check", { text: this.text.value });
-    if (found === null) return;
+    const text = this.text.value;
+    const found = await this.act("check", { text });
+    if (found === null || text !== this.text.value) return;
     const lines = found.map((/** @type {any} */ one) => {
       const more = one.count > one.registers.length ? ` and ${one.count - one.registers.length} more` : "";
       return element("li", {}, `${one.name}: ${one.operation}${one.when ? ` when ${one.when}` : ""}, over ${one.registers.join(", ")}${more}`);

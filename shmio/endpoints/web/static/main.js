@@ -140,9 +140,10 @@ function makeTheme() {
 connection.follow("overview", showHead);
 connection.addEventListener("open", async () => {
   byId("offline").hidden = true;
-  showUser(await session().catch(() => user)); // a restart may have brought other tabs
+  const before = user.roles.join();
+  showUser(await session().catch(() => user)); // a restart may have brought other tabs and roles
   connection.call("overview.follow").catch(() => {});
-  if (shown === null || !user.tabs.includes(shownName)) showTab();
+  if (shown === null || !user.tabs.includes(shownName) || before !== user.roles.join()) showTab();
   else shown.resume?.();
 });
 connection.addEventListener("lost", async () => {

@@ -211,8 +211,9 @@ export class RecordingsTab {
 
   async suggest() {
     const filter = this.search.value;
-    const found = await this.call("registers", { name: this.name, filter }).catch(() => []);
-    if (filter !== this.search.value) return;
+    const { name } = this;
+    const found = await this.call("registers", { name, filter }).catch(() => []);
+    if (filter !== this.search.value || name !== this.name) return;
     replace(this.found, ...found.map((/** @type {Signal} */ one) => element("option", { value: one.path })));
   }
 
@@ -327,8 +328,14 @@ export class RecordingsTab {
       setText(this.checkButton, "Check for damage");
       return;
     }
+    const { name } = this;
+    let number = null;
     try {
-      const number = await this.call("verify", { name: this.name });
+      number = await this.call("verify", { name });
+      if (name !== this.name) {
+        this.call("stop", { number }).catch(() => {});
+        return; // the user has chosen another recording
+      }
       this.works.set("check", number);
       setText(this.checkButton, "Stop");
       for (;;) {
@@ -339,6 +346,7 @@ export class RecordingsTab {
         else this.showResult(part);
       }
     } catch (error) {
+      if (name !== this.name || (this.works.get("check") ?? null) !== number) return; // it was stopped, or another one runs
       setText(this.checkState, String(/** @type {Error} */ (error).message));
     }
     this.works.delete("check");

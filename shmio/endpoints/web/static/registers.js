@@ -31,7 +31,11 @@ export class RegistersTab {
     this.timer = setInterval(() => this.fill(), 1000); // ages grow while no values come
     this.asked = 0;
     this.answered = 0;
-    this.selected = "";
+    /** @type {Row | null} The marked row. The form below the table writes this register, and no other. */
+    this.marked = null;
+    /** @type {HTMLElement | null} */
+    this.present = null;
+    this.form = ""; // what the form shows: the register, and what the user may do with it
 
     this.filter = element("input", {
       type: "search",
@@ -61,12 +65,16 @@ export class RegistersTab {
       this.view,
       this.detail,
     );
-    this.stop = context.connection.follow("registers", (values) => this.show(values));
+    this.stops = [
+      context.connection.follow("registers", (values) => this.show(values)),
+      context.connection.follow("layout", () => this.request()), // a reload may have moved, changed or removed registers
+    ];
   }
 
   close() {
-    this.stop();
+    for (const stop of this.stops) stop();
     clearInterval(this.timer);
+    clearTimeout(this.typing);
     this.virtual.close();
     this.context.connection.call("registers.rows", { first: 0, count: 0 }).catch(() => {});
   }
@@ -81,12 +89,15 @@ export class RegistersTab {
     this.request();
   }
 
-  /** Request the rows that are visible now. */
+  /** Request the rows that are visible now, and whether the marked row is still in the table. */
   async request() {
+    if (!this.root.isConnected) return; // the user has opened another tab
+    const marked = this.marked?.path ?? "";
     const given = {
       ...this.virtual.wanted(),
       expanded: this.untouched ? null : [...this.expanded],
       filter: this.filter.value,
+      marked,
     };
     const number = (this.asked += 1);
     try {
@@ -97,6 +108,7 @@ export class RegistersTab {
       this.total = found.total;
       this.rows = found.rows;
       if (this.untouched) for (const row of this.rows) if (row.depth === 0) this.expanded.add(row.path);
+      if (marked === (this.marked?.path ?? "")) this.marked = found.marked;
       this.draw();
     } catch (error) {
       if (this.context.connection.open) notify(String(/** @type {Error} */ (error).message), "problem");
@@ -106,6 +118,7 @@ export class RegistersTab {
   draw() {
     this.virtual.show(this.first, this.total, this.rows.map((row) => this.makeRow(row)));
     setText(this.count, this.total === 1 ? "1 row" : `${this.total} rows`);
+    this.edit();
     this.fill();
   }
 
@@ -129,7 +142,7 @@ export class RegistersTab {
       made.draggable = true;
       made.addEventListener("dragstart", (event) => event.dataTransfer?.setData("text/plain", row.path));
     }
-    made.setAttribute("aria-selected", String(row.path === this.selected));
+    made.setAttribute("aria-selected", String(row.path === this.marked?.path));
     return made;
   }
 
@@ -155,70 +168,90 @@ export class RegistersTab {
       setText(cells[3], origin);
       cells[3].className = `origin ${origin}`;
       setText(cells[4], age === null ? "" : duration(age + passedS));
-      if (row.path === this.selected && this.present) setText(this.present, `${text ?? "no value"} (${quality}, ${origin})`);
     });
+    const [text, quality, , origin] = this.values[this.marked?.path ?? ""] ?? [];
+    if (this.present) setText(this.present, quality === undefined ? "" : `${text ?? "no value"} (${quality}, ${origin})`);
   }
 
-  /** @param {Row} row */
+  /** Mark a row, and show the form for it. @param {Row | null} row */
+  mark(row) {
+    this.marked = row;
+    this.draw();
+    this.request();
+  }
+
+  /** Mark a row, and expand or collapse it. @param {Row} row */
   choose(row) {
-    this.selected = row.path;
     if (row.expandable) {
       this.untouched = false;
       if (!this.expanded.delete(row.path)) this.expanded.add(row.path);
       sessionStorage.setItem("expanded", JSON.stringify([...this.expanded].slice(-500)));
-      this.request();
-    } else this.draw();
-    if (row.type !== undefined) this.edit(row);
+    }
+    this.mark(row);
   }
 
-  /** @param {Row} row Show the form that writes a register. */
-  edit(row) {
+  /** Show the form that writes the marked register; no form if none is marked. A value that the user types stays only with its register. */
+  edit() {
     const { context } = this;
+    const row = this.marked;
+    const [mayWrite, injects] = [context.may("write"), context.may("inject")];
+    const form = row?.type === undefined ? "" : JSON.stringify([row.path, row.type, row.writable, mayWrite, injects]);
+    if (form === this.form) return;
+    this.form = form;
+    const typed = this.detail.querySelector("input")?.value ?? "";
+    const before = this.detail.dataset.register;
+    this.detail.onsubmit = null;
+    this.present = null;
+    if (row?.type === undefined) {
+      delete this.detail.dataset.register;
+      replace(this.detail);
+      return;
+    }
+    const { path } = row;
     const value = element("input", { type: "text", "aria-label": "New value", placeholder: "5, 1.5, true, 16#FF, T#1s" });
+    this.detail.dataset.register = `${path} ${row.type}`;
+    if (before === this.detail.dataset.register) value.value = typed;
     this.present = element("span", { class: "dim" });
     const result = element("output", {});
     const act = async (/** @type {string} */ name, /** @type {object} */ given) => {
       setText(result, "…");
-      try {
-        const done = await context.connection.call(`registers.${name}`, given);
-        setText(result, done === null ? "lifted" : [done.outcome, done.reason].filter(Boolean).join(": "));
-        this.request();
-      } catch (error) {
-        setText(result, String(/** @type {Error} */ (error).message));
-      }
+      const [text, kind] = await context.connection.call(`registers.${name}`, given).then(
+        (done) => [done === null ? "lifted" : [done.outcome, done.reason].filter(Boolean).join(": "), "info"],
+        (error) => [String(error.message), "problem"],
+      );
+      setText(result, text);
+      if (!result.isConnected) notify(`${path}: ${text}`, /** @type {"info" | "problem"} */ (kind)); // another register is marked now
+      this.request();
     };
-    const writable = row.writable && context.may("write");
-    const injects = context.may("inject");
+    const writable = row.writable && mayWrite;
     const reason = row.writable ? "your roles do not allow you to write" : "the configuration's writable does not name this register";
     const write = element("button", { type: "submit", disabled: !writable, title: writable ? "Write to the device" : reason }, "Write");
-    this.detail.onsubmit = () => writable && act("set", { path: row.path, value: value.value });
+    this.detail.onsubmit = () => writable && act("set", { path, value: value.value });
     replace(
       this.detail,
-      element("strong", {}, row.path),
+      element("strong", {}, path),
       this.present,
       value,
       write,
       element(
         "button",
-        { type: "button", disabled: !injects, title: "Show this value to all consumers until you lift the override", click: () => act("override", { path: row.path, value: value.value }) },
+        { type: "button", disabled: !injects, title: "Show this value to all consumers until you lift the override", click: () => act("override", { path, value: value.value }) },
         "Override",
       ),
-      element("button", { type: "button", disabled: !injects, click: () => act("lift", { path: row.path }) }, "Lift"),
-      element("button", { type: "button", click: () => plot(row.path) }, "Plot"),
+      element("button", { type: "button", disabled: !injects, click: () => act("lift", { path }) }, "Lift"),
+      element("button", { type: "button", click: () => plot(path) }, "Plot"),
       result,
     );
-    this.fill();
   }
 
   /** @param {KeyboardEvent} event */
   key(event) {
     const step = { ArrowDown: 1, ArrowUp: -1 }[event.key];
-    const at = this.rows.findIndex((row) => row.path === this.selected);
+    const at = this.rows.findIndex((row) => row.path === this.marked?.path);
     const row = this.rows[at];
     if (step !== undefined) {
-      const next = this.rows[Math.max(0, Math.min(this.rows.length - 1, at + step))];
-      this.selected = next?.path ?? "";
-      this.draw();
+      const next = at < 0 ? this.virtual.top() - this.first : at + step; // without a mark in view, it begins at the top
+      this.mark(this.rows[Math.max(0, Math.min(this.rows.length - 1, next))] ?? null);
       this.body.querySelector("[aria-selected=true]")?.scrollIntoView({ block: "nearest" });
     } else if (row && (event.key === "Enter" || (row.expandable && (event.key === "ArrowRight") !== this.expanded.has(row.path) && event.key.startsWith("Arrow")))) {
       this.choose(row);

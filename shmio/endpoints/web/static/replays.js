@@ -39,11 +39,13 @@ export class ReplayPanel {
   /** @param {Playing[]} playing @param {string[]} kinds */
   show(playing, kinds) {
     /** @type {Map<string, Playing[]>} The sources of one recording move together. */
-    const groups = new Map();
+    let groups = new Map();
     for (const one of playing) {
       const key = `${(one.time_s - one.position_s).toFixed(3)} ${one.length_s}`;
       groups.set(key, [...(groups.get(key) ?? []), one]);
     }
+    // A reload may add a source to a recording's replay: the controls move the sources that their heading names.
+    groups = new Map([...groups.values()].map((some) => [some.map((one) => one.source).join(", "), some]));
     const known = [...this.replays.keys()];
     if (known.length !== groups.size || known.some((key) => !groups.has(key))) {
       this.replays = new Map([...groups].map(([key, some]) => [key, new Replay(this.context, some, kinds)]));

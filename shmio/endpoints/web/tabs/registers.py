@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from itertools import chain
 from typing import Annotated, Any, ClassVar, Final
 
@@ -12,7 +13,7 @@ from msgspec import Meta
 from starlette.concurrency import run_in_threadpool
 
 from shmio.endpoints.web.page import Page, Tab, call, release
-from shmio.endpoints.web.register_tree import Node, Row, matching, rows, window
+from shmio.endpoints.web.register_tree import Node, Row, Window, matching, rows, window
 from shmio.errors import CommandError, PathError
 from shmio.layout.model import MAX_PATH, Register
 from shmio.layout.values.text import to_text
@@ -47,6 +48,8 @@ class Shown(msgspec.Struct, forbid_unknown_fields=True):
     expanded: Annotated[list[_Path], Meta(max_length=MAX_EXPANDED)] | None = None
     """Paths of the expanded nodes; None if all sources, and nothing else, are expanded."""
     filter: Annotated[str, Meta(max_length=200)] = ""
+    marked: Annotated[str, Meta(max_length=MAX_PATH)] = ""
+    """Path of the row that the user has marked; empty if there is none."""
 
 
 class Given(msgspec.Struct, forbid_unknown_fields=True):
@@ -78,7 +81,7 @@ class Registers(Tab):
         self._cell: Attachment = page.served.cell
         self._looking = asyncio.Lock()
         self._allowed: dict[int, bytes] = {}
-        self._visible: list[tuple[str, Register]] = []
+        self._visible: list[tuple[str, Block, Register]] = []
         self._sent: dict[str, list[Any]] = {}
         self._sending: asyncio.Task[None] | None = None
         self._overrides: dict[str, Shadow] = {}
@@ -91,16 +94,27 @@ class Registers(Tab):
 
     @call("read", Shown)
     async def rows(self, given: Shown) -> dict[str, Any]:
-        """Return the requested rows. From now on, send the values of these rows whenever they change."""
+        """Return the requested rows, and the marked row, even if it is scrolled out of view; null if it is gone.
+
+        From now on, send the values of these rows whenever they change.
+        """
         async with self._looking, self.page.served.trees.looking:  # one search at a time for a page, and for all pages
-            found, total = await run_in_threadpool(self._rows, given)
-        self._show([(row.path, row.register) for row in found if row.register is not None])
-        return {"first": given.first, "total": total, "rows": [self._describe(row) for row in found]}
+            rows, total, marked = await run_in_threadpool(self._rows, given)
+        followed = rows if marked is None or marked in rows else [*rows, marked]
+        self._show([row.path for row in followed if row.register is not None])
+        return {
+            "first": given.first,
+            "total": total,
+            "rows": [self._describe(row) for row in rows],
+            "marked": None if marked is None else self._describe(marked),
+        }
 
     @call("read", Followed)
     async def follow(self, given: Followed) -> None:
         """From now on, send the values of these registers, instead of those of the rows."""
-        self._show([(path, self._cell.resolve(path)[1]) for path in given.paths])
+        for path in given.paths:
+            self._cell.resolve(path)
+        self._show(given.paths)
 
     @call("write", Given)
     async def set(self, given: Given) -> dict[str, str]:
@@ -131,11 +145,18 @@ class Registers(Tab):
             raise PathError(f"{given.path}: this page does not override it; the tab Injections lifts others")
         await run_in_threadpool(shadow.close)
 
-    def _show(self, visible: list[tuple[str, Register]]) -> None:
-        self._visible, self._sent = visible, {}
+    def _show(self, paths: Iterable[str]) -> None:
+        self._find(paths)
         if self._sending is None:
             self._sending = self.page.start(self._send())
         self._send_values()
+
+    def _find(self, paths: Iterable[str]) -> None:
+        """Find the registers whose values are sent, in the present layouts."""
+        self._visible, self._sent = [], {}
+        for path in paths:
+            with suppress(PathError):  # a reload has removed it
+                self._visible.append((path, *self._cell.resolve(path)))
 
     def _typed(self, given: Given) -> tuple[str, Any]:
         block, register = self._cell.resolve(given.path)
@@ -144,7 +165,7 @@ class Registers(Tab):
             text = msgspec.json.encode(text).decode()
         return f"{block.source}/{register.path}", read_value(text, register)
 
-    def _rows(self, given: Shown) -> tuple[list[Row], int]:
+    def _rows(self, given: Shown) -> Window:
         blocks = self.page.served.segment.blocks
         expanded = frozenset(blocks if given.expanded is None else given.expanded)
         visible: Iterator[Row] = chain.from_iterable(
@@ -153,7 +174,7 @@ class Registers(Tab):
             else rows(self._tree(block), block.layout, expanded)
             for block in blocks.values()
         )
-        return window(visible, given.first, given.count, MAX_COUNTED)
+        return window(visible, given.first, given.count, MAX_COUNTED, given.marked)
 
     def _tree(self, block: Block) -> Node:
         return self.page.served.trees.of(block, self.page.served.segment.blocks.values())
@@ -198,14 +219,18 @@ class Registers(Tab):
 
         Unchanged values are sent, too, because a newer message replaces one that is not sent yet.
         """
+        self.page.served.segment.refresh()
         blocks = self.page.served.segment.blocks
-        frames = {source: block.latest() for source, block in blocks.items()}
+        if any(blocks.get(block.source, block).section != block.section for _, block, _ in self._visible):
+            self.page.push("layout", None)  # a reload has replaced a block, so registers may have moved
+            self._find([path for path, _, _ in self._visible])
+            return
+        frames = {block.section: block.latest() for block in blocks.values()}
         values: dict[str, list[Any]] = {}
         ages: dict[str, float | None] = {}
-        for path, register in self._visible:
-            source = path.partition("/")[0]
-            if source in blocks:
-                found = reading(blocks[source], register, frames[source])
+        for path, block, register in self._visible:
+            if block.section in frames:
+                found = reading(block, register, frames[block.section])
                 values[path], ages[path] = [*_value(found), found.source_time], found.age_s
         if values != self._sent:
             self._sent = values

@@ -71,8 +71,15 @@ def test_search_finds_paths_and_comments(text: str, paths: list[str]) -> None:
     assert [row.path for row in matching(ROOT, LAYOUT, text)] == paths
 
 
-def test_window_counts_rows_up_to_a_limit() -> None:
-    row = Row("a", "a", 0, None, expandable=False)
-    assert window(iter([row] * 10), 4, 3, 100) == ([row] * 3, 10)
-    assert window(iter([row] * 10), 0, 3, 5) == ([row] * 3, 5)
-    assert window(iter([row] * 10), 20, 3, 100) == ([], 10)
+def test_window_counts_rows_up_to_a_limit_and_finds_the_marked_one() -> None:
+    row, marked = Row("a", "a", 0, None, expandable=False), Row("b", "b", 0, None, expandable=False)
+    many = [*[row] * 9, marked]
+    for first, most, shown, total, found in (
+        (4, 100, 3, 10, marked),
+        (7, 100, 3, 10, marked),
+        (0, 5, 3, 5, None),
+        (20, 100, 0, 10, marked),
+    ):
+        window_ = window(iter(many), first, 3, most, "b")
+        assert (len(window_.rows), window_.total, window_.marked) == (shown, total, found), (first, most)
+    assert window(iter(many), 7, 3, 100).rows == [row, row, marked]

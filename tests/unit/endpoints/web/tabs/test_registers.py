@@ -7,8 +7,9 @@ from typing import Any
 import pytest
 from websockets.sync.connection import Connection
 
-from shmio.segment import Quality, Segment
-from tests.unit.endpoints.harness import LAYOUT
+from shmio.layout.compiler import Source, compile_sources
+from shmio.segment import Attributes, BlockSpec, Quality, Segment
+from tests.unit.endpoints.harness import LAYOUT, STALE_NS
 from tests.unit.endpoints.web.harness import TIMEOUT_S
 from tests.unit.endpoints.web.test_page import pages, said
 
@@ -38,6 +39,29 @@ def test_visible_rows_come_with_their_values(segment: Segment) -> None:
             pass
         assert found[:4] == ["1.5", "uncertain", "a test", "live"]
         assert 0 <= found[4] < 60
+
+
+def test_reload_that_moves_a_register_changes_what_the_page_shows(segment: Segment) -> None:
+    segment.writer("cell").publish(RAW, cycle=1, quality=Quality.GOOD)
+    moved = "STRUCT pad : REAL; axis : STRUCT speed : REAL; position : REAL; END_STRUCT; END_STRUCT;"
+    [layout] = compile_sources([Source("moved.db", f"DATA_BLOCK DB9 {moved} BEGIN END_DATA_BLOCK".encode())]).layouts
+    shown = {"first": 0, "count": 0, "expanded": ["cell", "cell/axis"], "marked": "cell/axis/position"}
+    with pages(segment) as server, server.open() as browser:
+        assert said(browser, "registers.rows", **shown)["result"]["marked"]["path"] == "cell/axis/position"
+        assert values(browser, "cell/axis/position")[0] == "1.5"
+        segment.change(
+            add=[BlockSpec("cell", layout, 20_000_000, STALE_NS, 1 << 20, Attributes("test"))], retire=["cell"]
+        )
+        segment.writer("cell").publish(struct.pack(">fff", 7.0, 8.0, 9.0), cycle=1, quality=Quality.GOOD)
+        topics = set()
+        while "registers" not in topics:
+            message = json.loads(browser.recv(TIMEOUT_S))
+            topics.add(message["topic"])
+        assert topics == {"layout", "registers"}
+        assert message["data"]["cell/axis/position"][0] == "9.0"
+        assert said(browser, "registers.rows", **shown | {"expanded": ["cell"]})["result"]["marked"] is None
+        assert said(browser, "registers.rows", **shown | {"filter": "speed"})["result"]["marked"] is None
+        assert said(browser, "registers.rows", **shown)["result"]["marked"]["type"] == "REAL"
 
 
 def test_all_sources_are_expanded_at_first(segment: Segment) -> None:
