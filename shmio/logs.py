@@ -20,11 +20,14 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from io import TextIOWrapper
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Any, Final
 
 from shmio.errors import ConfigError
 from shmio.times import utc_text
 from shmio.wording import printable
+
+if TYPE_CHECKING:
+    import asyncio
 
 MAX_FILE_BYTES = 5_000_000
 KEPT_FILES = 3
@@ -194,6 +197,23 @@ def fields(**values: object) -> dict[str, dict[str, object]]:
 def with_fields(message: str, fields: Mapping[str, object]) -> str:
     """Return a message followed by its extra fields, as ``key=value``."""
     return " ".join([message, *(f"{key}={value}" for key, value in fields.items())])
+
+
+def log_loop_errors() -> None:
+    """Have the running event loop log errors of the operating system in one line, without a traceback.
+
+    If no descriptor is free, for example, asyncio accepts no connection for a second, and then tries again.
+    """
+    import asyncio  # noqa: PLC0415  programs without an event loop start faster
+
+    asyncio.get_running_loop().set_exception_handler(_log_loop_error)
+
+
+def _log_loop_error(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    if isinstance(error := context.get("exception"), OSError):
+        logging.getLogger("asyncio").error("%s: %s", context["message"], error)
+    else:
+        loop.default_exception_handler(context)
 
 
 MAX_LINES: Final = 20

@@ -61,7 +61,7 @@ def read_tokens(tokens: Sequence[Token], section: str = "grpc.token") -> tuple[S
     found: dict[bytes, Secret] = {}
     for index, token in enumerate(tokens):
         key = f"{section}[{index}]"
-        digest = bytes.fromhex(token.sha256) if token.sha256 is not None else _read_token(key, str(token.token_file))
+        digest = bytes.fromhex(token.sha256) if token.sha256 is not None else read_token(key, str(token.token_file))
         if digest in found:
             raise ConfigError(
                 f"{key}: this is the same token as that of {found[digest].name!r}; give each section its own token"
@@ -75,7 +75,17 @@ def digest(token: bytes) -> bytes:
     return hashlib.sha256(token).digest()
 
 
-def _read_token(key: str, name: str) -> bytes:
+def read_token(key: str, name: str) -> bytes:
+    """Return the digest of the token in a file.
+
+    Args:
+        key: The section of the configuration that has the key ``token_file``, for messages.
+        name: Path of the file.
+
+    Raises:
+        ConfigError: The file has no usable token, or other users have access to it; the message never quotes it.
+
+    """
     key = f"{key}.token_file: {name}"
     text = read_secret(key, name, MAX_TOKEN_BYTES + 3, instead="a new token").rstrip(b"\r\n")
     if not MIN_TOKEN_BYTES <= len(text) <= MAX_TOKEN_BYTES or not all(0x21 <= byte <= 0x7E for byte in text):

@@ -462,7 +462,11 @@ class Fabric(Section):
 
 
 class Metrics(Section):
-    """``[metrics]``: the address at which Prometheus can read the figures of the instance."""
+    """``[metrics]``: the address at which Prometheus can read the figures of the instance.
+
+    ``roles`` has the roles of clients without a token. ``token_file`` has a token that gives the role
+    ``read`` at this address alone.
+    """
 
     listen: Text
     insecure: bool = False
@@ -470,16 +474,17 @@ class Metrics(Section):
     key: Text | None = None
     hosts: Annotated[list[Text], Meta(max_length=100)] = []
     registers: Annotated[list[Text], Meta(max_length=1000)] = []
+    roles: Annotated[list[Text], Meta(max_length=len(ROLES))] | None = None
+    token_file: Text | None = None
 
 
 class Web(Metrics):
     """``[web]``: the address of the web page, which also serves the figures of ``[metrics]``.
 
-    ``roles`` has the roles of users without a token. Users with a token have the roles in
-    ``[[grpc.token]]``. ``scene`` is the file that describes the cell in 3D (``scene.py``).
+    Users with a token have the roles in ``[[grpc.token]]``. ``scene`` is the file that describes the
+    cell in 3D (``scene.py``).
     """
 
-    roles: Annotated[list[Text], Meta(max_length=len(ROLES))] | None = None
     scene: Text | None = None
 
 

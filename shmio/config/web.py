@@ -30,8 +30,7 @@ def check_web(config: Config) -> None:
             raise ConfigError(f"{key}.listen: {error}") from None
         if not address.loopback and section.certificate is None and not section.insecure:
             raise ConfigError(f"{key}.listen: {plain_text(section.listen, PLAIN_REMEDY)}")
-        if isinstance(section, Web):
-            _check_roles(section, address, config)
+        _check_roles(key, section, address, config)
 
 
 def http_sections(config: Config) -> list[tuple[str, Metrics]]:
@@ -39,27 +38,29 @@ def http_sections(config: Config) -> list[tuple[str, Metrics]]:
     return [(key, section) for key, section in (("metrics", config.metrics), ("web", config.web)) if section]
 
 
-def _check_roles(web: Web, address: Address, config: Config) -> None:
-    """Check the roles of users without a token, and fill in their default."""
-    guarded = config.grpc is not None and bool(config.grpc.token)
-    if web.roles is None:
-        if not guarded and not address.loopback:
+def _check_roles(key: str, section: Metrics, address: Address, config: Config) -> None:
+    """Check the roles of clients without a token, and fill in their default."""
+    offered = ROLES if isinstance(section, Web) else ("read",)
+    guarded = section.token_file is not None or (config.grpc is not None and bool(config.grpc.token))
+    if section.roles is None:
+        if not guarded and not address.loopback and isinstance(section, Web):
             raise ConfigError(
-                f"web.roles: other hosts can reach {web.listen}; give the roles of users who show no token, such as "
-                'roles = ["read"], or add a [[grpc.token]]'
+                f"web.roles: other hosts can reach {section.listen}; give the roles of users who show no token, such "
+                'as roles = ["read"], or add a [[grpc.token]]'
             )
-        web.roles = [] if guarded else list(ROLES)
-    for role in web.roles:
-        if role not in ROLES:
-            raise ConfigError(f"web.roles: {unknown('role', role, ROLES)}")
-    if not web.roles and not guarded:
-        raise ConfigError("web.roles: nobody could use the page; give a role, or add a [[grpc.token]]")
+        section.roles = [] if guarded else list(offered)
+    for role in section.roles:
+        if role not in offered:
+            raise ConfigError(f"{key}.roles: {unknown('role', role, offered)}")
+    if not section.roles and not guarded:
+        what = "the page" if isinstance(section, Web) else "the figures"
+        raise ConfigError(f"{key}.roles: nobody could use {what}; give a role, or add a [[grpc.token]]")
 
 
 def resolve_web(config: Config) -> None:
     """Make the paths in ``[metrics]`` and ``[web]`` absolute."""
     for _, section in http_sections(config):
-        for field in ("certificate", "key", "scene"):
+        for field in ("certificate", "key", "scene", "token_file"):
             if name := getattr(section, field, None):
                 setattr(section, field, str(config.path(name)))
 

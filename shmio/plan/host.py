@@ -13,7 +13,7 @@ from typing import Final
 
 from shmio import realtime
 from shmio.config import Alert, Config, Metrics, Mqtt, OpcUa, UnixAddress, parse_address
-from shmio.config.credentials import read_accounts, read_headers, read_password, read_tokens
+from shmio.config.credentials import read_accounts, read_headers, read_password, read_token, read_tokens
 from shmio.config.fabric import check_library as check_fabric_library
 from shmio.config.folder import unwritable
 from shmio.config.listening import encrypted
@@ -135,6 +135,8 @@ def _check_fabric(fabric: Fabric) -> None:
 def _check_http(key: str, section: Metrics) -> None:
     """Check the libraries and the files of the HTTP endpoint."""
     check_web_library(key)
+    if section.token_file is not None:
+        read_token(key, section.token_file)
     if section.certificate and section.key:
         server_context(MqttTls(certificate=section.certificate, key=section.key), f"{key}.")
 

@@ -285,11 +285,11 @@ def make_plan(
         sections.append(("opcua", "opcua", msgspec.to_builtins(config.opcua)))
     if config.fabric and mode != "log":
         sections += _fabric(config, config.fabric)
+    http = {"folders": _folders(config), "token": msgspec.to_builtins(config.grpc.token) if config.grpc else []}
     if config.metrics and mode != "log":
-        sections.append(("metrics", "web", msgspec.to_builtins(config.metrics) | {"folders": _folders(config)}))
+        sections.append(("metrics", "web", msgspec.to_builtins(config.metrics) | http))
     if config.web and mode != "log":
-        tokens = msgspec.to_builtins(config.grpc.token) if config.grpc else []
-        more = {"folders": _folders(config), "token": tokens, "config_file": str(config_file.resolve())}
+        more = http | {"config_file": str(config_file.resolve())}
         more["recordings"] = recordings and str(recordings)
         more["scene"] = scene  # in place of its path
         more["fabric"] = config.fabric and msgspec.to_builtins(Access.of(config.fabric))

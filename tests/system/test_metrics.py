@@ -8,6 +8,7 @@ import re
 import shutil
 import signal
 import subprocess
+import urllib.error
 import urllib.parse
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -29,19 +30,24 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-def get(url: str) -> bytes:
-    with urllib.request.urlopen(url, timeout=20) as answer:
+def get(url: str, token: str = "") -> bytes:
+    headers = {"Authorization": f"Bearer {token}"} if token else {}
+    with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=20) as answer:
         return bytes(answer.read())
 
 
 @contextmanager
-def prometheus(folder: Path, target: Address, address: Address) -> Iterator[str]:
+def prometheus(folder: Path, target: Address, address: Address, token: Path) -> Iterator[str]:
     """Run Prometheus with the packaged rules. It reads the figures every 200 ms."""
     shutil.copytree(PACKAGING, folder, dirs_exist_ok=True)
     file = folder / "prometheus.yml"
     text = (
         file.read_text().replace("127.0.0.1:9464", str(target)).replace("scrape_interval: 5s", "scrape_interval: 200ms")
     )
+    text = text.replace("# authorization:", "authorization:").replace(
+        "#   credentials_file: metrics.token", f"  credentials_file: {token}"
+    )
+    assert str(token) in text
     file.write_text(text.replace("rule_files", "  evaluation_interval: 200ms\nrule_files"))
     command = ["prometheus", f"--config.file={file}", f"--storage.tsdb.path={folder / 'data'}"]
     process = subprocess.Popen(
@@ -63,23 +69,31 @@ def query(api: str, expression: str) -> list[Any]:
 def test_a_cell_is_monitored(make_cell: Callable[..., Cell], tmp_path: Path) -> None:
     with reserved_port() as target, reserved_port() as server, reserved_port() as broker, reserved_port() as opcua:
         section = f'[recorder]\n[mqtt]\nlisten = "{broker}"\nbroker = "mosquitto"\n[metrics]\nlisten = "{target}"\n'
+        section += 'token_file = "metrics.token"\n'
         section += f'[opcua]\nlisten = "{opcua}"\n'
         cell = make_cell(config=CONFIG.replace("timeout = 1000", 'timeout = 1000\nwritable = ["Outputs"]') + section)
+        token = tmp_path / "metrics.token"  # that of Prometheus, of 64 digits, as openssl rand -hex 32 makes it
+        token.touch(0o600)
+        token.write_text(f"{'0123456789abcdef' * 4}\n")
+        (cell.folder / token.name).touch(0o600)
+        (cell.folder / token.name).write_text(token.read_text())
         cell.up()
+        with pytest.raises(urllib.error.HTTPError, match="401"):
+            get(f"http://{target}/metrics")
         cell.output("shmio", "set", "Outputs/0", "3")
         with grpc.insecure_channel(str(cell.grpc)) as channel:
             get_topic: Any = channel.unary_unary(
                 "/simulation.server.SimlogAPI/GetTopic", TopicDescriptor.SerializeToString
             )
             assert get_topic(TopicDescriptor(path="cell/Outputs/0"), timeout=20)
-        figures = get(f"http://{target}/metrics")
+        figures = get(f"http://{target}/metrics", token.read_text().strip())
         checked = subprocess.run(["promtool", "check", "metrics"], input=figures, capture_output=True, check=False)
         assert (checked.returncode, checked.stdout, checked.stderr) == (0, b"", b"")
         rules = (PACKAGING / "alerts.yml").read_text()
         for name in re.findall(r"\bshmio_\w+", rules):
             assert f"\n{name}".encode() in figures, f"alerts.yml has the unknown metric {name}"
         subprocess.run(["promtool", "check", "rules", PACKAGING / "alerts.yml"], check=True, capture_output=True)
-        with prometheus(tmp_path / "prometheus", target, server) as api:
+        with prometheus(tmp_path / "prometheus", target, server, token) as api:
 
             def ready() -> bool:
                 try:

@@ -10,7 +10,7 @@ import msgspec
 
 from shmio import worker
 from shmio.config import Address
-from shmio.config.credentials import read_tokens
+from shmio.config.credentials import Secret, read_token, read_tokens
 from shmio.config.model import Metrics, Token, Web
 from shmio.config.web import check_library
 from shmio.local.attach import attach
@@ -51,14 +51,17 @@ async def _serve(worker: Worker) -> None:
     worker.on_stop(lambda: loop.call_soon_threadsafe(stopping.set))
     measurements = Measurements(worker.segment)
     page = cell = served = None
+    tokens = read_tokens(msgspec.convert(given, list[Token]))
+    if config.token_file is not None:
+        tokens += (Secret(worker.name, frozenset({"read"}), read_token(worker.name, config.token_file)),)
+    sessions = Sessions(tokens, config.roles or ())
     if isinstance(config, Web):
         cell = attach(worker.segment.instance, writable=True)
-        sessions = Sessions(read_tokens(msgspec.convert(given, list[Token])), config.roles or ())
         served = Served(worker.segment, cell, measurements, folders, file, recordings, scene, fabric)
         page = PageApp(served, sessions, TABS, secure=config.certificate is not None)
         app = page.app(measurements, config.registers)
     else:
-        app = metrics_app(worker.segment, measurements, folders, config.registers)
+        app = metrics_app(worker.segment, measurements, folders, config.registers, sessions)
     server = HttpServer(
         app,
         Address.parse(config.listen),

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -23,12 +24,13 @@ from shmio.endpoints.web.page import Page, Tab
 from shmio.endpoints.web.served import Served
 from shmio.endpoints.web.sessions import COOKIE, MAX_AGE_S, Sessions, User
 from shmio.endpoints.web.uploads import MAX_BYTES, Uploads
+from shmio.endpoints.wrong_tokens import WrongTokens
 from shmio.errors import EndpointError, ShmioError
 from shmio.segment import Segment
 
 STATIC: Final = Path(__file__).parent / "static"
 MAX_PAGES: Final = 64
-"""Maximum number of open pages that have made a call."""
+"""Maximum number of open pages that have made a call. Clients share them."""
 MAX_SILENT: Final = 256
 """Maximum number of WebSockets on which no call has been made. If there are more, the oldest is closed."""
 MAX_LOGIN_BYTES: Final = 4096
@@ -44,7 +46,11 @@ _HINT: Final = "shmio: /metrics has the figures of the instance, for Prometheus\
 
 
 def metrics_app(
-    segment: Segment, measurements: Measurements, folders: Mapping[str, str], registers: Sequence[str]
+    segment: Segment,
+    measurements: Measurements,
+    folders: Mapping[str, str],
+    registers: Sequence[str],
+    sessions: Sessions,
 ) -> Starlette:
     """Return the application of ``[metrics]``. It serves ``/metrics``, and a hint at ``/``.
 
@@ -53,13 +59,18 @@ def metrics_app(
         measurements: Histograms of the sources' timing.
         folders: Directories whose free space is reported, by purpose.
         registers: Patterns of the registers whose values are reported.
+        sessions: The tokens of clients, and the roles of clients without one.
 
     """
+    wrong = WrongTokens()
+
+    async def refuse(request: Request) -> Response | None:
+        return await _refused(request, sessions, wrong, sessions.user(None, _host(request)))
 
     async def hint(_request: Request) -> Response:
         return PlainTextResponse(_HINT)
 
-    return Starlette(routes=[_metrics(segment, measurements, folders, registers), Route("/", hint)])
+    return Starlette(routes=[_metrics(segment, measurements, folders, registers, refuse), Route("/", hint)])
 
 
 def _metrics(
@@ -67,16 +78,32 @@ def _metrics(
     measurements: Measurements,
     folders: Mapping[str, str],
     registers: Sequence[str],
-    refuse: Callable[[Request], Response | None] = lambda _: None,
+    refuse: Callable[[Request], Awaitable[Response | None]],
 ) -> Route:
     exposition = Exposition(InstanceCollector(segment, measurements, folders, registers))
 
     async def metrics(request: Request) -> Response:
-        if (refused := refuse(request)) is not None:
+        if (refused := await refuse(request)) is not None:
             return refused
         return Response(await run_in_threadpool(exposition.answer), media_type=CONTENT_TYPE_LATEST)
 
     return Route("/metrics", metrics)
+
+
+async def _refused(request: Request, sessions: Sessions, wrong: WrongTokens, user: User) -> Response | None:
+    """Return the refusal of a client that may not read the metrics; None: the token, or else ``user``, allows it."""
+    kind, _, token = request.headers.get("authorization", "").partition(" ")
+    if kind.lower() == "bearer":
+        owner = sessions.owner(token, user.host)
+        if owner is None and sessions.takes_tokens:
+            _record_sign_in(user.host, "wrong token")
+            if "read" not in user.roles:
+                await wrong.slow_down(user.host)
+        user = owner or user
+    if "read" in user.roles:
+        return None
+    text = "this needs the role read; send Authorization: Bearer TOKEN, with a token of token_file or [[grpc.token]]\n"
+    return PlainTextResponse(text, 401, {"www-authenticate": "Bearer"})
 
 
 class _Login(msgspec.Struct, forbid_unknown_fields=True):
@@ -99,10 +126,12 @@ class PageApp:
         self._served, self._sessions, self._secure = served, sessions, secure
         self._tabs = [tab for tab in tabs if tab.offered(served)]
         self._cookie = COOKIE.format(served.segment.instance)
-        self._pages: set[Page] = set()
+        self._pages: dict[Page, None] = {}
+        """The pages that have made a call, the oldest first."""
         self._silent: dict[Page, None] = {}
         """The pages without a call, the oldest first."""
         self._uploads = Uploads()
+        self._wrong = WrongTokens()
         self._files = {
             f"/{file.relative_to(STATIC)}": (file.read_bytes(), _TYPES[file.suffix])
             for file in STATIC.rglob("*")
@@ -141,22 +170,8 @@ class PageApp:
     def _user(self, request: HTTPConnection) -> User:
         return self._sessions.user(request.cookies.get(self._cookie), _host(request))
 
-    def _refuse_metrics(self, request: Request) -> Response | None:
-        """Return the refusal of a client that may not read the metrics; None: its session or token allows it."""
-        user, host = self._user(request), _host(request)
-        kind, _, token = request.headers.get("authorization", "").partition(" ")
-        if kind.lower() == "bearer":
-            if self._sessions.blocked(host):
-                _record_sign_in(host, "too many wrong tokens")
-                return PlainTextResponse("too many wrong tokens; try again in a minute\n", 429)
-            owner = self._sessions.owner(token, host)
-            if owner is None:
-                _record_sign_in(host, "wrong token")
-            user = owner or user
-        if "read" in user.roles:
-            return None
-        text = "this needs the role read; send a token of [[grpc.token]] as Authorization: Bearer\n"
-        return PlainTextResponse(text, 401, {"www-authenticate": "Bearer"})
+    async def _refuse_metrics(self, request: Request) -> Response | None:
+        return await _refused(request, self._sessions, self._wrong, self._user(request))
 
     async def _session(self, request: Request) -> Response:
         """Describe the user. POST first opens a session for a token, and DELETE first closes the session."""
@@ -168,9 +183,6 @@ class PageApp:
             answer = JSONResponse(self._describe(self._sessions.user(None, host)))
             answer.delete_cookie(self._cookie, httponly=True, samesite="strict", secure=self._secure)
             return answer
-        if self._sessions.blocked(host):
-            _record_sign_in(host, "too many wrong tokens")
-            return JSONResponse({"error": "too many wrong tokens; try again in a minute"}, 429)
         body = await _body(request, MAX_LOGIN_BYTES)
         if body is None:
             return JSONResponse({"error": "this text is too long for a token"}, 413)
@@ -181,6 +193,7 @@ class PageApp:
         opened = self._sessions.open(token, host)
         if opened is None:
             _record_sign_in(host, "wrong token")
+            await self._wrong.slow_down(host)
             return JSONResponse({"error": "this token is not in [[grpc.token]]"}, 403)
         cookie, user = opened
         self._sessions.close(request.cookies.get(self._cookie, ""))
@@ -235,14 +248,23 @@ class PageApp:
         finally:
             forget()
             self._silent.pop(page, None)
-            self._pages.discard(page)
+            self._pages.pop(page, None)
 
     def _admit(self, page: Page) -> str:
-        """Count a page that makes its first call. Return the reason to close it; empty: it stays open."""
+        """Count a page that makes its first call. Return the reason to close it; empty: it stays open.
+
+        No client keeps others out: if too many pages are open, the oldest of the client with most of them ends.
+        """
         self._silent.pop(page, None)
         if len(self._pages) >= MAX_PAGES:
-            return f"{MAX_PAGES} pages are open; close one of them"
-        self._pages.add(page)
+            counts = Counter(one.user.client for one in self._pages)
+            most, count = counts.most_common(1)[0]
+            if count <= counts[page.user.client] + 1:
+                return f"{MAX_PAGES} pages are open; close one of them"
+            oldest = next(one for one in self._pages if one.user.client == most)
+            oldest.end(f"{MAX_PAGES} pages are open, and this client has most of them; another client needs one")
+            del self._pages[oldest]
+        self._pages[page] = None
         return ""
 
 

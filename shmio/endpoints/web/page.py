@@ -32,6 +32,8 @@ MAX_CALLS: Final = 16
 """Maximum number of a page's calls that may be in progress. Further calls wait."""
 MAX_BATCHES: Final = 32
 """Maximum number of binary messages that wait for a page. If there are more, the oldest are dropped."""
+CLOSE_S: Final = 1.0
+"""Time in s for which a page that is being closed waits for its client to read the reason."""
 FIRST_CALL_S: Final = 10.0
 """Time in s that a page has to make its first call. If too many pages have made none, the oldest is closed."""
 
@@ -198,6 +200,7 @@ class Page:
         try:
             async with self._limit:
                 await self._socket.accept()
+                sender.add_done_callback(lambda _: self.end("the connection is lost"))
                 message = await self._receive()
                 if message is not None and self.silent:
                     self.silent = False
@@ -208,8 +211,9 @@ class Page:
                         self._limit.reschedule(None if lasts_s is None else asyncio.get_running_loop().time() + lasts_s)
                 await self._serve(message)
         except TimeoutError:
-            with suppress(RuntimeError):  # the connection is closed
-                await self._socket.close(1008, self._why)
+            with suppress(RuntimeError, TimeoutError):  # the connection is closed, or the client does not read
+                async with asyncio.timeout(CLOSE_S):
+                    await self._socket.close(1008, self._why)
         except (WebSocketDisconnect, RuntimeError):  # starlette raises RuntimeError for a connection that is closed
             pass
         finally:
@@ -300,8 +304,9 @@ class Page:
             answer = {"id": number, "error": str(error)}
         except asyncio.CancelledError:
             raise
-        except Exception:  # noqa: BLE001  the page gets an answer to each call
-            _log.exception("a call of a page failed")
+        except Exception as error:  # noqa: BLE001  the page gets an answer to each call
+            # An error of the operating system, such as that no descriptor is free, is no error in the program.
+            _log.error("a call of a page failed: %s", error, exc_info=not isinstance(error, OSError))
             answer = {"id": number, "error": "the server failed to do this; its log has the reason"}
         self._answers.append(msgspec.json.encode(answer))
         self._waiting.set()

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import asyncio
 import ipaddress
+import logging
 import socket
 import ssl
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any, Final
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn import Config
 from uvicorn import Server as Uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.utils import ClientDisconnected
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from shmio.config import Address
 from shmio.errors import EndpointError
+from shmio.logs import log_loop_errors
 from shmio.wording import cannot_listen
 
 MAX_CONNECTIONS: Final = 512
@@ -32,6 +37,8 @@ REQUEST_S: Final = 10.0
 """Time in s in which a client must send its first request, and each later request from its first byte on."""
 IDLE_S: Final = 75
 """Time in s after which an idle connection is closed. Between scrapes, Prometheus keeps its connection."""
+UNREAD_S: Final = 20.0
+"""Time in s after which a connection ends whose client reads nothing, or does not end a connection that is closing."""
 MAX_HEADER_BYTES: Final = 16 << 10
 BACKLOG: Final = 64
 STOP_S: Final = 1
@@ -45,6 +52,7 @@ _HEADERS: Final = (
     (b"cache-control", b"no-store"),
 )
 """The headers of each answer."""
+_log = logging.getLogger("shmio.web")
 
 
 @dataclass
@@ -58,7 +66,86 @@ class Counters:
     """Number of bytes in the bodies of answers to HTTP requests."""
 
 
-class _Protocol(H11Protocol):
+class _Connection(asyncio.Protocol):
+    """What both kinds of connections have in common: they end if their clients do not read, or do not close."""
+
+    transport: asyncio.Transport
+    loop: asyncio.AbstractEventLoop
+    unread_s: float | None = None
+    """The event loop's time in s since which the client has not read what was sent; None: it reads."""
+    closing_s: float | None = None
+
+    def pause_writing(self) -> None:
+        """Remember since when the client reads nothing."""
+        super().pause_writing()
+        self.unread_s = self.loop.time()
+
+    def resume_writing(self) -> None:
+        """Note that the client reads again."""
+        super().resume_writing()
+        self.unread_s = None
+
+    def review(self) -> None:
+        """End the connection if its client has not read or closed it for too long. Call this about once a second."""
+        now_s = self.loop.time()
+        if self.closing_s is None and self.transport.is_closing():
+            self.closing_s = now_s
+        if any(since_s is not None and now_s - since_s >= UNREAD_S for since_s in (self.unread_s, self.closing_s)):
+            self.transport.abort()
+
+
+class _WebSocket(_Connection, WebSocketsSansIOProtocol):
+    """A WebSocket. Its page ends with the connection, whatever the page waits for."""
+
+    _page: asyncio.Task[None] | None = None
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """End the page."""
+        super().connection_lost(exc)
+        if self._page is not None:
+            self._page.cancel()
+
+    def pause_writing(self) -> None:
+        """Read nothing while the client reads nothing. Otherwise, answers to pings would fill the memory."""
+        super().pause_writing()
+        self.transport.pause_reading()
+
+    def resume_writing(self) -> None:
+        """Read again, unless the page has not read the last message yet."""
+        super().resume_writing()
+        if not self.read_paused:
+            self.transport.resume_reading()
+
+    def send_receive_event_to_app(self) -> None:
+        """Hand a message to the page. A text that is not UTF-8 ends the connection (RFC 6455, section 8.1)."""
+        if self.curr_msg_data_type == "text" and not self.close_sent:
+            try:
+                b"".join(self.frames).decode()
+            except UnicodeDecodeError:
+                _log.warning("a page sent text that is not UTF-8, so its connection is closed")
+                self.frames = []
+                self.conn.send_close(1007)
+                self.handle_parser_exception()
+                return
+        super().send_receive_event_to_app()
+
+    async def run_asgi(self) -> None:
+        """Run the page until it ends, or until the connection is lost."""
+        self._page = asyncio.current_task()
+        try:
+            await self.app(self.scope, self.receive, self.send)
+        except (ClientDisconnected, asyncio.CancelledError):
+            pass
+        except Exception as error:  # noqa: BLE001  a page must not end the server
+            _log_failure("a page", error)
+            self.send_500_response()
+        finally:
+            self._page = None
+        if self.close_timer is None:
+            self.transport.close()
+
+
+class _Protocol(_Connection, H11Protocol):
     """A connection that is closed if its client does not send whole requests in time."""
 
     counters: Counters
@@ -69,7 +156,6 @@ class _Protocol(H11Protocol):
     def connection_made(self, transport: Any) -> None:
         """Accept the connection. If there are now too many connections, close one of them."""
         super().connection_made(transport)
-        self.counters.connections = len(self.connections)
         self._quiet_s = self.loop.time()
         self._set_deadline()
         if len(self.connections) > MAX_CONNECTIONS:
@@ -77,12 +163,18 @@ class _Protocol(H11Protocol):
             self._longest_quiet().abort()
 
     def _longest_quiet(self) -> asyncio.Transport:
-        """Return the connection to close: a WebSocket that is closing, or else the one longest without a request."""
+        """Return the connection to close: one that is closing, or else the one longest without a request or reading."""
         for other in self.connections:
-            if getattr(other, "close_sent", False):
+            if getattr(other, "close_sent", False) or other.transport.is_closing():
                 return other.transport
-        quiet = [one for one in self.connections if isinstance(one, _Protocol) and one._quiet_s is not None]
-        return min(quiet, key=lambda one: one._quiet_s or 0.0).transport
+        quiet = [
+            (since_s, one.transport)
+            for one in self.connections
+            if isinstance(one, _Protocol)
+            for since_s in (one._quiet_s, one.unread_s)
+            if since_s is not None
+        ]
+        return min(quiet, key=itemgetter(0))[1]
 
     def handle_websocket_upgrade(self, event: Any) -> None:
         """Hand the connection over to a page's WebSocket, without a deadline."""
@@ -93,7 +185,6 @@ class _Protocol(H11Protocol):
         """Forget the connection."""
         self._clear_deadline()
         super().connection_lost(exc)
-        self.counters.connections = len(self.connections)
 
     def data_received(self, data: bytes) -> None:
         """Process bytes of a request. The first byte starts the request's deadline."""
@@ -174,7 +265,11 @@ class _Guarded:
         ):
             await refuse(403, b"this request comes from a page of another server\n")
         else:
-            await self._app(scope, receive, with_headers)
+            try:
+                await self._app(scope, receive, with_headers)
+            except OSError as error:  # such as: no descriptor is free
+                _log_failure(f"{scope['method']} {scope['path'][:80]!r}", error)
+                await refuse(503, b"the server cannot do this now; its log has the reason\n")
 
     def knows(self, host: str) -> bool:
         """Return whether a Host header names this server: an IP address, ``localhost``, or a configured name."""
@@ -195,6 +290,12 @@ def _same_origin(origins: list[bytes], host: bytes, *, secure: bool) -> bool:
     return not origins or origins == [(b"https://" if secure else b"http://") + host.lower()]
 
 
+def _log_failure(what: str, error: Exception) -> None:
+    """Log why a request or a page failed; with a traceback only if it may be an error in the program."""
+    expected = isinstance(error, OSError)
+    _log.error("%s failed: %s", what, error, exc_info=None if expected else error)
+
+
 class _Server(Uvicorn):
     """A server that leaves signals to the worker."""
 
@@ -207,6 +308,14 @@ class _Server(Uvicorn):
         """Start to accept connections."""
         await super().startup(sockets)
         self.ready.set()
+
+    async def on_tick(self, counter: int) -> bool:
+        """End the connections whose clients do not read or close. uvicorn calls this ten times a second."""
+        if counter % 10 == 0:
+            for connection in tuple(self.server_state.connections):
+                if isinstance(connection, _Connection):
+                    connection.review()
+        return await super().on_tick(counter)
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -240,13 +349,13 @@ class HttpServer:
 
         """
         self.address = address
-        self.counters = Counters()
+        self._counters = Counters()
         names = frozenset(name.lower() for name in ("localhost", address.host, *hosts))
-        protocol = type("Protocol", (_Protocol,), {"counters": self.counters})
+        protocol = type("Protocol", (_Protocol,), {"counters": self._counters})
         config = Config(
-            _Guarded(app, names, self.counters),
+            _Guarded(app, names, self._counters),
             http=protocol,
-            ws="websockets-sansio" if sockets else "none",
+            ws=_WebSocket if sockets else "none",
             ws_max_size=MAX_MESSAGE_BYTES,
             ws_ping_interval=PING_S,
             ws_ping_timeout=PING_S,
@@ -268,12 +377,19 @@ class HttpServer:
         self._server = _Server(config)
         self._serving: asyncio.Task[None] | None = None
 
+    @property
+    def counters(self) -> Counters:
+        """What the server has counted until now."""
+        self._counters.connections = len(self._server.server_state.connections)
+        return self._counters
+
     async def start(self) -> None:
         """Start to listen.
 
         Raises:
             EndpointError: The address cannot be used.
         """
+        log_loop_errors()
         family = socket.AF_INET6 if ":" in self.address.host else socket.AF_INET
         listening = socket.socket(family, socket.SOCK_STREAM)
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hmac
 import secrets
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
@@ -22,12 +22,9 @@ from shmio.config.model import ROLES
 COOKIE: Final = "shmio_session_{}"
 """Name of the cookie. It includes the instance's name, because browsers share cookies among a host's ports."""
 MAX_SESSIONS: Final = 256
+"""Maximum number of sessions. If there are more, the oldest of the user who has most of them ends."""
 MAX_AGE_S: Final = 12 * 3600
 """Time in s after which a session ends, so that the user must show the token again."""
-ATTEMPTS: Final = 10
-ATTEMPTS_S: Final = 60.0
-"""Length in s of the period in which a host may show at most ``ATTEMPTS`` wrong tokens."""
-_MAX_HOSTS: Final = 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +39,11 @@ class User:
     def actor(self) -> Actor:
         """The user's identity for the audit log."""
         return Actor("token" if self.name else "anonymous", self.name, self.host)
+
+    @property
+    def client(self) -> str:
+        """The name under which the user's pages and sessions count towards limits: of the token, or else the host."""
+        return f"token {self.name}" if self.name else self.host
 
     @property
     def listed_roles(self) -> list[str]:
@@ -75,7 +77,6 @@ class Sessions:
         self._anonymous = frozenset(anonymous)
         self._now = now
         self._users: OrderedDict[bytes, _Session] = OrderedDict()
-        self._failures: OrderedDict[str, list[float]] = OrderedDict()
 
     @property
     def takes_tokens(self) -> bool:
@@ -119,22 +120,18 @@ class Sessions:
         cookie = secrets.token_urlsafe(32)
         self._users[digest(cookie.encode())] = _Session(user, self._now())
         if len(self._users) > MAX_SESSIONS:
-            self._ended(self._users.popitem(last=False)[1])
+            most, _ = Counter(one.user.client for one in self._users.values()).most_common(1)[0]
+            oldest = next(key for key, one in self._users.items() if one.user.client == most)
+            self._ended(self._users.pop(oldest))
         return cookie, user
 
     def owner(self, token: str, host: str) -> User | None:
-        """Return the owner of a token; None if there is no such token.
-
-        A wrong token counts as a failed attempt of the host.
-        """
+        """Return the owner of a token; None if there is no such token. The time that this takes depends on no token."""
         shown, owner = digest(token.strip().encode()), None
         for secret in self._tokens:
             if hmac.compare_digest(secret.digest, shown):
                 owner = secret
-        if owner is None:
-            self._failed(host)
-            return None
-        return User(owner.name, owner.roles | self._anonymous, host)
+        return None if owner is None else User(owner.name, owner.roles | self._anonymous, host)
 
     def close(self, cookie: str) -> None:
         """Close the session with this cookie, and its pages."""
@@ -145,16 +142,3 @@ class Sessions:
     def _ended(self, session: _Session) -> None:
         for end in tuple(session.ends):
             end()
-
-    def blocked(self, host: str) -> bool:
-        """Return whether a host has shown ``ATTEMPTS`` wrong tokens within the last ``ATTEMPTS_S``."""
-        failures = self._failures.get(host, [])
-        return len(failures) >= ATTEMPTS and self._now() - failures[-ATTEMPTS] < ATTEMPTS_S
-
-    def _failed(self, host: str) -> None:
-        failures = self._failures.setdefault(host, [])
-        self._failures.move_to_end(host)
-        failures.append(self._now())
-        del failures[:-ATTEMPTS]
-        if len(self._failures) > _MAX_HOSTS:
-            self._failures.popitem(last=False)

@@ -94,6 +94,10 @@ class DeniedError(ShmioError):
         self.code = code
 
 
+class WrongTokenError(DeniedError):
+    """The client shows a token that is not configured."""
+
+
 class Credentials(NamedTuple):
     """A client's credentials: the hash of its token, and the names in its certificate."""
 
@@ -225,7 +229,7 @@ class ListenerAccess:
             )
         secret = self.keys.secret(shown)
         if secret is None:
-            raise DeniedError(
+            raise WrongTokenError(
                 grpc.StatusCode.UNAUTHENTICATED,
                 "the token is not in [[grpc.token]]; send authorization: Bearer TOKEN with a token that is; after a "
                 "change of a token's file, run shmio-supervisor reload",
@@ -272,6 +276,12 @@ def holder_of(
     if peer.startswith("unix:") or (address is not None and address[0].is_loopback):
         return "this host"
     return peer if address is None else address[0]
+
+
+def host_of(peer: str) -> str:
+    """Return the host of a client, without its port."""
+    address = peer_of(peer)
+    return peer if address is None else str(address[0])
 
 
 def client_of(peer: str, token: str | None) -> str:

@@ -26,10 +26,13 @@ from shmio.endpoints.grpc.server.access import (
     Credentials,
     DeniedError,
     ListenerAccess,
+    WrongTokenError,
     action_of,
     client_of,
+    host_of,
 )
 from shmio.endpoints.grpc.server.error_status import Context
+from shmio.endpoints.wrong_tokens import WrongTokens
 from shmio.errors import EndpointError
 from shmio.layout.topic import shorten
 from shmio.logs import fields
@@ -134,6 +137,7 @@ class OpenCalls:
     def __init__(self, limits: CallLimits | None = None) -> None:
         self.limits = limits or CallLimits()
         self.refusals = Refusals("call refused", "call")
+        self.wrong = WrongTokens()
         self.sent_bytes = 0
         """Size of all messages that were sent to clients, without the framing of gRPC and HTTP/2."""
         self._open: set[_Call] = set()
@@ -259,6 +263,8 @@ class CallGuard:
             try:
                 call = self._calls.enter(method, self._access, context)
             except DeniedError as error:
+                if isinstance(error, WrongTokenError):
+                    await self._calls.wrong.slow_down(host_of(context.peer()))
                 await context.abort(error.code, str(error))
             try:
                 request: Any = messages

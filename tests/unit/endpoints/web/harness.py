@@ -13,9 +13,11 @@ from typing import Any
 from prometheus_client.parser import text_string_to_metric_families
 
 from shmio.config import Address
+from shmio.config.credentials import Secret
 from shmio.endpoints.web.app import metrics_app
 from shmio.endpoints.web.measurements import Measurements
 from shmio.endpoints.web.server import HttpServer
+from shmio.endpoints.web.sessions import Sessions
 from shmio.segment import Attributes, BlockSpec, BlockWriter, ProcessSpec, Quality, Segment
 from tests.unit.endpoints.harness import LAYOUT, STALE_NS, WRITABLE
 
@@ -74,11 +76,16 @@ class Served:
 
 @contextmanager
 def served(
-    segment: Segment, registers: Sequence[str] = (), folders: Mapping[str, str] | None = None, hosts: Sequence[str] = ()
+    segment: Segment,
+    registers: Sequence[str] = (),
+    folders: Mapping[str, str] | None = None,
+    hosts: Sequence[str] = (),
+    secrets: Sequence[Secret] = (),
 ) -> Iterator[Served]:
     """Serve a segment on a free port."""
     measurements = Measurements(segment)
-    app = metrics_app(segment, measurements, folders or {}, registers)
+    sessions = Sessions(secrets, () if secrets else ("read",))
+    app = metrics_app(segment, measurements, folders or {}, registers, sessions)
     server = HttpServer(app, Address("127.0.0.1", 0), hosts=tuple(hosts))
     loop = asyncio.new_event_loop()
     thread = threading.Thread(target=loop.run_forever)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from shmio.config.credentials import Secret, digest
 from shmio.endpoints.alerts.lifecycle import Progress
 from shmio.endpoints.alerts.state_file import FILE_NAME, AlertState, State, StateWriter
 from shmio.endpoints.web import metrics
@@ -57,6 +58,24 @@ def test_the_broker_counts_nothing(segment: Segment) -> None:
     segment.processes.find("mqtt").report = Report(1, Activity.RUNNING, 1, (7,))
     with served(segment) as endpoint:
         assert endpoint.figure("shmio_mqtt_messages_total") == 7
+
+
+def test_clients_need_a_token_if_there_are_tokens(segment: Segment) -> None:
+    secrets = (
+        Secret("scraper", frozenset({"read"}), digest(b"right")),
+        Secret("robot", frozenset({"write"}), digest(b"weak")),
+    )
+    with served(segment, secrets=secrets) as endpoint:
+        for token, status in (
+            (None, 401),
+            ("Bearer wrong", 401),
+            ("Bearer weak", 401),
+            ("right", 401),
+            ("Bearer right", 200),
+        ):
+            found, headers, text = endpoint.get(headers={} if token is None else {"Authorization": token})
+            assert (found, "shmio_instance_info" in text) == (status, status == 200), token
+            assert ("www-authenticate" in headers) == (status == 401), token
 
 
 def test_values_of_registers_while_they_are_not_bad(segment: Segment) -> None:

@@ -19,6 +19,7 @@ from websockets.sync.connection import Connection
 
 from shmio.config import Address
 from shmio.config.credentials import Secret, digest
+from shmio.endpoints import wrong_tokens
 from shmio.endpoints.grpc.server.access import NEEDS
 from shmio.endpoints.web import app, page, sessions
 from shmio.endpoints.web.app import PageApp
@@ -42,9 +43,30 @@ SECRETS = (Secret("ann", frozenset({"read"}), digest(TOKEN.encode())),)
 class Pages:
     """A server of the page, and a browser's requests to it."""
 
-    def __init__(self, server: HttpServer, instance: str) -> None:
+    def __init__(self, server: HttpServer, instance: str, app: PageApp, loop: asyncio.AbstractEventLoop) -> None:
         self.port = server.port
         self.cookie = COOKIE.format(instance)
+        self._server, self._app, self._loop = server, app, loop
+
+    def waiting(self) -> int:
+        """Return the number of answers to wrong tokens that are being delayed."""
+        return len(self._app._wrong._waiting)
+
+    def held(self) -> dict[str, int]:
+        """Return what the server holds for its clients: slots, connections, tasks, and this process's descriptors."""
+
+        async def count() -> dict[str, int]:
+            return {
+                "pages": len(self._app._pages),
+                "silent": len(self._app._silent),
+                "connections": self._server.counters.connections,
+                "tasks": len(asyncio.all_tasks()) - 1,
+                "wrong": self.waiting(),
+                "uploads": len(self._app._uploads._receiving),
+            }
+
+        found = asyncio.run_coroutine_threadsafe(count(), self._loop).result(TIMEOUT_S)
+        return found | {"descriptors": len(list(Path("/proc/self/fd").iterdir()))}
 
     def request(
         self, method: str, path: str, body: str | bytes | None = None, **headers: str
@@ -92,7 +114,7 @@ def pages(
         thread.start()
         try:
             asyncio.run_coroutine_threadsafe(server.start(), loop).result(TIMEOUT_S)
-            yield Pages(server, segment.instance)
+            yield Pages(server, segment.instance, served, loop)
         finally:
             asyncio.run_coroutine_threadsafe(server.stop(), loop).result(TIMEOUT_S)
             loop.call_soon_threadsafe(loop.stop)
@@ -196,9 +218,33 @@ def test_figures_need_the_role_read(segment: Segment) -> None:
         assert server.request("GET", "/metrics", Authorization="Bearer wrong")[0] == 401
         assert server.request("GET", "/metrics", Authorization=f"Bearer {TOKEN}")[0] == 200
         assert server.request("GET", "/metrics", Cookie=f"{server.cookie}={server.sign_in(TOKEN)}")[0] == 200
-        for _ in range(sessions.ATTEMPTS):
-            server.request("GET", "/metrics", Authorization="Bearer wrong")
-        assert server.request("GET", "/metrics", Authorization=f"Bearer {TOKEN}")[0] == 429
+
+
+def test_right_token_is_accepted_at_once_while_wrong_ones_are_slowed_down(
+    segment: Segment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(wrong_tokens, "DELAYS_S", (10 * TIMEOUT_S,))
+    monkeypatch.setattr(wrong_tokens, "MAX_WAITING", 4)
+    right, wrong = {"Authorization": f"Bearer {TOKEN}"}, {"Authorization": "Bearer wrong"}
+    with pages(segment, SECRETS, roles=()) as server, ExitStack() as stack:
+        for _ in range(wrong_tokens.FREE):
+            assert server.request("GET", "/metrics", **wrong)[0] == 401
+        slowed = []
+        for path in ("/metrics", "/session") * 3:  # the answers to the first two make room for the last two
+            client = http.client.HTTPConnection("127.0.0.1", server.port, timeout=TIMEOUT_S)
+            stack.callback(client.close)
+            if path == "/metrics":
+                client.request("GET", path, headers=wrong)
+            else:
+                client.request("POST", path, json.dumps({"token": "wrong"}))
+            slowed.append(client)
+            while server.waiting() < min(len(slowed), 4):
+                pass
+        assert [slowed[n].getresponse().status for n in range(2)] == [401, 403]
+        assert server.waiting() == 4
+        assert server.request("GET", "/metrics", **right)[0] == 200
+        assert server.sign_in(TOKEN)
+        assert server.waiting() == 4
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ import trustme
 
 from shmio.config import Address, Grpc, Tls, Token
 from shmio.config.model import Client, Listening
+from shmio.endpoints import wrong_tokens
 from shmio.endpoints.grpc.server.access import NEEDS, Keys, Listener, ListenerAccess, Listeners
 from shmio.endpoints.grpc.server.server import Server
 from shmio.segment import Segment
@@ -219,6 +220,39 @@ def test_the_names_of_a_certificate_give_its_roles(segment: Segment, tmp_path: P
             async with as_client("dash.lab.example.evil.org") as channel:
                 told, message = await refusal(call(channel, GET))
                 assert (told, "send authorization: Bearer" in message) == (UNKNOWN, True)
+
+    serve(segment, test)
+
+
+def test_right_token_is_accepted_at_once_while_wrong_ones_are_slowed_down(
+    segment: Segment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(wrong_tokens, "DELAYS_S", (10 * TIMEOUT_S,))
+
+    async def test(served: Endpoint) -> None:
+        begun, ended = asyncio.Event(), asyncio.Event()
+
+        async def watched(host: str) -> None:
+            begun.set()
+            try:
+                await wrong_tokens.WrongTokens.slow_down(server.calls.wrong, host)
+            finally:
+                ended.set()
+
+        async with (
+            guarded(served, Listeners(LOCAL).listeners) as (server, (port,)),
+            grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel,
+        ):
+            for _ in range(wrong_tokens.FREE):
+                assert (await refusal(call(channel, GET, secret="wrong")))[0] is UNKNOWN
+            monkeypatch.setattr(server.calls.wrong, "slow_down", watched)
+            slowed = call(channel, GET, secret="wrong")
+            await begun.wait()
+            assert await call(channel, GET, secret=READER)
+            assert not slowed.done()
+            assert not ended.is_set()
+            slowed.cancel()
+            await ended.wait()  # a client that gives up leaves nothing behind
 
     serve(segment, test)
 
